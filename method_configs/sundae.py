@@ -1,0 +1,159 @@
+"""Method specifications of SUNDAE and its variants: one object tree each, built by helpers that share nothing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.datamanager import SundaeDatamanagerConfig
+from sundae_ns.model import SundaeModelConfig
+from sundae_ns.pruning import PruningConfig
+from sundae_ns.schedulers import PruneAwareDecayConfig
+
+
+def _adam(lr: float) -> AdamOptimizerConfig:
+    return AdamOptimizerConfig(lr=lr, eps=1e-15)
+
+
+def optimizers(steps: int, *, restart_means: bool = True) -> dict[str, Any]:
+    """A fresh set of optimizers for a run of ``steps`` steps: splatfacto's rates, and those of features and head.
+
+    Args:
+        steps: length of the run, where decaying rates reach their final value.
+        restart_means: whether the rate of the centres begins anew at the prune, so that the kept primitives can move
+            into the gaps that the others left.
+    """
+    return {
+        "means": {
+            "optimizer": _adam(1.6e-4),
+            "scheduler": PruneAwareDecayConfig(
+                lr_final=1.6e-6, max_steps=steps, lr_restart=1.6e-4 if restart_means else None
+            ),
+        },
+        "features_dc": {"optimizer": _adam(0.0025), "scheduler": None},
+        "features_rest": {"optimizer": _adam(0.0025 / 20), "scheduler": None},
+        "opacities": {"optimizer": _adam(0.05), "scheduler": None},
+        "scales": {"optimizer": _adam(0.005), "scheduler": None},
+        "quats": {"optimizer": _adam(0.001), "scheduler": None},
+        "features": {"optimizer": _adam(0.0025), "scheduler": None},
+        "compensation": {
+            "optimizer": _adam(1e-3),
+            "scheduler": PruneAwareDecayConfig(lr_final=1e-5, max_steps=steps, lr_restart=1e-3, hold_until_prune=True),
+        },
+        "camera_opt": {
+            "optimizer": _adam(1e-4),
+            "scheduler": PruneAwareDecayConfig(lr_final=5e-7, max_steps=steps),
+        },
+    }
+
+
+def method(
+    name: str,
+    description: str,
+    *,
+    pruning: PruningConfig,
+    head: HeadConfig | None = None,
+    steps: int = 30000,
+    restart_means: bool = True,
+    trainer: dict[str, Any] | None = None,
+    **model: Any,
+) -> MethodSpecification:
+    """One method.
+
+    Args:
+        name: what users type after ``ns-train``.
+        description: the line in ``ns-train --help``.
+        pruning: when and what to prune.
+        head: the compensation head.
+        steps: length of the run.
+        restart_means: see :func:`optimizers`.
+        trainer: more options of the trainer.
+        model: more options of the model.
+    """
+    config = TrainerConfig(
+        method_name=name,
+        steps_per_eval_image=500,
+        steps_per_eval_batch=0,
+        steps_per_save=2000,
+        steps_per_eval_all_images=5000,
+        max_num_iterations=steps,
+        mixed_precision=False,
+        machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
+        pipeline=VanillaPipelineConfig(
+            datamanager=SundaeDatamanagerConfig(
+                dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
+            ),
+            model=SundaeModelConfig(
+                pruning=pruning,
+                head=head or HeadConfig(),
+                camera_optimizer=CameraOptimizerConfig(mode="off"),
+                **model,
+            ),
+        ),
+        optimizers=optimizers(steps, restart_means=restart_means),
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        vis="viewer",
+    )
+    for option, value in (trainer or {}).items():
+        setattr(config, option, value)
+    return MethodSpecification(config=config, description=description)
+
+
+def _keep(percent: int) -> MethodSpecification:
+    name = "sundae" if percent == 10 else f"sundae-{percent}"
+    description = (
+        f"SUNDAE: spectrally pruned Gaussian field with neural compensation, keeps {percent}% of the primitives."
+    )
+    return method(name, description, pruning=PruningConfig(keep_ratio=percent / 100))
+
+
+sundae = _keep(10)
+sundae_1 = _keep(1)
+sundae_30 = _keep(30)
+sundae_50 = _keep(50)
+sundae_80 = _keep(80)
+sundae_100 = _keep(100)
+
+sundae_continuous = method(
+    "sundae-continuous",
+    "SUNDAE with continuous pruning while densifying: a lower peak of memory, a loosely held final count.",
+    pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
+)
+
+sundae_paper = method(
+    "sundae-paper",
+    "SUNDAE as literal as the paper's text allows: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",
+    pruning=PruningConfig(keep_ratio=0.1, selection="band", score="response", signal="positions", gamma=0.5),
+    head=HeadConfig(mode="features", size="regular", pixel_unshuffle=1, precision="fp32"),
+    steps=60000,
+    restart_means=False,
+    base_loss_weight=0.0,
+    ssim_lambda=0.25,
+)
+
+sundae_tiny = method(
+    "sundae-tiny",
+    "SUNDAE for a first look: small scenes, a few minutes on a CPU.",
+    pruning=PruningConfig(keep_ratio=0.25, prune_at=600),
+    head=HeadConfig(size="tiny", pixel_unshuffle=1, num_features=5),
+    steps=1200,
+    trainer={"vis": "tensorboard", "steps_per_save": 400, "steps_per_eval_all_images": 10000},
+    num_downscales=0,
+    sh_degree=2,
+    sh_degree_interval=200,
+    warmup_length=100,
+    stop_split_at=600,
+    stop_screen_size_at=0,
+    reset_alpha_every=100,
+    densify_grad_thresh=0.0004,
+    cull_alpha_thresh=0.02,
+)

@@ -1,0 +1,157 @@
+"""``sundae doctor``: what this machine can run, and how to mend what it cannot."""
+
+from __future__ import annotations
+
+import ctypes.util
+import importlib.util
+import os
+import platform
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    name: str
+    ok: bool
+    detail: str
+    mend: str = ""
+    needed: bool = True
+    """Whether training needs it, rather than one more comfort."""
+
+
+def versions() -> list[Finding]:
+    """Python, and the packages that matter."""
+    findings = [Finding("python", True, platform.python_version())]
+    for package in PACKAGES:
+        try:
+            findings.append(Finding(package, True, metadata.version(package)))
+        except metadata.PackageNotFoundError:
+            findings.append(Finding(package, False, "not installed", f"pip install {package}"))
+    return findings
+
+
+def cuda() -> Finding:
+    """Whether torch sees a CUDA device."""
+    if torch.cuda.is_available():
+        return Finding("CUDA", True, f"{torch.cuda.get_device_name(0)}, torch built for {torch.version.cuda}")
+    if torch.version.cuda is None:
+        return Finding("CUDA", False, "this torch is built without CUDA", "pip install torch==2.11.0", needed=False)
+    mend = "install an NVIDIA driver (nvidia-smi shows whether it works)"
+    return Finding("CUDA", False, "no device that torch can use", mend, needed=False)
+
+
+def nvcc() -> Finding:
+    """Whether the CUDA compiler is there, which builds gsplat's kernels once."""
+    home = os.environ.get("CUDA_HOME", "/usr/local/cuda")
+    found = shutil.which("nvcc") or shutil.which("nvcc", path=str(Path(home) / "bin"))
+    if found:
+        return Finding("nvcc", True, found)
+    mend = "install the CUDA toolkit of torch's version and put nvcc on the PATH, or set CUDA_HOME"
+    return Finding("nvcc", False, "not found; gsplat needs it once, to build its kernels", mend, needed=False)
+
+
+def kernels_built() -> bool:
+    """Whether gsplat's CUDA extension lies ready: shipped with it, or built before. Builds nothing."""
+    spec = importlib.util.find_spec("gsplat")
+    if spec is None or spec.origin is None:
+        return False
+    if any(Path(spec.origin).parent.glob("csrc*")):
+        return True
+    cache = os.environ.get("TORCH_EXTENSIONS_DIR")
+    root = Path(cache) if cache else Path(torch.hub.get_dir()).parent.parent / "torch_extensions"
+    return any(root.glob("**/gsplat_cuda.so"))
+
+
+def kernels(compile_kernels: bool) -> Finding:
+    """Whether gsplat's kernels run; builds them only if asked to."""
+    if not torch.cuda.is_available():
+        return Finding("gsplat kernels", False, "need a CUDA device", "mend CUDA first", needed=False)
+    if not compile_kernels and not kernels_built():
+        mend = "sundae doctor --compile (minutes; else the first training step does it)"
+        return Finding("gsplat kernels", False, "not built yet", mend, needed=False)
+    from sundae_ns.errors import BackendError
+    from sundae_ns.rasterization import select_backend
+
+    try:
+        select_backend("gsplat", "cuda")
+    except BackendError as error:
+        return Finding("gsplat kernels", False, str(error), "sundae doctor --compile", needed=False)
+    return Finding("gsplat kernels", True, "run")
+
+
+def rasterizer(kernels_finding: Finding) -> Finding:
+    """Which rasteriser ``auto`` takes."""
+    if torch.cuda.is_available():
+        if kernels_finding.ok:
+            return Finding("rasteriser", True, "auto takes gsplat")
+        if kernels_finding.detail == "not built yet":
+            return Finding("rasteriser", True, "auto takes gsplat, after it has built its kernels")
+    detail = "auto takes reference, in plain PyTorch: right for small scenes, slow for captures"
+    return Finding("rasteriser", True, detail)
+
+
+def lpips() -> Finding:
+    """Whether the metric's weights are at hand."""
+    from sundae_ns.evaluation import lpips_weights_available
+
+    if lpips_weights_available():
+        return Finding("LPIPS weights", True, "at hand")
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    mend = f"put torchvision's alexnet-owt-7be5be79.pth into {folder}, or evaluate once with network"
+    return Finding("LPIPS weights", False, "not at hand: metrics leave LPIPS out", mend, needed=False)
+
+
+def system_library(name: str, package: str) -> Finding:
+    """Whether a library is there that open3d, and so ns-export, loads."""
+    if ctypes.util.find_library(name):
+        return Finding(f"lib{name}", True, "found")
+    return Finding(f"lib{name}", False, "not found; ns-export needs it", f"apt-get install {package}", needed=False)
+
+
+def examine(compile_kernels: bool = False) -> list[Finding]:
+    """All findings, in the order of the report."""
+    kernels_finding = kernels(compile_kernels)
+    findings: list[Callable[[], Finding]] = [
+        cuda,
+        nvcc,
+        lambda: kernels_finding,
+        lambda: rasterizer(kernels_finding),
+        lpips,
+        lambda: system_library("usb-1.0", "libusb-1.0-0"),
+        lambda: system_library("GL", "libgl1"),
+    ]
+    return versions() + [finding() for finding in findings]
+
+
+def run_doctor(compile_kernels: bool = False, console: Console | None = None) -> int:
+    """Print the report; the exit code is 1 if something is missing that training needs.
+
+    Args:
+        compile_kernels: build gsplat's kernels if they are not built.
+        console: where to print.
+    """
+    console = console or Console()
+    findings = examine(compile_kernels)
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for finding in findings:
+        mark = "[green]ok[/]" if finding.ok else "[red]missing[/]" if finding.needed else "[yellow]-[/]"
+        table.add_row(mark, finding.name, finding.detail)
+    console.print(table)
+    mends = [finding for finding in findings if not finding.ok and finding.mend]
+    if mends:
+        console.print("\nTo mend:")
+        for finding in mends:
+            console.print(f"  {finding.name}: {finding.mend}", soft_wrap=True, highlight=False)
+    return int(any(finding.needed and not finding.ok for finding in findings))

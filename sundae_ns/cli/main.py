@@ -1,0 +1,90 @@
+"""Entry point of ``sundae``: one subcommand a module, errors shown as one line."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from sundae_ns.errors import SundaeError
+
+app = tyro.extras.SubcommandApp()
+
+
+@app.command
+def doctor(compile: bool = False) -> int:  # noqa: A002
+    """Check what this machine can run, and say for each thing missing the command that mends it.
+
+    Args:
+        compile: build gsplat's CUDA kernels now if they are not built yet (minutes, needs nvcc).
+    """
+    from sundae_ns.cli.doctor import run_doctor
+
+    return run_doctor(compile_kernels=compile)
+
+
+@app.command
+def scene(
+    out: Annotated[Path, tyro.conf.Positional],
+    seed: int = 0,
+    train_views: int = 48,
+    test_views: int = 8,
+    width: int = 128,
+    height: int = 128,
+    points: int = 2000,
+) -> int:
+    """Write the embedded scene: a small ray-traced capture in nerfstudio format, with a sparse point cloud.
+
+    Args:
+        out: folder to write; it is the value for ns-train's --data.
+        seed: varies everything; the same seed gives the same scene.
+        train_views: training pictures.
+        test_views: test pictures.
+        width: pixels.
+        height: pixels.
+        points: size of the sparse point cloud.
+    """
+    from rich.progress import Progress
+
+    from sundae_ns.data import write_scene
+
+    with Progress(transient=True) as progress:
+        task = progress.add_task("Ray tracing", total=train_views + test_views)
+        write_scene(
+            out,
+            seed=seed,
+            train_views=train_views,
+            test_views=test_views,
+            width=width,
+            height=height,
+            points=points,
+            progress=lambda done, total: progress.update(task, completed=done, total=total),
+        )
+    print(f"wrote {train_views} training and {test_views} test views to {out}")
+    return 0
+
+
+@app.command
+def demo(out: Annotated[Path, tyro.conf.Positional] = Path(".demo"), steps: int | None = None) -> int:
+    """Make the embedded scene, train it with ns-train, evaluate it with ns-eval, and show what came out.
+
+    Args:
+        out: folder for the scene, the run and the pictures.
+        steps: length of the training instead of sundae-tiny's own.
+    """
+    from sundae_ns.cli.demo import run_demo
+
+    return run_demo(out, steps=steps)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run ``sundae``; exits with 2 and one line on an error of ours."""
+    try:
+        code = app.cli(prog="sundae", description="SUNDAE for nerfstudio.", args=arguments)
+    except SundaeError as error:
+        print(f"sundae: {error}", file=sys.stderr)
+        sys.exit(2)
+    sys.exit(code or 0)

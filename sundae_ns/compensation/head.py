@@ -1,0 +1,99 @@
+"""The compensation head: from splatted colours, features and accumulation to the final picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from sundae_ns.compensation.unet import UNet
+from sundae_ns.errors import ConfigError
+
+WIDTHS = {"tiny": 8, "small": 32, "regular": 64, "large": 128}
+"""Channels of the finest level. The last three are the paper's 7.2, 30 and 120 MB in fp32; ``tiny`` is 0.5 MB."""
+
+PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
+
+
+@dataclass
+class HeadConfig:
+    """What the compensation head is."""
+
+    mode: Literal["residual", "features", "off"] = "residual"
+    """residual: the head adds a correction to the spherical-harmonics picture, which stays valid by itself.
+    features: the paper's way, the head alone makes the picture from splatted features. off: no head."""
+    size: Literal["tiny", "small", "regular", "large"] = "small"
+    """Width of the U-Net: 0.5, 7.8, 31 or 124 MB in fp32. The paper's default is regular."""
+    pixel_unshuffle: int = 2
+    """Fold blocks of this many pixels a side into channels before the U-Net: 1 is the paper's, 2 is faster."""
+    num_features: int = 13
+    """Length F of the feature vector of each primitive. 1, 5, 13 and 29 splat without padding."""
+    start_at: int | None = None
+    """Training step at which the head starts; by default it starts with the prune."""
+    precision: Literal["fp32", "bf16", "fp16"] = "bf16"
+    """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is meant for inference: it trains unscaled."""
+
+    def validate(self) -> None:
+        """Check the values.
+
+        Raises:
+            ConfigError: a value cannot work.
+        """
+        if self.num_features < 1:
+            raise ConfigError(
+                f"head.num-features is {self.num_features}; give at least 1, or switch the head off with head.mode off"
+            )
+        if self.pixel_unshuffle < 1:
+            raise ConfigError(f"head.pixel-unshuffle is {self.pixel_unshuffle}; give 1, 2 or 4")
+
+
+class CompensationHead(nn.Module):
+    """Makes the compensated picture (``I_hat = Phi(F)`` of the paper, and a residual variant of ours).
+
+    Args:
+        config: mode, size and arithmetic; ``mode="off"`` has no head to build.
+
+    Raises:
+        ConfigError: the configuration cannot work.
+    """
+
+    def __init__(self, config: HeadConfig) -> None:
+        super().__init__()
+        config.validate()
+        if config.mode == "off":
+            raise ConfigError("head.mode is off: there is no compensation head to build; ask for residual or features")
+        self.config = config
+        # The residual head sees the colours and the accumulation beside the features.
+        in_channels = config.num_features + (4 if config.mode == "residual" else 0)
+        self.net = UNet(
+            in_channels,
+            3,
+            WIDTHS[config.size],
+            pixel_unshuffle=config.pixel_unshuffle,
+            zero_init=config.mode == "residual",
+        )
+        self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
+        """Compensate one picture.
+
+        Args:
+            base: ``[H, W, 3]`` spherical-harmonics picture over its background, in [0, 1].
+            colors: ``[H, W, 3]`` the same without background, so that the head does not depend on it.
+            features: ``[H, W, F]`` splatted features.
+            alpha: ``[H, W, 1]`` accumulation.
+
+        Returns:
+            ``[H, W, 3]`` float32, not clamped. Where nothing was splatted the residual head returns ``base``.
+        """
+        residual = self.config.mode == "residual"
+        image = torch.cat([colors, alpha, features], dim=-1) if residual else features
+        # [H, W, C] is the channels-last layout of [1, C, H, W]: no copy.
+        image = image.permute(2, 0, 1)[None]
+        dtype = PRECISIONS[self.config.precision]
+        with torch.autocast(image.device.type, dtype=dtype, enabled=image.is_cuda and dtype != torch.float32):
+            out = self.net(image)[0].permute(1, 2, 0)
+        out = out.float()
+        return base + alpha * out if residual else out

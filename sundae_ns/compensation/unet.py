@@ -1,0 +1,80 @@
+"""The paper's network: four levels, average pooling, bilinear upsampling, skip connections, no normalisation layers.
+
+No normalisation on purpose: the viewer switches between training and evaluation for every frame, and a picture must not
+depend on the pictures shown before it.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+LEVELS = 4
+"""Resolutions that the network works at; the coarsest is 1 / 2 ** (LEVELS - 1) of its input."""
+
+
+def _double_conv(c_in: int, c_out: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(c_in, c_out, 3, padding=1),
+        nn.ReLU(inplace=True),
+        nn.Conv2d(c_out, c_out, 3, padding=1),
+        nn.ReLU(inplace=True),
+    )
+
+
+class UNet(nn.Module):
+    """Four-level fully convolutional U-Net (Neural Compensation section of the paper).
+
+    Works at any image size of at least one pixel: inputs are padded by their edge to a multiple of
+    ``pixel_unshuffle * 2 ** (LEVELS - 1)`` and the result is cropped back.
+
+    Args:
+        in_channels: channels of the input image.
+        out_channels: channels of the output image.
+        width: channels of the finest level; each coarser level doubles them. 64 gives the paper's 30 MB.
+        pixel_unshuffle: fold blocks of this many pixels a side into channels first, and unfold the result. 1 is the
+            paper's network; 2 does a quarter of the work at the full-resolution level.
+        zero_init: start with an output of exactly zero.
+    """
+
+    def __init__(
+        self, in_channels: int, out_channels: int, width: int, *, pixel_unshuffle: int = 1, zero_init: bool = False
+    ) -> None:
+        super().__init__()
+        widths = [width * 2**level for level in range(LEVELS)]
+        fold = pixel_unshuffle**2
+        self.pixel_unshuffle = pixel_unshuffle
+        inputs = [in_channels * fold, *widths[:-1]]
+        self.encoder = nn.ModuleList(_double_conv(c_in, c_out) for c_in, c_out in zip(inputs, widths, strict=True))
+        self.decoder = nn.ModuleList(
+            _double_conv(coarse + fine, fine) for coarse, fine in zip(widths[:0:-1], widths[-2::-1], strict=True)
+        )
+        self.out = nn.Conv2d(width, out_channels * fold, 1)
+        if zero_init:
+            nn.init.zeros_(self.out.weight)
+            nn.init.zeros_(self.out.bias)  # type: ignore[arg-type]
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Run the network.
+
+        Args:
+            image: ``[B, in_channels, H, W]``, any H and W of at least 1.
+
+        Returns:
+            ``[B, out_channels, H, W]``.
+        """
+        height, width = image.shape[-2:]
+        stride = self.pixel_unshuffle * 2 ** (LEVELS - 1)
+        bottom, right = -height % stride, -width % stride
+        x = F.pad(image, (0, right, 0, bottom), mode="replicate") if bottom or right else image
+        x = F.pixel_unshuffle(x, self.pixel_unshuffle)
+        skips: list[Tensor] = []
+        for level, block in enumerate(self.encoder):
+            x = block(x if level == 0 else F.avg_pool2d(x, 2))
+            skips.append(x)
+        skips.pop()
+        for block in self.decoder:
+            x = F.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
+            x = block(torch.cat([x, skips.pop()], dim=1))
+        return F.pixel_shuffle(self.out(x), self.pixel_unshuffle)[..., :height, :width]

@@ -1,0 +1,31 @@
+"""The embedded scene: a still life, ray-traced in numpy, for the demo and the tests. Floor 2.
+
+:func:`write_scene` writes it as a nerfstudio data set. Its parts are usable alone: ``shapes`` and ``textures`` make the
+solids, ``still_life`` places them, ``cameras`` looks at them, ``tracer`` renders, ``points`` imitates structure from
+motion.
+"""
+
+from sundae_ns.data.cameras import Camera, in_frame, look_at, orbit, pixel_rays, project
+from sundae_ns.data.points import observe, sparse_points
+from sundae_ns.data.scene_folder import held_out_indices, write_scene
+from sundae_ns.data.still_life import still_life
+from sundae_ns.data.tracer import Body, Scene, first_hits, render, shade
+
+__all__ = [
+    "Body",
+    "Camera",
+    "Scene",
+    "first_hits",
+    "held_out_indices",
+    "in_frame",
+    "look_at",
+    "observe",
+    "orbit",
+    "pixel_rays",
+    "project",
+    "render",
+    "shade",
+    "sparse_points",
+    "still_life",
+    "write_scene",
+]

@@ -1,0 +1,175 @@
+"""Write the embedded scene to disk in nerfstudio's format, without ever touching what somebody else put there."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from sundae_ns.data.cameras import Camera, orbit
+from sundae_ns.data.points import sparse_points
+from sundae_ns.data.shapes import Array
+from sundae_ns.data.still_life import still_life
+from sundae_ns.data.tracer import render
+from sundae_ns.errors import ConfigError, DataError
+
+TRANSFORMS = "transforms.json"
+POINT_CLOUD = "sparse_pc.ply"
+MARKER = ".sundae_scene.json"
+"""Lists the files that we wrote: written first and by us only, so that its folder may be written over."""
+
+
+def held_out_indices(train_views: int, test_views: int) -> list[int]:
+    """Places of the test views in the orbit: evenly spread, so that each lies between training views."""
+    total = train_views + test_views
+    return [int((j + 0.5) * total / test_views) for j in range(test_views)]
+
+
+def _write_point_cloud(path: Path, xyz: Array, rgb: Array) -> None:
+    names = ["x", "y", "z", "red", "green", "blue"]
+    vertices = np.empty(len(xyz), dtype=list(zip(names, ["<f4"] * 3 + ["u1"] * 3, strict=True)))
+    for name, column in zip(names, [*xyz.T, *rgb.T], strict=True):
+        vertices[name] = column
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}"]
+    header += [f"property {'float' if name in 'xyz' else 'uchar'} {name}" for name in names]
+    path.write_bytes("\n".join([*header, "end_header\n"]).encode("ascii") + vertices.tobytes())
+
+
+def _transforms(cameras: Sequence[Camera], names: Sequence[str], held_out: Sequence[int]) -> dict[str, object]:
+    first = cameras[0]
+    test = [names[i] for i in held_out]
+    return {
+        "camera_model": "OPENCV",
+        "fl_x": first.focal,
+        "fl_y": first.focal,
+        "cx": first.width / 2,
+        "cy": first.height / 2,
+        "w": first.width,
+        "h": first.height,
+        "k1": 0.0,
+        "k2": 0.0,
+        "p1": 0.0,
+        "p2": 0.0,
+        "ply_file_path": POINT_CLOUD,
+        "train_filenames": [name for name in names if name not in set(test)],
+        "val_filenames": test,
+        "test_filenames": test,
+        "frames": [
+            {"file_path": name, "transform_matrix": camera.camera_to_world.tolist()}
+            for name, camera in zip(names, cameras, strict=True)
+        ],
+    }
+
+
+def _claim(out: Path, files: Sequence[str]) -> None:
+    """Make ``out`` ours: create it, or clear the files of an earlier scene of ours; refuse anything else."""
+    marker = out / MARKER
+    if out.exists() and not out.is_dir():
+        raise DataError(f"{out} is a file; name a folder for the scene.")
+    if marker.exists():
+        try:
+            stale = [str(name) for name in json.loads(marker.read_text())["files"]]
+        except (ValueError, KeyError, TypeError) as error:
+            raise DataError(
+                f"{marker} is damaged; remove it and the scene in {out}, or name another folder."
+            ) from error
+        for name in [*stale, TRANSFORMS]:
+            # A marker that somebody edited must not reach outside its folder.
+            if (out / name).resolve().is_relative_to(out.resolve()):
+                (out / name).unlink(missing_ok=True)
+    elif out.is_dir() and any(out.iterdir()):
+        raise DataError(f"{out} holds files that are not a scene of ours; name a new or an empty folder.")
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    marker.write_text(json.dumps({"files": list(files)}, indent=1))
+
+
+def write_scene(
+    out: Path,
+    *,
+    seed: int = 0,
+    train_views: int = 48,
+    test_views: int = 8,
+    width: int = 128,
+    height: int = 128,
+    points: int = 2000,
+    point_noise: float = 0.002,
+    outliers: float = 0.01,
+    samples: int = 2,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Render the embedded still life and write it as a nerfstudio data set.
+
+    Writes ``transforms.json`` (with its own train/test split), ``images/*.png`` and ``sparse_pc.ply``. The same
+    arguments give the same bytes on the same machine. ``transforms.json`` comes last: a folder that an interrupted run
+    left behind has none.
+
+    Args:
+        out: folder; new, empty, or an earlier scene of ours, which is replaced.
+        seed: varies placement, textures, light, cameras and points.
+        train_views: number of training pictures.
+        test_views: number of held-out pictures, spread between the training ones along the orbit.
+        width: pixels.
+        height: pixels.
+        points: size of the sparse point cloud.
+        point_noise: standard deviation of a point's error, as a fraction of its distance from the camera.
+        outliers: fraction of wrong points.
+        samples: each pixel is the mean of ``samples`` x ``samples`` rays.
+        progress: called with (views done, views in all) after each view.
+
+    Returns:
+        ``out``, the value for ``--data``.
+
+    Raises:
+        ConfigError: a count or size is too small.
+        DataError: ``out`` is a file, or holds files that are not ours.
+    """
+    for name, value, least in (
+        ("seed", seed, 0),
+        ("train_views", train_views, 3),
+        ("test_views", test_views, 1),
+        ("width", width, 16),
+        ("height", height, 16),
+        ("points", points, 1),
+        ("samples", samples, 1),
+        ("point_noise", point_noise, 0),
+        ("outliers", outliers, 0),
+    ):
+        if not value >= least:
+            raise ConfigError(f"{name} is {value}; it must be {least} or more.")
+    if not outliers <= 1:
+        raise ConfigError(f"outliers is {outliers}, a fraction of the points; it must be 1 or less.")
+    if test_views > train_views:
+        raise ConfigError(f"{test_views} test views cannot lie between {train_views} training views; ask for fewer.")
+
+    out = Path(out)
+    total = train_views + test_views
+    held_out = held_out_indices(train_views, test_views)
+    names = [f"images/frame_{i + 1:05d}.png" for i in range(total)]
+    _claim(out, [*names, POINT_CLOUD, TRANSFORMS])
+
+    scene = still_life(seed)
+    cameras = orbit(total, width=width, height=height, rng=np.random.default_rng([seed, 2]))
+    pictures = []
+    for i, (camera, name) in enumerate(zip(cameras, names, strict=True)):
+        picture = render(scene, camera, samples=samples)
+        Image.fromarray(np.round(picture * 255).astype(np.uint8)).save(out / name)
+        pictures.append(picture)
+        if progress is not None:
+            progress(i + 1, total)
+
+    training = [i for i in range(total) if i not in set(held_out)]
+    xyz, rgb = sparse_points(
+        scene,
+        [cameras[i] for i in training],
+        [pictures[i] for i in training],
+        points,
+        noise=point_noise,
+        outliers=outliers,
+        rng=np.random.default_rng([seed, 3]),
+    )
+    _write_point_cloud(out / POINT_CLOUD, xyz, rgb)
+    (out / TRANSFORMS).write_text(json.dumps(_transforms(cameras, names, held_out), indent=1))
+    return out

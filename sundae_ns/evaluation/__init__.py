@@ -1,0 +1,33 @@
+"""Measuring: image metrics in named variants, synchronised times, comparisons, tables, and records of runs. Floor 2."""
+
+from sundae_ns.evaluation import display
+from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
+from sundae_ns.evaluation.metrics import psnr, ssim
+from sundae_ns.evaluation.picture import ComparisonRow, comparison_sheet, save_comparison, side_by_side
+from sundae_ns.evaluation.records import COLUMNS, RunRow, append_row, read_rows
+from sundae_ns.evaluation.report import Quality, RunFigures, report_tables, report_text
+from sundae_ns.evaluation.timing import Timing, median_ms
+
+__all__ = [
+    "COLUMNS",
+    "ComparisonRow",
+    "Lpips",
+    "Quality",
+    "RunFigures",
+    "RunRow",
+    "Timing",
+    "append_row",
+    "comparison_sheet",
+    "display",
+    "lpips_weights_available",
+    "lpips_weights_path",
+    "lpips_weights_url",
+    "median_ms",
+    "psnr",
+    "read_rows",
+    "report_tables",
+    "report_text",
+    "save_comparison",
+    "side_by_side",
+    "ssim",
+]

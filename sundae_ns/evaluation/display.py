@@ -1,0 +1,57 @@
+"""What per-primitive and per-pixel quantities look like in the viewer."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+COMPONENTS = 3
+
+
+def fill_depth(depth: Tensor, alpha: Tensor) -> Tensor:
+    """Depth ``[H, W, 1]`` with the largest depth seen where nothing was splatted (``alpha`` 0)."""
+    return torch.where(alpha > 0, depth, depth.max())
+
+
+def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean ``[F]``, first three principal directions ``[F, 3]`` and standard deviations ``[3]`` of ``features`` ``[N, F]``.
+
+    With fewer than three channels the missing directions are zero. Signs are fixed, so that colours do not flip.
+    """
+    mean = features.mean(dim=0)
+    centred = features - mean
+    covariance = centred.T @ centred / max(len(features), 1)
+    variances, directions = torch.linalg.eigh(covariance)
+    k = min(COMPONENTS, features.shape[1])
+    directions = directions[:, -k:].flip(-1)
+    signs = torch.where(directions.sum(dim=0) < 0, -1.0, 1.0)
+    basis = features.new_zeros(features.shape[1], COMPONENTS)
+    basis[:, :k] = directions * signs
+    deviations = features.new_zeros(COMPONENTS)
+    deviations[:k] = variances[-k:].flip(-1).clamp_min(0).sqrt()
+    return mean, basis, deviations
+
+
+def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Tensor, alpha: Tensor) -> Tensor:
+    """Splatted features as colours: three standard deviations of each principal component fill [0, 1].
+
+    Args:
+        features: ``[H, W, F]`` splatted, that is already weighted by ``alpha``.
+        mean, basis, deviations: from :func:`principal_components` of the primitives.
+        alpha: ``[H, W, 1]`` accumulation.
+
+    Returns:
+        ``[H, W, 3]`` in [0, 1], black where nothing was splatted.
+    """
+    components = (features - alpha * mean) @ basis
+    scaled = components / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha
+    return scaled.clamp(0, 1)
+
+
+def response_values(response: Tensor) -> Tensor:
+    """Response magnitudes ``[N]`` as values in [0, 1]: their rank, which shows fields of any scale alike; unknown is 0."""
+    known = torch.isfinite(response)
+    order = response[known].argsort().argsort()
+    values = torch.zeros_like(response)
+    values[known] = (order + 1).to(response) / max(int(known.sum()), 1)
+    return values

@@ -1,0 +1,62 @@
+"""Image metrics, each in one named variant; see ``lpips.py`` for the learned one.
+
+PSNR is over all pixels and channels, with a peak of 1. SSIM is that of pytorch_msssim, as splatfacto uses it: an 11 x
+11 Gaussian window of sigma 1.5 where it fits whole ("valid"), on each colour channel, averaged. Other libraries pad, or
+weigh the variance differently, and differ in the fourth digit.
+"""
+
+from __future__ import annotations
+
+import torch
+from pytorch_msssim import ssim as _windowed_ssim
+from torch import Tensor
+
+from sundae_ns.errors import DataError
+
+SSIM_WINDOW = 11
+"""Pixels a side of SSIM's window; smaller pictures have no SSIM."""
+
+
+def check_pair(pred: Tensor, target: Tensor) -> None:
+    """Raise DataError unless both are pictures ``[H, W, 3]`` of one size."""
+    if pred.shape != target.shape or pred.dim() != 3 or pred.shape[-1] != 3:
+        raise DataError(
+            f"Pictures have shapes {list(pred.shape)} and {list(target.shape)}; give two of one size, [H, W, 3]."
+        )
+
+
+def psnr(pred: Tensor, target: Tensor) -> Tensor:
+    """Peak signal-to-noise ratio ``-10 log10(MSE)``, in dB; infinite for equal pictures.
+
+    Args:
+        pred: ``[H, W, 3]``, nominally in [0, 1]; not clamped here.
+        target: ``[H, W, 3]`` in [0, 1].
+
+    Returns:
+        A scalar of the inputs' dtype and device; differentiable.
+
+    Raises:
+        DataError: the shapes differ, or are not those of pictures.
+    """
+    check_pair(pred, target)
+    return -10 * torch.log10(torch.mean((pred - target) ** 2))
+
+
+def ssim(pred: Tensor, target: Tensor) -> Tensor:
+    """Structural similarity (Wang et al. 2004), pytorch_msssim's variant with the valid window and a data range of 1.
+
+    Args:
+        pred: ``[H, W, 3]``, nominally in [0, 1].
+        target: ``[H, W, 3]`` in [0, 1].
+
+    Returns:
+        A scalar of the inputs' dtype and device; differentiable. NaN where a side is shorter than the window, 11
+        pixels: pytorch_msssim would leave that side unsmoothed, and return another quantity.
+
+    Raises:
+        DataError: the shapes differ, or are not those of pictures.
+    """
+    check_pair(pred, target)
+    if min(pred.shape[:2]) < SSIM_WINDOW:
+        return pred.new_full((), float("nan"))
+    return _windowed_ssim(pred.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], data_range=1.0)

@@ -1,0 +1,139 @@
+"""Rows of ``benchmarks/results/runs.csv``: one finished run each."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from sundae_ns.errors import DataError
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """One run. The fields are the columns, in order; None, an empty cell, is what was not measured.
+
+    Metrics are means over all test views. ``psnr_base`` and ``ssim_base`` are of the base colours, without the head.
+    """
+
+    scene: str
+    method: str
+    variant: str
+    keep_ratio: float | None
+    seed: int
+    steps: int
+    primitives: int
+    psnr: float | None
+    ssim: float | None
+    psnr_base: float | None
+    ssim_base: float | None
+    lpips: float | None
+    lpips_net: str
+    bytes_primitives: int
+    bytes_head: int
+    bytes_total: int
+    ms_frame: float | None
+    ms_splat: float | None
+    ms_head: float | None
+    train_s: float | None
+    prune_s: float | None
+    peak_vram_mib: float | None
+    gpu: str
+    resolution: str
+    """Width x height of the pictures, pixels: ``1237x822``."""
+    commit: str
+    command: str
+
+
+COLUMNS = tuple(field.name for field in fields(RunRow))
+_TYPES = get_type_hints(RunRow)
+
+
+def _line(cells: list[str]) -> str:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerow(cells)
+    return buffer.getvalue()
+
+
+def _cell(value: object) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ""
+    # One line a row: it is what makes an append one write, and a difference in git readable.
+    return " ".join(str(value).split())
+
+
+def _parse(name: str, text: str) -> Any:
+    kind = _TYPES[name]
+    if kind is str:
+        return text
+    if kind is int:
+        return int(text)
+    return float(text) if text else None
+
+
+def _check_header(path: Path, header: list[str]) -> None:
+    if tuple(header) == COLUMNS:
+        return
+    odd = sorted(set(header) ^ set(COLUMNS)) or ["their order"]
+    raise DataError(f"{path} has other columns (different: {', '.join(odd)}); name another file.")
+
+
+def append_row(path: Path, row: RunRow) -> None:
+    """Append a run to a CSV file, which is created with its header where there is none.
+
+    The line goes out in one write to the file's end, so that a crash, or another process that appends, cannot leave
+    half a row.
+
+    Args:
+        path: the file; missing folders are created.
+        row: the run; NaN is written as not measured.
+
+    Raises:
+        DataError: the file has other columns, or cannot be written.
+    """
+    path = Path(path)
+    line = _line([_cell(getattr(row, name)) for name in COLUMNS])
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists() and path.stat().st_size > 0:
+            with path.open(newline="", encoding="utf-8") as file:
+                _check_header(path, next(csv.reader(file)))
+            with path.open("rb") as file:
+                file.seek(-1, os.SEEK_END)
+                # An editor may have dropped the last line's end.
+                line = line if file.read(1) == b"\n" else "\n" + line
+        else:
+            line = _line(list(COLUMNS)) + line
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            os.write(descriptor, line.encode("utf-8"))
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise DataError(f"{path} cannot be written ({error.strerror}); name another file.") from error
+
+
+def read_rows(path: Path) -> list[RunRow]:
+    """Read all runs of a CSV file; the inverse of :func:`append_row`.
+
+    Raises:
+        DataError: the file is missing, has other columns, or a row does not fit them.
+    """
+    path = Path(path)
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            lines = list(csv.reader(file))
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror}); check the path.") from error
+    _check_header(path, lines[0] if lines else [])
+    rows = []
+    for number, cells in enumerate(lines[1:], start=2):
+        try:
+            rows.append(RunRow(**{name: _parse(name, text) for name, text in zip(COLUMNS, cells, strict=True)}))
+        except ValueError as error:
+            raise DataError(f"{path}, row {number} does not fit the columns ({error}); mend or remove it.") from error
+    return rows

@@ -1,0 +1,77 @@
+"""How far edges reach (``tau``) and how fast their weights fall (``sigma``)."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, get_args
+
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import ConfigError
+
+BandwidthRule = Literal["robust", "literal"]
+
+CUTOFF = 3.0
+"""Edges of the robust rule end at this many sigma, where the weight has fallen to exp(-4.5) = 0.011."""
+
+
+class Bandwidth(NamedTuple):
+    """The two numbers of the paper's edge equation ``W_ij = exp(-d^2 / (2 sigma^2))`` where ``d^2 < tau``."""
+
+    tau: float
+    """Threshold on the *squared* distance, squared scene units."""
+    sigma: float
+    """Width of the Gaussian, scene units."""
+
+
+def bandwidth(
+    distances: Tensor, rule: BandwidthRule = "robust", *, tau: float | None = None, sigma: float | None = None
+) -> Bandwidth:
+    """Choose ``tau`` and ``sigma`` from the distances to the nearest neighbours.
+
+    - ``robust``: ``sigma`` is the median of all positive distances, ``tau = (3 sigma)^2``. The median is a length,
+      moves with the scale of the scene, and neither clones (distance 0, left out) nor far floaters can drag it along.
+      Half of all near neighbours lie within one sigma, so weights spread over (0, 1), and only primitives lonelier than
+      three times the typical spacing are left without an edge.
+    - ``literal``: the paper's words. ``tau`` is ten times the smallest nearest-neighbour distance, compared with
+      squared distances as printed; ``sigma`` is the variance of the distances, of the nearest neighbours since the full
+      matrix has N squared of them. Units do not match, and one pair of clones makes ``tau`` 0 and the
+      graph empty: it is kept to be compared with, not to be used.
+
+    Where no distance is positive (coincident points, or none), every width gives the same graph and 1 stands in for the
+    robust sigma.
+
+    Args:
+        distances: ascending neighbour distances in scene units ``[N, K]``; ``inf`` where a neighbour is missing.
+        rule: which rule fills in what is not given.
+        tau: replaces the rule's threshold, squared scene units.
+        sigma: replaces the rule's width, scene units; the robust ``tau`` follows it.
+
+    Raises:
+        ConfigError: the rule is unknown, ``tau`` is negative or ``sigma`` is not positive.
+    """
+    if rule not in get_args(BandwidthRule):
+        raise ConfigError(f"unknown bandwidth rule {rule!r}: use one of {', '.join(get_args(BandwidthRule))}")
+    if tau is not None and not tau >= 0:
+        raise ConfigError(f"tau is {tau}: use a squared distance of at least 0")
+    if sigma is not None and not sigma > 0:
+        raise ConfigError(f"sigma is {sigma}: use a positive distance")
+    finite = distances.detach()[torch.isfinite(distances)]
+    if sigma is None:
+        sigma = _robust_sigma(finite) if rule == "robust" else _variance(finite)
+    if tau is None:
+        tau = (CUTOFF * sigma) ** 2 if rule == "robust" else _ten_times_smallest(finite)
+    return Bandwidth(float(tau), float(sigma))
+
+
+def _robust_sigma(finite: Tensor) -> float:
+    positive = finite[finite > 0]
+    return float(positive.median()) if positive.numel() else 1.0
+
+
+def _variance(finite: Tensor) -> float:
+    return float(finite.double().var(correction=0)) if finite.numel() else 0.0
+
+
+def _ten_times_smallest(finite: Tensor) -> float:
+    return 10.0 * float(finite.min()) if finite.numel() else 0.0

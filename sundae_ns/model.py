@@ -1,0 +1,592 @@
+"""The SUNDAE model: splatfacto's field with spectral pruning and neural compensation. Orchestrates, and holds no maths.
+
+The module path and the class names are written into every run's ``config.yml``: moving them breaks saved runs.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, MutableMapping
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, cast
+
+import torch
+from gsplat.strategy import DefaultStrategy
+from nerfstudio.cameras.camera_optimizers import CameraOptimizer
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from nerfstudio.utils import writer
+from nerfstudio.utils.colors import get_color
+from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.viewer.viewer_elements import ViewerCheckbox
+from pytorch_msssim import SSIM
+from rich.progress import track
+from torch import Tensor
+
+from sundae_ns import checkpoint
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
+from sundae_ns.errors import CheckpointError, ConfigError, DataError
+from sundae_ns.evaluation import Lpips, display, psnr, ssim
+from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
+from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
+from sundae_ns.rasterization import (
+    Backend,
+    Rasterization,
+    blending_weights,
+    rasterize,
+    select_backend,
+    spherical_harmonics,
+)
+from sundae_ns.schedulers import notify_pruned
+from sundae_ns.storage.transform import similarity
+
+NEAR_PLANE = 0.01
+SSIM_WINDOW = 11
+
+
+@dataclass
+class SundaeModelConfig(SplatfactoModelConfig):
+    """Splatfacto, spectrally pruned and compensated. Options of splatfacto keep their meaning."""
+
+    _target: type = field(default_factory=lambda: SundaeModel)
+    pruning: PruningConfig = field(default_factory=PruningConfig)
+    """When to prune, how many primitives to keep, and which."""
+    head: HeadConfig = field(default_factory=HeadConfig)
+    """The compensation head."""
+    rasterizer: Literal["auto", "gsplat", "reference"] = "auto"
+    """auto takes gsplat where CUDA works, else the reference in plain PyTorch, which also runs on a CPU."""
+    base_loss_weight: float = 0.2
+    """Weight of the loss on the picture without the head, which keeps exported .ply files valid."""
+    warm_start: Path | None = None
+    """Start from a finished field instead of warming up: a splatfacto or sundae .ckpt (or the folder), or a 3DGS .ply."""
+    warm_start_frame: Literal["auto", "model", "capture"] = "auto"
+    """Coordinates of the warm start: nerfstudio's model, or the capture's own (COLMAP). auto goes by the kind of file."""
+    evaluate_prune: bool = True
+    """Evaluate all test views right before and right after the prune, and record both."""
+
+
+class View(NamedTuple):
+    """One camera for the rasteriser."""
+
+    viewmat: Tensor
+    """World-to-camera, OpenCV axes ``[4, 4]``."""
+    K: Tensor
+    """Intrinsics in pixels ``[3, 3]``."""
+    width: int
+    height: int
+
+
+class SundaeModel(SplatfactoModel):
+    """Warms up a Gaussian field, prunes it spectrally, and compensates for the loss.
+
+    A subclass of ``SplatfactoModel`` because nerfstudio's exporter and viewer test for it; what ties the original to CUDA
+    or to downloads (initialisation, view matrix, outputs, LPIPS) is replaced.
+
+    Args:
+        config: the configuration.
+        scene_box, num_train_data, metadata, seed_points: as nerfstudio's pipeline passes them.
+
+    Raises:
+        ConfigError: options that cannot work.
+        CheckpointError: the warm start cannot be read.
+    """
+
+    config: SundaeModelConfig
+
+    def populate_modules(self) -> None:
+        """Build the field, the head and what training needs. The model's device is not known yet."""
+        config = self.config
+        config.pruning.validate()
+        if config.head.mode != "off":
+            config.head.validate()
+        if config.base_loss_weight < 0:
+            raise ConfigError(f"base-loss-weight is {config.base_loss_weight}; give 0 or more")
+        if config.use_bilateral_grid:
+            raise ConfigError("sundae has no bilateral grid: the head would learn against it; use splatfacto for it")
+
+        self.step = 0
+        self.num_features = 0 if config.head.mode == "off" else config.head.num_features
+        params = self._warm_field() if config.warm_start is not None else self._sparse_field()
+        self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
+        self.head = None if config.head.mode == "off" else CompensationHead(config.head)
+        self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
+            num_cameras=self.num_train_data, device="cpu"
+        )
+
+        self.policy = make_policy(config.pruning)
+        self.pruning_state: dict[str, Any] = self.policy.initialize_state()
+        self.strategy = DefaultStrategy(
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            grow_scale2d=config.split_screen_size,
+            prune_scale3d=config.cull_scale_thresh,
+            prune_scale2d=config.cull_screen_size,
+            refine_scale2d_stop_iter=config.stop_screen_size_at,
+            refine_start_iter=config.warmup_length,
+            # Densification after a one-shot prune would undo it.
+            refine_stop_iter=min(config.stop_split_at, self._prune_at or config.stop_split_at),
+            reset_every=config.reset_alpha_every * config.refine_every,
+            refine_every=config.refine_every,
+            pause_refine_after_reset=self.num_train_data + config.refine_every,
+            absgrad=config.use_absgrad,
+            verbose=False,
+        )
+        self.strategy_state: dict[str, Any] = self.strategy.initialize_state(scene_scale=1.0)
+
+        self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+        self.lpips = Lpips()  # type: ignore[assignment]
+        self.crop_box: OrientedBox | None = None
+        # Viser's own background, as in splatfacto: training backgrounds are random, shown ones are this.
+        random_background = config.background_color == "random"
+        self.background_color = (
+            torch.tensor([0.1490, 0.1647, 0.2157]) if random_background else get_color(config.background_color)
+        )
+        self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
+        self._backend: Backend | None = None
+        self._response: tuple[Any, Tensor | None] = (None, None)
+        self.attached = False
+        """Whether a trainer drives this model."""
+
+    # ---------------------------------------------------------------------------------------------------- the field
+
+    def _sparse_field(self) -> dict[str, Tensor]:
+        config = self.config
+        points = self.seed_points
+        if points is not None and len(points[0]) > 0 and not config.random_init:
+            xyz, rgb = points[0], points[1].float() / 255 if len(points[1]) else torch.full_like(points[0], 0.5)
+        else:
+            if not config.random_init:
+                CONSOLE.print(
+                    f"[yellow]Warning: the capture has no sparse point cloud; starting from {config.num_random} random "
+                    "points. Results are better with one (COLMAP, or ply_file_path in transforms.json)."
+                )
+            xyz, rgb = random_points(config.num_random, config.random_scale)
+        return from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=self.num_features)
+
+    def _warm_field(self) -> dict[str, Tensor]:
+        config = self.config
+        assert config.warm_start is not None
+        params, in_model_frame = checkpoint.read_field(config.warm_start)
+        if config.warm_start_frame != "auto":
+            in_model_frame = config.warm_start_frame == "model"
+        if not in_model_frame:
+            frame = (self.kwargs.get("metadata") or {}).get(DATASET_FRAME)
+            if frame is None:
+                raise CheckpointError(
+                    "the warm start is in the capture's coordinates, and only the sundae datamanager knows the way from "
+                    "there; train with its own datamanager, or say --pipeline.model.warm-start-frame model"
+                )
+            params = similarity(params, *frame)
+        wanted, found = (config.sh_degree + 1) ** 2 - 1, params["features_rest"].shape[1]
+        rest = params["features_rest"].new_zeros(len(params["means"]), wanted, 3)
+        rest[:, : min(wanted, found)] = params["features_rest"][:, : min(wanted, found)]
+        params["features_rest"] = rest
+        if self.num_features:
+            params[FEATURES] = initial_features(params["features_dc"], self.num_features)
+        CONSOLE.log(f"warm start: {len(params['means'])} primitives from {config.warm_start}")
+        return params
+
+    @property
+    def gaussians(self) -> MutableMapping[str, torch.nn.Parameter]:
+        """The parameters of the field; a ``ParameterDict`` is a mapping in all but its declared type."""
+        return cast(MutableMapping[str, torch.nn.Parameter], self.gauss_params)
+
+    @property
+    def _prune_at(self) -> int | None:
+        """Step of the one-shot prune; None with another mode."""
+        return self.config.pruning.prune_at if self.config.pruning.mode == "one-shot" else None
+
+    @property
+    def schedule_step(self) -> int:
+        """Step of the schedule: a warm start begins where the warm-up would have ended."""
+        return self.step + (self.config.pruning.prune_at if self.config.warm_start is not None else 0)
+
+    @property
+    def head_active(self) -> bool:
+        """Whether the head takes part: it starts with the prune unless told otherwise."""
+        pruning, start = self.config.pruning, self.config.head.start_at
+        if start is None:
+            start = pruning.stop if pruning.mode == "continuous" else pruning.prune_at
+        return self.head is not None and self.schedule_step > start
+
+    @property
+    def backend(self) -> Backend:
+        """The rasteriser, chosen when the device is known.
+
+        Raises:
+            BackendError: ``gsplat`` was asked for and cannot run here.
+        """
+        if self._backend is None:
+            self._backend = select_backend(self.config.rasterizer, self.device)
+        return self._backend
+
+    def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """One group per parameter of the field, features included."""
+        return {name: [value] for name, value in self.gauss_params.items()}
+
+    def get_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """Groups of the field, of the head (``compensation``) and of the cameras."""
+        groups = super().get_param_groups()
+        if self.head is not None:
+            groups["compensation"] = list(self.head.parameters())
+        return groups
+
+    # -------------------------------------------------------------------------------------------------- checkpoints
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Step, and the states of densification and pruning: what resuming needs beside the tensors."""
+        return checkpoint.extra_state(self.step, self.num_features, self.strategy_state, self.pruning_state)
+
+    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+        """Counterpart of :meth:`get_extra_state`; tensors move to the device of the field."""
+        self.step = int(state["step"])
+        for own, theirs in ((self.strategy_state, state["strategy"]), (self.pruning_state, state["pruning"])):
+            own.clear()
+            own.update({k: v.to(self.means.device) if isinstance(v, Tensor) else v for k, v in theirs.items()})
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> Any:  # type: ignore[override]
+        """Load a SUNDAE checkpoint with any number of primitives.
+
+        Parameters are resized in place, so that optimizers that were built before keep moving live tensors.
+
+        Raises:
+            CheckpointError: it is another method's checkpoint, or one of another feature width or head.
+        """
+        checkpoint.check_model_state(state_dict, self.state_dict(), self.num_features)
+        n = state_dict["gauss_params.means"].shape[0]
+        for value in self.gauss_params.values():
+            value.data = value.data.new_zeros(n, *value.shape[1:])
+        # Past SplatfactoModel's own loader on purpose: it replaces parameters and resets the step.
+        return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
+
+    # ---------------------------------------------------------------------------------------------------- rendering
+
+    def view_of(self, camera: Cameras, downscale: int = 1) -> View:
+        """The rasteriser's form of a camera of shape ``(1,)``; nothing in ``camera`` is changed.
+
+        Args:
+            camera: nerfstudio camera, camera-to-world with OpenGL axes.
+            downscale: divide the resolution by this.
+        """
+        pose = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
+        pose = pose.reshape(-1, 3, 4)[0]
+        rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
+        top = torch.cat([rotation.T, -rotation.T @ pose[:, 3:]], dim=1)
+        viewmat = torch.cat([top, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+        K = camera.get_intrinsics_matrices().reshape(-1, 3, 3)[0].clone()
+        K[:2] /= downscale
+        size = (int(camera.width.item()) // downscale, int(camera.height.item()) // downscale)
+        return View(viewmat.to(self.device), K.to(self.device), *size)
+
+    def _splat(self, params: Mapping[str, Tensor], view: View, channels: Tensor, **kwargs: Any) -> Rasterization:
+        return rasterize(
+            params["means"],
+            params["quats"],
+            params["scales"].exp(),
+            params["opacities"].sigmoid().squeeze(-1),
+            channels,
+            view.viewmat,
+            view.K,
+            view.width,
+            view.height,
+            near_plane=NEAR_PLANE,
+            antialiased=self.config.rasterize_mode == "antialiased",
+            backend=self.backend,
+            **kwargs,
+        )
+
+    def _colors(self, params: Mapping[str, Tensor], view: View) -> Tensor:
+        """Colours ``[N, 3]`` of the primitives as this view sees them."""
+        if self.config.sh_degree == 0:
+            return params["features_dc"].sigmoid()
+        degree = min(self.schedule_step // self.config.sh_degree_interval, self.config.sh_degree)
+        center = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+        coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
+        return (spherical_harmonics(degree, params["means"] - center, coeffs, backend=self.backend) + 0.5).clamp_min(0)
+
+    def render(
+        self,
+        params: Mapping[str, Tensor],
+        view: View,
+        background: Tensor,
+        *,
+        depth: bool = True,
+        compensate: bool = True,
+    ) -> tuple[dict[str, Any], Rasterization]:
+        """The pictures of one view: one splatting pass for colours, features and depth, then the head.
+
+        Args:
+            params: the field, or a part of it.
+            view: the camera.
+            background: ``[3]`` colour behind everything.
+            depth: whether to render depth.
+            compensate: whether the head may take part.
+
+        Returns:
+            ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
+        """
+        compensate = compensate and self.head_active
+        colors = self._colors(params, view)
+        channels = torch.cat([colors, params[FEATURES]], dim=1) if compensate else colors
+        absgrad = self.training and self.config.use_absgrad and not compensate
+        splat = self._splat(params, view, channels, render_depth=depth, absgrad=absgrad)
+        blended, features = splat.colors[..., :3], splat.colors[..., 3:]
+        base = (blended + (1 - splat.alpha) * background).clamp(0.0, 1.0)
+        rgb = base
+        if compensate:
+            assert self.head is not None
+            rgb = self.head(base, blended, features, splat.alpha)
+            if not self.training:
+                rgb = rgb.clamp(0.0, 1.0)
+        pictures = {
+            "rgb": rgb,
+            "base_rgb": base,
+            "depth": splat.depth,
+            "accumulation": splat.alpha,
+            "feature_image": features,
+        }
+        return pictures, splat
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Any]:  # type: ignore[override]
+        """Render a camera.
+
+        Args:
+            camera: of shape ``(1,)``.
+
+        Returns:
+            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; outside training also ``features``
+            (principal components as colours) and ``response`` (spectral response of the primitives seen).
+        """
+        view = self.view_of(camera, self._get_downscale_factor())
+        background = self._get_background_color()
+        if self.training:
+            outputs, splat = self.render(
+                self.gaussians, view, background, depth=self.config.output_depth_during_training
+            )
+            self.info = splat.info
+            if self._densifying:
+                self.strategy.step_pre_backward(
+                    self.gauss_params, self.optimizers, self.strategy_state, self.schedule_step, self.info
+                )
+            outputs.pop("feature_image")
+            return {**outputs, "background": background}
+
+        mask = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
+        if mask is not None and not mask.any():
+            return self.get_empty_outputs(view.width, view.height, background)
+        params = self.gaussians if mask is None else {k: v[mask] for k, v in self.gaussians.items()}
+        outputs, splat = self.render(params, view, background, compensate=self.compensate.value)
+        outputs["depth"] = display.fill_depth(outputs["depth"], splat.alpha)
+        outputs["features"] = self._feature_colors(outputs.pop("feature_image"), splat.alpha)
+        outputs["response"] = self._response_image(params, mask, view)
+        outputs["background"] = background.expand(view.height, view.width, 3)
+        return outputs
+
+    def _feature_colors(self, features: Tensor, alpha: Tensor) -> Tensor:
+        if features.shape[-1] == 0:
+            return alpha.new_zeros(*alpha.shape[:2], 3)
+        return display.feature_colors(features, *display.principal_components(self.gauss_params[FEATURES]), alpha)
+
+    def _response_image(self, params: Mapping[str, Tensor], mask: Tensor | None, view: View) -> Tensor:
+        shown = self._response_values()
+        if shown is None:
+            return params["means"].new_zeros(view.height, view.width, 1)
+        return self._splat(params, view, (shown if mask is None else shown[mask])[:, None]).colors
+
+    def _response_values(self) -> Tensor | None:
+        """Spectral response ``[N]`` for display, kept until the field is pruned again; None while the field still grows."""
+        if self.attached and self._densifying:
+            return None
+        key = (self.num_points, self.pruning_state["num_prunes"])
+        if self._response[0] != key:
+            try:
+                values: Tensor | None = display.response_values(response(self.gaussians, self.config.pruning).magnitude)
+            except DataError:  # too few primitives for a graph: nothing to show
+                values = None
+            self._response = (key, values)
+        return self._response[1]
+
+    @staticmethod
+    def get_empty_outputs(width: int, height: int, background: Tensor) -> dict[str, Any]:
+        """What a crop without primitives shows: the same keys and shapes as any other picture."""
+        picture = background.expand(height, width, 3)
+        zeros = background.new_zeros(height, width, 1)
+        return {
+            "rgb": picture,
+            "base_rgb": picture,
+            "depth": zeros + 10,
+            "accumulation": zeros,
+            "features": background.new_zeros(height, width, 3),
+            "response": zeros,
+            "background": picture,
+        }
+
+    # ----------------------------------------------------------------------------------------------------- training
+
+    @property
+    def _densifying(self) -> bool:
+        return self.schedule_step < self.strategy.refine_stop_iter
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        """Splatfacto's callbacks, then pruning: after densification has had its say on the same step."""
+        backend = self.backend  # an unusable rasteriser should be known before the first step
+        CONSOLE.log(f"rasteriser: {backend.name} on {self.device}")
+        self.attached = True
+        callbacks = super().get_training_callbacks(training_callback_attributes)
+        prune = partial(self._prune_if_due, training_callback_attributes)
+        prune.__name__ = "prune_if_due"  # type: ignore[attr-defined]
+        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], prune))
+        return callbacks
+
+    def step_post_backward(self, step: int) -> None:
+        """Densify."""
+        if self._densifying:
+            self.strategy.step_post_backward(
+                params=self.gauss_params,
+                optimizers=self.optimizers,
+                state=self.strategy_state,
+                step=self.schedule_step,
+                info=self.info,
+                packed=False,
+            )
+
+    def _prune_if_due(self, attributes: TrainingCallbackAttributes, step: int) -> None:
+        optimizers, pipeline = attributes.optimizers, attributes.pipeline
+        assert optimizers is not None
+        assert pipeline is not None
+        due = self.policy.due(self.pruning_state, self.schedule_step, self.num_points)
+        evaluate = due and self.config.evaluate_prune and self._prune_at is not None
+        before = self._evaluate(pipeline, "warm-up", step) if evaluate else {}
+        report = self.policy.step_post_backward(
+            self.gaussians,
+            optimizers.optimizers,
+            self.pruning_state,
+            self.schedule_step,
+            strategy_state=self.strategy_state,
+            contribution=partial(self.contribution, cast(SundaeDatamanager, pipeline.datamanager)),
+        )
+        self._refresh(optimizers)
+        if report is None:
+            return
+        CONSOLE.log(report.summary())
+        if report.dropped_nonfinite:
+            CONSOLE.print(f"[yellow]Warning: dropped {report.dropped_nonfinite} primitives that were not finite")
+        notify_pruned(optimizers.schedulers, step)
+        after = self._evaluate(pipeline, "pruned", step) if evaluate else {}
+        self._record(attributes, report, before, after, step)
+
+    def _refresh(self, optimizers: Optimizers) -> None:
+        """Surgery makes new parameters; nerfstudio's own list of them would go stale."""
+        for name, value in self.gauss_params.items():
+            optimizers.parameters[name] = [value]
+
+    def _evaluate(self, pipeline: Any, label: str, step: int) -> dict[str, float]:
+        if not pipeline.datamanager.eval_dataset:
+            return {}
+        results = pipeline.get_average_eval_image_metrics(step=step)
+        CONSOLE.log(f"{label}: PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f} on all test views")
+        return {name: results[name] for name in ("psnr", "ssim")}
+
+    def _record(
+        self,
+        attributes: TrainingCallbackAttributes,
+        report: PruneReport,
+        before: dict[str, float],
+        after: dict[str, float],
+        step: int,
+    ) -> None:
+        """Write what the prune did to tensorboard, and to ``prune.json`` in the run's folder."""
+        scalars = {"before": report.before, "after": report.after, "seconds": report.seconds, "peak": report.peak}
+        writer.put_dict(name="Prune", scalar_dict=scalars, step=step)
+        if attributes.trainer is None:
+            return
+        path = attributes.trainer.base_dir / "prune.json"
+        reports = json.loads(path.read_text()) if path.exists() else []
+        reports.append({**asdict(report), "warm_up": before, "pruned": after})
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(reports, indent=2))
+
+    @torch.no_grad()
+    def contribution(self, datamanager: SundaeDatamanager) -> Tensor:
+        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``."""
+        params = self.gaussians
+        total = torch.zeros(self.num_points, device=self.device)
+        cameras = list(datamanager.training_cameras())
+        for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
+            view = self.view_of(camera)
+            total += blending_weights(
+                params["means"],
+                params["quats"],
+                params["scales"].exp(),
+                params["opacities"].sigmoid().squeeze(-1),
+                view.viewmat,
+                view.K,
+                view.width,
+                view.height,
+                backend=self.backend,
+            )
+        return total
+
+    # --------------------------------------------------------------------------------------------- losses and metrics
+
+    def _target(self, batch: dict[str, Any], outputs: dict[str, Any]) -> Tensor:
+        return self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+
+    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
+        """PSNR with and without the head, and the number of primitives."""
+        target = self._target(batch, outputs)
+        metrics: dict[str, Any] = {
+            "psnr": psnr(outputs["rgb"].detach().clamp(0, 1), target),
+            "psnr_base": psnr(outputs["base_rgb"].detach(), target),
+            "gaussian_count": self.num_points,
+        }
+        self.camera_optimizer.get_metrics_dict(metrics)
+        return metrics
+
+    def _picture_loss(self, picture: Tensor, target: Tensor) -> Tensor:
+        """``lambda_1 L1 + lambda_2 (1 - SSIM)`` of the paper, both pictures ``[H, W, 3]``."""
+        weight = self.config.ssim_lambda
+        l1 = (picture - target).abs().mean()
+        if weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
+            return l1
+        similarity = self.ssim(target.permute(2, 0, 1)[None], picture.permute(2, 0, 1)[None])
+        return (1 - weight) * l1 + weight * (1 - similarity)
+
+    def get_loss_dict(
+        self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
+    ) -> dict[str, Tensor]:
+        """The picture's loss; beside it, while the head takes part, an L1 loss on the base colours."""
+        target, rgb, base = self._target(batch, outputs), outputs["rgb"], outputs["base_rgb"]
+        if "mask" in batch:
+            mask = self._downscale_if_required(batch["mask"]).to(self.device)
+            target, rgb, base = target * mask, rgb * mask, base * mask
+        losses = {"main_loss": self._picture_loss(rgb, target)}
+        if self.head_active and self.config.base_loss_weight > 0:
+            losses["base_loss"] = self.config.base_loss_weight * (base - target).abs().mean()
+        if self.training:
+            self.camera_optimizer.get_loss_dict(losses)
+        return losses
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Any], batch: dict[str, Any]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """PSNR, SSIM and, where its weights are at hand, LPIPS; each with the head and without (``_base``)."""
+        target = self._target(batch, outputs)
+        metrics: dict[str, float] = {"gaussian_count": float(self.num_points)}
+        for suffix, picture in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
+            metrics["psnr" + suffix] = float(psnr(picture, target))
+            metrics["ssim" + suffix] = float(ssim(picture, target))
+            lpips = self.lpips(picture, target)
+            if lpips is not None:
+                metrics["lpips" + suffix] = float(lpips)
+        images = {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}
+        return metrics, images

@@ -1,0 +1,102 @@
+"""Options of pruning, shared by training and by the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from sundae_ns.errors import ConfigError
+
+Mode = Literal["one-shot", "continuous", "off"]
+ScoreName = Literal["response-contribution", "response", "contribution", "opacity", "random"]
+SelectionName = Literal["sampled", "band", "top"]
+SignalName = Literal["attributes", "positions"]
+RuleName = Literal["robust", "literal"]
+
+
+@dataclass
+class PruningConfig:
+    """When to prune, how much, and by which score.
+
+    The defaults are what ``sundae`` uses: sampling in proportion to response times contribution. The paper's rule is
+    ``selection="band", score="response", signal="positions"``.
+    """
+
+    mode: Mode = "one-shot"
+    """Prune once (the paper's main strategy), periodically while densifying (lower peak memory), or never."""
+    keep_ratio: float = 0.1
+    """Share of the primitives to keep at each prune, in (0, 1]; the kept count is exactly round(keep_ratio * N)."""
+    selection: SelectionName = "sampled"
+    """How a score becomes a choice: sampled in proportion to it, its highest and lowest band, or the highest only."""
+    score: ScoreName = "response-contribution"
+    """Importance of a primitive: high-pass response, blending weight over the training views, their product, opacity,
+    or uniformly random (which leaves nothing for the selection to choose)."""
+    signal: SignalName = "attributes"
+    """Graph signal that is filtered: position, colour, opacity and size together, or the paper's positions alone."""
+    gamma: float = 0.5
+    """Share of the kept primitives that the band selection takes from the high end, in [0, 1]; the rest is low end."""
+    num_neighbors: int = 16
+    """Most neighbours of a primitive in the graph."""
+    bandwidth: RuleName = "robust"
+    """How the reach and the width of edges are found; the paper's literal rule gives an empty graph on most fields."""
+    tau: float | None = None
+    """Squared distance below which primitives are joined, in squared scene units; replaces the bandwidth rule's."""
+    sigma: float | None = None
+    """Width of the edge weights in scene units; replaces the bandwidth rule's."""
+    seed: int = 0
+    """Seed of random choices; the same on every device."""
+    prune_at: int = 15000
+    """Step after which the one-shot prune happens."""
+    start: int = 2000
+    """First step at which continuous pruning may happen."""
+    stop: int = 15000
+    """Last step at which continuous pruning may happen."""
+    every: int = 2000
+    """Steps from one continuous prune to the next."""
+    max_primitives: int | None = None
+    """Cap for continuous pruning: prune down to this count where there are more, instead of by the keep ratio."""
+
+    @property
+    def uses_contribution(self) -> bool:
+        """Whether the score needs the blending weights over the training views."""
+        return self.score in ("contribution", "response-contribution")
+
+    @property
+    def uses_graph(self) -> bool:
+        """Whether the score needs the neighbour graph."""
+        return self.score in ("response", "response-contribution")
+
+    def validate(self) -> None:
+        """Check every option.
+
+        Raises:
+            ConfigError: the first option that cannot work, and what it may be.
+        """
+        for name, choices in (
+            ("mode", Mode),
+            ("selection", SelectionName),
+            ("score", ScoreName),
+            ("signal", SignalName),
+            ("bandwidth", RuleName),
+        ):
+            value = getattr(self, name)
+            if value not in get_args(choices):
+                raise ConfigError(f"{name} is {value!r}: use one of {', '.join(get_args(choices))}")
+        if not 0 < self.keep_ratio <= 1:
+            raise ConfigError(f"keep_ratio is {self.keep_ratio}: use a share in (0, 1], 0.1 to keep a tenth")
+        if not 0 <= self.gamma <= 1:
+            raise ConfigError(f"gamma is {self.gamma}: use a share in [0, 1]")
+        for name, least in (("num_neighbors", 1), ("every", 1), ("prune_at", 0), ("start", 0), ("max_primitives", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ConfigError(f"{name} is {value}: use at least {least}")
+        if self.stop < self.start:
+            raise ConfigError(f"stop ({self.stop}) lies before start ({self.start}): swap them, or set mode to off")
+        for name in ("tau", "sigma"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ConfigError(f"{name} is {value}: use a positive number, or leave it out for the bandwidth rule")
+        if self.max_primitives is not None and self.mode != "continuous":
+            raise ConfigError(
+                f"max_primitives is set but mode is {self.mode}: set mode to continuous, or drop max_primitives"
+            )

@@ -1,0 +1,198 @@
+"""When to prune: policies of plain numbers whose running state lives in a dict.
+
+The four verbs are those of gsplat's densification strategies. A policy decides a mask and
+:func:`sundae_ns.gaussians.surgery.keep` applies it. The state holds integers only, so that it can be stored in a
+checkpoint and a resumed run neither prunes twice nor forgets its peak.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, MutableMapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
+
+from sundae_ns.errors import DataError
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, num_primitives
+from sundae_ns.gaussians.surgery import check_wiring, keep, keep_state
+from sundae_ns.pruning.config import PruningConfig
+from sundae_ns.pruning.decision import decide
+from sundae_ns.pruning.report import PruneReport
+from sundae_ns.pruning.scores import Contribution
+
+NEVER = -1
+"""Value of ``state["pruned_at"]`` before the first prune."""
+
+
+@dataclass(frozen=True)
+class PruningPolicy:
+    """Base of the policies: the four verbs, the running peak, and the prune itself. Subclasses say when it is due."""
+
+    config: PruningConfig
+    """Options; not changed."""
+
+    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
+        """Whether a field of ``n`` primitives is to be pruned after this step."""
+        raise NotImplementedError
+
+    def check_sanity(self, params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> None:
+        """Check options, names of the field, and that the optimizers hold its tensors.
+
+        Raises:
+            ConfigError: an option cannot work.
+            DataError: a parameter is missing, or parameters and optimizers do not fit.
+        """
+        self.config.validate()
+        missing = [name for name in SPLAT_NAMES if name not in params]
+        if missing:
+            raise DataError(f"the field lacks {', '.join(missing)}: it is not a 3DGS field, load another")
+        check_wiring(params, optimizers)
+
+    def initialize_state(self) -> dict[str, Any]:
+        """Running state: step of the last prune (-1 for none), number of prunes, most primitives so far."""
+        return {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
+
+    def step_pre_backward(
+        self,
+        params: Mapping[str, Tensor],
+        optimizers: Mapping[str, Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Count the primitives before the backward pass, where memory peaks."""
+        state["peak"] = max(state["peak"], num_primitives(params))
+
+    @torch.no_grad()
+    def step_post_backward(
+        self,
+        params: MutableMapping[str, Parameter],
+        optimizers: Mapping[str, Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Mapping[str, Any] | None = None,
+        *,
+        contribution: Contribution | None = None,
+        strategy_state: MutableMapping[str, Any] | None = None,
+    ) -> PruneReport | None:
+        """Prune if it is due. Call it after the optimizer's step and after densification.
+
+        Args:
+            params: the field; its parameters are replaced when it is pruned.
+            optimizers: optimizers by parameter name; others are left alone.
+            state: from :meth:`initialize_state`, or from a checkpoint.
+            step: training step that has just ended.
+            info: taken for the sake of the common signature, not read.
+            contribution: gives the summed blending weights over the training views for ``params`` as they are when it
+                is called, which is after NaN and infinite primitives have gone ``[N]``; called only if the score needs
+                it.
+            strategy_state: state of a densification strategy on the same primitives; sliced with them.
+
+        Returns:
+            What was done, or None if nothing was due.
+
+        Raises:
+            ConfigError: the score needs a contribution and there is none.
+            DataError: the field cannot be pruned, see :func:`decide`.
+        """
+        before = num_primitives(params)
+        state["peak"] = max(state["peak"], before)
+        if not self.due(state, step, before):
+            return None
+        started = _now(params)
+
+        def apply(mask: Tensor) -> None:
+            keep(params, optimizers, state, mask)
+            if strategy_state is not None:
+                keep_state(strategy_state, mask)
+
+        finite = finite_mask(params)
+        dropped = before - int(finite.sum())
+        if dropped:
+            # Before the decision: the contribution is a render of the field, and one NaN spoils all of its pixels.
+            apply(finite)
+        decision = decide(params, self._config_at(step), contribution, count=self._count())
+        apply(decision.mask)
+        state["pruned_at"] = step
+        state["num_prunes"] += 1
+        return PruneReport(
+            step=step,
+            before=before,
+            after=decision.kept,
+            dropped_nonfinite=dropped,
+            peak=state["peak"],
+            seconds=_now(params) - started,
+            tau=decision.tau,
+            sigma=decision.sigma,
+            isolated=decision.isolated,
+        )
+
+    def _config_at(self, step: int) -> PruningConfig:
+        """Options of the prune at a step."""
+        return self.config
+
+    def _count(self) -> int | None:
+        """Number of primitives to keep, or None for the keep ratio."""
+        return None
+
+
+class NoPruning(PruningPolicy):
+    """Never prunes; the state still counts the peak, to compare with."""
+
+    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
+        """Never."""
+        return False
+
+
+class OneShotPruning(PruningPolicy):
+    """Training, then one prune down to ``keep_ratio``, then fine-tuning: the paper's main strategy."""
+
+    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
+        """Once, at ``prune_at``; or at once, if training went on from a later step without having pruned."""
+        return state["pruned_at"] == NEVER and step >= self.config.prune_at
+
+
+class ContinuousPruning(PruningPolicy):
+    """Periodic pruning while densification goes on: a lower peak, a loosely held final count.
+
+    The alternative strategy of the paper (section "Continuous Pruning as a Strategy"). With ``max_primitives`` it
+    prunes down to that cap where there are more; without, by ``keep_ratio`` each time.
+    """
+
+    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
+        """At ``start`` and each ``every`` steps from there until ``stop``, if the count is above the cap."""
+        config = self.config
+        scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
+        above = config.max_primitives is None or n > config.max_primitives
+        return scheduled and above and step > state["pruned_at"]
+
+    def _config_at(self, step: int) -> PruningConfig:
+        # Another draw each time, and after a resume the same as without it.
+        return replace(self.config, seed=self.config.seed + step)
+
+    def _count(self) -> int | None:
+        return self.config.max_primitives
+
+
+def make_policy(config: PruningConfig) -> PruningPolicy:
+    """Policy of the configured mode.
+
+    Raises:
+        ConfigError: an option cannot work.
+    """
+    config.validate()
+    policies = {"off": NoPruning, "one-shot": OneShotPruning, "continuous": ContinuousPruning}
+    return policies[config.mode](config)
+
+
+def _now(params: Mapping[str, Tensor]) -> float:
+    """Wall-clock seconds, after all work queued on the field's device."""
+    device = params["means"].device
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()

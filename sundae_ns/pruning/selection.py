@@ -1,0 +1,106 @@
+"""Exact selection: turn scores into a mask that keeps precisely the asked number of primitives.
+
+All functions take scores ``[N]`` of any floating dtype on any device and return a bool mask ``[N]`` on that device with
+exactly ``count`` True entries. Equal scores are taken by lower index first. NaN means "unknown" and is taken only when
+nothing else is left; ``+inf`` is the highest score. The work is done on the CPU in float64, so that the same scores
+give the same mask on each device.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import ConfigError, DataError
+
+
+def kept_count(keep_ratio: float, n: int) -> int:
+    """How many of ``n`` primitives a share keeps: ``round(keep_ratio * n)``, but at least 1."""
+    return max(1, round(keep_ratio * n))
+
+
+def select_top(score: Tensor, count: int) -> Tensor:
+    """Keep the ``count`` highest scores; ``[N]`` to bool ``[N]``."""
+    values = _prepared(score, count)
+    return _mask(_ranked(values)[:count], score)
+
+
+def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
+    """Keep ``round(gamma * count)`` of the highest magnitudes and fill up with the lowest.
+
+    The paper's rule (paragraph "Controlling bandwidth with gamma"). The two ends never overlap. NaN
+    magnitudes, those of isolated primitives, belong to neither end.
+
+    Args:
+        magnitude: response magnitudes ``[N]``.
+        count: number of primitives to keep, 1 to N.
+        gamma: share of the high end, in [0, 1].
+
+    Raises:
+        ConfigError: ``gamma`` is out of range.
+        DataError: ``count`` is not in 1 to N.
+    """
+    if not 0 <= gamma <= 1:
+        raise ConfigError(f"gamma is {gamma}: use a share in [0, 1]")
+    values = _prepared(magnitude, count)
+    high = _ranked(values)[: round(gamma * count)]
+    rest = torch.ones_like(values, dtype=torch.bool)
+    rest[high] = False
+    remaining = rest.nonzero().squeeze(1)
+    low = remaining[_ranked(-values[remaining])][: count - len(high)]
+    return _mask(torch.cat([high, low]), magnitude)
+
+
+def select_sampled(score: Tensor, count: int, seed: int) -> Tensor:
+    """Draw ``count`` primitives without replacement, each draw with probability proportional to the scores left.
+
+    Gumbel top-k: adding independent Gumbel noise to the log scores and taking the highest is the same as drawing one by
+    one (Efraimidis and Spirakis, 2006). In logarithms the scale of the scores does not matter. Scores of zero or less
+    and NaN are drawn uniformly, and only after all positive ones.
+
+    Args:
+        score: scores ``[N]``; need not sum to 1.
+        count: number of primitives to keep, 1 to N.
+        seed: seed of the draw, independent of the global generator.
+
+    Raises:
+        DataError: ``count`` is not in 1 to N.
+    """
+    values = _prepared(score, count)
+    generator = torch.Generator().manual_seed(seed)
+    uniform = torch.rand(len(values), generator=generator, dtype=torch.float64)
+    gumbel = -torch.log((-torch.log1p(-uniform)).clamp_min(torch.finfo(torch.float64).tiny))
+    positive = values > 0
+    first = positive.nonzero().squeeze(1)
+    last = (~positive).nonzero().squeeze(1)
+    keys = torch.log(values[first]) + gumbel[first]
+    order = torch.cat([first[_ranked(keys)], last[_ranked(gumbel[last])]])
+    return _mask(order[:count], score)
+
+
+def select_random(n: int, count: int, seed: int, device: torch.device | str = "cpu") -> Tensor:
+    """Draw ``count`` of ``n`` primitives uniformly: the control that every score has to beat; bool ``[n]``."""
+    return select_sampled(torch.ones(n, device=device), count, seed)
+
+
+def _prepared(score: Tensor, count: int) -> Tensor:
+    if score.ndim != 1:
+        raise DataError(f"scores have shape {list(score.shape)}: pass one number per primitive, [N]")
+    if not 1 <= count <= len(score):
+        raise DataError(f"cannot keep {count} of {len(score)} primitives: ask for 1 to {len(score)}")
+    return score.detach().to(device="cpu", dtype=torch.float64)
+
+
+def _ranked(values: Tensor) -> Tensor:
+    """Indices by falling value, lower index first among equals, NaN after everything else."""
+    unknown = values.isnan()
+    order = torch.sort(values.masked_fill(unknown, -torch.inf), descending=True, stable=True).indices
+    # -inf and NaN tie in the sort, so NaN is moved behind in a second stable pass.
+    late = unknown[order]
+    return torch.cat([order[~late], order[late]])
+
+
+def _mask(chosen: Tensor, like: Tensor) -> Tensor:
+    mask = torch.zeros(len(like), dtype=torch.bool)
+    mask[chosen] = True
+    return mask.to(like.device)

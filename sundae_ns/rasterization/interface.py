@@ -1,0 +1,173 @@
+"""The interface of the room: arguments are checked here, the backend does the work."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import DataError
+from sundae_ns.rasterization.types import Backend, Rasterization
+
+MAX_SH_DEGREE = 4
+
+
+def rasterize(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [N, C]
+    viewmat: Tensor,  # [4, 4]
+    K: Tensor,  # [3, 3]
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    antialiased: bool = False,
+    absgrad: bool = False,
+    render_depth: bool = False,
+    backend: Backend,
+) -> Rasterization:
+    """Splat N Gaussian primitives into one pinhole view (EWA splatting, front-to-back blending; Kerbl et al. 2023).
+
+    Differentiable with respect to the primitives; not to ``K``, and to ``viewmat`` only under the reference.
+
+    Args:
+        means: Centres in world units. ``[N, 3]``
+        quats: Rotations as wxyz quaternions of any length; all-zero ones count as the identity. ``[N, 4]``
+        scales: Standard deviations in world units, post-activation. ``[N, 3]``
+        opacities: Opacities in [0, 1], post-activation. ``[N]``
+        colors: Any per-primitive vector to blend: colours, features. ``[N, C]`` with C >= 1
+        viewmat: World-to-camera transform, OpenCV axes (x right, y down, z forward). ``[4, 4]``
+        K: Intrinsics in pixels. ``[3, 3]``
+        width: Image width in pixels.
+        height: Image height in pixels.
+        near_plane: Primitives with a smaller camera z are culled. World units.
+        far_plane: Primitives with a larger camera z are culled. World units.
+        antialiased: Scale opacities by the ratio of screen areas without and with blur (Mip-Splatting).
+        absgrad: Have the backward pass set ``info["means2d"].absgrad`` (AbsGS): per-pixel gradients, absolute, summed.
+        render_depth: Also blend camera z.
+        backend: From :func:`sundae_ns.rasterization.select_backend`.
+
+    Raises:
+        DataError: A tensor has the wrong shape, dtype or device, or the image is empty.
+    """
+    n = means.shape[0]
+    _check_size(width, height)
+    _check_shape("means", means, (n, 3))
+    _check_shape("quats", quats, (n, 4))
+    _check_shape("scales", scales, (n, 3))
+    _check_shape("opacities", opacities, (n,))
+    _check_shape("viewmat", viewmat, (4, 4))
+    _check_shape("K", K, (3, 3))
+    if colors.dim() != 2 or colors.shape[0] != n or colors.shape[1] < 1:
+        raise DataError(f"colors has shape {list(colors.shape)}; pass [{n}, C] with at least one channel")
+    _check_alike("means", means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmat=viewmat, K=K)
+    return backend.rasterize(
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmat,
+        K,
+        width,
+        height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        antialiased=antialiased,
+        absgrad=absgrad,
+        render_depth=render_depth,
+    )
+
+
+def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:
+    """Evaluate real spherical harmonics up to ``degree``: the raw sum, without the 0.5 that colours add.
+
+    Args:
+        degree: 0 to 4; only the first ``(degree + 1) ** 2`` coefficients are read.
+        directions: From the camera to the primitive, any length; zero vectors count as +z, with zero gradient. ``[N, 3]``
+        coeffs: Coefficients, bands in the order and with the signs of 3DGS. ``[N, K, 3]``
+        backend: From :func:`sundae_ns.rasterization.select_backend`.
+
+    Returns:
+        ``[N, 3]``
+
+    Raises:
+        DataError: The degree is out of range or a shape does not fit.
+    """
+    if not 0 <= degree <= MAX_SH_DEGREE:
+        raise DataError(f"spherical harmonics of degree {degree} are unknown; use 0 to {MAX_SH_DEGREE}")
+    n = directions.shape[0]
+    _check_shape("directions", directions, (n, 3))
+    needed = (degree + 1) ** 2
+    if coeffs.dim() != 3 or coeffs.shape[0] != n or coeffs.shape[1] < needed or coeffs.shape[2] != 3:
+        raise DataError(f"coeffs has shape {list(coeffs.shape)}; degree {degree} needs [{n}, {needed} or more, 3]")
+    _check_alike("directions", directions, coeffs=coeffs)
+    # Replaced before any backend normalises: the CUDA kernel would return NaN for a camera inside a primitive's centre.
+    is_zero = (directions == 0).all(dim=-1, keepdim=True)
+    directions = torch.where(is_zero, directions.new_tensor([0.0, 0.0, 1.0]), directions)
+    return backend.spherical_harmonics(degree, directions, coeffs)
+
+
+def blending_weights(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    viewmat: Tensor,  # [4, 4]
+    K: Tensor,  # [3, 3]
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    antialiased: bool = False,
+    backend: Backend,
+) -> Tensor:
+    """Contribution of each primitive to one view: its alpha times transmittance, summed over the pixels.
+
+    Blending is linear in the colours, so this is exactly the gradient of the summed image with respect to a one-channel
+    colour; no backend needs code for it. Arguments are those of :func:`rasterize`.
+
+    Returns:
+        ``[N]``, in pixels, detached; 0 for primitives that are invisible.
+    """
+    with torch.enable_grad():
+        ones = torch.ones_like(means[:, :1], requires_grad=True)
+        image = rasterize(
+            means.detach(),
+            quats.detach(),
+            scales.detach(),
+            opacities.detach(),
+            ones,
+            viewmat.detach(),
+            K.detach(),
+            width,
+            height,
+            near_plane=near_plane,
+            far_plane=far_plane,
+            antialiased=antialiased,
+            backend=backend,
+        ).colors
+        (weights,) = torch.autograd.grad(image.sum(), ones)
+    return weights[:, 0]
+
+
+def _check_size(width: int, height: int) -> None:
+    if width < 1 or height < 1:
+        raise DataError(f"an image of {width}x{height} pixels is empty; width and height must be at least 1")
+
+
+def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
+    if tuple(value.shape) != shape:
+        raise DataError(f"{name} has shape {list(value.shape)}; pass {list(shape)}")
+
+
+def _check_alike(name: str, model: Tensor, **others: Tensor) -> None:
+    for other, value in others.items():
+        if value.dtype != model.dtype or value.device != model.device:
+            raise DataError(
+                f"{other} is {value.dtype} on {value.device} but {name} is {model.dtype} on {model.device}; convert one"
+            )

@@ -1,0 +1,63 @@
+"""Which backend runs where. Nothing of gsplat is imported, and no kernel built, before a CUDA device is asked for."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal
+
+import torch
+
+from sundae_ns.errors import BackendError, ConfigError
+from sundae_ns.rasterization.gsplat_backend import GsplatBackend
+from sundae_ns.rasterization.reference import ReferenceBackend
+from sundae_ns.rasterization.types import Backend
+
+BackendName = Literal["auto", "gsplat", "reference"]
+
+
+def select_backend(name: BackendName, device: torch.device | str) -> Backend:
+    """Choose the rasteriser for tensors on ``device``.
+
+    ``auto`` takes gsplat on a CUDA device where its kernels run, else the reference. The check is made once per process;
+    where gsplat has no prebuilt kernels, it builds them during that check.
+
+    Raises:
+        BackendError: ``gsplat`` was asked for and cannot run on ``device``.
+        ConfigError: The name is unknown.
+    """
+    if name not in ("auto", "gsplat", "reference"):
+        raise ConfigError(f"unknown rasterizer {name!r}; use auto, gsplat or reference")
+    if name == "reference":
+        return ReferenceBackend()
+    problem = _problem_on(torch.device(device))
+    if problem is None:
+        return GsplatBackend()
+    if name == "auto":
+        return ReferenceBackend()
+    raise BackendError(f"gsplat cannot rasterize: {problem}; or use the backend 'reference'")
+
+
+def _problem_on(device: torch.device) -> str | None:
+    if not torch.cuda.is_available():
+        return "CUDA is not available; use a machine with an NVIDIA GPU and a CUDA build of torch"
+    if device.type != "cuda":
+        return f"the tensors are on the device '{device}'; move them to 'cuda'"
+    return _kernel_problem()
+
+
+@lru_cache(maxsize=1)
+def _kernel_problem() -> str | None:
+    """Run gsplat's smallest kernel; the cause and mend if it fails, else None."""
+    try:
+        GsplatBackend().spherical_harmonics(
+            0, torch.ones(1, 3, device="cuda"), torch.ones(1, 1, 3, device="cuda")
+        ).sum().item()
+    except ImportError as error:
+        return f"gsplat does not import ({_first_line(error)}); install gsplat"
+    except Exception as error:  # a failed build or a missing kernel image raises whatever the tool chain raises
+        return f"its kernels do not run ({_first_line(error)}); install a gsplat wheel for this torch, or nvcc"
+    return None
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,64 @@
+"""What goes in and out of every backend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rasterization:
+    """One rendered view; every tensor has the dtype and device of the primitives, ``radii`` is int32."""
+
+    colors: Tensor
+    """Blended colours ``[H, W, C]``; no background is added."""
+
+    depth: Tensor | None
+    """Expected camera z ``[H, W, 1]``, world units, 0 where nothing was blended; None unless asked for."""
+
+    alpha: Tensor
+    """Accumulated opacity ``[H, W, 1]`` in [0, 1]."""
+
+    radii: Tensor
+    """Screen radius ``[N]`` in whole pixels, 0 where the primitive was culled; not differentiable."""
+
+    info: dict[str, Any]
+    """What the ``DefaultStrategy`` of the installed gsplat reads, in the shapes it expects.
+
+    ``means2d`` ``[1, N, 2]`` in pixels is part of the graph (``retain_grad()`` works; ``.absgrad`` is set by the backward
+    pass if asked for); ``radii`` is ``[1, N]`` under gsplat 1.4 and ``[1, N, 2]`` from 1.5; ``width``, ``height`` and
+    ``n_cameras`` are ints; ``gaussian_ids`` is None, because nothing is packed.
+    """
+
+
+class Backend(Protocol):
+    """A rasteriser. Call it through :mod:`sundae_ns.rasterization.interface`, which checks the arguments first."""
+
+    @property
+    def name(self) -> str:
+        """``"gsplat"`` or ``"reference"``."""
+
+    def rasterize(
+        self,
+        means: Tensor,  # [N, 3]
+        quats: Tensor,  # [N, 4]
+        scales: Tensor,  # [N, 3]
+        opacities: Tensor,  # [N]
+        colors: Tensor,  # [N, C]
+        viewmat: Tensor,  # [4, 4]
+        K: Tensor,  # [3, 3]
+        width: int,
+        height: int,
+        *,
+        near_plane: float,
+        far_plane: float,
+        antialiased: bool,
+        absgrad: bool,
+        render_depth: bool,
+    ) -> Rasterization:
+        """Render one view; see :func:`sundae_ns.rasterization.rasterize`."""
+
+    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
+        """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` of any positive length and coefficients ``[N, K, 3]``."""

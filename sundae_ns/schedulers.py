@@ -1,0 +1,76 @@
+"""Learning rates of SUNDAE: exponential decay that can begin anew at the prune.
+
+nerfstudio's own exponential decay leaves numpy numbers in its state, and checkpoints that hold them cannot be read with
+plain ``torch.load`` from torch 2.6 on. This one deals in Python floats only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR, LRScheduler
+
+
+class Decay:
+    """Multiplier of the learning rate as a function of the step; picklable state, plain numbers only.
+
+    Before the prune the rate decays exponentially from 1 to ``final`` over ``max_steps``, or stays at 1 where
+    ``hold_until_prune`` is set. The prune may restart it: from ``restart`` at the prune down to ``final`` at ``max_steps``.
+    """
+
+    def __init__(self, final: float, max_steps: int, restart: float | None, hold_until_prune: bool) -> None:
+        self.final = final
+        self.max_steps = max_steps
+        self.restart = restart
+        self.hold_until_prune = hold_until_prune
+        self.pruned_at: int | None = None
+
+    def __call__(self, step: int) -> float:
+        """The multiplier at ``step``."""
+        start, begin = 1.0, 0
+        if self.pruned_at is None:
+            if self.hold_until_prune:
+                return 1.0
+        elif self.restart is not None and step >= self.pruned_at:
+            start, begin = self.restart, self.pruned_at
+        t = (step - begin) / max(self.max_steps - begin, 1)
+        t = min(max(t, 0.0), 1.0)
+        return float(start ** (1.0 - t) * self.final**t)
+
+
+@dataclass
+class PruneAwareDecayConfig(SchedulerConfig):
+    """Exponential decay that the prune can restart."""
+
+    _target: type = field(default_factory=lambda: PruneAwareDecay)
+    """target class to instantiate"""
+    lr_final: float = 1.6e-6
+    """Learning rate at max_steps."""
+    max_steps: int = 30000
+    """Step at which the decay ends."""
+    lr_restart: float | None = None
+    """Learning rate right after the prune, from which the decay begins anew; None goes on as if nothing happened."""
+    hold_until_prune: bool = False
+    """Whether the rate stays constant until the prune."""
+
+
+class PruneAwareDecay(Scheduler):
+    """Builds the torch scheduler of a :class:`PruneAwareDecayConfig`."""
+
+    config: PruneAwareDecayConfig
+
+    def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
+        """A ``LambdaLR`` whose state holds Python numbers only."""
+        restart = None if self.config.lr_restart is None else self.config.lr_restart / lr_init
+        decay = Decay(self.config.lr_final / lr_init, self.config.max_steps, restart, self.config.hold_until_prune)
+        return LambdaLR(optimizer, lr_lambda=decay)
+
+
+def notify_pruned(schedulers: dict[str, LRScheduler], step: int) -> None:
+    """Tell every :class:`Decay` among ``schedulers`` that the field was pruned at ``step``; the first prune counts."""
+    for scheduler in schedulers.values():
+        for multiplier in getattr(scheduler, "lr_lambdas", []):
+            if isinstance(multiplier, Decay) and multiplier.pruned_at is None:
+                multiplier.pruned_at = step

@@ -1,0 +1,47 @@
+"""Bytes of what has to be stored: the primitives and the head. MB means 1e6 bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import chain
+
+from torch import Tensor, nn
+
+BYTES_PER_FLOAT = 4
+MEGABYTE = 1_000_000
+
+
+def bytes_of(params: Mapping[str, Tensor]) -> int:
+    """Bytes of a field's parameters stored in fp32, feature vectors included, whatever their dtype in memory."""
+    return sum(value.numel() for value in params.values()) * BYTES_PER_FLOAT
+
+
+def bytes_of_module(module: nn.Module) -> int:
+    """Bytes of a module's parameters and buffers, each in its own dtype; a tensor that is shared counts once."""
+    return sum(tensor.numel() * tensor.element_size() for tensor in chain(module.parameters(), module.buffers()))
+
+
+def megabytes(count: int) -> str:
+    """Bytes as text in MB = 1e6 bytes: ``31.10 MB``."""
+    return f"{count / MEGABYTE:.2f} MB"
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What a compensated field takes on disk."""
+
+    primitives: int
+    """Bytes of the primitives."""
+    head: int = 0
+    """Bytes of the compensation network."""
+
+    @property
+    def total(self) -> int:
+        """Bytes of both."""
+        return self.primitives + self.head
+
+    def __str__(self) -> str:
+        """``23.60 MB primitives + 7.80 MB head = 31.40 MB``."""
+        parts = f"{megabytes(self.primitives)} primitives + {megabytes(self.head)} head"
+        return f"{parts} = {megabytes(self.total)}"

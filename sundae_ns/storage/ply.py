@@ -1,0 +1,157 @@
+"""The .ply of 3D Gaussian splatting, which viewers and converters read.
+
+One binary vertex a primitive, all properties float32, values before activation as in
+:mod:`sundae_ns.gaussians.parameters`: ``x y z  nx ny nz  f_dc_0..2  f_rest_*  opacity  scale_0..2  rot_0..3``. Normals
+are zero. ``f_rest`` is channel-major: all coefficients of red, then green, then blue. The format has no place for
+feature vectors, nor for a head: what it shows are base colours.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyParseError
+from torch import Tensor
+
+from sundae_ns.errors import DataError
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives
+
+_COLUMNS = {
+    "means": ("x", "y", "z"),
+    "features_dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
+    "opacities": ("opacity",),
+    "scales": ("scale_0", "scale_1", "scale_2"),
+    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
+}
+_NORMALS = ("nx", "ny", "nz")
+_MAX_SH_DEGREE = 4
+
+
+def _rest_columns(count: int) -> tuple[str, ...]:
+    """Names of the ``count`` properties that hold SH bands 1 and up."""
+    return tuple(f"f_rest_{i}" for i in range(count))
+
+
+def sh_degree_of(coefficients: int) -> int | None:
+    """Degree whose bands 1 and up have ``coefficients`` per channel, (degree + 1)^2 - 1; None if there is none."""
+    return next((d for d in range(_MAX_SH_DEGREE + 1) if (d + 1) ** 2 - 1 == coefficients), None)
+
+
+def _check(params: Mapping[str, Tensor]) -> None:
+    missing = [name for name in SPLAT_NAMES if name not in params]
+    if missing:
+        raise DataError(f"The field has no {', '.join(missing)}; a .ply needs all of {', '.join(SPLAT_NAMES)}.")
+    n = num_primitives(params)
+    for name, columns in _COLUMNS.items():
+        if params[name].shape != (n, len(columns)):
+            raise DataError(f"{name} has shape {list(params[name].shape)}; it must be [{n}, {len(columns)}].")
+    rest = params["features_rest"].shape
+    if len(rest) != 3 or rest[0] != n or rest[2] != 3 or sh_degree_of(rest[1]) is None:
+        raise DataError(f"features_rest has shape {list(rest)}; it must be [{n}, (degree + 1)^2 - 1, 3].")
+
+
+def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[str] = ()) -> None:
+    """Write the base colours of a field as a 3DGS .ply; an existing file is replaced only once the new one is whole.
+
+    Args:
+        path: the file; its folder must exist.
+        params: a field; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are left out. Non-finite values are
+            written as they are: drop them before (``finite_mask``), for viewers do not.
+        comments: lines for the header: ``storage.MODEL_FRAME`` for the field of a nerfstudio model, ``SplatRenderMode:
+            mip`` for an antialiased scene.
+
+    Raises:
+        DataError: a parameter is missing or has the wrong shape.
+    """
+    path = Path(path)
+    _check(params)
+    n = num_primitives(params)
+
+    def columns(name: str) -> NDArray[np.float32]:
+        return params[name].detach().to(device="cpu", dtype=torch.float32).numpy()
+
+    rest = columns("features_rest").transpose(0, 2, 1).reshape(n, 3 * params["features_rest"].shape[1])
+    blocks = [
+        (_COLUMNS["means"], columns("means")),
+        (_NORMALS, np.zeros((n, 3), np.float32)),
+        (_COLUMNS["features_dc"], columns("features_dc")),
+        (_rest_columns(rest.shape[1]), rest),
+        (_COLUMNS["opacities"], columns("opacities")),
+        (_COLUMNS["scales"], columns("scales")),
+        (_COLUMNS["quats"], columns("quats")),
+    ]
+    names = [name for block, _ in blocks for name in block]
+    table = np.ascontiguousarray(np.concatenate([values for _, values in blocks], axis=1), dtype="<f4")
+    vertices = table.view([(name, "<f4") for name in names]).reshape(n)
+    data = PlyData([PlyElement.describe(vertices, "vertex")], text=False, byte_order="<", comments=list(comments))
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        data.write(str(partial))
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_ply(path: Path) -> PlyData:
+    """Parse a .ply file of any kind.
+
+    Raises:
+        DataError: the file is missing, no .ply, cut short, or has no vertices.
+    """
+    try:
+        # Not memory-mapped: if the file shrinks while it is read, a map would end the process without an exception.
+        data = PlyData.read(str(path), mmap=False)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path.") from error
+    except (PlyParseError, ValueError) as error:
+        # Among the ValueErrors are bytes that are no text, where a header should be.
+        reason = " ".join(str(error).split())
+        raise DataError(f"{path} is not a whole .ply file ({reason}); export it again.") from error
+    if "vertex" not in data:
+        raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussian primitives.")
+    return data
+
+
+def stack_columns(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
+    """Properties of all vertices side by side: ``[N, len(columns)]`` float32."""
+    table = np.empty((vertex.count, len(columns)), np.float32)
+    for i, name in enumerate(columns):
+        table[:, i] = vertex[name]
+    return torch.from_numpy(table)
+
+
+def read_ply(path: Path) -> dict[str, Tensor]:
+    """Read a 3DGS .ply.
+
+    Args:
+        path: a binary .ply; further properties and elements are ignored.
+
+    Returns:
+        A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU. The SH degree
+        follows from the number of ``f_rest_*``; ``features_rest`` is ``[N, 0, 3]`` where there are none.
+
+    Raises:
+        DataError: the file is missing, no binary .ply, cut short, or not one of Gaussian primitives.
+    """
+    data = load_ply(path)
+    if data.text:
+        raise DataError(f"{path} is an ascii .ply; export it as binary.")
+    vertex = data["vertex"]
+    present = {prop.name for prop in vertex.properties}
+    missing = [name for columns in _COLUMNS.values() for name in columns if name not in present]
+    if missing:
+        raise DataError(f"{path} lacks {', '.join(missing)}; give a .ply of 3D Gaussian primitives with SH colours.")
+    rest = sum(name.startswith("f_rest_") for name in present)
+    degree = sh_degree_of(rest // 3) if rest % 3 == 0 else None
+    if degree is None or not present.issuperset(_rest_columns(rest)):
+        raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
+
+    params = {name: stack_columns(vertex, columns) for name, columns in _COLUMNS.items()}
+    by_channel = stack_columns(vertex, _rest_columns(rest)).reshape(vertex.count, 3, rest // 3)
+    params["features_rest"] = by_channel.transpose(1, 2).contiguous()
+    return {name: params[name] for name in SPLAT_NAMES}

@@ -1,0 +1,75 @@
+"""Similarity transforms of a field: centres, sizes, rotations and spherical harmonics together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from sundae_ns.rasterization.harmonics import harmonic_basis
+
+
+def rotation_to_quaternion(rotation: Tensor) -> Tensor:
+    """Unit quaternion wxyz ``[4]`` of a rotation matrix ``[3, 3]``.
+
+    The quaternion is the eigenvector of the largest eigenvalue of Bar-Itzhack's symmetric 4 x 4 matrix (2000), which has
+    no special cases.
+    """
+    m = rotation.double()
+    k = torch.zeros(4, 4, dtype=torch.float64, device=m.device)
+    k[0, 0] = m.trace()
+    k[0, 1:] = k[1:, 0] = torch.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    k[1:, 1:] = m + m.T - m.trace() * torch.eye(3, dtype=torch.float64, device=m.device)
+    return torch.linalg.eigh(k).eigenvectors[:, -1].to(rotation)
+
+
+def multiply_quaternions(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product of wxyz quaternions ``[..., 4]``: first ``b``, then ``a``."""
+    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    w = aw * bw - (av * bv).sum(dim=-1, keepdim=True)
+    return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av.expand_as(bv), bv)], dim=-1)
+
+
+def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tensor:
+    """Coefficients of the rotated function: ``f'(R d) = f(d)``.
+
+    A rotation maps each band onto itself, so its matrix is found exactly by evaluating the band's functions on a few
+    directions before and after the rotation.
+
+    Args:
+        features_rest: ``[N, K, 3]`` bands 1 and up, K = (degree + 1)^2 - 1.
+        rotation: ``[3, 3]``.
+    """
+    degree = round((features_rest.shape[1] + 1) ** 0.5) - 1
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
+    before = harmonic_basis(degree, directions)
+    after = harmonic_basis(degree, directions @ rotation.double().cpu().T)
+    rotated = features_rest.clone()
+    for band in range(1, degree + 1):
+        columns = slice(band**2, (band + 1) ** 2)
+        matrix = torch.linalg.lstsq(after[:, columns], before[:, columns]).solution
+        rows = slice(band**2 - 1, (band + 1) ** 2 - 1)
+        rotated[:, rows] = torch.einsum("ij,njc->nic", matrix.to(features_rest), features_rest[:, rows])
+    return rotated
+
+
+def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) -> dict[str, Tensor]:
+    """Move a field by ``x -> scale * (R x + t)``.
+
+    Args:
+        params: the mapping that ``gaussians.parameters`` describes.
+        transform: ``[3, 4]``, a rotation R beside a translation t.
+        scale: factor.
+
+    Returns:
+        New parameters; opacities, band 0 and features are shared with ``params``.
+    """
+    rotation, translation = transform[:, :3].to(params["means"]), transform[:, 3].to(params["means"])
+    moved = dict(params)
+    moved["means"] = scale * (params["means"] @ rotation.T + translation)
+    moved["scales"] = params["scales"] + torch.tensor(scale).log().to(params["scales"])
+    moved["quats"] = multiply_quaternions(rotation_to_quaternion(rotation), params["quats"])
+    moved["features_rest"] = rotate_spherical_harmonics(params["features_rest"], rotation)
+    return moved

@@ -1,0 +1,102 @@
+"""The head: its two modes, its start, and what it must not depend on."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.errors import ConfigError
+
+
+def inputs(height: int = 33, width: int = 40, features: int = 5) -> tuple[torch.Tensor, ...]:
+    colors = torch.rand(height, width, 3)
+    alpha = torch.rand(height, width, 1)
+    return (colors + (1 - alpha) * 0.5).clamp(0, 1), colors, torch.randn(height, width, features), alpha
+
+
+def head(**options: object) -> CompensationHead:
+    return CompensationHead(HeadConfig(size="tiny", num_features=5, **options))  # type: ignore[arg-type]
+
+
+def perturb(module: torch.nn.Module) -> None:
+    """Move the zero start away from zero, as training does."""
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+
+
+def test_residual_starts_at_the_base_exactly() -> None:
+    base, colors, features, alpha = inputs()
+    assert torch.equal(head()(base, colors, features, alpha), base)
+
+
+def test_residual_leaves_empty_pixels_alone() -> None:
+    base, colors, features, alpha = inputs()
+    module = head()
+    perturb(module)
+    alpha[:10] = 0
+    out = module(base, colors, features, alpha)
+    assert torch.equal(out[:10], base[:10])
+    assert not torch.allclose(out[10:], base[10:])
+
+
+def test_residual_does_not_depend_on_the_background() -> None:
+    base, colors, features, alpha = inputs()
+    module = head()
+    perturb(module)
+    shifted = base + 0.1
+    difference = module(shifted, colors, features, alpha) - module(base, colors, features, alpha)
+    assert torch.allclose(difference, torch.full_like(difference, 0.1), atol=1e-6)
+
+
+def test_features_mode_sees_features_alone() -> None:
+    base, colors, features, alpha = inputs()
+    module = head(mode="features")
+    out = module(base, colors, features, alpha)
+    assert torch.equal(out, module(base * 0, colors * 0, features, alpha * 0))
+    assert not torch.equal(out, module(base, colors, features + 1, alpha))
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_a_few_steps_learn(mode: str) -> None:
+    base, colors, features, _ = inputs()
+    alpha = torch.ones(33, 40, 1)  # the residual head has no say where nothing was splatted
+    target = (base * 0.8).detach()
+    module = head(mode=mode)
+    features.requires_grad_()
+    optimizer = torch.optim.Adam([*module.parameters(), features], lr=1e-2)
+
+    def loss() -> torch.Tensor:
+        return (module(base, colors, features, alpha) - target).abs().mean()
+
+    first = loss().item()
+    for _ in range(60):
+        optimizer.zero_grad()
+        value = loss()
+        value.backward()
+        optimizer.step()
+    assert value.item() < 0.6 * first
+    assert features.grad is not None
+    assert features.grad.abs().sum() > 0
+
+
+@pytest.mark.parametrize("options", [{"num_features": 0}, {"pixel_unshuffle": 0}, {"mode": "off"}])
+def test_bad_options(options: dict[str, object]) -> None:
+    with pytest.raises(ConfigError) as error:
+        CompensationHead(HeadConfig(**options))  # type: ignore[arg-type]
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+def test_half_precision_is_close(precision: str) -> None:
+    tensors = [t.cuda() for t in inputs(features=5)]
+    module = head(precision=precision).cuda()
+    perturb(module)
+    exact = CompensationHead(HeadConfig(size="tiny", num_features=5, precision="fp32")).cuda()
+    exact.load_state_dict(module.state_dict())
+    out = module(*tensors)
+    assert out.dtype == torch.float32
+    scale = (exact(*tensors) - tensors[0]).abs().mean()
+    assert (out - exact(*tensors)).abs().mean() < 0.03 * scale

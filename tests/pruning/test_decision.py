@@ -1,0 +1,180 @@
+"""Signals, scores and the decision: what is kept, and that nothing is touched or computed in vain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import ConfigError, DataError, SundaeError
+from sundae_ns.gaussians.parameters import rgb_to_sh
+from sundae_ns.pruning import PruningConfig, attribute_signal, decide, position_signal, response, score
+
+PAPER = PruningConfig(selection="band", score="response", signal="positions")
+
+
+def field(n: int = 60, seed: int = 0) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {
+        "means": (3,),
+        "scales": (3,),
+        "quats": (4,),
+        "features_dc": (3,),
+        "features_rest": (3, 3),
+        "opacities": (1,),
+    }
+    return {name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()}
+
+
+def ones(n: int = 60) -> Tensor:
+    return torch.ones(n)
+
+
+@pytest.mark.parametrize("selection", ["band", "sampled", "top"])
+@pytest.mark.parametrize("name", ["response-contribution", "response", "contribution", "opacity", "random"])
+@pytest.mark.parametrize("keep_ratio", [0.001, 0.1, 0.25, 1.0])
+def test_every_score_and_selection_keeps_the_exact_count(name: Any, selection: Any, keep_ratio: float) -> None:
+    params = field()
+    before = {key: value.clone() for key, value in params.items()}
+    config = PruningConfig(score=name, selection=selection, keep_ratio=keep_ratio)
+    decision = decide(params, config, ones)
+    assert int(decision.mask.sum()) == decision.kept == max(1, round(keep_ratio * 60))
+    assert torch.equal(decide(params, config, ones).mask, decision.mask)
+    assert (decision.sigma is not None) == (config.uses_graph and keep_ratio < 1)
+    assert all(torch.equal(params[key], before[key]) for key in params)
+
+
+def test_the_papers_rule_is_the_band_of_the_position_response() -> None:
+    params = field()
+    decision = decide(params, replace(PAPER, keep_ratio=0.2))
+    assert decision.magnitude is not None
+    magnitude = decision.magnitude[~decision.magnitude.isnan()]
+    ranked = magnitude.sort().values
+    assert sorted(decision.magnitude[decision.mask].tolist()) == torch.cat([ranked[:6], ranked[-6:]]).tolist()
+    found = response(params, PAPER)
+    torch.testing.assert_close(found.magnitude, decision.magnitude, equal_nan=True)
+    assert found.isolated == decision.isolated == int(found.magnitude.isnan().sum())
+
+
+def test_isolated_floaters_are_judged_by_contribution_or_not_kept() -> None:
+    params = field()
+    params["means"][[3, 40]] = torch.tensor([[500.0, 0, 0], [0, 500.0, 0]])
+    for gamma in (0.0, 0.5, 1.0):
+        assert not decide(params, replace(PAPER, keep_ratio=0.5, gamma=gamma)).mask[[3, 40]].any()
+    contribution = torch.ones(60)
+    contribution[3], contribution[40] = 1e6, 0.0
+    mask = decide(params, PruningConfig(keep_ratio=0.5), lambda: contribution).mask
+    assert mask[3]
+    assert not mask[40]
+
+
+def test_contribution_alone_decides_on_a_graph_without_edges() -> None:
+    contribution = torch.arange(60).float()
+    config = PruningConfig(selection="top", keep_ratio=0.1, tau=1e-12)
+    decision = decide(field(), config, lambda: contribution)
+    assert decision.isolated == 60
+    assert decision.mask.nonzero().squeeze(1).tolist() == list(range(54, 60))
+
+
+def test_attribute_response_finds_the_colour_edge() -> None:
+    n = 400
+    params = field(n)
+    grid = torch.arange(20.0)
+    params["means"] = torch.cartesian_prod(grid, grid, torch.zeros(1))
+    left = params["means"][:, 0] < 10
+    params["features_dc"] = rgb_to_sh(torch.where(left, 0.2, 0.8)[:, None].expand(-1, 3)).clone()
+    params["scales"] = torch.zeros(n, 3)
+    params["opacities"] = torch.zeros(n, 1)
+    magnitude = response(params, PruningConfig(num_neighbors=8)).magnitude
+    edge = (params["means"][:, 0] - 9.5).abs() < 1
+    assert magnitude[edge].min() > 10 * magnitude[~edge].max()
+
+
+def test_signals_have_no_unit_and_no_dominating_group() -> None:
+    params = field()
+    signal = attribute_signal(params)
+    assert signal.shape == (60, 10)
+    assert torch.equal(position_signal(params), params["means"])
+    for group in (slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10)):
+        assert signal[:, group].norm(dim=1).median().item() == pytest.approx(1.0, rel=1e-5)
+    scaled = {**params, "means": 1000 * params["means"] + 5, "scales": params["scales"] + 3}
+    torch.testing.assert_close(attribute_signal(scaled), signal, rtol=1e-4, atol=1e-4)
+
+
+def test_constant_and_almost_constant_attributes_are_finite() -> None:
+    params = field()
+    params["scales"] = torch.full((60, 3), 2.0)
+    params["opacities"] = torch.zeros(60, 1)
+    params["opacities"][0] = 3.0
+    signal = attribute_signal(params)
+    assert signal.isfinite().all()
+    assert (signal[:, 7:] == 0).all()
+    assert signal[0, 6] > 0
+    assert (signal[1:, 6] == 0).all()
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_broken_primitives_go_first_and_do_not_count(value: float) -> None:
+    params = field()
+    params["features_rest"][7, 1, 2] = value
+    params["means"][8] = value
+    contribution = torch.ones(60)
+    contribution[7] = torch.nan
+    decision = decide(params, PruningConfig(keep_ratio=0.5), lambda: contribution)
+    assert decision.dropped_nonfinite == 2
+    assert int(decision.mask.sum()) == decision.kept == 29
+    assert not decision.mask[[7, 8]].any()
+    assert decision.magnitude is not None
+    assert decision.magnitude[[7, 8]].isnan().all()
+    everything = decide(params, PruningConfig(keep_ratio=1.0), lambda: contribution)
+    assert everything.mask.nonzero().squeeze(1).tolist() == [i for i in range(60) if i not in (7, 8)]
+
+
+def test_contribution_is_only_asked_for_when_it_matters() -> None:
+    def never() -> Tensor:
+        raise AssertionError
+
+    for name in ("response", "opacity", "random"):
+        decide(field(), PruningConfig(score=name), never)
+    decide(field(), PruningConfig(keep_ratio=1.0), never)
+
+
+def test_count_replaces_the_share() -> None:
+    config = PruningConfig(score="opacity", selection="top")
+    decision = decide(field(), config, count=17)
+    opacities = field()["opacities"].squeeze(1)
+    assert torch.equal(decision.mask, opacities >= opacities.sort(descending=True).values[16])
+    assert decide(field(), config, count=1000).kept == 60
+
+
+def test_what_cannot_work_says_why_in_one_line() -> None:
+    cases: list[tuple[type[Exception], str, Any]] = [
+        (DataError, "12 primitives cannot have 16 neighbours", lambda: decide(field(12), PAPER)),
+        (DataError, "none of 60", lambda: decide({k: v * torch.nan for k, v in field().items()}, PAPER)),
+        (ConfigError, "training views", lambda: decide(field(), PruningConfig())),
+        (DataError, r"shape \[59\] for 60", lambda: decide(field(), PruningConfig(), lambda: ones(59))),
+        (
+            DataError,
+            r"shape \[9\] for 60",
+            lambda: score(field(), PruningConfig(score="contribution"), None, lambda: ones(9)),
+        ),
+        (ConfigError, "graph response", lambda: score(field(), PAPER, None, None)),
+        (ConfigError, "keep_ratio", lambda: decide(field(), PruningConfig(keep_ratio=0.0))),
+    ]
+    for error, message, call in cases:
+        with pytest.raises(error, match=message) as caught:
+            call()
+        assert isinstance(caught.value, SundaeError)
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.gpu
+def test_decision_on_the_gpu_keeps_the_same_primitives() -> None:
+    params = field(500)
+    config = replace(PAPER, keep_ratio=0.3)
+    on_gpu = decide({name: value.cuda() for name, value in params.items()}, config)
+    assert on_gpu.mask.is_cuda
+    assert torch.equal(on_gpu.mask.cpu(), decide(params, config).mask)

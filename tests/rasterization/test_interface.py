@@ -1,0 +1,107 @@
+"""Choice of a backend, and the errors users see."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from sundae_ns.errors import BackendError, ConfigError, DataError
+from sundae_ns.rasterization import blending_weights, rasterize, select_backend, spherical_harmonics
+
+REFERENCE = select_backend("reference", "cpu")
+
+
+def _arguments(n: int = 3) -> dict:
+    return {
+        "means": torch.ones(n, 3),
+        "quats": torch.ones(n, 4),
+        "scales": torch.ones(n, 3),
+        "opacities": torch.ones(n),
+        "colors": torch.ones(n, 3),
+        "viewmat": torch.eye(4),
+        "K": torch.eye(3),
+        "width": 4,
+        "height": 4,
+        "backend": REFERENCE,
+    }
+
+
+@pytest.mark.parametrize("device", ["cpu", torch.device("cpu")])
+def test_auto_takes_the_reference_on_a_cpu(device: torch.device | str) -> None:
+    assert select_backend("auto", device).name == "reference"
+
+
+def test_gsplat_without_a_gpu_is_one_line_with_cause_and_mend(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(BackendError, match=r"CUDA is not available; use .* or use the backend 'reference'") as caught:
+        select_backend("gsplat", "cuda")
+    assert "\n" not in str(caught.value)
+    assert select_backend("auto", "cuda").name == "reference"
+
+
+def test_gsplat_on_cpu_tensors_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    with pytest.raises(BackendError, match="on the device 'cpu'"):
+        select_backend("gsplat", "cpu")
+    assert select_backend("auto", "cpu").name == "reference"
+
+
+def test_kernels_that_fail_are_reported_and_auto_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr("sundae_ns.rasterization.select._kernel_problem", lambda: "its kernels do not run (x); mend")
+    with pytest.raises(BackendError, match="its kernels do not run"):
+        select_backend("gsplat", "cuda")
+    assert select_backend("auto", "cuda:0").name == "reference"
+
+
+def test_unknown_backend() -> None:
+    with pytest.raises(ConfigError, match="auto, gsplat or reference"):
+        select_backend("vulkan", "cpu")  # type: ignore[arg-type]
+
+
+def test_selecting_on_a_cpu_imports_nothing_of_gsplat() -> None:
+    code = (
+        "import sys; from sundae_ns.rasterization import select_backend; select_backend('auto', 'cpu'); "
+        "sys.exit(any(name.split('.')[0] == 'gsplat' for name in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("means", torch.ones(3, 2), r"means has shape \[3, 2\]; pass \[3, 3\]"),
+        ("quats", torch.ones(2, 4), r"quats has shape \[2, 4\]"),
+        ("scales", torch.ones(3), "scales has shape"),
+        ("opacities", torch.ones(3, 1), r"opacities has shape \[3, 1\]; pass \[3\]"),
+        ("colors", torch.ones(3, 0), "at least one channel"),
+        ("viewmat", torch.eye(4)[:3], "viewmat has shape"),
+        ("K", torch.eye(4), "K has shape"),
+        ("K", torch.eye(3, dtype=torch.float64), "K is torch.float64"),
+        ("width", 0, "empty"),
+    ],
+)
+def test_wrong_arguments(name: str, value: object, message: str) -> None:
+    arguments = _arguments()
+    arguments[name] = value
+    with pytest.raises(DataError, match=message):
+        rasterize(**arguments)
+
+
+def test_wrong_harmonics() -> None:
+    with pytest.raises(DataError, match="degree 5"):
+        spherical_harmonics(5, torch.ones(2, 3), torch.ones(2, 36, 3), backend=REFERENCE)
+    with pytest.raises(DataError, match="needs"):
+        spherical_harmonics(2, torch.ones(2, 3), torch.ones(2, 8, 3), backend=REFERENCE)
+
+
+def test_blending_weights_work_without_grad() -> None:
+    arguments = _arguments()
+    arguments.pop("colors")
+    with torch.no_grad():
+        weights = blending_weights(**arguments)
+    assert weights.shape == (3,)
+    assert not weights.requires_grad

@@ -1,0 +1,177 @@
+import sys
+import types
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from plyfile import PlyData, PlyElement
+
+from sundae_ns.errors import DataError
+from sundae_ns.gaussians.parameters import SPLAT_NAMES
+from sundae_ns.storage import is_nerfstudio_ply, read_ply, write_ply
+
+
+def _field(n=7, degree=3, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    return {
+        "means": normal(n, 3),
+        "scales": normal(n, 3),
+        "quats": normal(n, 4),
+        "features_dc": normal(n, 3),
+        "features_rest": normal(n, (degree + 1) ** 2 - 1, 3),
+        "opacities": normal(n, 1),
+    }
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("n", [0, 1, 50])
+def test_round_trip_is_exact(tmp_path, n, degree):
+    params = _field(n, degree)
+    write_ply(tmp_path / "a.ply", {**params, "features": torch.zeros(n, 13)})
+    back = read_ply(tmp_path / "a.ply")
+    assert tuple(back) == SPLAT_NAMES
+    for name, value in params.items():
+        assert back[name].dtype == torch.float32
+        assert back[name].is_contiguous()
+        assert torch.equal(back[name], value), name
+
+
+def test_parameters_of_any_kind_are_written_as_float32(tmp_path):
+    params = {name: torch.nn.Parameter(value.double()) for name, value in _field().items()}
+    write_ply(tmp_path / "a.ply", params)
+    back = read_ply(tmp_path / "a.ply")
+    assert all(torch.equal(back[name], params[name].detach().float()) for name in SPLAT_NAMES)
+
+
+def test_layout(tmp_path):
+    params = _field(n=3, degree=1)
+    write_ply(tmp_path / "a.ply", params, comments=["SplatRenderMode: mip"])
+    data = PlyData.read(str(tmp_path / "a.ply"))
+    assert data.byte_order == "<"
+    assert data.comments == ["SplatRenderMode: mip"]
+    vertex = data["vertex"]
+    expected = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 " + " ".join(f"f_rest_{i}" for i in range(9))
+    expected += " opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    assert [prop.name for prop in vertex.properties] == expected.split()
+    # Three coefficients of red come first, then green's.
+    np.testing.assert_array_equal(vertex["f_rest_1"], params["features_rest"][:, 1, 0])
+    np.testing.assert_array_equal(vertex["f_rest_3"], params["features_rest"][:, 0, 1])
+    np.testing.assert_array_equal(vertex["rot_0"], params["quats"][:, 0])
+
+
+def test_same_vertices_as_nerfstudio_exports(tmp_path, monkeypatch):
+    # The exporter imports open3d for its meshes only; without a display it may not import.
+    monkeypatch.setitem(sys.modules, "open3d", types.ModuleType("open3d"))
+    monkeypatch.delitem(sys.modules, "nerfstudio.scripts.exporter", raising=False)
+    from nerfstudio.models.splatfacto import SplatfactoModel
+    from nerfstudio.scripts import exporter
+
+    params = _field(n=9, degree=3)
+    model = SplatfactoModel.__new__(SplatfactoModel)
+    torch.nn.Module.__init__(model)
+    model.gauss_params = torch.nn.ParameterDict(params)
+    model.config = SimpleNamespace(sh_degree=3)
+    pipeline = SimpleNamespace(model=model)
+    monkeypatch.setattr(exporter, "eval_setup", lambda *_, **__: (None, pipeline, None, None))
+    exporter.ExportGaussianSplat(load_config=tmp_path, output_dir=tmp_path).main()
+    monkeypatch.delitem(sys.modules, "nerfstudio.scripts.exporter")
+
+    write_ply(tmp_path / "ours.ply", params)
+    ours, theirs = (PlyData.read(str(tmp_path / name))["vertex"].data for name in ("ours.ply", "splat.ply"))
+    assert ours.dtype == theirs.dtype
+    assert ours.tobytes() == theirs.tobytes()
+    assert is_nerfstudio_ply(tmp_path / "splat.ply")
+    assert not is_nerfstudio_ply(tmp_path / "ours.ply")
+
+
+def test_foreign_properties_and_order_do_not_matter(tmp_path):
+    params = _field(n=4, degree=1)
+    write_ply(tmp_path / "a.ply", params)
+    vertices = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    names = sorted(vertices.dtype.names, reverse=True)
+    other = np.empty(4, dtype=[("segment", "<i4")] + [(name, ">f8") for name in names])
+    for name in names:
+        other[name] = vertices[name]
+    PlyData([PlyElement.describe(other, "vertex")], byte_order=">").write(str(tmp_path / "b.ply"))
+    back = read_ply(tmp_path / "b.ply")
+    assert all(torch.equal(back[name], params[name]) for name in SPLAT_NAMES)
+
+
+def _without(path, names):
+    data = PlyData.read(str(path), mmap=False)["vertex"].data
+    kept = [name for name in data.dtype.names if name not in names]
+    PlyData([PlyElement.describe(np.array(data[kept].tolist(), [(k, "f4") for k in kept]), "vertex")]).write(str(path))
+
+
+@pytest.mark.parametrize(
+    ("names", "cause"),
+    [
+        (["opacity"], "lacks opacity"),
+        (["scale_2"], "lacks scale_2"),
+        (["f_rest_8"], "8 f_rest"),
+        (["f_rest_0"], "8 f_rest"),
+        (["f_rest_6", "f_rest_7", "f_rest_8"], "6 f_rest"),
+    ],
+)
+def test_missing_properties(tmp_path, names, cause):
+    path = tmp_path / "a.ply"
+    write_ply(path, _field(degree=1))
+    _without(path, names)
+    with pytest.raises(DataError, match=cause) as caught:
+        read_ply(path)
+    assert "\n" not in str(caught.value)
+
+
+def _ascii(path):
+    data = PlyData.read(str(path), mmap=False)
+    data.text = True
+    data.write(str(path))
+
+
+WRONG = {
+    "gone": (lambda path: path.unlink(), "cannot be read"),
+    "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
+    "ascii": (_ascii, "ascii"),
+    "cut short": (lambda path: path.write_bytes(path.read_bytes()[:-5]), "not a whole"),
+    "empty": (lambda path: path.write_bytes(b""), "not a whole"),
+    "a picture": (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe" * 9), "not a whole"),
+    "no vertices": (
+        lambda path: path.write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n"),
+        "no vertices",
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_wrong_files(tmp_path, wrong):
+    spoil, cause = WRONG[wrong]
+    path = tmp_path / "a.ply"
+    write_ply(path, _field())
+    spoil(path)
+    with pytest.raises(DataError, match=cause) as caught:
+        read_ply(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "change", [{"opacities": torch.zeros(7)}, {"means": torch.zeros(7, 2)}, {"features_rest": torch.zeros(7, 4, 3)}]
+)
+def test_wrong_shapes_leave_the_old_file(tmp_path, change):
+    path = tmp_path / "a.ply"
+    path.write_text("old")
+    with pytest.raises(DataError, match=next(iter(change))):
+        write_ply(path, {**_field(), **change})
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_missing_parameter(tmp_path):
+    params = _field()
+    del params["quats"]
+    with pytest.raises(DataError, match="no quats"):
+        write_ply(tmp_path / "a.ply", params)
