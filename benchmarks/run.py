@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
@@ -71,6 +72,7 @@ def configure(options: argparse.Namespace, extra: list[str]) -> tuple[TrainerCon
     arguments += ["--eval-mode", "interval", "--eval-interval", "8"]
     config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)
     shown = [options.scene if part == str(options.data) else part for part in arguments]
+    config.pipeline.datamanager.data = config.data
     config.output_dir = options.out
     config.experiment_name = f"{options.scene}-{options.variant}-{options.seed}"
     config.set_timestamp()
@@ -97,11 +99,13 @@ def evaluate(pipeline: Any) -> dict[str, float]:
 
 
 def commit() -> str:
-    """The revision measured; a machine without git is told it by the file that travels with the tree."""
-    told = Path(".commit")
-    if told.exists():
-        return told.read_text().strip()
-    return subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+    """The revision measured: of this checkout, or told by ``BENCHMARK_COMMIT`` where the tree travelled without git."""
+    told = os.environ.get("BENCHMARK_COMMIT")
+    if told:
+        return told
+    return subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+    ).stdout.strip()
 
 
 def main() -> None:

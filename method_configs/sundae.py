@@ -8,7 +8,6 @@ import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -16,12 +15,13 @@ from nerfstudio.plugins.types import MethodSpecification
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.model import SundaeModelConfig
+from sundae_ns.optimizers import FusedAdamConfig
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.schedulers import PruneAwareDecayConfig
 
 
-def _adam(lr: float) -> AdamOptimizerConfig:
-    return AdamOptimizerConfig(lr=lr, eps=1e-15)
+def _adam(lr: float) -> FusedAdamConfig:
+    return FusedAdamConfig(lr=lr, eps=1e-15)
 
 
 def optimizers(steps: int, *, restart_means: bool = True) -> dict[str, Any]:

@@ -22,6 +22,7 @@ FLOORS = {
     "evaluation": 2,
     "data": 2,
     "schedulers": 3,
+    "optimizers": 3,
     "datamanager": 3,
     "checkpoint": 3,
     "model": 3,

@@ -26,7 +26,7 @@ def _double_conv(c_in: int, c_out: int) -> nn.Sequential:
 class UNet(nn.Module):
     """Four-level fully convolutional U-Net (Neural Compensation section of the paper).
 
-    Works at any image size of at least one pixel: inputs are padded by their edge to a multiple of
+    Works at any image size of at least one pixel: inputs are padded by zeros to a multiple of
     ``pixel_unshuffle * 2 ** (LEVELS - 1)`` and the result is cropped back.
 
     Args:
@@ -67,7 +67,8 @@ class UNet(nn.Module):
         height, width = image.shape[-2:]
         stride = self.pixel_unshuffle * 2 ** (LEVELS - 1)
         bottom, right = -height % stride, -width % stride
-        x = F.pad(image, (0, right, 0, bottom), mode="replicate") if bottom or right else image
+        # By zeros, as the convolutions pad themselves.
+        x = F.pad(image, (0, right, 0, bottom)) if bottom or right else image
         x = F.pixel_unshuffle(x, self.pixel_unshuffle)
         skips: list[Tensor] = []
         for level, block in enumerate(self.encoder):

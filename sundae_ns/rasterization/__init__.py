@@ -1,8 +1,8 @@
 """Gaussian splatting of one view: one interface, two backends.
 
 :func:`rasterize`, :func:`spherical_harmonics` and :func:`blending_weights` are the whole interface; each takes a
-:class:`Backend` from :func:`select_backend`. ``gsplat`` runs the CUDA kernels of the package of that name; ``reference``
-is pure torch with the same thresholds, runs on any device in float32 or float64, and is differentiable.
+:class:`Backend` from :func:`select_backend`. ``gsplat`` runs the CUDA kernels of the package of that name;
+``reference`` is pure torch with the same thresholds, runs on any device in float32 or float64, and is differentiable.
 """
 
 from sundae_ns.rasterization.interface import blending_weights, rasterize, spherical_harmonics

@@ -1,8 +1,8 @@
 """Front-to-back blending of tile lists, with an analytic backward pass that keeps memory bounded.
 
-Tiles with lists of similar length go through together as padded arrays ``[T, M, P]`` (tiles, list entries, pixels) of a
-limited size, and long lists in segments, so that a tile whose pixels are all opaque drops out early. Only the list entries
-and the transmittance at the head of each segment are kept for the backward pass; it evaluates the rest again.
+Tiles with lists of similar length go through together as padded arrays ``[T, M, P]`` (tiles, list entries, pixels) of
+a limited size, and long lists in segments, so that a tile whose pixels are all opaque drops out early. Only the list
+entries and the transmittance at the head of each segment are kept for the backward pass; it evaluates the rest again.
 
 For pixel p and list entry m, with g the gradient of the loss with respect to the blended channels:
 
@@ -34,10 +34,10 @@ MIN_TRANSMITTANCE = 1e-4
 
 _PIXELS = TILE * TILE
 _SEGMENT = 128  # list entries between two looks at whether a tile is opaque
-_BATCH_ELEMENTS = 2**18  # of one [T, M, P] array: 1 MiB in float32, so that the passes over it stay in cache
+_BATCH_ELEMENTS = 2**17  # of one [T, M, P] array: half a MiB in float32, so that the passes over it stay in cache
 _LENGTH_RATIO = 0.75  # shortest over longest list of a batch: the padding wastes at most a quarter ...
 _SMALL_BATCH = 2**15  # ... except in batches so small that the cost per call outweighs it
-_NEVER = -1e4  # exponent of padding: finite, and its exponential is 0
+_FAINTEST = -20.0  # exponents are cut off here, far below log(1 / 255): exp() is ten times slower where it underflows
 
 
 def composite(
@@ -132,10 +132,9 @@ class _Composite(torch.autograd.Function):
             total = after[:, -1] + behind[tiles]
             behind[tiles] = total
             torch.sub(total[:, None], after, out=after)
-            capped = (alphas >= MAX_ALPHA) if may_cap else None
-            pull = gains.sub_(after.mul_(alphas.div_(1 - alphas)))  # dL/de
-            if capped is not None:
-                pull.masked_fill_(capped, 0.0)
+            pull = gains.sub_(after.mul_(alphas).div_(1 - alphas))  # dL/de
+            if may_cap:
+                pull.mul_(torch.lt(alphas, MAX_ALPHA, out=after))
             moments[batch.entries] = pull @ basis.mT
             if ctx.absgrad:
                 absolute[batch.entries] = _absolute_gradients(pull.abs_(), coefficients, basis)
@@ -201,7 +200,7 @@ def _exponents(offsets: Tensor, conics: Tensor, opacities: Tensor, lists: TileLi
     x, y = xx * u + xy * v, xy * u + yy * v
     constant = opacities[lists.gaussian_ids].log() - 0.5 * (x * u + y * v)
     coefficients = torch.stack([constant, x, y, -0.5 * xx, -xy, -0.5 * yy], dim=-1)
-    return torch.cat([coefficients, coefficients.new_tensor([[_NEVER, 0, 0, 0, 0, 0]])])
+    return torch.cat([coefficients, coefficients.new_tensor([[_FAINTEST, 0, 0, 0, 0, 0]])])
 
 
 def _owners(colors: Tensor, lists: TileLists) -> Tensor:
@@ -210,13 +209,14 @@ def _owners(colors: Tensor, lists: TileLists) -> Tensor:
 
 
 def _channels(colors: Tensor) -> Tensor:
-    """Colours with a channel of ones, which blends to the accumulated alpha, and a row for padding: ``[N + 1, C + 1]``."""
+    """Colours, a channel of ones that blends to the accumulated alpha, and a row for padding: ``[N + 1, C + 1]``."""
     return pad(pad(colors, (0, 1), value=1.0), (0, 0, 0, 1))
 
 
 def _alphas(coefficients: Tensor, basis: Tensor) -> Tensor:
     """Alphas ``[T, M, P]``, capped, and 0 where too faint."""
-    return torch.threshold_((coefficients @ basis).exp_().clamp_(max=MAX_ALPHA), MIN_ALPHA, 0.0)
+    exponents = (coefficients @ basis).clamp_(min=_FAINTEST)
+    return torch.threshold_(exponents.exp_().clamp_(max=MAX_ALPHA), MIN_ALPHA, 0.0)
 
 
 def _transmittances(alphas: Tensor, start: Tensor) -> Tensor:
@@ -224,7 +224,7 @@ def _transmittances(alphas: Tensor, start: Tensor) -> Tensor:
     factors = alphas.new_empty(alphas.shape[0], alphas.shape[1] + 1, alphas.shape[2])
     factors[:, 0] = start
     torch.sub(1.0, alphas, out=factors[:, 1:])
-    return torch.cumprod(factors, dim=1, out=factors)
+    return factors.cumprod_(dim=1)
 
 
 def _weights(alphas: Tensor, through: Tensor) -> Tensor:
@@ -235,7 +235,8 @@ def _weights(alphas: Tensor, through: Tensor) -> Tensor:
     """
     weights = alphas * through[:, :-1]
     if (through[:, -1] <= MIN_TRANSMITTANCE).any():
-        weights.masked_fill_(through[:, 1:] <= MIN_TRANSMITTANCE, 0.0)
+        # Masks of floats, here and below: on a CPU, masked_fill() takes ten times as long.
+        weights.mul_(torch.gt(through[:, 1:], MIN_TRANSMITTANCE, out=torch.empty_like(weights)))
     return weights
 
 

@@ -43,16 +43,22 @@ class GsplatBackend:
         from gsplat import rasterization
 
         _check_kernels_take(means)
-        options = {
-            "near_plane": near_plane,
-            "far_plane": far_plane,
-            "antialiased": antialiased,
-            "absgrad": absgrad,
-            "render_depth": render_depth,
-        }
         if means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
             return ReferenceBackend().rasterize(
-                means, quats, scales, opacities, colors, viewmat, K, width, height, **options
+                means,
+                quats,
+                scales,
+                opacities,
+                colors,
+                viewmat,
+                K,
+                width,
+                height,
+                near_plane=near_plane,
+                far_plane=far_plane,
+                antialiased=antialiased,
+                absgrad=absgrad,
+                render_depth=render_depth,
             )
         channels = colors.shape[1]
         rendered, alpha, info = rasterization(

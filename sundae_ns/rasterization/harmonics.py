@@ -1,7 +1,7 @@
 """Real spherical harmonics as polynomials of the unit direction.
 
-Constants follow from normalising each polynomial over the sphere (P.-P. Sloan, "Efficient Spherical Harmonic Evaluation",
-JCGT 2013). The signs are those of 3DGS: odd orders m carry the Condon-Shortley phase.
+Constants follow from normalising each polynomial over the sphere (P.-P. Sloan, "Efficient Spherical Harmonic
+Evaluation", JCGT 2013). The signs are those of 3DGS: odd orders m carry the Condon-Shortley phase.
 """
 
 from __future__ import annotations

@@ -87,7 +87,8 @@ def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, back
 
     Args:
         degree: 0 to 4; only the first ``(degree + 1) ** 2`` coefficients are read.
-        directions: From the camera to the primitive, any length; zero vectors count as +z, with zero gradient. ``[N, 3]``
+        directions: From the camera to the primitive, any length; zero vectors count as +z, without gradient.
+            ``[N, 3]``
         coeffs: Coefficients, bands in the order and with the signs of 3DGS. ``[N, K, 3]``
         backend: From :func:`sundae_ns.rasterization.select_backend`.
 

@@ -1,7 +1,8 @@
 """EWA projection of 3D Gaussians to the screen, in plain autograd torch.
 
-Zwicker et al., "EWA Splatting", 2002, with the conventions of 3DGS: the Jacobian of the perspective map is taken at the
-centre, its off-axis angle is limited to 1.3 times the field of view, and every footprint is blurred by 0.3 square pixels.
+Zwicker et al., "EWA Splatting", 2002, with the conventions of 3DGS: the Jacobian of the perspective map is taken at
+the centre, its slope is held within the image plus 0.15 of its size on each side, and every footprint is blurred by
+0.3 square pixels.
 """
 
 from __future__ import annotations

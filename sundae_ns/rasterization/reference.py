@@ -79,7 +79,7 @@ def _strategy_info(means2d: Tensor, radii: Tensor, width: int, height: int) -> d
 
 @lru_cache(maxsize=1)
 def _radii_per_axis() -> bool:
-    """Whether the installed gsplat's strategies expect radii ``[1, N, 2]``, as they do from 1.5; 1.4's want ``[1, N]``."""
+    """Whether the installed gsplat's strategies expect radii ``[1, N, 2]``, as from 1.5; those of 1.4 want ``[1, N]``."""
     try:
         major, minor = version("gsplat").split(".")[:2]
     except PackageNotFoundError:

@@ -18,8 +18,8 @@ BackendName = Literal["auto", "gsplat", "reference"]
 def select_backend(name: BackendName, device: torch.device | str) -> Backend:
     """Choose the rasteriser for tensors on ``device``.
 
-    ``auto`` takes gsplat on a CUDA device where its kernels run, else the reference. The check is made once per process;
-    where gsplat has no prebuilt kernels, it builds them during that check.
+    ``auto`` takes gsplat on a CUDA device where its kernels run, else the reference. The check is made once per
+    process; where gsplat has no prebuilt kernels, it builds them during that check.
 
     Raises:
         BackendError: ``gsplat`` was asked for and cannot run on ``device``.

@@ -1,8 +1,9 @@
 """Depth-ordered lists of the primitives that can touch each tile of the image.
 
-gsplat bins primitives into 16-pixel tiles by their three-sigma square and blends them in every pixel of those tiles, so
-its images depend on that grid. The lists here are on a finer grid, and leave out only what cannot reach an alpha of 1/255
-in a tile: blending them gives the image of the 16-pixel grid with fewer pixels looked at.
+gsplat 1.4 bins primitives into 16-pixel tiles by their three-sigma square and blends them in every pixel of those
+tiles, so its images depend on that grid. The lists here are on a finer grid, and leave out only what cannot reach an
+alpha of 1/255 in a tile: blending them gives the image of the 16-pixel grid with fewer pixels looked at. (gsplat 1.5
+fits the bins to the opacity instead, and so also keeps the rim of opaque primitives from 3 to 3.33 sigma.)
 """
 
 from __future__ import annotations
@@ -51,20 +52,26 @@ def build_tile_lists(projection: Projection, opacities: Tensor, width: int, heig
     low = torch.maximum(((centres - radii) / _BIN).floor() * per_bin, ((centres - half) / TILE).floor())
     high = torch.minimum(((centres + radii) / _BIN).ceil() * per_bin, ((centres + half) / TILE).ceil())
     grid = centres.new_tensor([columns, rows])
-    low = low.clamp(min=0).minimum(grid).long()
-    spans = (high.clamp(min=0).minimum(grid).long() - low).clamp(min=0)
+    low, high = low.clamp(min=0).minimum(grid), high.clamp(min=0).minimum(grid)
+    spans = (high - low).clamp(min=0).long()
 
+    # One row for each cell of each rectangle of tiles, in order of depth.
     counts = spans[:, 0] * spans[:, 1]
-    owner = torch.repeat_interleave(torch.arange(ids.shape[0], device=ids.device), counts)
-    within = torch.arange(owner.shape[0], device=ids.device) - (counts.cumsum(0) - counts)[owner]
-    width_of = spans[owner, 0]
-    cells = low[owner] + torch.stack([within % width_of, within // width_of], dim=-1)  # [L, 2]
+    owner = torch.repeat_interleave(counts)
+    within = torch.arange(owner.shape[0], device=ids.device) - (counts.cumsum(0) - counts).index_select(0, owner)
+    width_of = spans[:, 0].index_select(0, owner)
+    down = torch.div(within, width_of, rounding_mode="floor")
+    across = within - down * width_of
+    table = torch.cat([low, centres, projection.conics[ids], reach[:, None]], dim=-1).index_select(0, owner)
+    left, top, u, v, xx, xy, yy, limit = table.unbind(-1)
+    left, top = left + across, top + down
 
-    touches = _least_exponent(centres[owner], projection.conics[ids][owner], cells) <= reach[owner]
-    cells, owner = cells[touches], owner[touches]
-    tile_ids, order = torch.sort(cells[:, 1] * columns + cells[:, 0], stable=True)
+    touches = (_least_exponent(left * TILE - u, top * TILE - v, xx, xy, yy) <= limit).nonzero()[:, 0]
+    cells = top.long() * columns + left.long()
+    tile_ids, order = torch.sort(cells.index_select(0, touches), stable=True)
+    gaussian_ids = ids.index_select(0, owner.index_select(0, touches.index_select(0, order)))
     lengths = torch.bincount(tile_ids, minlength=columns * rows)
-    return TileLists(columns, rows, ids[owner[order]], tile_ids, lengths.cumsum(0) - lengths, lengths)
+    return TileLists(columns, rows, gaussian_ids, tile_ids, lengths.cumsum(0) - lengths, lengths)
 
 
 def tile_centres(tile_ids: Tensor, columns: int) -> Tensor:
@@ -72,22 +79,18 @@ def tile_centres(tile_ids: Tensor, columns: int) -> Tensor:
     return torch.stack([tile_ids % columns, tile_ids // columns], dim=-1) * TILE + TILE // 2
 
 
-def _least_exponent(centres: Tensor, conics: Tensor, cells: Tensor) -> Tensor:
-    """Minimum over the pixel centres' bounding box of half the squared Mahalanobis distance: ``[L]``.
+def _least_exponent(left: Tensor, top: Tensor, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
+    """Minimum of half the squared Mahalanobis distance over a tile with its corner at (left, top): ``[L]``.
 
-    The distance is convex, so off the box its minimum lies on an edge that faces the centre: the nearer vertical or the
-    nearer horizontal one.
+    It is taken over the box of the tile's pixel centres. The distance is convex, so off the box its minimum lies on an
+    edge that faces the centre: the nearer vertical or the nearer horizontal one.
     """
-    low = cells * TILE + 0.5 - centres
-    high = low + (TILE - 1)
-    near = torch.zeros_like(low).clamp(min=low, max=high)
-    xx, xy, yy = conics.unbind(-1)
-    best_y = (-xy / yy * near[:, 0]).clamp(min=low[:, 1], max=high[:, 1])
-    best_x = (-xy / xx * near[:, 1]).clamp(min=low[:, 0], max=high[:, 0])
-    return torch.minimum(
-        _exponent(xx, xy, yy, near[:, 0], best_y),
-        _exponent(xx, xy, yy, best_x, near[:, 1]),
-    )
+    x0, y0 = left + 0.5, top + 0.5
+    x1, y1 = x0 + (TILE - 1), y0 + (TILE - 1)
+    near_x, near_y = x0.clamp(min=0) + x1.clamp(max=0), y0.clamp(min=0) + y1.clamp(max=0)
+    best_x = (-xy / xx * near_y).maximum(x0).minimum(x1)
+    best_y = (-xy / yy * near_x).maximum(y0).minimum(y1)
+    return torch.minimum(_exponent(xx, xy, yy, near_x, best_y), _exponent(xx, xy, yy, best_x, near_y))
 
 
 def _exponent(xx: Tensor, xy: Tensor, yy: Tensor, dx: Tensor, dy: Tensor) -> Tensor:

@@ -27,9 +27,9 @@ class Rasterization:
     info: dict[str, Any]
     """What the ``DefaultStrategy`` of the installed gsplat reads, in the shapes it expects.
 
-    ``means2d`` ``[1, N, 2]`` in pixels is part of the graph (``retain_grad()`` works; ``.absgrad`` is set by the backward
-    pass if asked for); ``radii`` is ``[1, N]`` under gsplat 1.4 and ``[1, N, 2]`` from 1.5; ``width``, ``height`` and
-    ``n_cameras`` are ints; ``gaussian_ids`` is None, because nothing is packed.
+    ``means2d`` ``[1, N, 2]`` in pixels is part of the graph (``retain_grad()`` works; ``.absgrad`` is set by the
+    backward pass if asked for); ``radii`` is ``[1, N]`` under gsplat 1.4 and ``[1, N, 2]`` from 1.5; ``width``,
+    ``height`` and ``n_cameras`` are ints; ``gaussian_ids`` is None, because nothing is packed.
     """
 
 
@@ -61,4 +61,4 @@ class Backend(Protocol):
         """Render one view; see :func:`sundae_ns.rasterization.rasterize`."""
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-        """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` of any positive length and coefficients ``[N, K, 3]``."""
+        """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""

@@ -25,16 +25,14 @@ def test_any_size(unshuffle: int, height: int, width: int) -> None:
     assert out.isfinite().all()
 
 
-def test_padding_does_not_change_a_picture_that_needs_none() -> None:
-    net = UNet(3, 3, 4, pixel_unshuffle=2)
-    picture = torch.rand(1, 3, 32, 32)
-    assert torch.equal(net(picture), net(picture.clone()))
-    # A constant picture has nothing at its edge that padding by the edge could change.
-    constant = torch.full((1, 3, 40, 40), 0.3)
-    inner = net(constant)[..., 16:24, 16:24]
-    odd = net(constant[..., :37, :35])
-    assert odd.shape[-2:] == (37, 35)
-    assert torch.allclose(odd[..., 16:20, 16:20], inner[..., :4, :4], atol=1e-5)
+def test_padding_reaches_the_edge_alone() -> None:
+    """A picture cut down to an odd size keeps its values far from the cut."""
+    net = UNet(3, 3, 8)
+    picture = torch.rand(1, 3, 128, 128)
+    whole, cut = net(picture), net(picture[..., :117, :115])
+    assert cut.shape[-2:] == (117, 115)
+    assert torch.allclose(cut[..., :24, :24], whole[..., :24, :24], atol=1e-6)
+    assert not torch.allclose(cut[..., -4:, -4:], whole[..., 113:117, 111:115], atol=1e-6)
 
 
 def test_zero_start_is_exactly_zero() -> None:

@@ -23,11 +23,10 @@ def test_points_gather_where_the_pictures_have_detail():
     cameras = orbit(12, width=64, height=64, rng=np.random.default_rng(0))
     pictures = [render(scene, camera) for camera in cameras]
 
-    def share_on_mosaic(views):
+    def share_of_background(views):
         rng = np.random.default_rng(1)
         points, _ = sparse_points(scene, cameras, views, 600, noise=0.0, outliers=0.0, rng=rng)
-        radius = np.hypot(points[:, 0], points[:, 1])
-        return ((np.abs(points[:, 2]) < 1e-3) & (radius > 1.3) & (radius < 1.86)).mean()
+        return (np.linalg.norm(points, axis=1) > 15).mean()
 
-    # Flat pictures have no detail anywhere: points fall evenly on them.
-    assert share_on_mosaic(pictures) > 1.25 * share_on_mosaic([0 * picture for picture in pictures])
+    # Flat pictures have no detail anywhere: points fall evenly on them, and so on the smooth landscape too.
+    assert share_of_background(pictures) < 0.6 * share_of_background([0 * picture for picture in pictures])
