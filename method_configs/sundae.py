@@ -20,34 +20,45 @@ from sundae_ns.pruning import PruningConfig
 from sundae_ns.schedulers import PruneAwareDecayConfig
 
 
-def _adam(lr: float) -> FusedAdamConfig:
-    return FusedAdamConfig(lr=lr, eps=1e-15)
+def _adam(lr: float, eps: float = 1e-15) -> FusedAdamConfig:
+    return FusedAdamConfig(lr=lr, eps=eps)
 
 
-def optimizers(steps: int, *, restart_means: bool = True) -> dict[str, Any]:
+def _settling(lr: float, steps: int, settle: float) -> dict[str, Any]:
+    """A rate that is constant while the field grows and, once it is pruned, decays to ``settle`` times its value."""
+    if settle == 1.0:
+        return {"optimizer": _adam(lr), "scheduler": None}
+    decay = PruneAwareDecayConfig(lr_final=settle * lr, max_steps=steps, lr_restart=lr, hold_until_prune=True)
+    return {"optimizer": _adam(lr), "scheduler": decay}
+
+
+def optimizers(steps: int, *, means_restart: float | None = 1.6e-4, settle: float = 0.1) -> dict[str, Any]:
     """A fresh set of optimizers for a run of ``steps`` steps: splatfacto's rates, and those of features and head.
 
     Args:
         steps: length of the run, where decaying rates reach their final value.
-        restart_means: whether the rate of the centres begins anew at the prune, so that the kept primitives can move
-            into the gaps that the others left.
+        means_restart: rate of the centres right after the prune, from which its decay begins anew, so that the kept
+            primitives can move into the gaps that the others left; None: the decay goes on.
+        settle: share of their rate that the other parameters end with. A pruned field does not grow any more, so its
+            colours, sizes and opacities may settle.
     """
     return {
         "means": {
             "optimizer": _adam(1.6e-4),
-            "scheduler": PruneAwareDecayConfig(
-                lr_final=1.6e-6, max_steps=steps, lr_restart=1.6e-4 if restart_means else None
-            ),
+            "scheduler": PruneAwareDecayConfig(lr_final=1.6e-6, max_steps=steps, lr_restart=means_restart),
         },
-        "features_dc": {"optimizer": _adam(0.0025), "scheduler": None},
-        "features_rest": {"optimizer": _adam(0.0025 / 20), "scheduler": None},
-        "opacities": {"optimizer": _adam(0.05), "scheduler": None},
-        "scales": {"optimizer": _adam(0.005), "scheduler": None},
-        "quats": {"optimizer": _adam(0.001), "scheduler": None},
-        "features": {"optimizer": _adam(0.0025), "scheduler": None},
+        "features_dc": _settling(0.0025, steps, settle),
+        "features_rest": _settling(0.0025 / 20, steps, settle),
+        "opacities": _settling(0.05, steps, settle),
+        "scales": _settling(0.005, steps, settle),
+        "quats": _settling(0.001, steps, settle),
+        "features": _settling(0.0025, steps, settle),
         "compensation": {
-            "optimizer": _adam(1e-3),
-            "scheduler": PruneAwareDecayConfig(lr_final=1e-5, max_steps=steps, lr_restart=1e-3, hold_until_prune=True),
+            # The usual eps: with 3DGS's tiny one, weights whose gradient is all but zero would take full steps.
+            "optimizer": _adam(1e-3, eps=1e-8),
+            "scheduler": PruneAwareDecayConfig(
+                lr_final=1e-5, max_steps=steps, lr_restart=1e-3, hold_until_prune=True, warmup_steps=500
+            ),
         },
         "camera_opt": {
             "optimizer": _adam(1e-4),
@@ -63,7 +74,8 @@ def method(
     pruning: PruningConfig,
     head: HeadConfig | None = None,
     steps: int = 30000,
-    restart_means: bool = True,
+    means_restart: float | None = 1.6e-4,
+    settle: float = 0.1,
     trainer: dict[str, Any] | None = None,
     **model: Any,
 ) -> MethodSpecification:
@@ -75,7 +87,8 @@ def method(
         pruning: when and what to prune.
         head: the compensation head.
         steps: length of the run.
-        restart_means: see :func:`optimizers`.
+        means_restart: see :func:`optimizers`.
+        settle: see :func:`optimizers`.
         trainer: more options of the trainer.
         model: more options of the model.
     """
@@ -99,7 +112,7 @@ def method(
                 **model,
             ),
         ),
-        optimizers=optimizers(steps, restart_means=restart_means),
+        optimizers=optimizers(steps, means_restart=means_restart, settle=settle),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",
     )
@@ -135,7 +148,8 @@ sundae_paper = method(
     pruning=PruningConfig(keep_ratio=0.1, selection="band", score="response", signal="positions", gamma=0.5),
     head=HeadConfig(mode="features", size="regular", pixel_unshuffle=1, precision="fp32"),
     steps=60000,
-    restart_means=False,
+    means_restart=None,
+    settle=1.0,
     base_loss_weight=0.0,
     ssim_lambda=0.25,
 )
@@ -154,6 +168,6 @@ sundae_tiny = method(
     stop_split_at=600,
     stop_screen_size_at=0,
     reset_alpha_every=100,
-    densify_grad_thresh=0.0004,
+    densify_grad_thresh=0.0016,
     cull_alpha_thresh=0.02,
 )

@@ -17,27 +17,32 @@ class Decay:
     """Multiplier of the learning rate as a function of the step; picklable state, plain numbers only.
 
     Before the prune the rate decays exponentially from 1 to ``final`` over ``max_steps``, or stays at 1 where
-    ``hold_until_prune`` is set. The prune may restart it: from ``restart`` at the prune down to ``final`` at ``max_steps``.
+    ``hold_until_prune`` is set. The prune may restart it: from ``restart`` at the prune down to ``final`` at ``max_steps``,
+    after rising for ``warmup_steps``.
     """
 
-    def __init__(self, final: float, max_steps: int, restart: float | None, hold_until_prune: bool) -> None:
+    def __init__(
+        self, final: float, max_steps: int, restart: float | None, hold_until_prune: bool, warmup_steps: int
+    ) -> None:
         self.final = final
         self.max_steps = max_steps
         self.restart = restart
         self.hold_until_prune = hold_until_prune
+        self.warmup_steps = warmup_steps
         self.pruned_at: int | None = None
 
     def __call__(self, step: int) -> float:
         """The multiplier at ``step``."""
-        start, begin = 1.0, 0
+        start, begin, rise = 1.0, 0, 1.0
         if self.pruned_at is None:
             if self.hold_until_prune:
                 return 1.0
         elif self.restart is not None and step >= self.pruned_at:
             start, begin = self.restart, self.pruned_at
+            rise = min((step - begin + 1) / (self.warmup_steps + 1), 1.0)
         t = (step - begin) / max(self.max_steps - begin, 1)
         t = min(max(t, 0.0), 1.0)
-        return float(start ** (1.0 - t) * self.final**t)
+        return float(rise * start ** (1.0 - t) * self.final**t)
 
 
 @dataclass
@@ -54,6 +59,8 @@ class PruneAwareDecayConfig(SchedulerConfig):
     """Learning rate right after the prune, from which the decay begins anew; None goes on as if nothing happened."""
     hold_until_prune: bool = False
     """Whether the rate stays constant until the prune."""
+    warmup_steps: int = 0
+    """Steps over which the rate rises after the prune."""
 
 
 class PruneAwareDecay(Scheduler):
@@ -64,7 +71,13 @@ class PruneAwareDecay(Scheduler):
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
         """A ``LambdaLR`` whose state holds Python numbers only."""
         restart = None if self.config.lr_restart is None else self.config.lr_restart / lr_init
-        decay = Decay(self.config.lr_final / lr_init, self.config.max_steps, restart, self.config.hold_until_prune)
+        decay = Decay(
+            self.config.lr_final / lr_init,
+            self.config.max_steps,
+            restart,
+            self.config.hold_until_prune,
+            self.config.warmup_steps,
+        )
         return LambdaLR(optimizer, lr_lambda=decay)
 
 

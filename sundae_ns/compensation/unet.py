@@ -14,13 +14,19 @@ LEVELS = 4
 """Resolutions that the network works at; the coarsest is 1 / 2 ** (LEVELS - 1) of its input."""
 
 
+SLOPE = 0.1
+"""Slope of the activation below zero. Without normalisation layers a plain ReLU can die, and whole levels with it."""
+
+
 def _double_conv(c_in: int, c_out: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(c_in, c_out, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(c_out, c_out, 3, padding=1),
-        nn.ReLU(inplace=True),
-    )
+    layers: list[nn.Module] = []
+    for channels in (c_in, c_out):
+        conv = nn.Conv2d(channels, c_out, 3, padding=1)
+        # Keeps the variance of activations through the depth (He et al. 2015), which nothing else here would.
+        nn.init.kaiming_normal_(conv.weight, a=SLOPE)
+        nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
+        layers += [conv, nn.LeakyReLU(SLOPE, inplace=True)]
+    return nn.Sequential(*layers)
 
 
 class UNet(nn.Module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -69,7 +70,7 @@ def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) ->
     rotation, translation = transform[:, :3].to(params["means"]), transform[:, 3].to(params["means"])
     moved = dict(params)
     moved["means"] = scale * (params["means"] @ rotation.T + translation)
-    moved["scales"] = params["scales"] + torch.tensor(scale).log().to(params["scales"])
+    moved["scales"] = params["scales"] + math.log(scale)
     moved["quats"] = multiply_quaternions(rotation_to_quaternion(rotation), params["quats"])
     moved["features_rest"] = rotate_spherical_harmonics(params["features_rest"], rotation)
     return moved

@@ -1,0 +1,177 @@
+"""The datamanager: an order that resumes, views held back, images cached without CUDA, bad captures named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+from PIL import Image
+
+from sundae_ns.data import write_scene
+from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.errors import ConfigError, DataError
+
+VIEWS = 7
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("capture") / "scene"
+    return write_scene(out, train_views=VIEWS, test_views=2, width=20, height=16, points=60, samples=1)
+
+
+@pytest.fixture
+def own_copy(capture: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(capture, tmp_path / "scene"))
+
+
+def manager(data: Path, **options: Any) -> SundaeDatamanager:
+    parser = NerfstudioDataParserConfig(load_3D_points=True)
+    config = SundaeDatamanagerConfig(data=data, dataparser=parser, cache_images_type="uint8", **options)
+    return config.setup(device="cpu", test_mode="val")
+
+
+def edit(data: Path, **changes: Any) -> None:
+    path = data / "transforms.json"
+    meta = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({name: value for name, value in meta.items() if value is not None}))
+
+
+def test_each_pass_is_a_new_permutation(capture: Path) -> None:
+    order = [manager(capture).view_of_step(step) for step in range(4 * VIEWS)]
+    passes = [tuple(order[i : i + VIEWS]) for i in range(0, len(order), VIEWS)]
+    assert all(sorted(one) == list(range(VIEWS)) for one in passes)
+    assert len(set(passes)) > 1
+
+
+def test_order_is_a_function_of_seed_and_step(capture: Path) -> None:
+    first = manager(capture)
+    order = [first.view_of_step(step) for step in range(40)]
+    again = manager(capture)
+    # Asked in any order, as a resumed run or a viewer may.
+    assert [again.view_of_step(step) for step in reversed(range(40))] == order[::-1]
+    assert [first.view_of_step(step) for step in (39, 3, 20)] == [order[39], order[3], order[20]]
+    other = manager(capture, train_cameras_sampling_seed=7)
+    assert [other.view_of_step(step) for step in range(40)] != order
+
+
+def test_next_train_serves_the_view_of_the_step(capture: Path) -> None:
+    made = manager(capture)
+    for step in range(VIEWS):
+        camera, batch = made.next_train(step)
+        index = made.view_of_step(step)
+        assert camera.shape == (1,)
+        assert camera.metadata is not None
+        assert camera.metadata["cam_idx"] == index
+        assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[index])
+        assert batch["image"].dtype == torch.uint8
+        assert torch.equal(batch["image"], made.train_dataset.get_data(index, image_type="uint8")["image"])
+
+
+def test_held_out_views_are_never_trained_on(capture: Path) -> None:
+    made = manager(capture, holdout_every=3)
+    assert made.holdout_indices == [2, 5]
+    assert made.train_indices == [0, 1, 3, 4, 6]
+    assert {made.view_of_step(step) for step in range(50)} == {0, 1, 3, 4, 6}
+    assert len(list(made.training_cameras())) == 5
+    held_back = made.holdout_views
+    assert [batch["image_idx"] for _, batch in held_back] == [2, 5]
+    camera, batch = held_back[0]
+    assert torch.equal(camera.camera_to_worlds[0], made.train_dataset.cameras.camera_to_worlds[2])
+    assert batch["image"].shape == (16, 20, 3)
+
+
+def test_nothing_is_held_back_unless_asked_for(capture: Path) -> None:
+    made = manager(capture)
+    assert made.holdout_indices == []
+    assert made.holdout_views == []
+    cameras = list(made.training_cameras())
+    assert all(camera.shape == (1,) for camera in cameras)
+    poses = torch.cat([camera.camera_to_worlds for camera in cameras])
+    assert torch.equal(poses, made.train_dataset.cameras.camera_to_worlds)
+
+
+@pytest.mark.parametrize("every", [1, -2])
+def test_impossible_holdout(capture: Path, every: int) -> None:
+    with pytest.raises(ConfigError, match="holdout-every"):
+        manager(capture, holdout_every=every)
+
+
+def test_cpu_cache_without_cuda(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    made = manager(capture, cache_images="cpu")
+    images = [batch["image"] for batch in (*made.cached_train, *made.cached_eval)]
+    assert len(images) == VIEWS + 2
+    assert not any(image.is_pinned() for image in images)
+    assert made.next_train(0)[1]["image"].shape == (16, 20, 3)
+
+
+def test_farthest_point_order_is_refused(capture: Path) -> None:
+    with pytest.raises(ConfigError, match="fps") as caught:
+        manager(capture, train_cameras_sampling_strategy="fps")
+    assert "\n" not in str(caught.value)
+
+
+def test_image_of_another_size_is_named(own_copy: Path) -> None:
+    path = sorted((own_copy / "images").iterdir())[1]
+    Image.new("RGB", (18, 16)).save(path)
+    with pytest.raises(DataError, match=r"frame_\d+\.png is 18 x 16 px but its camera says 20 x 16") as caught:
+        made = manager(own_copy)
+        assert made.cached_train
+        assert made.cached_eval
+    assert "\n" not in str(caught.value)
+
+
+def test_images_may_differ_where_each_has_its_own_camera(own_copy: Path) -> None:
+    meta = json.loads((own_copy / "transforms.json").read_text())
+    for index, frame in enumerate(meta["frames"]):
+        size = (20 + 2 * index, 16)
+        frame.update(w=size[0], h=size[1], fl_x=20.0, fl_y=20.0, cx=size[0] / 2, cy=8.0)
+        Image.new("RGB", size).save(own_copy / frame["file_path"])
+    edit(own_copy, frames=meta["frames"], w=None, h=None, fl_x=None, fl_y=None, cx=None, cy=None)
+    assert len({batch["image"].shape for batch in manager(own_copy).cached_train}) == VIEWS
+
+
+def test_point_cloud_as_nerfstudio_reads_it(capture: Path) -> None:
+    pytest.importorskip("open3d", reason="open3d does not import here (libusb-1.0, libGL)")
+    config = NerfstudioDataParserConfig(data=capture, load_3D_points=True)
+    theirs = Nerfstudio(config).get_dataparser_outputs("train").metadata
+    made = manager(capture)
+    ours = made.train_dataparser_outputs.metadata
+    torch.testing.assert_close(ours["points3D_xyz"], theirs["points3D_xyz"], atol=1e-6, rtol=1e-6)
+    # nerfstudio rounds colours down on their way through floats.
+    assert (ours["points3D_rgb"].int() - theirs["points3D_rgb"].int()).abs().max() <= 1
+    assert ours["points3D_rgb"].dtype == torch.uint8
+
+
+def test_point_cloud_needs_no_open3d(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "open3d", None)
+    assert len(manager(capture).train_dataparser_outputs.metadata["points3D_xyz"]) == 60
+
+
+def test_frame_of_the_capture_goes_to_the_model(capture: Path) -> None:
+    made = manager(capture)
+    transform, scale = made.train_dataset.metadata[DATASET_FRAME]
+    pose = torch.tensor(json.loads((capture / "transforms.json").read_text())["frames"][0]["transform_matrix"])
+    center = scale * (transform[:, :3] @ pose[:3, 3] + transform[:, 3])
+    distances = (made.train_dataset.cameras.camera_to_worlds[:, :, 3] - center).norm(dim=1)
+    assert distances.min() < 1e-5
+
+
+def test_missing_point_cloud(own_copy: Path) -> None:
+    (own_copy / "sparse_pc.ply").unlink()
+    with pytest.raises(DataError, match=r"sparse_pc\.ply does not exist; .*ply_file_path"):
+        manager(own_copy)
+    edit(own_copy, ply_file_path=None)
+    assert "points3D_xyz" not in manager(own_copy).train_dataparser_outputs.metadata
+
+
+def test_no_training_images(own_copy: Path) -> None:
+    edit(own_copy, train_filenames=[])
+    with pytest.raises(DataError, match="no training images"):
+        manager(own_copy)
