@@ -335,7 +335,7 @@ class SundaeModel(SplatfactoModel):
         compensate = compensate and self.head_active
         colors = self._colors(params, view)
         channels = torch.cat([colors, params[FEATURES]], dim=1) if compensate else colors
-        absgrad = self.training and self.config.use_absgrad and not compensate
+        absgrad = self.training and self.config.use_absgrad and self._densifying
         splat = self._splat(params, view, channels, render_depth=depth, absgrad=absgrad)
         blended, features = splat.colors[..., :3], splat.colors[..., 3:]
         base = (blended + (1 - splat.alpha) * background).clamp(0.0, 1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+
 import pytest
 import torch
 
@@ -18,3 +20,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def open3d() -> None:
+    """Skips where open3d cannot be imported: it loads libraries of a desktop."""
+    try:
+        importlib.import_module("open3d")
+    except (ImportError, OSError) as error:
+        pytest.skip(f"open3d does not import here: {error}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -137,8 +138,8 @@ def test_images_may_differ_where_each_has_its_own_camera(own_copy: Path) -> None
     assert len({batch["image"].shape for batch in manager(own_copy).cached_train}) == VIEWS
 
 
+@pytest.mark.usefixtures("open3d")
 def test_point_cloud_as_nerfstudio_reads_it(capture: Path) -> None:
-    pytest.importorskip("open3d", reason="open3d does not import here (libusb-1.0, libGL)")
     config = NerfstudioDataParserConfig(data=capture, load_3D_points=True)
     theirs = Nerfstudio(config).get_dataparser_outputs("train").metadata
     made = manager(capture)
@@ -150,7 +151,7 @@ def test_point_cloud_as_nerfstudio_reads_it(capture: Path) -> None:
 
 
 def test_point_cloud_needs_no_open3d(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "open3d", None)
+    monkeypatch.setitem(sys.modules, "open3d", None)
     assert len(manager(capture).train_dataparser_outputs.metadata["points3D_xyz"]) == 60
 
 

@@ -1,0 +1,153 @@
+"""``sundae demo``: the whole job on the embedded scene, through the commands that users type."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import torch
+from PIL import Image
+from rich.console import Console
+from rich.progress import Progress
+
+from sundae_ns.data import write_scene
+from sundae_ns.errors import SundaeError
+from sundae_ns.evaluation import ComparisonRow, Quality, RunFigures, report_text, save_comparison
+
+METHOD = "sundae-tiny"
+SHOWN = 3
+"""Test views in the picture."""
+_STEP = re.compile(r"^\s*(\d+) \([\d.]+%\)")
+
+
+def _command(name: str) -> str:
+    """A console script beside this interpreter, so that the demo runs what is installed with it."""
+    path = Path(sys.executable).parent / name
+    return str(path) if path.exists() else name
+
+
+def _run(arguments: list[str], log: Path, on_line: Any = None) -> None:
+    """Run a command with its output in ``log``; on failure, show the end of it."""
+    environment = {**os.environ, "COLUMNS": "160"}
+    last: deque[str] = deque(maxlen=12)
+    with open(log, "w") as file:
+        process = subprocess.Popen(
+            arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, errors="replace"
+        )
+        assert process.stdout is not None
+        for line in process.stdout:
+            file.write(line)
+            last.append(line.rstrip())
+            if on_line is not None:
+                on_line(line)
+        code = process.wait()
+    if code != 0:
+        tail = "\n".join(last)
+        raise SundaeError(
+            f"{Path(arguments[0]).name} failed with {code}; its whole output is in {log}, it ended so:\n{tail}"
+        )
+
+
+def _picture(path: Path) -> torch.Tensor:
+    import numpy as np
+
+    with Image.open(path) as image:
+        return torch.from_numpy(np.asarray(image.convert("RGB"), dtype=np.float32) / 255)
+
+
+def _comparison(renders: Path, out: Path) -> None:
+    """Truth, base, compensated and error of a few test views, from the pictures that ``ns-eval`` wrote."""
+    pairs = sorted(renders.glob("eval_img_*.png"))
+    rows = []
+    for path in pairs[:: max(len(pairs) // SHOWN, 1)][:SHOWN]:
+        truth, compensated = _picture(path).chunk(2, dim=1)
+        base = _picture(path.with_name(path.name.replace("img", "base")))
+        rows.append(ComparisonRow(truth, base, compensated, title=f"test view {int(path.stem[-4:])}"))
+    save_comparison(out, rows)
+
+
+def _quality(results: dict[str, float], suffix: str = "") -> Quality:
+    return Quality(results["psnr" + suffix], results["ssim" + suffix], results.get("lpips" + suffix))
+
+
+def run_demo(out: Path, steps: int | None = None, console: Console | None = None) -> int:
+    """Make the scene, train, evaluate, and print the table.
+
+    Args:
+        out: folder for scene, run, logs and pictures; an earlier demo in it is replaced.
+        steps: length of the training instead of the method's own.
+        console: where to print.
+
+    Raises:
+        SundaeError: a command failed; the message shows the end of its output.
+    """
+    console = console or Console()
+    out.mkdir(parents=True, exist_ok=True)
+    scene, run = out / "scene", out / "runs" / "demo" / METHOD / "run"
+    device = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "CPU"
+    console.print(f"SUNDAE demo on {device}: ray-trace a scene, train it with ns-train, evaluate it with ns-eval.")
+    with Progress(console=console, transient=True) as progress:
+        tracing = progress.add_task("Ray tracing the scene", total=None)
+        write_scene(scene, progress=lambda done, total: progress.update(tracing, completed=done, total=total))
+        training = progress.add_task(f"ns-train {METHOD}", total=None)
+
+        from sundae_ns.method_configs import sundae_tiny
+
+        total = steps or sundae_tiny.config.max_num_iterations
+        progress.update(training, total=total)
+
+        def show(line: str) -> None:
+            found = _STEP.match(line)
+            if found:
+                progress.update(training, completed=int(found[1]) + 1)
+
+        train = [_command("ns-train"), METHOD, "--data", str(scene), "--output-dir", str(out / "runs")]
+        train += ["--experiment-name", "demo", "--timestamp", "run", "--max-num-iterations", str(total)]
+        # An earlier demo's prunes are not this one's.
+        (run / "prune.json").unlink(missing_ok=True)
+        _run(train, out / "train.log", show)
+        progress.update(training, completed=total)
+        progress.add_task("ns-eval", total=None)
+        evaluate = [
+            _command("ns-eval"),
+            "--load-config",
+            str(run / "config.yml"),
+            "--output-path",
+            str(out / "eval.json"),
+        ]
+        _run([*evaluate, "--render-output-path", str(out / "renders")], out / "eval.log")
+        progress.add_task("Timing frames", total=None)
+
+        from sundae_ns.measure import frame_times, load_run, sizes
+
+        with console.capture():
+            model, cameras = load_run(run / "config.yml")
+            times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
+    _comparison(out / "renders", out / "comparison.png")
+
+    results = json.loads((out / "eval.json").read_text())["results"]
+    prunes = json.loads((run / "prune.json").read_text()) if (run / "prune.json").exists() else []
+    prune = prunes[-1] if prunes else {"before": model.num_points, "after": model.num_points}
+    figures = RunFigures(
+        title=f"sundae demo, {cameras[0].width.item()} x {cameras[0].height.item()} px, {device}",
+        primitives_before=prune["before"],
+        primitives_after=prune["after"],
+        warm_up=_quality(prune["warm_up"]) if prune.get("warm_up") else None,
+        after_prune=_quality(prune["pruned"]) if prune.get("pruned") else None,
+        base=_quality(results, "_base"),
+        compensated=_quality(results),
+        bytes_primitives=stored.primitives,
+        bytes_head=stored.head,
+        ms_frame=times.frame,
+        ms_splat=times.splat,
+        ms_head=times.head,
+    )
+    console.print(report_text(figures), highlight=False)
+    console.print(f"Pictures: {out / 'comparison.png'}   Look around: ns-viewer --load-config {run / 'config.yml'}")
+    return 0

@@ -1,0 +1,88 @@
+"""The ``sundae`` command itself: the scene, help, and errors as one line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sundae_ns.cli import main
+
+SMALL = ["--train-views", "3", "--test-views", "1", "--width", "20", "--height", "16", "--points", "15"]
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as caught:
+        main([str(argument) for argument in arguments])
+    assert isinstance(caught.value.code, int)
+    return caught.value.code
+
+
+def test_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("scene", tmp_path / "scene", *SMALL) == 0
+    meta = json.loads((tmp_path / "scene" / "transforms.json").read_text())
+    assert (meta["w"], meta["h"], len(meta["frames"])) == (20, 16, 4)
+    assert len(meta["train_filenames"]) == 3
+    assert "wrote 3 training and 1 test views" in capsys.readouterr().out
+
+
+def test_scene_is_a_function_of_its_seed(tmp_path: Path) -> None:
+    clouds = []
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert run("scene", tmp_path / name, "--seed", seed, *SMALL) == 0
+        clouds.append((tmp_path / name / "sparse_pc.ply").read_bytes())
+    assert clouds[0] == clouds[1]
+    assert clouds[0] != clouds[2]
+
+
+@pytest.mark.parametrize("wrong", ["foreign folder", "file", "option"])
+def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: str) -> None:
+    out, more = tmp_path / "scene", list(SMALL)
+    if wrong == "foreign folder":
+        out.mkdir()
+        (out / "thesis.txt").write_text("years of work")
+    elif wrong == "file":
+        out.write_text("years of work")
+    else:
+        more[1] = "2"
+    assert run("scene", out, *more) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.strip().splitlines()
+    assert line.startswith("sundae: ")
+    assert "Traceback" not in captured.err
+    if wrong == "foreign folder":
+        assert [path.name for path in out.iterdir()] == ["thesis.txt"]
+
+
+def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(**_: object) -> int:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("sundae_ns.cli.doctor.run_doctor", broken)
+    with pytest.raises(ZeroDivisionError):
+        main(["doctor"])
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["scene", "--help"], ["doctor", "--help"]])
+def test_help(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*arguments) == 0
+    text = capsys.readouterr().out
+    for word in {"--help": ("scene", "doctor", "demo"), "scene": ("--train-views",), "doctor": ("--compile",)}[arguments[0]]:
+        assert word in text
+
+
+def test_unknown_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("fly") == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_installed_command_and_its_exit_code(tmp_path: Path) -> None:
+    command = Path(sys.executable).parent / "sundae"
+    out = tmp_path / "file"
+    out.touch()
+    result = subprocess.run([command, "scene", out], capture_output=True, text=True, check=False)
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1

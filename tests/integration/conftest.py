@@ -1,0 +1,138 @@
+"""One tiny run for all tests of this folder, made by the commands that users type."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import urllib.request
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import yaml
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import profiler, writer
+
+Call = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+class TinyRun(NamedTuple):
+    """A finished run and what is known of it."""
+
+    scene: Path
+    folder: Path
+    output: str
+    """What ns-train printed."""
+    points: int
+    """Size of the sparse cloud."""
+    prune_at: int
+    save_every: int
+    steps: int
+    keep_ratio: float
+
+    @property
+    def config(self) -> Path:
+        return self.folder / "config.yml"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.folder / "nerfstudio_models"
+
+    def checkpoint(self, step: int) -> Path:
+        return self.checkpoints / f"step-{step:09d}.ckpt"
+
+
+@pytest.fixture(scope="session")
+def call(tmp_path_factory: pytest.TempPathFactory) -> Call:
+    """Run an installed command in a fresh process, out of reach of any network; its output is in the error, if any."""
+    folder = tmp_path_factory.mktemp("bin")
+    ffmpeg = folder / "ffmpeg"
+    ffmpeg.write_text("#!/bin/sh\nexit 1\n")
+    ffmpeg.chmod(0o755)
+    commands = Path(sys.executable).parent
+    # ns-render asks for ffmpeg even where it writes images only; one that is installed comes first.
+    path = os.pathsep.join([str(commands), os.environ.get("PATH", ""), str(folder)])
+    nowhere = "http://127.0.0.1:9"
+    environment = {**os.environ, "PATH": path, "COLUMNS": "250", "https_proxy": nowhere, "http_proxy": nowhere}
+
+    def run(*arguments: object, **variables: str) -> subprocess.CompletedProcess[str]:
+        words = [str(word) for word in arguments]
+        result = subprocess.run(
+            [str(commands / words[0]), *words[1:]],
+            capture_output=True,
+            text=True,
+            env={**environment, **variables},
+            stdin=subprocess.DEVNULL,
+            check=False,
+        )
+        if result.returncode != 0:
+            pytest.fail(f"{' '.join(words)}\nexit code {result.returncode}\n{result.stdout}\n{result.stderr}")
+        return result
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def tiny(call: Call, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
+    root = tmp_path_factory.mktemp("tiny")
+    scene = root / "scene"
+    points, prune_at, save_every, steps, keep_ratio = 300, 45, 30, 120, 0.5
+    call("sundae", "scene", scene, "--train-views", 12, "--test-views", 3, "--width", 48, "--height", 48, "--points", points)
+    options = {
+        "data": scene,
+        "output-dir": root / "outputs",
+        "experiment-name": "tiny",
+        "timestamp": "now",
+        "max-num-iterations": steps,
+        "steps-per-save": save_every,
+        "save-only-latest-checkpoint": False,
+        "steps-per-eval-image": 50,
+        "vis": "tensorboard",
+        "viewer.quit-on-train-completion": True,
+        "logging.steps-per-log": 5,
+        "pipeline.model.pruning.prune-at": prune_at,
+        "pipeline.model.pruning.keep-ratio": keep_ratio,
+        # One round of densification, at step 30; nothing random after it, so that resuming can be compared.
+        "pipeline.model.warmup-length": 5,
+        "pipeline.model.refine-every": 15,
+        "pipeline.model.densify-grad-thresh": 0.0004,
+        "pipeline.model.background-color": "black",
+        "pipeline.model.sh-degree-interval": 20,
+    }
+    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
+    output = call("ns-train", "sundae-tiny", *arguments).stdout
+    folder = root / "outputs" / "tiny" / "sundae-tiny" / "now"
+    return TinyRun(scene, folder, output, points, prune_at, save_every, steps, keep_ratio)
+
+
+@pytest.fixture(autouse=True)
+def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError("no network in tests")
+
+    monkeypatch.setattr(urllib.request, "urlopen", refuse)
+
+
+@pytest.fixture
+def trainer_of(tiny: TinyRun, tmp_path: Path) -> Iterator[Callable[..., Trainer]]:
+    """Set up nerfstudio's trainer in this process with the tiny run's configuration, changed by a function."""
+
+    def make(change: Callable[[TrainerConfig], Any]) -> Trainer:
+        config = yaml.load(tiny.config.read_text(), Loader=yaml.Loader)
+        config.output_dir = tmp_path
+        config.steps_per_save = 10000
+        config.steps_per_eval_image = 10000
+        config.pipeline.model.evaluate_prune = False
+        change(config)
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        return trainer
+
+    yield make
+    # nerfstudio keeps its loggers in globals.
+    writer.EVENT_WRITERS.clear()
+    writer.EVENT_STORAGE.clear()
+    writer.GLOBAL_BUFFER.clear()
+    profiler.PROFILER.clear()

@@ -1,0 +1,85 @@
+"""nerfstudio's own commands on a finished run, each in a fresh process."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from sundae_ns.gaussians import SPLAT_NAMES
+from sundae_ns.storage import is_nerfstudio_ply, read_ply
+
+
+def test_ns_eval(tiny: Any, call: Any, tmp_path: Path) -> None:
+    call("ns-eval", "--load-config", tiny.config, "--output-path", tmp_path / "eval.json")
+    result = json.loads((tmp_path / "eval.json").read_text())
+    assert result["method_name"] == "sundae-tiny"
+    assert result["checkpoint"].endswith(f"step-{tiny.steps - 1:09d}.ckpt")
+    found = result["results"]
+    for name in ("psnr", "psnr_base"):
+        assert 10 < found[name] < 60
+    for name in ("ssim", "ssim_base"):
+        assert 0 < found[name] < 1
+    assert found["psnr"] != found["psnr_base"]
+    (prune,) = json.loads((tiny.folder / "prune.json").read_text())
+    assert found["gaussian_count"] == prune["after"]
+    assert found["psnr"] > prune["pruned"]["psnr"]
+
+
+def pictures(folder: Path) -> list[np.ndarray]:
+    return [np.asarray(Image.open(path)) for path in sorted(folder.glob("*.png"))]
+
+
+def test_ns_render_interpolate(tiny: Any, call: Any, tmp_path: Path) -> None:
+    names = ("rgb", "base_rgb", "depth", "accumulation", "features", "response", "background")
+    call(
+        *("ns-render", "interpolate", "--load-config", tiny.config, "--output-path", tmp_path / "out"),
+        *("--output-format", "images", "--image-format", "png", "--interpolation-steps", 2),
+        *("--rendered-output-names", *names),
+    )
+    frames = pictures(tmp_path / "out")
+    assert len(frames) == 4
+    assert all(frame.shape == (48, len(names) * 48, 3) for frame in frames)
+    rgb = frames[0][:, :48].astype(float)
+    assert rgb.std() > 5
+    assert np.abs(rgb - frames[-1][:, :48]).mean() > 1
+    # The head changes the picture a little, not the scene.
+    assert 0 < np.abs(rgb - frames[0][:, 48:96]).mean() < 30
+
+
+def test_ns_render_camera_path(tiny: Any, call: Any, tmp_path: Path) -> None:
+    pose = torch.eye(4)
+    pose[2, 3] = 1.0
+    turned = pose.clone()
+    turned[:2, :2] = torch.tensor([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]])
+    path = {
+        "camera_type": "perspective",
+        "render_height": 31,
+        "render_width": 45,
+        "seconds": 1,
+        "camera_path": [{"camera_to_world": m.flatten().tolist(), "fov": 70, "aspect": 1} for m in (pose, turned)],
+    }
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    call(
+        *("ns-render", "camera-path", "--load-config", tiny.config, "--output-path", tmp_path / "out"),
+        *("--output-format", "images", "--image-format", "png", "--camera-path-filename", tmp_path / "path.json"),
+    )
+    frames = pictures(tmp_path / "out")
+    assert [frame.shape for frame in frames] == [(31, 45, 3)] * 2
+    assert not np.array_equal(*frames)
+
+
+@pytest.mark.usefixtures("open3d")
+def test_ns_export(tiny: Any, call: Any, tmp_path: Path) -> None:
+    call("ns-export", "gaussian-splat", "--load-config", tiny.config, "--output-dir", tmp_path)
+    exported = read_ply(tmp_path / "splat.ply")
+    assert is_nerfstudio_ply(tmp_path / "splat.ply")
+    state = torch.load(tiny.checkpoint(tiny.steps - 1), map_location="cpu")["pipeline"]
+    for name in SPLAT_NAMES:
+        assert torch.equal(exported[name], state[f"_model.gauss_params.{name}"]), name

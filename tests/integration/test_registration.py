@@ -1,0 +1,103 @@
+"""How nerfstudio finds the methods: entry points, help, configurations, and an import path that is light."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import entry_points
+from typing import Any
+
+import pytest
+import yaml
+from nerfstudio.plugins.types import MethodSpecification
+
+from sundae_ns.datamanager import SundaeDatamanager
+from sundae_ns.model import SundaeModel
+
+METHODS = {
+    "sundae": 0.1,
+    "sundae-1": 0.01,
+    "sundae-30": 0.3,
+    "sundae-50": 0.5,
+    "sundae-80": 0.8,
+    "sundae-100": 1.0,
+    "sundae-continuous": None,
+    "sundae-paper": 0.1,
+    "sundae-tiny": None,
+}
+
+
+def ours() -> dict[str, MethodSpecification]:
+    group = entry_points(group="nerfstudio.method_configs")
+    return {point.name: point.load() for point in group if point.value.startswith("sundae_ns.")}
+
+
+def test_every_method_is_registered_under_its_own_name() -> None:
+    found = ours()
+    assert set(found) == set(METHODS)
+    for name, specification in found.items():
+        assert isinstance(specification, MethodSpecification)
+        assert specification.config.method_name == name
+        assert specification.description
+
+
+def test_nerfstudio_lists_them() -> None:
+    from nerfstudio.configs.method_configs import all_descriptions, all_methods
+
+    assert set(METHODS) <= set(all_methods)
+    assert set(METHODS) <= set(all_descriptions)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_configuration(name: str) -> None:
+    config = ours()[name].config
+    model = config.pipeline.model
+    assert model._target is SundaeModel
+    assert config.pipeline.datamanager._target is SundaeDatamanager
+    model.pruning.validate()
+    model.head.validate()
+    if METHODS[name] is not None:
+        assert model.pruning.keep_ratio == METHODS[name]
+    if model.pruning.mode == "one-shot":
+        assert model.pruning.prune_at < config.max_num_iterations
+    groups = {"means", "scales", "quats", "features_dc", "features_rest", "opacities", "features", "compensation"}
+    assert groups <= set(config.optimizers)
+    assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config
+
+
+def test_methods_share_no_objects() -> None:
+    def parts(value: Any, seen: set[int]) -> set[int]:
+        if hasattr(value, "__dataclass_fields__") and not isinstance(value, type) and id(value) not in seen:
+            seen.add(id(value))
+            for inner in vars(value).values():
+                parts(inner, seen)
+        elif isinstance(value, dict):
+            for inner in value.values():
+                parts(inner, seen)
+        return seen
+
+    found = [parts(specification.config, set()) for specification in ours().values()]
+    assert len(set().union(*found)) == sum(len(one) for one in found)
+
+
+def test_help_of_ns_train(call: Any) -> None:
+    text = call("ns-train", "sundae", "--help").stdout
+    for option in ("keep-ratio", "gamma", "score", "selection", "signal", "mode", "prune-at"):
+        assert f"--pipeline.model.pruning.{option}" in text
+    for option in ("head.mode", "head.size", "head.num-features", "warm-start", "rasterizer"):
+        assert f"--pipeline.model.{option}" in text
+    assert "Share of the primitives to keep" in text
+
+
+def test_import_is_light() -> None:
+    masked = ("open3d", "torchmetrics", "wandb", "comet_ml", "tinycudann")
+    # An import error here would break every ns-* command, and so would importing what imports the entry points.
+    code = (
+        "import sys\n"
+        f"for name in {masked!r}: sys.modules[name] = None\n"
+        "import sundae_ns.method_configs as configs\n"
+        "assert configs.sundae.config.method_name == 'sundae'\n"
+        "assert 'nerfstudio.configs.method_configs' not in sys.modules\n"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr

@@ -1,0 +1,220 @@
+"""Train, prune, save, resume: the tiny run, and what goes on from it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.utils.eval_utils import eval_setup
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import Tensor
+
+from sundae_ns.gaussians import SPLAT_NAMES
+from sundae_ns.model import SundaeModel
+from sundae_ns.storage import MODEL_FRAME, write_ply
+
+
+def load(path: Any) -> dict[str, Any]:
+    """With plain ``torch.load``, as nerfstudio does it."""
+    return torch.load(path, map_location="cpu")
+
+
+def field(state: dict[str, Any]) -> dict[str, Tensor]:
+    prefix = "_model.gauss_params."
+    return {name[len(prefix) :]: value for name, value in state["pipeline"].items() if name.startswith(prefix)}
+
+
+def report(tiny: Any) -> dict[str, Any]:
+    (only,) = json.loads((tiny.folder / "prune.json").read_text())
+    return only
+
+
+@pytest.fixture(scope="module")
+def scalars(tiny: Any) -> dict[str, dict[int, float]]:
+    events = EventAccumulator(str(tiny.folder), size_guidance={"scalars": 0}).Reload()
+    return {tag: {e.step: e.value for e in events.Scalars(tag)} for tag in events.Tags()["scalars"]}
+
+
+def test_prune_keeps_exactly_the_share(tiny: Any) -> None:
+    found = report(tiny)
+    assert found["step"] == tiny.prune_at
+    assert found["before"] > tiny.points, "densification added nothing"
+    assert found["after"] == round(tiny.keep_ratio * found["before"])
+    assert found["peak"] == found["before"]
+    assert found["seconds"] > 0
+    assert found["sigma"] > 0
+    counts = {step: len(field(load(tiny.checkpoint(step)))["means"]) for step in (30, 60, 90, 119)}
+    assert counts == {30: found["before"], 60: found["after"], 90: found["after"], 119: found["after"]}
+    assert f"kept {found['after']:,} of {found['before']:,} primitives" in " ".join(tiny.output.split())
+
+
+def test_prune_costs_quality_and_training_brings_it_back(tiny: Any) -> None:
+    found = report(tiny)
+    assert found["pruned"]["psnr"] < found["warm_up"]["psnr"]
+    _, pipeline, _, _ = eval_setup(tiny.config, test_mode="test")
+    after = pipeline.get_average_eval_image_metrics()
+    assert after["psnr"] > found["pruned"]["psnr"] + 0.5
+    assert after["psnr_base"] > found["pruned"]["psnr"]
+    assert after["gaussian_count"] == found["after"]
+
+
+def test_loss_falls(scalars: dict[str, dict[int, float]], tiny: Any) -> None:
+    loss = scalars["Train Loss Dict/main_loss"]
+    early = [value for step, value in loss.items() if step < 15]
+    late = [value for step, value in loss.items() if step >= tiny.steps - 15]
+    assert sum(late) / len(late) < 0.7 * sum(early) / len(early)
+
+
+def test_tensorboard_has_counts_and_both_psnrs(scalars: dict[str, dict[int, float]], tiny: Any) -> None:
+    found = report(tiny)
+    counts = scalars["Train Metrics Dict/gaussian_count"]
+    assert counts[tiny.prune_at] == found["before"]
+    assert counts[tiny.prune_at + 5] == found["after"]
+    assert scalars["Prune/before"] == {tiny.prune_at: found["before"]}
+    assert scalars["Prune/after"] == {tiny.prune_at: found["after"]}
+    for tag in ("Train Metrics Dict/psnr", "Train Metrics Dict/psnr_base"):
+        assert len(scalars[tag]) == tiny.steps / 5
+    evaluated = {tag: values for tag, values in scalars.items() if tag.startswith("Eval Images Metrics")}
+    for name in ("psnr", "psnr_base", "ssim", "ssim_base"):
+        assert any(tag.endswith("/" + name) and set(values) == {50, 100} for tag, values in evaluated.items()), name
+
+
+def test_checkpoints_are_plain_and_hold_no_lpips(tiny: Any) -> None:
+    for step in (30, 119):
+        state = load(tiny.checkpoint(step))
+        assert not [name for name in state["pipeline"] if "lpips" in name]
+        assert state["pipeline"]["_model._extra_state"]["step"] == step
+        for name, value in field(state).items():
+            (moments,) = state["optimizers"][name]["state"].values()
+            # Features have no gradient, and so no moments, before the head takes part.
+            assert (moments == {}) if (name, step) == ("features", 30) else moments["exp_avg"].shape == value.shape
+    assert load(tiny.checkpoint(30))["pipeline"]["_model._extra_state"]["pruning"]["pruned_at"] == -1
+    assert load(tiny.checkpoint(119))["pipeline"]["_model._extra_state"]["pruning"]["pruned_at"] == tiny.prune_at
+
+
+def assert_live(trainer: Any) -> None:
+    """Model, optimizers and nerfstudio's own list hold the same tensors, with moments of their shape."""
+    optimizers = trainer.optimizers
+    for name, value in trainer.pipeline.model.gauss_params.items():
+        (held,) = optimizers.optimizers[name].param_groups[0]["params"]
+        assert held is value
+        assert optimizers.parameters[name] == [value]
+        assert optimizers.optimizers[name].state[value]["exp_avg"].shape == value.shape
+
+
+@pytest.mark.parametrize("start", [30, 60], ids=["before the prune", "after the prune"])
+def test_a_resumed_run_goes_on_as_if_never_stopped(tiny: Any, trainer_of: Any, start: int) -> None:
+    def change(config: Any) -> None:
+        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, start, tiny.save_every
+
+    trainer = trainer_of(change)
+    served = []
+    next_train = trainer.pipeline.datamanager.next_train
+
+    def watched(step: int) -> Any:
+        camera, batch = next_train(step)
+        served.append((step, batch["image_idx"]))
+        return camera, batch
+
+    trainer.pipeline.datamanager.next_train = watched
+    before = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
+    trainer.train()
+
+    end = start + tiny.save_every
+    assert [step for step, _ in served] == list(range(start + 1, end + 1))
+    # The views that an uninterrupted run sees at these steps.
+    fresh = trainer.config.pipeline.datamanager.setup(device="cpu", test_mode="val")
+    assert [view for _, view in served] == [fresh.view_of_step(step) for step in range(start + 1, end + 1)]
+
+    model = trainer.pipeline.model
+    assert model.num_points == report(tiny)["after"]
+    assert model.pruning_state["num_prunes"] == 1
+    assert model.pruning_state["pruned_at"] == tiny.prune_at
+    assert (trainer.base_dir / "prune.json").exists() == (start < tiny.prune_at)
+    assert_live(trainer)
+    if start > tiny.prune_at:
+        assert all((value.detach() - before[name]).abs().max() > 0 for name, value in model.gauss_params.items())
+
+    # Bit for bit on a CPU (measured); CUDA sums gradients in any order.
+    tolerance = {"atol": 0.02, "rtol": 0.02} if torch.cuda.is_available() else {"atol": 0.0, "rtol": 0.0}
+    whole, resumed = load(tiny.checkpoint(end)), load(trainer.checkpoint_dir / f"step-{end:09d}.ckpt")
+    for name, value in whole["pipeline"].items():
+        if isinstance(value, Tensor):
+            torch.testing.assert_close(resumed["pipeline"][name], value, **tolerance, msg=lambda m, n=name: f"{n}: {m}")
+    for name, state in whole["schedulers"].items():
+        assert resumed["schedulers"][name]["_last_lr"] == pytest.approx(state["_last_lr"])
+        assert resumed["schedulers"][name]["last_epoch"] == state["last_epoch"]
+
+
+def warm(trainer_of: Any, path: Any) -> tuple[dict[str, Tensor], Any]:
+    """The field as it was read, and the trainer after three steps."""
+
+    def change(config: Any) -> None:
+        config.pipeline.model.warm_start, config.max_num_iterations = path, 3
+
+    trainer = trainer_of(change)
+    start = {name: value.detach().clone() for name, value in trainer.pipeline.model.gauss_params.items()}
+    trainer.train()
+    return start, trainer
+
+
+def check_warm(tiny: Any, params: dict[str, Tensor], start: dict[str, Tensor], trainer: Any) -> None:
+    for name in SPLAT_NAMES:
+        assert torch.equal(start[name].cpu(), params[name]), name
+    (found,) = json.loads((trainer.base_dir / "prune.json").read_text())
+    kept = round(tiny.keep_ratio * len(params["means"]))
+    assert (found["before"], found["after"]) == (len(params["means"]), kept)
+    assert trainer.pipeline.model.num_points == kept
+    assert trainer.pipeline.model.pruning_state["num_prunes"] == 1
+    assert trainer.pipeline.model.head_active
+    assert_live(trainer)
+    assert load(trainer.checkpoint_dir / "step-000000002.ckpt")["step"] == 2
+
+
+def test_warm_start_from_a_checkpoint(tiny: Any, trainer_of: Any) -> None:
+    params = field(load(tiny.checkpoint(119)))
+    check_warm(tiny, params, *warm(trainer_of, tiny.checkpoints))
+
+
+def test_warm_start_from_a_stock_checkpoint(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
+    params = {name: value for name, value in field(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
+    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
+    config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
+    scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
+    optimizer.step()
+    scheduler.step()
+    path = tmp_path / "step-000029999.ckpt"
+    pipeline = {f"_model.gauss_params.{name}": value for name, value in params.items()}
+    torch.save({"step": 29999, "pipeline": pipeline, "schedulers": {"means": scheduler.state_dict()}}, path)
+    with pytest.raises(Exception, match="[Ww]eights.only"):
+        load(path)
+    check_warm(tiny, params, *warm(trainer_of, path))
+
+
+def test_warm_start_from_a_ply(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
+    params = {name: value for name, value in field(load(tiny.checkpoint(30))).items() if name in SPLAT_NAMES}
+    write_ply(tmp_path / "a.ply", params, comments=[MODEL_FRAME])
+    check_warm(tiny, params, *warm(trainer_of, tmp_path / "a.ply"))
+
+
+def test_a_splatfacto_checkpoint_is_not_loaded_in_silence(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
+    state = load(tiny.checkpoint(30))
+    stock = [name for name in state["pipeline"] if name.startswith("_model.gauss_params.") and "features" not in name]
+    state["pipeline"] = {name: state["pipeline"][name] for name in stock}
+    torch.save(state, tmp_path / "step-000000030.ckpt")
+
+    def change(config: Any) -> None:
+        config.load_checkpoint = tmp_path / "step-000000030.ckpt"
+
+    with pytest.raises(ValueError, match="warm-start"):
+        trainer_of(change)
+
+
+def test_saved_config_is_read_back_the_same(tiny: Any) -> None:
+    config, pipeline, _, step = eval_setup(tiny.config, test_mode="inference")
+    assert step == tiny.steps - 1
+    assert isinstance(pipeline.model, SundaeModel)
+    assert config.pipeline.model.pruning.prune_at == tiny.prune_at

@@ -1,0 +1,73 @@
+"""What nerfstudio's viewer asks of a model, on the trained run, without a browser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils import colormaps
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerElement
+
+
+@pytest.fixture(scope="module")
+def pipeline(tiny: Any) -> Any:
+    return eval_setup(tiny.config, test_mode="inference")[1]
+
+
+def camera(pipeline: Any, height: int, aspect: float) -> Cameras:
+    """A test camera at another size, as the viewer makes it."""
+    known = pipeline.datamanager.eval_dataset.cameras[0:1]
+    width = int(height * aspect)
+    return Cameras(known.camera_to_worlds, fx=1.2 * height, fy=1.2 * height, cx=width / 2, cy=height / 2).to(
+        pipeline.device
+    )
+
+
+def elements(thing: object) -> Iterator[ViewerElement[Any]]:
+    """Elements that the viewer's control panel finds among a module's attributes."""
+    for value in vars(thing).values():
+        if isinstance(value, ViewerElement):
+            yield value
+
+
+@pytest.mark.parametrize(("height", "aspect"), [(30, 1.0), (31, 1.7), (75, 0.6)])
+@torch.no_grad()
+def test_every_output_becomes_a_picture(pipeline: Any, height: int, aspect: float) -> None:
+    assert isinstance(pipeline.model, SplatfactoModel)
+    pipeline.model.set_background(torch.tensor([0.1, 0.2, 0.3], device=pipeline.device))
+    outputs = pipeline.model.get_outputs_for_camera(camera(pipeline, height, aspect), obb_box=None)
+    assert list(outputs)[0] == "rgb"
+    for name, value in outputs.items():
+        for normalize in (False, True):
+            shown = colormaps.apply_colormap(value, colormaps.ColormapOptions(normalize=normalize))
+            assert shown.shape == (height, int(height * aspect), 3), name
+            assert torch.isfinite(shown).all(), name
+    for name in ("rgb", "base_rgb", "features", "response", "depth"):
+        assert outputs[name].std() > 0, name
+
+
+@torch.no_grad()
+def test_check_box_switches_the_head_off(pipeline: Any) -> None:
+    (box,) = [element for element in elements(pipeline.model) if isinstance(element, ViewerCheckbox)]
+    view = camera(pipeline, 40, 1.0)
+    on = pipeline.model.get_outputs_for_camera(view)
+    box.value = False
+    off = pipeline.model.get_outputs_for_camera(view)
+    box.value = True
+    assert torch.equal(off["rgb"], off["base_rgb"])
+    assert not torch.equal(on["rgb"], on["base_rgb"])
+    assert set(on) == set(off)
+
+
+@torch.no_grad()
+def test_training_state_of_the_viewer_does_not_show(pipeline: Any) -> None:
+    model, view = pipeline.model, camera(pipeline, 40, 1.0)
+    expected = model.eval().get_outputs_for_camera(view)["rgb"]
+    model.train()
+    model.eval()
+    assert torch.equal(model.get_outputs_for_camera(view)["rgb"], expected)
