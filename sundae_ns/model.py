@@ -31,7 +31,7 @@ from torch import Tensor
 from sundae_ns import checkpoint
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
-from sundae_ns.errors import CheckpointError, ConfigError, DataError
+from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
 from sundae_ns.evaluation import Lpips, display, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
@@ -107,6 +107,8 @@ class SundaeModel(SplatfactoModel):
             config.head.validate()
         if config.base_loss_weight < 0:
             raise ConfigError(f"base-loss-weight is {config.base_loss_weight}; give 0 or more")
+        if config.warm_start is not None and config.pruning.mode == "continuous":
+            raise ConfigError("a warm start is pruned at once, not while it grows: set pruning.mode to one-shot")
         if config.use_bilateral_grid:
             raise ConfigError("sundae has no bilateral grid: the head would learn against it; use splatfacto for it")
 
@@ -209,12 +211,16 @@ class SundaeModel(SplatfactoModel):
         return self.step + (self.config.pruning.prune_at if self.config.warm_start is not None else 0)
 
     @property
+    def _pruning_end(self) -> int:
+        """Step of the schedule after which the field keeps its primitives."""
+        pruning = self.config.pruning
+        return pruning.stop if pruning.mode == "continuous" else pruning.prune_at
+
+    @property
     def head_active(self) -> bool:
-        """Whether the head takes part: it starts with the prune unless told otherwise."""
-        pruning, start = self.config.pruning, self.config.head.start_at
-        if start is None:
-            start = pruning.stop if pruning.mode == "continuous" else pruning.prune_at
-        return self.head is not None and self.schedule_step > start
+        """Whether the head takes part: it starts when pruning has ended, unless told otherwise."""
+        start = self.config.head.start_at
+        return self.head is not None and self.schedule_step > (self._pruning_end if start is None else start)
 
     @property
     def backend(self) -> Backend:
@@ -466,21 +472,28 @@ class SundaeModel(SplatfactoModel):
         due = self.policy.due(self.pruning_state, self.schedule_step, self.num_points)
         evaluate = due and self.config.evaluate_prune and self._prune_at is not None
         before = self._evaluate(pipeline, "warm-up", step) if evaluate else {}
-        report = self.policy.step_post_backward(
-            self.gaussians,
-            optimizers.optimizers,
-            self.pruning_state,
-            self.schedule_step,
-            strategy_state=self.strategy_state,
-            contribution=partial(self.contribution, cast(SundaeDatamanager, pipeline.datamanager)),
-        )
+        try:
+            report = self.policy.step_post_backward(
+                self.gaussians,
+                optimizers.optimizers,
+                self.pruning_state,
+                self.schedule_step,
+                strategy_state=self.strategy_state,
+                contribution=partial(self.contribution, cast(SundaeDatamanager, pipeline.datamanager)),
+            )
+        except SundaeError:
+            # The warm-up should not be lost to an option that can be mended: resuming prunes at the first step.
+            if attributes.trainer is not None:
+                attributes.trainer.save_checkpoint(step)
+            raise
         self._refresh(optimizers)
+        if self.schedule_step >= self._pruning_end:
+            notify_pruned(optimizers.schedulers, step)
         if report is None:
             return
         CONSOLE.log(report.summary())
         if report.dropped_nonfinite:
             CONSOLE.print(f"[yellow]Warning: dropped {report.dropped_nonfinite} primitives that were not finite")
-        notify_pruned(optimizers.schedulers, step)
         after = self._evaluate(pipeline, "pruned", step) if evaluate else {}
         self._record(attributes, report, before, after, step)
 

@@ -23,7 +23,7 @@ from sundae_ns.evaluation import ComparisonRow, Quality, RunFigures, report_text
 METHOD = "sundae-tiny"
 SHOWN = 3
 """Test views in the picture."""
-_STEP = re.compile(r"^\s*(\d+) \([\d.]+%\)")
+_PERCENT = re.compile(r"^\s*\d+ \(([\d.]+)%\)")
 
 
 def _command(name: str) -> str:
@@ -95,24 +95,21 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
     with Progress(console=console, transient=True) as progress:
         tracing = progress.add_task("Ray tracing the scene", total=None)
         write_scene(scene, progress=lambda done, total: progress.update(tracing, completed=done, total=total))
-        training = progress.add_task(f"ns-train {METHOD}", total=None)
-
-        from sundae_ns.method_configs import sundae_tiny
-
-        total = steps or sundae_tiny.config.max_num_iterations
-        progress.update(training, total=total)
+        training = progress.add_task(f"ns-train {METHOD}", total=100)
 
         def show(line: str) -> None:
-            found = _STEP.match(line)
+            found = _PERCENT.match(line)
             if found:
-                progress.update(training, completed=int(found[1]) + 1)
+                progress.update(training, completed=float(found[1]))
 
         train = [_command("ns-train"), METHOD, "--data", str(scene), "--output-dir", str(out / "runs")]
-        train += ["--experiment-name", "demo", "--timestamp", "run", "--max-num-iterations", str(total)]
+        train += ["--experiment-name", "demo", "--timestamp", "run"]
+        if steps is not None:
+            train += ["--max-num-iterations", str(steps)]
         # An earlier demo's prunes are not this one's.
         (run / "prune.json").unlink(missing_ok=True)
         _run(train, out / "train.log", show)
-        progress.update(training, completed=total)
+        progress.update(training, completed=100)
         progress.add_task("ns-eval", total=None)
         evaluate = [
             _command("ns-eval"),

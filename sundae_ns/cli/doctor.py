@@ -6,6 +6,7 @@ import ctypes.util
 import importlib.util
 import os
 import platform
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -104,12 +105,11 @@ def rasterizer(kernels_finding: Finding) -> Finding:
 
 def lpips() -> Finding:
     """Whether the metric's weights are at hand."""
-    from sundae_ns.evaluation import lpips_weights_available
+    from sundae_ns.evaluation import lpips_weights_available, lpips_weights_path, lpips_weights_url
 
     if lpips_weights_available():
         return Finding("LPIPS weights", True, "at hand")
-    folder = Path(torch.hub.get_dir()) / "checkpoints"
-    mend = f"put torchvision's alexnet-owt-7be5be79.pth into {folder}, or evaluate once with network"
+    mend = f"curl --location --create-dirs --output {shlex.quote(str(lpips_weights_path()))} {lpips_weights_url()}"
     return Finding("LPIPS weights", False, "not at hand: metrics leave LPIPS out", mend, needed=False)
 
 

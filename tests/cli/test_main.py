@@ -70,7 +70,9 @@ def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch
 def test_help(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*arguments) == 0
     text = capsys.readouterr().out
-    for word in {"--help": ("scene", "doctor", "demo"), "scene": ("--train-views",), "doctor": ("--compile",)}[arguments[0]]:
+    for word in {"--help": ("scene", "doctor", "demo"), "scene": ("--train-views",), "doctor": ("--compile",)}[
+        arguments[0]
+    ]:
         assert word in text
 
 

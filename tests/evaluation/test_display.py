@@ -29,14 +29,11 @@ def test_principal_components_by_falling_variance() -> None:
     torch.testing.assert_close(deviations, torch.tensor([3.0, 1.0, 0.3]), atol=0, rtol=0.1)
 
 
-def test_signs_do_not_flip() -> None:
-    values = features()
-    # The same cloud in another order, and mirrored through its mean, has the same axes.
-    mirrored = 2 * values.mean(dim=0) - values
-    for other in (values.flip(0), mirrored):
-        torch.testing.assert_close(
-            display.principal_components(other)[1], display.principal_components(values)[1], atol=1e-3, rtol=0
-        )
+def test_signs_are_fixed() -> None:
+    for seed in range(8):
+        values = torch.randn(50, 6, generator=torch.Generator().manual_seed(seed))
+        _, basis, _ = display.principal_components(values)
+        assert (basis.sum(dim=0) > 0).all()
 
 
 @pytest.mark.parametrize("width", [1, 2])

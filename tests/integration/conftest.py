@@ -79,7 +79,21 @@ def tiny(call: Call, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
     root = tmp_path_factory.mktemp("tiny")
     scene = root / "scene"
     points, prune_at, save_every, steps, keep_ratio = 300, 45, 30, 120, 0.5
-    call("sundae", "scene", scene, "--train-views", 12, "--test-views", 3, "--width", 48, "--height", 48, "--points", points)
+    call(
+        "sundae",
+        "scene",
+        scene,
+        "--train-views",
+        12,
+        "--test-views",
+        3,
+        "--width",
+        48,
+        "--height",
+        48,
+        "--points",
+        points,
+    )
     options = {
         "data": scene,
         "output-dir": root / "outputs",
@@ -105,6 +119,14 @@ def tiny(call: Call, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
     output = call("ns-train", "sundae-tiny", *arguments).stdout
     folder = root / "outputs" / "tiny" / "sundae-tiny" / "now"
     return TinyRun(scene, folder, output, points, prune_at, save_every, steps, keep_ratio)
+
+
+@pytest.fixture(scope="session")
+def exported(tiny: TinyRun, call: Call, open3d: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The .ply that ns-export writes of the tiny run; skips where open3d does not import."""
+    folder = tmp_path_factory.mktemp("exported")
+    call("ns-export", "gaussian-splat", "--load-config", tiny.config, "--output-dir", folder)
+    return folder / "splat.ply"
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from PIL import Image
 
@@ -75,11 +74,9 @@ def test_ns_render_camera_path(tiny: Any, call: Any, tmp_path: Path) -> None:
     assert not np.array_equal(*frames)
 
 
-@pytest.mark.usefixtures("open3d")
-def test_ns_export(tiny: Any, call: Any, tmp_path: Path) -> None:
-    call("ns-export", "gaussian-splat", "--load-config", tiny.config, "--output-dir", tmp_path)
-    exported = read_ply(tmp_path / "splat.ply")
-    assert is_nerfstudio_ply(tmp_path / "splat.ply")
+def test_ns_export(tiny: Any, exported: Path) -> None:
+    assert is_nerfstudio_ply(exported)
+    found = read_ply(exported)
     state = torch.load(tiny.checkpoint(tiny.steps - 1), map_location="cpu")["pipeline"]
     for name in SPLAT_NAMES:
-        assert torch.equal(exported[name], state[f"_model.gauss_params.{name}"]), name
+        assert torch.equal(found[name], state[f"_model.gauss_params.{name}"]), name

@@ -200,6 +200,11 @@ def test_warm_start_from_a_ply(tiny: Any, trainer_of: Any, tmp_path: Any) -> Non
     check_warm(tiny, params, *warm(trainer_of, tmp_path / "a.ply"))
 
 
+def test_warm_start_from_the_exported_ply(tiny: Any, trainer_of: Any, exported: Any) -> None:
+    params = {name: value for name, value in field(load(tiny.checkpoint(119))).items() if name in SPLAT_NAMES}
+    check_warm(tiny, params, *warm(trainer_of, exported))
+
+
 def test_a_splatfacto_checkpoint_is_not_loaded_in_silence(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
     state = load(tiny.checkpoint(30))
     stock = [name for name in state["pipeline"] if name.startswith("_model.gauss_params.") and "features" not in name]

@@ -1,0 +1,40 @@
+"""The demo's own parts; the commands that it calls are tested in integration/."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sundae_ns.cli.demo import _comparison, _run
+from sundae_ns.errors import SundaeError
+
+
+def test_a_failing_command_shows_its_end_and_keeps_its_log(tmp_path: Path) -> None:
+    log = tmp_path / "train.log"
+    script = "import sys; print('first'); print('the cause', file=sys.stderr); sys.exit(3)"
+    with pytest.raises(SundaeError, match="failed with 3") as error:
+        _run([sys.executable, "-c", script], log)
+    assert "the cause" in str(error.value)
+    assert "first" in log.read_text()
+
+
+def test_lines_reach_the_progress_bar(tmp_path: Path) -> None:
+    lines: list[str] = []
+    _run([sys.executable, "-c", "print('10 (50.00%)'); print('20 (100.00%)')"], tmp_path / "log", lines.append)
+    assert [line.strip() for line in lines] == ["10 (50.00%)", "20 (100.00%)"]
+
+
+def test_comparison_takes_the_pictures_apart(tmp_path: Path) -> None:
+    """Truth is white, the base grey, the compensated light grey: the sheet must show all of them, and their error."""
+    for index in range(2):
+        truth, compensated = np.full((40, 40, 3), 255, np.uint8), np.full((40, 40, 3), 245, np.uint8)
+        Image.fromarray(np.concatenate([truth, compensated], axis=1)).save(tmp_path / f"eval_img_{index:04d}.png")
+        Image.fromarray(np.full((40, 40, 3), 200, np.uint8)).save(tmp_path / f"eval_base_{index:04d}.png")
+    _comparison(tmp_path, tmp_path / "sheet.png")
+    with Image.open(tmp_path / "sheet.png") as sheet:
+        colors = {color for _, color in sheet.convert("RGB").getcolors(1 << 20)}
+    assert {(255, 255, 255), (200, 200, 200), (245, 245, 245), (50, 50, 50)} <= colors
