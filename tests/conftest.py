@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import os
 
 import pytest
 import torch
+
+
+def pytest_configure() -> None:
+    # Tests are small: a second thread gains little, and waits long where something else runs on the machine. Commands
+    # that tests start inherit it, so that their sums come out as those of this process.
+    os.environ["OMP_NUM_THREADS"] = "1"
+    torch.set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -49,7 +49,9 @@ def cuda() -> Finding:
         return Finding("CUDA", True, f"{torch.cuda.get_device_name(0)}, torch built for {torch.version.cuda}")
     if torch.version.cuda is None:
         return Finding("CUDA", False, "this torch is built without CUDA", "pip install torch==2.11.0", needed=False)
-    mend = "install an NVIDIA driver (nvidia-smi shows whether it works)"
+    mend = (
+        "apt-get install nvidia-driver (Ubuntu: ubuntu-drivers install), then reboot; nvidia-smi shows whether it works"
+    )
     return Finding("CUDA", False, "no device that torch can use", mend, needed=False)
 
 
@@ -59,7 +61,7 @@ def nvcc() -> Finding:
     found = shutil.which("nvcc") or shutil.which("nvcc", path=str(Path(home) / "bin"))
     if found:
         return Finding("nvcc", True, found)
-    mend = "install the CUDA toolkit of torch's version and put nvcc on the PATH, or set CUDA_HOME"
+    mend = "apt-get install nvidia-cuda-toolkit, or NVIDIA's toolkit of torch's CUDA version with CUDA_HOME set to it"
     return Finding("nvcc", False, "not found; gsplat needs it once, to build its kernels", mend, needed=False)
 
 
@@ -78,7 +80,8 @@ def kernels_built() -> bool:
 def kernels(compile_kernels: bool) -> Finding:
     """Whether gsplat's kernels run; builds them only if asked to."""
     if not torch.cuda.is_available():
-        return Finding("gsplat kernels", False, "need a CUDA device", "mend CUDA first", needed=False)
+        mend = "sundae doctor --compile, once there is a CUDA device"
+        return Finding("gsplat kernels", False, "need a CUDA device", mend, needed=False)
     if not compile_kernels and not kernels_built():
         mend = "sundae doctor --compile (minutes; else the first training step does it)"
         return Finding("gsplat kernels", False, "not built yet", mend, needed=False)
@@ -120,6 +123,14 @@ def system_library(name: str, package: str) -> Finding:
     return Finding(f"lib{name}", False, "not found; ns-export needs it", f"apt-get install {package}", needed=False)
 
 
+def ffmpeg() -> Finding:
+    """Whether ffmpeg is there, without which ns-render does not start, not even for single images."""
+    found = shutil.which("ffmpeg")
+    if found:
+        return Finding("ffmpeg", True, found)
+    return Finding("ffmpeg", False, "not found; ns-render needs it", "apt-get install ffmpeg", needed=False)
+
+
 def examine(compile_kernels: bool = False) -> list[Finding]:
     """All findings, in the order of the report."""
     kernels_finding = kernels(compile_kernels)
@@ -131,6 +142,7 @@ def examine(compile_kernels: bool = False) -> list[Finding]:
         lpips,
         lambda: system_library("usb-1.0", "libusb-1.0-0"),
         lambda: system_library("GL", "libgl1"),
+        ffmpeg,
     ]
     return versions() + [finding() for finding in findings]
 
