@@ -24,35 +24,29 @@ def _adam(lr: float, eps: float = 1e-15) -> FusedAdamConfig:
     return FusedAdamConfig(lr=lr, eps=eps)
 
 
-def _settling(lr: float, steps: int, settle: float) -> dict[str, Any]:
-    """A rate that is constant while the field grows and, once it is pruned, decays to ``settle`` times its value."""
-    if settle == 1.0:
-        return {"optimizer": _adam(lr), "scheduler": None}
-    decay = PruneAwareDecayConfig(lr_final=settle * lr, max_steps=steps, lr_restart=lr, hold_until_prune=True)
-    return {"optimizer": _adam(lr), "scheduler": decay}
+def _constant(lr: float) -> dict[str, Any]:
+    return {"optimizer": _adam(lr), "scheduler": None}
 
 
-def optimizers(steps: int, *, means_restart: float | None = 1.6e-4, settle: float = 0.1) -> dict[str, Any]:
+def optimizers(steps: int, *, means_restart: float | None = 1.6e-4) -> dict[str, Any]:
     """A fresh set of optimizers for a run of ``steps`` steps: splatfacto's rates, and those of features and head.
 
     Args:
         steps: length of the run, where decaying rates reach their final value.
         means_restart: rate of the centres right after the prune, from which its decay begins anew, so that the kept
             primitives can move into the gaps that the others left; None: the decay goes on.
-        settle: share of their rate that the other parameters end with. A pruned field does not grow any more, so its
-            colours, sizes and opacities may settle.
     """
     return {
         "means": {
             "optimizer": _adam(1.6e-4),
             "scheduler": PruneAwareDecayConfig(lr_final=1.6e-6, max_steps=steps, lr_restart=means_restart),
         },
-        "features_dc": _settling(0.0025, steps, settle),
-        "features_rest": _settling(0.0025 / 20, steps, settle),
-        "opacities": _settling(0.05, steps, settle),
-        "scales": _settling(0.005, steps, settle),
-        "quats": _settling(0.001, steps, settle),
-        "features": _settling(0.0025, steps, settle),
+        "features_dc": _constant(0.0025),
+        "features_rest": _constant(0.0025 / 20),
+        "opacities": _constant(0.05),
+        "scales": _constant(0.005),
+        "quats": _constant(0.001),
+        "features": _constant(0.0025),
         "compensation": {
             # The usual eps: with 3DGS's tiny one, weights whose gradient is all but zero would take full steps.
             "optimizer": _adam(1e-3, eps=1e-8),
@@ -75,7 +69,6 @@ def method(
     head: HeadConfig | None = None,
     steps: int = 30000,
     means_restart: float | None = 1.6e-4,
-    settle: float = 0.1,
     trainer: dict[str, Any] | None = None,
     **model: Any,
 ) -> MethodSpecification:
@@ -88,7 +81,6 @@ def method(
         head: the compensation head.
         steps: length of the run.
         means_restart: see :func:`optimizers`.
-        settle: see :func:`optimizers`.
         trainer: more options of the trainer.
         model: more options of the model.
     """
@@ -112,7 +104,7 @@ def method(
                 **model,
             ),
         ),
-        optimizers=optimizers(steps, means_restart=means_restart, settle=settle),
+        optimizers=optimizers(steps, means_restart=means_restart),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",
     )
@@ -149,7 +141,6 @@ sundae_paper = method(
     head=HeadConfig(mode="features", size="regular", pixel_unshuffle=1, precision="fp32"),
     steps=60000,
     means_restart=None,
-    settle=1.0,
     base_loss_weight=0.0,
     ssim_lambda=0.25,
 )

@@ -114,7 +114,8 @@ class SundaeModel(SplatfactoModel):
 
         self.step = 0
         self.num_features = 0 if config.head.mode == "off" else config.head.num_features
-        params = self._warm_field() if config.warm_start is not None else self._sparse_field()
+        self._warm_start_error: CheckpointError | None = None
+        params = self._initial_field()
         self.gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
         self.head = None if config.head.mode == "off" else CompensationHead(config.head)
         self.camera_optimizer: CameraOptimizer = config.camera_optimizer.setup(
@@ -158,6 +159,16 @@ class SundaeModel(SplatfactoModel):
 
     # ---------------------------------------------------------------------------------------------------- the field
 
+    def _initial_field(self) -> dict[str, Tensor]:
+        if self.config.warm_start is None:
+            return self._sparse_field()
+        try:
+            return self._warm_field(self.config.warm_start)
+        except CheckpointError as error:
+            # A finished run must open without what it once started from; training without it is refused.
+            self._warm_start_error = error
+            return self._sparse_field()
+
     def _sparse_field(self) -> dict[str, Tensor]:
         config = self.config
         points = self.seed_points
@@ -172,10 +183,9 @@ class SundaeModel(SplatfactoModel):
             xyz, rgb = random_points(config.num_random, config.random_scale)
         return from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=self.num_features)
 
-    def _warm_field(self) -> dict[str, Tensor]:
+    def _warm_field(self, source: Path) -> dict[str, Tensor]:
         config = self.config
-        assert config.warm_start is not None
-        params, in_model_frame = checkpoint.read_field(config.warm_start)
+        params, in_model_frame = checkpoint.read_field(source)
         if config.warm_start_frame != "auto":
             in_model_frame = config.warm_start_frame == "model"
         if not in_model_frame:
@@ -192,7 +202,7 @@ class SundaeModel(SplatfactoModel):
         params["features_rest"] = rest
         if self.num_features:
             params[FEATURES] = initial_features(params["features_dc"], self.num_features)
-        CONSOLE.log(f"warm start: {len(params['means'])} primitives from {config.warm_start}")
+        CONSOLE.log(f"warm start: {len(params['means'])} primitives from {source}")
         return params
 
     @property
@@ -269,6 +279,7 @@ class SundaeModel(SplatfactoModel):
         n = state_dict["gauss_params.means"].shape[0]
         for value in self.gauss_params.values():
             value.data = value.data.new_zeros(n, *value.shape[1:])
+        self._warm_start_error = None
         # Past SplatfactoModel's own loader on purpose: it replaces parameters and resets the step.
         return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
 
@@ -312,7 +323,9 @@ class SundaeModel(SplatfactoModel):
         """Colours ``[N, 3]`` of the primitives as this view sees them."""
         if self.config.sh_degree == 0:
             return params["features_dc"].sigmoid()
-        degree = min(self.schedule_step // self.config.sh_degree_interval, self.config.sh_degree)
+        degree = self.config.sh_degree
+        if self.config.warm_start is None:
+            degree = min(self.step // self.config.sh_degree_interval, degree)
         center = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
         return (spherical_harmonics(degree, params["means"] - center, coeffs, backend=self.backend) + 0.5).clamp_min(0)
@@ -436,6 +449,10 @@ class SundaeModel(SplatfactoModel):
 
     # ----------------------------------------------------------------------------------------------------- training
 
+    def _get_downscale_factor(self) -> int:
+        """Splatfacto's rising resolution; a warm start has risen."""
+        return 1 if self.config.warm_start is not None else super()._get_downscale_factor()
+
     @property
     def _densifying(self) -> bool:
         return self.schedule_step < self.strategy.refine_stop_iter
@@ -444,6 +461,8 @@ class SundaeModel(SplatfactoModel):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Splatfacto's callbacks, then pruning: after densification has had its say on the same step."""
+        if self._warm_start_error is not None:
+            raise self._warm_start_error
         backend = self.backend  # an unusable rasteriser should be known before the first step
         CONSOLE.log(f"rasteriser: {backend.name} on {self.device}")
         self.attached = True

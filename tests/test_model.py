@@ -592,8 +592,29 @@ def test_a_ply_of_the_capture_is_moved_into_the_model(tmp_path: Path) -> None:
 def test_a_ply_of_the_capture_needs_to_know_the_way(tmp_path: Path) -> None:
     _ply(tmp_path / "a.ply")
     with pytest.raises(CheckpointError, match="warm-start-frame model") as caught:
-        build(warm_start=tmp_path / "a.ply")
+        Training(build(warm_start=tmp_path / "a.ply"))
     assert "\n" not in str(caught.value)
+
+
+def test_a_finished_run_opens_without_what_it_started_from(tmp_path: Path) -> None:
+    """Training without the warm start is refused in one line; loading the run's checkpoint needs it no more."""
+    _ply(tmp_path / "a.ply")
+    state = build(warm_start=tmp_path / "a.ply", warm_start_frame="model").state_dict()
+    (tmp_path / "a.ply").unlink()
+    orphan = build(warm_start=tmp_path / "a.ply", warm_start_frame="model")
+    with pytest.raises(CheckpointError, match="does not exist"):
+        Training(orphan)
+    orphan.load_state_dict(state)
+    assert torch.equal(orphan.means, state["gauss_params.means"])
+    Training(orphan)
+
+
+def test_a_warm_start_trains_at_full_resolution(tmp_path: Path) -> None:
+    _ply(tmp_path / "a.ply")
+    options = {"num_downscales": 2, "resolution_schedule": 3000}
+    cold, warm = build(**options), build(warm_start=tmp_path / "a.ply", warm_start_frame="model", **options)
+    assert cold.train()._get_downscale_factor() == 4
+    assert warm.train()._get_downscale_factor() == 1
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
