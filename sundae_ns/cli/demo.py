@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections import deque
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -121,9 +122,10 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         _run([*evaluate, "--render-output-path", str(out / "renders")], out / "eval.log")
         progress.add_task("Timing frames", total=None)
 
-        from sundae_ns.measure import frame_times, load_run, sizes
+        # nerfstudio is chatty while it imports and loads.
+        with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
+            from sundae_ns.measure import frame_times, load_run, sizes
 
-        with console.capture():
             model, cameras = load_run(run / "config.yml")
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
     _comparison(out / "renders", out / "comparison.png")
