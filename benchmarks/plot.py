@@ -1,0 +1,47 @@
+"""Plot quality against bytes and against time of the measured runs: python benchmarks/plot.py."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+ROOT = Path(__file__).parents[1]
+RUNS = ROOT / "benchmarks" / "results" / "runs.csv"
+FIGURE = ROOT / "docs" / "figures" / "runs.png"
+AXES = (("bytes_total", 1e6, "MB, primitives and head in fp32"), ("ms_frame", 1.0, "ms a frame, head included"))
+
+
+def main() -> None:
+    with open(RUNS, newline="") as file:
+        rows = list(csv.DictReader(file))
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    figure, panels = plt.subplots(len(scenes), 2, figsize=(11, 4.2 * len(scenes)), layout="constrained")
+    labels = sorted({(row["method"], row["variant"]) for row in rows})
+    colors = {label: plt.get_cmap("tab10")(i % 10) for i, label in enumerate(labels)}
+    for scene, line in zip(scenes, panels, strict=True):
+        own = [row for row in rows if row["scene"] == scene]
+        for (column, unit, title), panel in zip(AXES, line, strict=True):
+            for label in labels:
+                runs = [row for row in own if (row["method"], row["variant"]) == label]
+                if runs:
+                    x = [float(row[column]) / unit for row in runs]
+                    y = [float(row["psnr"]) for row in runs]
+                    marker = "s" if label[0] == "splatfacto" else "o"
+                    panel.scatter(x, y, color=colors[label], marker=marker, s=45, label=" ".join(label))
+            panel.set_xlabel(title)
+            panel.set_ylabel("test PSNR, dB")
+            panel.set_title(f"{scene}, {own[0]['resolution']} px, {own[0]['gpu'].replace('NVIDIA ', '')}")
+            panel.grid(alpha=0.3)
+        line[1].legend(fontsize=8)
+    FIGURE.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(FIGURE, dpi=110)
+    print(f"wrote {FIGURE}")
+
+
+if __name__ == "__main__":
+    main()
