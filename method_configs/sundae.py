@@ -113,17 +113,12 @@ def method(
     return MethodSpecification(config=config, description=description)
 
 
-def _measured_head() -> HeadConfig:
-    """The mode that measured better on the two captures of docs/results.md, in PSNR on average and in SSIM on both."""
-    return HeadConfig(mode="features")
-
-
 def _keep(percent: int) -> MethodSpecification:
     name = "sundae" if percent == 10 else f"sundae-{percent}"
     description = (
         f"SUNDAE: spectrally pruned Gaussian field with neural compensation, keeps {percent}% of the primitives."
     )
-    return method(name, description, pruning=PruningConfig(keep_ratio=percent / 100), head=_measured_head())
+    return method(name, description, pruning=PruningConfig(keep_ratio=percent / 100))
 
 
 sundae = _keep(10)
@@ -137,7 +132,6 @@ sundae_continuous = method(
     "sundae-continuous",
     "SUNDAE with continuous pruning while densifying: a lower peak of memory, a loosely held final count.",
     pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
-    head=_measured_head(),
 )
 
 sundae_paper = method(
