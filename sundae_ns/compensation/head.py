@@ -29,7 +29,7 @@ class HeadConfig:
     """Width of the U-Net: 0.5, 7.8, 31 or 124 MB in fp32. The paper's default is regular."""
     pixel_unshuffle: int = 2
     """Fold blocks of this many pixels a side into channels before the U-Net: 1 is the paper's, 2 is faster."""
-    num_features: int = 13
+    num_features: int = 5
     """Length F of the feature vector of each primitive. 1, 5, 13 and 29 splat without padding."""
     start_at: int | None = None
     """Training step at which the head starts; by default it starts with the prune."""
