@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -40,25 +41,20 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
         repeats: timed runs of each picture.
     """
     background = model._get_background_color()
+
+    def milliseconds(fn: Callable[[], object]) -> float:
+        return median_ms(fn, device=model.device, warmup=warmup, repeats=repeats).median_ms
+
     frames, splats, heads = [], [], []
     for camera in cameras:
-        view = model.view_of(camera)
-
-        def timed(compensate: bool, view=view) -> float:  # type: ignore[no-untyped-def]
-            def render() -> object:
-                return model.render(model.gaussians, view, background, compensate=compensate)
-
-            return median_ms(render, device=model.device, warmup=warmup, repeats=repeats).median_ms
-
-        frames.append(timed(True))
-        splats.append(timed(False))
+        render = partial(model.render, model.gaussians, model.view_of(camera), background)
+        frames.append(milliseconds(render))
+        splats.append(milliseconds(partial(render, compensate=False)))
         if model.head is not None and model.head_active:
-            pictures, _ = model.render(model.gaussians, view, background)
-            inputs = (pictures["base_rgb"], pictures["base_rgb"], pictures["feature_image"], pictures["accumulation"])
-            head = model.head
-            heads.append(
-                median_ms(lambda: head(*inputs), device=model.device, warmup=warmup, repeats=repeats).median_ms  # noqa: B023
-            )
+            pictures, _ = render()
+            # The blended colours are not among the pictures; the base has their shape, and the time is the same.
+            base, features, alpha = (pictures[name] for name in ("base_rgb", "feature_image", "accumulation"))
+            heads.append(milliseconds(partial(model.head, base, base, features, alpha)))
     return FrameTimes(median(frames), median(splats), median(heads) if heads else 0.0)
 
 

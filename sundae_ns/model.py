@@ -590,7 +590,7 @@ class SundaeModel(SplatfactoModel):
         l1 = (picture - target).abs().mean()
         if weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
             return l1
-        # Contiguous planes: on interleaved colours the same convolutions take twice as long.
+        # Contiguous planes: on the interleaved colours of a large picture the same convolutions take much longer.
         planes = (image.permute(2, 0, 1)[None].contiguous() for image in (target, picture))
         return (1 - weight) * l1 + weight * (1 - self.ssim(*planes))
 
