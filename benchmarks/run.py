@@ -55,6 +55,7 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks"))
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--save", action="store_true", help="keep the final checkpoint")
+    parser.add_argument("--save-pruned", action="store_true", help="keep the checkpoint right after the prune")
     own, extra = sys.argv[1:], []
     if "--" in own:
         cut = own.index("--")
@@ -118,7 +119,13 @@ def main() -> None:
     _set_random_seed(config.machine.seed)
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    trainer.save_checkpoint = trainer.save_checkpoint if options.save else lambda step: None
+    save, wanted = trainer.save_checkpoint, set()
+    if options.save_pruned:
+        trainer.config.steps_per_save = config.pipeline.model.pruning.prune_at
+        wanted.add(config.pipeline.model.pruning.prune_at)
+    if options.save:
+        wanted.add(config.max_num_iterations - 1)
+    trainer.save_checkpoint = lambda step: save(step) if step in wanted else None
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
         torch.cuda.synchronize()

@@ -138,7 +138,9 @@ sundae_paper = method(
     "sundae-paper",
     "SUNDAE as literal as the paper's text allows: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",
     pruning=PruningConfig(keep_ratio=0.1, selection="band", score="response", signal="positions", gamma=0.5),
-    head=HeadConfig(mode="features", size="regular", pixel_unshuffle=1, num_features=13, precision="fp32"),
+    head=HeadConfig(
+        mode="features", size="regular", pixel_unshuffle=1, num_features=13, precision="fp32", max_train_pixels=0
+    ),
     steps=60000,
     means_restart=None,
     base_loss_weight=0.0,
@@ -149,7 +151,7 @@ sundae_tiny = method(
     "sundae-tiny",
     "SUNDAE for a first look: small scenes, a few minutes on a CPU.",
     pruning=PruningConfig(keep_ratio=0.25, prune_at=600),
-    head=HeadConfig(size="tiny", pixel_unshuffle=1),
+    head=HeadConfig(size="tiny", pixel_unshuffle=1, num_features=5),
     steps=1200,
     trainer={"vis": "tensorboard", "steps_per_save": 400, "steps_per_eval_all_images": 10000},
     num_downscales=0,

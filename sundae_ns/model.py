@@ -29,7 +29,7 @@ from rich.progress import track
 from torch import Tensor
 
 from sundae_ns import checkpoint
-from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.compensation import CompensationHead, HeadConfig, Window, training_window
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
 from sundae_ns.evaluation import Lpips, display, psnr, ssim
@@ -71,6 +71,13 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Evaluate all test views right before and right after the prune, and record both."""
 
 
+def _cut(image: Tensor, window: Window | None) -> Tensor:
+    """A window of an image ``[H, W, C]``."""
+    if window is None:
+        return image
+    return image[window.top : window.top + window.height, window.left : window.left + window.width]
+
+
 class View(NamedTuple):
     """One camera for the rasteriser."""
 
@@ -80,6 +87,13 @@ class View(NamedTuple):
     """Intrinsics in pixels ``[3, 3]``."""
     width: int
     height: int
+
+    def cut(self, window: Window) -> View:
+        """The camera that sees this window of the picture alone."""
+        K = self.K.clone()
+        K[0, 2] -= window.left
+        K[1, 2] -= window.top
+        return View(self.viewmat, K, window.width, window.height)
 
 
 class SundaeModel(SplatfactoModel):
@@ -381,11 +395,14 @@ class SundaeModel(SplatfactoModel):
 
         Returns:
             ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; outside training also ``features``
-            (principal components as colours) and ``response`` (spectral response of the primitives seen).
+            (principal components as colours) and ``response`` (spectral response of the primitives seen). In training,
+            pictures may be of a ``window`` alone, then given beside them.
         """
         view = self.view_of(camera, self._get_downscale_factor())
         background = self._get_background_color()
         if self.training:
+            window = self._training_window(view)
+            view = view if window is None else view.cut(window)
             outputs, splat = self.render(
                 self.gaussians, view, background, depth=self.config.output_depth_during_training
             )
@@ -395,7 +412,7 @@ class SundaeModel(SplatfactoModel):
                     self.gauss_params, self.optimizers, self.strategy_state, self.schedule_step, self.info
                 )
             outputs.pop("feature_image")
-            return {**outputs, "background": background}
+            return {**outputs, "background": background, "window": window}
 
         mask = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
         if mask is not None and not mask.any():
@@ -452,6 +469,12 @@ class SundaeModel(SplatfactoModel):
     def _get_downscale_factor(self) -> int:
         """Splatfacto's rising resolution; a warm start has risen."""
         return 1 if self.config.warm_start is not None else super()._get_downscale_factor()
+
+    def _training_window(self, view: View) -> Window | None:
+        # Densification takes its statistics from whole pictures.
+        if not self.head_active or self._densifying:
+            return None
+        return training_window(view.width, view.height, self.config.head.max_train_pixels, seed=self.step)
 
     @property
     def _densifying(self) -> bool:
@@ -571,7 +594,8 @@ class SundaeModel(SplatfactoModel):
     # --------------------------------------------------------------------------------------------- losses and metrics
 
     def _target(self, batch: dict[str, Any], outputs: dict[str, Any]) -> Tensor:
-        return self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        truth = _cut(self.get_gt_img(batch["image"]), outputs.get("window"))
+        return self.composite_with_background(truth, outputs["background"])
 
     def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
         """PSNR with and without the head, and the number of primitives."""
@@ -600,7 +624,7 @@ class SundaeModel(SplatfactoModel):
         """The picture's loss; beside it, while the head takes part, an L1 loss on the base colours."""
         target, rgb, base = self._target(batch, outputs), outputs["rgb"], outputs["base_rgb"]
         if "mask" in batch:
-            mask = self._downscale_if_required(batch["mask"]).to(self.device)
+            mask = _cut(self._downscale_if_required(batch["mask"]).to(self.device), outputs.get("window"))
             target, rgb, base = target * mask, rgb * mask, base * mask
         losses = {"main_loss": self._picture_loss(rgb, target)}
         if self.head_active and self.config.base_loss_weight > 0:

@@ -636,3 +636,45 @@ def test_a_warm_start_prunes_at_its_first_step(tmp_path: Path) -> None:
     assert training.live()
     assert "base_loss" in training.step(1)
     assert training.model.num_points == N // 2
+
+
+# --------------------------------------------------------------------------------------------------------- windows
+
+
+def test_a_window_is_a_part_of_the_whole_picture() -> None:
+    """Pictures, truth and mask of a window are what the whole picture shows there."""
+    whole, cut = (perturb(build(head={"max_train_pixels": limit}, background_color="black")) for limit in (0, 600))
+    with torch.no_grad():
+        # Rasterisers clamp how they linearise large primitives far outside of the picture, and a window is a picture.
+        whole.gauss_params["scales"] -= 2
+    cut.load_state_dict(whole.state_dict())
+    masked = {**batch(), "mask": torch.rand(32, 40, 1, generator=torch.Generator().manual_seed(4)) > 0.5}
+    for model in (whole, cut):
+        model.train()
+    outputs = {model: model.get_outputs(camera()) for model in (whole, cut)}
+    window = outputs[cut]["window"]
+    assert outputs[whole]["window"] is None
+    assert window.width * window.height <= 600
+    rows, columns = slice(window.top, window.top + window.height), slice(window.left, window.left + window.width)
+    for name in ("base_rgb", "accumulation"):
+        torch.testing.assert_close(outputs[cut][name], outputs[whole][name][rows, columns], atol=1e-5, rtol=0)
+    truth = whole._target(masked, outputs[whole])[rows, columns]
+    assert torch.equal(cut._target(masked, outputs[cut]), truth)
+    losses = cut.get_loss_dict(outputs[cut], masked, {})
+    expected = ((outputs[cut]["base_rgb"] - truth).abs() * masked["mask"][rows, columns]).mean()
+    torch.testing.assert_close(losses["base_loss"], cut.config.base_loss_weight * expected)
+
+
+def test_windows_wait_for_the_head_and_for_densification() -> None:
+    model = build(head={"max_train_pixels": 600})
+    view = model.view_of(camera())
+    assert not model.head_active
+    assert model._training_window(view) is None
+    perturb(model)
+    assert model._training_window(view) is not None
+    assert model.eval().get_outputs(camera())["rgb"].shape == (32, 40, 3)  # what is shown is whole
+    early = perturb(
+        build(head={"max_train_pixels": 600, "start_at": 0}, pruning={"mode": "continuous", "start": 5, "stop": 50})
+    )
+    assert early.head_active
+    assert early._training_window(view) is None  # densification takes its statistics from whole pictures

@@ -2,5 +2,6 @@
 
 from sundae_ns.compensation.head import CompensationHead, HeadConfig
 from sundae_ns.compensation.unet import UNet
+from sundae_ns.compensation.window import Window, training_window
 
-__all__ = ["CompensationHead", "HeadConfig", "UNet"]
+__all__ = ["CompensationHead", "HeadConfig", "UNet", "Window", "training_window"]

@@ -12,8 +12,14 @@ from sundae_ns.compensation.graphed import GraphedTraining
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import ConfigError
 
-WIDTHS = {"tiny": 8, "small": 32, "regular": 64, "large": 128}
-"""Channels of the finest level. The last three are the paper's 7.2, 30 and 120 MB in fp32; ``tiny`` is 0.5 MB."""
+SIZES: dict[str, tuple[int, int | None]] = {
+    "tiny": (8, None),
+    "compact": (32, 64),
+    "small": (32, None),
+    "regular": (64, None),
+    "large": (128, None),
+}
+"""Channels of the finest level, and the most that a coarser one may have. The last three are the paper's."""
 
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -25,14 +31,18 @@ class HeadConfig:
     mode: Literal["residual", "features", "off"] = "residual"
     """residual: the head adds a correction to the spherical-harmonics picture, which stays valid by itself.
     features: the paper's way, the head alone makes the picture from splatted features. off: no head."""
-    size: Literal["tiny", "small", "regular", "large"] = "small"
-    """Width of the U-Net: 0.5, 7.8, 31 or 124 MB in fp32. The paper's default is regular."""
+    size: Literal["tiny", "compact", "small", "regular", "large"] = "compact"
+    """Width of the U-Net: 0.5, 2, 7.8, 31 or 124 MB in fp32. The last three are the paper's, which takes regular;
+    compact is small with at most 64 channels a level."""
     pixel_unshuffle: int = 2
     """Fold blocks of this many pixels a side into channels before the U-Net: 1 is the paper's, 2 is faster."""
-    num_features: int = 5
+    num_features: int = 13
     """Length F of the feature vector of each primitive. 1, 5, 13 and 29 splat without padding."""
     start_at: int | None = None
     """Training step at which the head starts; by default it starts with the prune."""
+    max_train_pixels: int = 2**20
+    """Train on a random window of at most this many pixels where pictures are larger, once the head takes part; 0 for
+    whole pictures."""
     precision: Literal["fp32", "bf16", "fp16"] = "bf16"
     """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is meant for inference: it trains unscaled."""
     cuda_graph: bool = True
@@ -50,6 +60,8 @@ class HeadConfig:
             )
         if self.pixel_unshuffle < 1:
             raise ConfigError(f"head.pixel-unshuffle is {self.pixel_unshuffle}; give 1, 2 or 4")
+        if self.max_train_pixels < 0:
+            raise ConfigError(f"head.max-train-pixels is {self.max_train_pixels}; give 0 for whole pictures, or more")
 
 
 class CompensationHead(nn.Module):
@@ -70,10 +82,12 @@ class CompensationHead(nn.Module):
         self.config = config
         # The residual head sees the colours and the accumulation beside the features.
         in_channels = config.num_features + (4 if config.mode == "residual" else 0)
+        width, max_width = SIZES[config.size]
         self.net = UNet(
             in_channels,
             3,
-            WIDTHS[config.size],
+            width,
+            max_width=max_width,
             pixel_unshuffle=config.pixel_unshuffle,
             zero_init=config.mode == "residual",
         )

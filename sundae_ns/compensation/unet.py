@@ -39,16 +39,26 @@ class UNet(nn.Module):
         in_channels: channels of the input image.
         out_channels: channels of the output image.
         width: channels of the finest level; each coarser level doubles them. 64 gives the paper's 30 MB.
+        max_width: most channels of a level; None for the paper's doubling all the way.
         pixel_unshuffle: fold blocks of this many pixels a side into channels first, and unfold the result. 1 is the
             paper's network; 2 does a quarter of the work at the full-resolution level.
         zero_init: start with an output of exactly zero.
     """
 
     def __init__(
-        self, in_channels: int, out_channels: int, width: int, *, pixel_unshuffle: int = 1, zero_init: bool = False
+        self,
+        in_channels: int,
+        out_channels: int,
+        width: int,
+        *,
+        max_width: int | None = None,
+        pixel_unshuffle: int = 1,
+        zero_init: bool = False,
     ) -> None:
         super().__init__()
         widths = [width * 2**level for level in range(LEVELS)]
+        if max_width is not None:
+            widths = [min(channels, max_width) for channels in widths]
         fold = pixel_unshuffle**2
         self.pixel_unshuffle = pixel_unshuffle
         inputs = [in_channels * fold, *widths[:-1]]

@@ -6,14 +6,21 @@ import pytest
 import torch
 
 from sundae_ns.compensation import UNet
-from sundae_ns.compensation.head import WIDTHS
+from sundae_ns.compensation.head import SIZES
 
 
 @pytest.mark.parametrize(("size", "mebibytes"), [("small", 7.2), ("regular", 30), ("large", 120)])
 def test_paper_sizes(size: str, mebibytes: float) -> None:
-    net = UNet(3, 3, WIDTHS[size])
+    width, max_width = SIZES[size]
+    net = UNet(3, 3, width, max_width=max_width)
     stored = 4 * sum(p.numel() for p in net.parameters()) / 2**20
     assert stored == pytest.approx(mebibytes, rel=0.04)
+
+
+def test_widest_level() -> None:
+    net = UNet(3, 3, 8, max_width=16)
+    assert {p.shape[0] for p in net.encoder.parameters()} == {8, 16}
+    assert net(torch.rand(1, 3, 20, 24)).shape == (1, 3, 20, 24)
 
 
 @pytest.mark.parametrize("unshuffle", [1, 2, 4])
