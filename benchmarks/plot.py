@@ -22,22 +22,35 @@ def main() -> None:
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, panels = plt.subplots(len(scenes), 2, figsize=(11, 4.2 * len(scenes)), layout="constrained")
     labels = sorted({(row["method"], row["variant"]) for row in rows})
-    colors = {label: plt.get_cmap("tab10")(i % 10) for i, label in enumerate(labels)}
+    colors = {label: plt.get_cmap("tab20")(i % 20) for i, label in enumerate(labels)}
+    # One filling a machine: times compare within a filling only.
+    newest = rows[-1]["gpu"]
     for scene, line in zip(scenes, panels, strict=True):
         own = [row for row in rows if row["scene"] == scene]
         for (column, unit, title), panel in zip(AXES, line, strict=True):
             for label in labels:
-                runs = [row for row in own if (row["method"], row["variant"]) == label]
-                if runs:
-                    x = [float(row[column]) / unit for row in runs]
-                    y = [float(row["psnr"]) for row in runs]
-                    marker = "s" if label[0] == "splatfacto" else "o"
-                    panel.scatter(x, y, color=colors[label], marker=marker, s=45, label=" ".join(label))
+                for here in (True, False):
+                    runs = [
+                        row
+                        for row in own
+                        if (row["method"], row["variant"]) == label and (row["gpu"] == newest) == here
+                    ]
+                    if not runs:
+                        continue
+                    panel.scatter(
+                        [float(row[column]) / unit for row in runs],
+                        [float(row["psnr"]) for row in runs],
+                        facecolor=colors[label] if here else "none",
+                        edgecolor=colors[label],
+                        marker="s" if label[0] == "splatfacto" else "o",
+                        s=50 if here else 30,
+                        label=" ".join([*label, runs[0]["gpu"].split()[1]]),
+                    )
             panel.set_xlabel(title)
             panel.set_ylabel("test PSNR, dB")
-            panel.set_title(f"{scene}, {own[0]['resolution']} px, {own[0]['gpu'].replace('NVIDIA ', '')}")
+            panel.set_title(f"{scene}, {own[0]['resolution']} px")
             panel.grid(alpha=0.3)
-        line[1].legend(fontsize=8)
+        line[1].legend(fontsize=7)
     FIGURE.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(FIGURE, dpi=110)
     print(f"wrote {FIGURE}")

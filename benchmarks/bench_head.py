@@ -1,0 +1,79 @@
+"""Time the heads alone on CUDA, each as one CUDA graph; append a JSON line for each to results/heads.jsonl.
+
+    python benchmarks/bench_head.py
+
+Inference: fp16 weights and pictures, as a packed scene would hold them. Training: forward and backward in bf16 with fp32
+weights, as ``ns-train`` runs it.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import torch
+
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.compensation.graphed import GraphedTraining
+from sundae_ns.evaluation import median_ms
+
+RESULTS = Path(__file__).parent / "results" / "heads.jsonl"
+HEADS = (
+    HeadConfig(size="tiny"),
+    HeadConfig(size="compact", num_features=5),
+    HeadConfig(),
+    HeadConfig(size="small", num_features=5),
+    HeadConfig(size="small"),
+    HeadConfig(pixel_unshuffle=4),
+    HeadConfig(size="regular", pixel_unshuffle=1),
+)
+PICTURES = ((824, 1240), (1893, 1061), (533, 800))
+
+
+def recorded(net: torch.nn.Module, picture: torch.Tensor) -> torch.cuda.CUDAGraph:
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            net(picture)
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        net(picture)
+    return graph
+
+
+def main() -> None:
+    for config in HEADS:
+        channels = config.num_features + 4
+        line: dict[str, object] = {
+            "size": config.size,
+            "num_features": config.num_features,
+            "pixel_unshuffle": config.pixel_unshuffle,
+            "gpu": torch.cuda.get_device_name(0),
+        }
+        for height, width in PICTURES:
+            half = CompensationHead(config).net.cuda().half()
+            # [H, W, C] as splatted, seen as [1, C, H, W].
+            picture = torch.rand(1, height, width, channels, device="cuda").half().permute(0, 3, 1, 2)
+            with torch.no_grad():
+                graph = recorded(half, picture)
+            line[f"ms_{height}x{width}"] = median_ms(graph.replay, device=picture.device).median_ms
+            net = CompensationHead(config).net.cuda()
+            training = GraphedTraining(net, torch.bfloat16)
+            sample = picture.bfloat16().requires_grad_()
+
+            def step(training: GraphedTraining = training, sample: torch.Tensor = sample) -> None:
+                out = training(sample)
+                assert out is not None
+                out.backward(torch.ones_like(out))
+
+            line[f"ms_train_{height}x{width}"] = median_ms(step, device=picture.device).median_ms
+            line["parameters"] = sum(p.numel() for p in net.parameters())
+        print(json.dumps(line))
+        with open(RESULTS, "a") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+if __name__ == "__main__":
+    main()
