@@ -25,7 +25,11 @@ _PREFIX = "gauss_params."
 
 
 def extra_state(
-    step: int, num_features: int, strategy: Mapping[str, Any], pruning: Mapping[str, Any]
+    step: int,
+    num_features: int,
+    strategy: Mapping[str, Any],
+    pruning: Mapping[str, Any],
+    trained_focal: tuple[float, float] | None,
 ) -> dict[str, Any]:
     """What a checkpoint carries beside the tensors of the model: plain numbers, strings, and tensors."""
     return {
@@ -35,6 +39,7 @@ def extra_state(
         "num_features": num_features,
         "strategy": dict(strategy),
         "pruning": dict(pruning),
+        "trained_focal": None if trained_focal is None else list(trained_focal),
     }
 
 

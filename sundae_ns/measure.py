@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
+from typing import NamedTuple, cast
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
+from torch import Tensor
 
+from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError
 from sundae_ns.evaluation import median_ms
 from sundae_ns.model import SundaeModel
@@ -63,8 +66,19 @@ def sizes(model: SundaeModel) -> Sizes:
     return Sizes(bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head))
 
 
-def load_run(config: Path) -> tuple[SundaeModel, list[Cameras]]:
-    """A finished run's model, in evaluation mode, and its test cameras.
+class LoadedRun(NamedTuple):
+    """A finished run."""
+
+    model: SundaeModel
+    """In evaluation mode."""
+    cameras: list[Cameras]
+    """Test cameras, each of shape ``(1,)``."""
+    truths: list[Tensor]
+    """What they photographed ``[H, W, 3]``, in [0, 1], over the model's background."""
+
+
+def load_run(config: Path) -> LoadedRun:
+    """Open a finished run.
 
     Raises:
         CheckpointError: there is no such run, or it is of another method.
@@ -72,8 +86,12 @@ def load_run(config: Path) -> tuple[SundaeModel, list[Cameras]]:
     if not config.is_file():
         raise CheckpointError(f"{config} does not exist; give the config.yml of a run's folder")
     _, pipeline, _, _ = eval_setup(config, test_mode="test")
-    if not isinstance(pipeline.model, SundaeModel):
+    model = pipeline.model
+    if not isinstance(model, SundaeModel):
         raise CheckpointError(f"{config} is a run of another method; give one of sundae")
-    assert pipeline.datamanager.eval_dataset is not None
-    cameras = pipeline.datamanager.eval_dataset.cameras.to(pipeline.device)
-    return pipeline.model, [cameras[i : i + 1] for i in range(len(cameras))]
+    cameras, truths = [], []
+    for camera, batch in cast(SundaeDatamanager, pipeline.datamanager).fixed_indices_eval_dataloader:
+        cameras.append(camera.to(pipeline.device))
+        image = model.get_gt_img(batch["image"])
+        truths.append(model.composite_with_background(image, model._get_background_color()))
+    return LoadedRun(model, cameras, truths)

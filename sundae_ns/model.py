@@ -29,7 +29,7 @@ from rich.progress import track
 from torch import Tensor
 
 from sundae_ns import checkpoint
-from sundae_ns.compensation import CompensationHead, HeadConfig, Window, training_window
+from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
 from sundae_ns.evaluation import Lpips, display, psnr, ssim
@@ -88,12 +88,22 @@ class View(NamedTuple):
     width: int
     height: int
 
+    focal: float
+    """Focal length in pixels, the mean of both axes; beside K, because reading K back would wait for the GPU."""
+
+    def zoomed(self, factor: float) -> View:
+        """The camera that sees the same in a picture whose sides are ``factor`` times as long."""
+        width, height = (max(round(side * factor), 1) for side in (self.width, self.height))
+        # By what rounding made of the factor, so that the pictures' edges agree.
+        scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
+        return View(self.viewmat, self.K * scale, width, height, self.focal * factor)
+
     def cut(self, window: Window) -> View:
         """The camera that sees this window of the picture alone."""
         K = self.K.clone()
         K[0, 2] -= window.left
         K[1, 2] -= window.top
-        return View(self.viewmat, K, window.width, window.height)
+        return View(self.viewmat, K, window.width, window.height, self.focal)
 
 
 class SundaeModel(SplatfactoModel):
@@ -170,6 +180,8 @@ class SundaeModel(SplatfactoModel):
         self._response: tuple[Any, Tensor | None] = (None, None)
         self.attached = False
         """Whether a trainer drives this model."""
+        self.trained_focal: tuple[float, float] | None = None
+        """Shortest and longest focal length, pixels, of the pictures that the head was trained on."""
 
     # ---------------------------------------------------------------------------------------------------- the field
 
@@ -271,12 +283,16 @@ class SundaeModel(SplatfactoModel):
     # -------------------------------------------------------------------------------------------------- checkpoints
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Step, and the states of densification and pruning: what resuming needs beside the tensors."""
-        return checkpoint.extra_state(self.step, self.num_features, self.strategy_state, self.pruning_state)
+        """Step, states of densification and pruning, and the head's scale: what goes on needs beside the tensors."""
+        return checkpoint.extra_state(
+            self.step, self.num_features, self.strategy_state, self.pruning_state, self.trained_focal
+        )
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`get_extra_state`; tensors move to the device of the field."""
         self.step = int(state["step"])
+        focal = state.get("trained_focal")  # older checkpoints do not know it
+        self.trained_focal = None if focal is None else (float(focal[0]), float(focal[1]))
         for own, theirs in ((self.strategy_state, state["strategy"]), (self.pruning_state, state["pruning"])):
             own.clear()
             own.update({k: v.to(self.means.device) if isinstance(v, Tensor) else v for k, v in theirs.items()})
@@ -314,7 +330,8 @@ class SundaeModel(SplatfactoModel):
         K = camera.get_intrinsics_matrices().reshape(-1, 3, 3)[0].clone()
         K[:2] /= downscale
         size = (int(camera.width.item()) // downscale, int(camera.height.item()) // downscale)
-        return View(viewmat.to(self.device), K.to(self.device), *size)
+        focal = (camera.fx + camera.fy).item() / 2 / downscale
+        return View(viewmat.to(self.device), K.to(self.device), *size, focal)
 
     def _splat(self, params: Mapping[str, Tensor], view: View, channels: Tensor, **kwargs: Any) -> Rasterization:
         return rasterize(
@@ -375,7 +392,13 @@ class SundaeModel(SplatfactoModel):
         rgb = base
         if compensate:
             assert self.head is not None
-            rgb = self.head(base, blended, features, splat.alpha)
+            zoom, weight = (1.0, 1.0) if self.training else plan(view.focal, self.trained_focal)
+            if zoom == 1.0:
+                rgb = self.head(base, blended, features, splat.alpha)
+            elif weight > 0:
+                at_scale, _ = self.render(params, view.zoomed(zoom), background, depth=False)
+                correction = at_scale["rgb"] - at_scale["base_rgb"]
+                rgb = base + weight * resize(correction, view.height, view.width)
             if not self.training:
                 rgb = rgb.clamp(0.0, 1.0)
         pictures = {
@@ -401,6 +424,7 @@ class SundaeModel(SplatfactoModel):
         view = self.view_of(camera, self._get_downscale_factor())
         background = self._get_background_color()
         if self.training:
+            self._remember_focal(view)
             window = self._training_window(view)
             view = view if window is None else view.cut(window)
             outputs, splat = self.render(
@@ -469,6 +493,11 @@ class SundaeModel(SplatfactoModel):
     def _get_downscale_factor(self) -> int:
         """Splatfacto's rising resolution; a warm start has risen."""
         return 1 if self.config.warm_start is not None else super()._get_downscale_factor()
+
+    def _remember_focal(self, view: View) -> None:
+        if self.head_active and self._get_downscale_factor() == 1:
+            low, high = self.trained_focal or (view.focal, view.focal)
+            self.trained_focal = (min(low, view.focal), max(high, view.focal))
 
     def _training_window(self, view: View) -> Window | None:
         # Densification takes its statistics from whole pictures.

@@ -35,7 +35,7 @@ def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
     state: dict[str, Any] = {f"gauss_params.{name}": value for name, value in field(n, degree).items()}
     state["gauss_params.features"] = torch.zeros(n, 5)
     state["head.weight"] = torch.zeros(4, 4)
-    about = checkpoint.extra_state(7, 5, {"grad2d": None}, {"pruned_at": -1})
+    about = checkpoint.extra_state(7, 5, {"grad2d": None}, {"pruned_at": -1}, None)
     state["_extra_state"] = {**about, **extra}
     return state
 
@@ -171,6 +171,8 @@ def test_what_is_no_field(tmp_path: Path, wrong: str) -> None:
 
 
 def test_extra_state_is_plain_data(tmp_path: Path) -> None:
-    state = checkpoint.extra_state(12, 5, {"grad2d": torch.ones(3), "scene_scale": 1.0}, {"pruned_at": 7})
+    state = checkpoint.extra_state(
+        12, 5, {"grad2d": torch.ones(3), "scene_scale": 1.0}, {"pruned_at": 7}, (900.0, 1100.0)
+    )
     torch.save(state, tmp_path / "a.pt")
     assert torch.load(tmp_path / "a.pt", weights_only=True)["pruning"] == {"pruned_at": 7}

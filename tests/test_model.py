@@ -20,7 +20,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils import colormaps, writer
 from torch import Tensor
 
-from sundae_ns.compensation import HeadConfig
+from sundae_ns.compensation import HeadConfig, resize
 from sundae_ns.datamanager import DATASET_FRAME
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
@@ -678,3 +678,49 @@ def test_windows_wait_for_the_head_and_for_densification() -> None:
     )
     assert early.head_active
     assert early._training_window(view) is None  # densification takes its statistics from whole pictures
+
+
+# ---------------------------------------------------------------------------------------------------------- scales
+
+
+def at_focal(factor: float) -> Cameras:
+    """The test camera, its picture magnified."""
+    small = camera()
+    sides = {"width": round(40 * factor), "height": round(32 * factor)}
+    center = {"cx": 20.0 * factor, "cy": 16.0 * factor}
+    return Cameras(small.camera_to_worlds, fx=30.0 * factor, fy=30.0 * factor, **center, **sides)
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_other_scales_get_the_correction_of_the_trained_one(mode: Any) -> None:
+    model = perturb(build(head={"mode": mode}, background_color="black")).eval()
+    model.trained_focal = (30.0, 30.0)
+    own = model.get_outputs(camera())
+    correction = own["rgb"] - own["base_rgb"]
+    assert correction.abs().max() > 1e-3
+    double = model.get_outputs(at_focal(2))
+    expected = (double["base_rgb"] + resize(correction, 64, 80)).clamp(0, 1)
+    torch.testing.assert_close(double["rgb"], expected, atol=1e-5, rtol=0)
+    # Within the tolerance the head sees the picture itself.
+    near = model.get_outputs(at_focal(1.1))
+    model.trained_focal = None
+    assert torch.equal(near["rgb"], model.get_outputs(at_focal(1.1))["rgb"])
+
+
+def test_thumbnails_are_base_colours() -> None:
+    model = perturb(build(background_color="black")).eval()
+    model.trained_focal = (300.0, 300.0)
+    outputs = model.get_outputs(camera())
+    assert torch.equal(outputs["rgb"], outputs["base_rgb"])
+
+
+def test_the_head_remembers_its_scale() -> None:
+    training = Training(build(background_color="black"))
+    for step in range(4):
+        training.step(step)
+    assert training.model.trained_focal is None  # the head took no part so far
+    training.step(4)
+    assert training.model.trained_focal == (30.0, 30.0)
+    other = build(background_color="black")
+    other.load_state_dict(training.model.state_dict())
+    assert other.trained_focal == (30.0, 30.0)

@@ -126,7 +126,7 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
             from sundae_ns.measure import frame_times, load_run, sizes
 
-            model, cameras = load_run(run / "config.yml")
+            model, cameras, _ = load_run(run / "config.yml")
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
     _comparison(out / "renders", out / "comparison.png")
 

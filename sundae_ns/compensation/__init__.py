@@ -1,7 +1,8 @@
 """Neural compensation: the U-Net that makes up, in image space, for what pruning lost. Floor 1."""
 
 from sundae_ns.compensation.head import CompensationHead, HeadConfig
+from sundae_ns.compensation.scale import ScalePlan, plan, resize
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.compensation.window import Window, training_window
 
-__all__ = ["CompensationHead", "HeadConfig", "UNet", "Window", "training_window"]
+__all__ = ["CompensationHead", "HeadConfig", "ScalePlan", "UNet", "Window", "plan", "resize", "training_window"]

@@ -12,7 +12,9 @@ from sundae_ns.measure import frame_times, load_run, sizes
 
 
 def test_figures_of_a_run(tiny: Any) -> None:
-    model, cameras = load_run(tiny.config)
+    model, cameras, truths = load_run(tiny.config)
+    assert [truth.shape[:2] for truth in truths] == [(int(c.height), int(c.width)) for c in cameras]
+    assert all(0 <= truth.min() <= truth.max() <= 1 for truth in truths)
     times = frame_times(model, cameras[:1], warmup=0, repeats=1)
     assert min(times.frame, times.splat, times.head) > 0
     floats = sum(value.numel() for value in model.gauss_params.values())

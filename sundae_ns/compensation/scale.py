@@ -1,0 +1,51 @@
+"""Pictures of another scale than the head was trained at.
+
+A screen-space network knows one size of a pixel in the scene. Shown a picture of half or twice the focal length it may do
+harm, so such pictures are compensated at the trained scale, and the correction is resized.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch.nn.functional as F
+from torch import Tensor
+
+TOLERANCE = 1.25
+"""Ratio of focal lengths within which the head is used as it is."""
+FADE = (4.0, 2.0)
+"""Pictures shrunk by more than the first factor are shown without the head, those by less than the second with all of it:
+a thumbnail should not cost a whole picture, nor the head appear at once while one zooms."""
+
+
+class ScalePlan(NamedTuple):
+    """How to compensate a picture."""
+
+    zoom: float
+    """Factor on the picture's focal length and sides at which the head runs; 1 for the picture itself."""
+    weight: float
+    """Share of the correction that is added; 0 means that the head need not run."""
+
+
+def plan(focal: float, trained: tuple[float, float] | None) -> ScalePlan:
+    """How to compensate a picture of a focal length.
+
+    Args:
+        focal: focal length of the picture, pixels.
+        trained: shortest and longest focal length of the training pictures; None where they are not known.
+    """
+    if trained is None:
+        return ScalePlan(1.0, 1.0)
+    nearest = min(max(focal, trained[0]), trained[1])
+    zoom = nearest / focal
+    if 1 / TOLERANCE <= zoom <= TOLERANCE:
+        return ScalePlan(1.0, 1.0)
+    off, full = FADE
+    return ScalePlan(zoom, min(max((off - zoom) / (off - full), 0.0), 1.0))
+
+
+def resize(image: Tensor, height: int, width: int) -> Tensor:
+    """Resize ``[h, w, C]`` to ``[height, width, C]``, antialiased where it shrinks."""
+    planes = image.permute(2, 0, 1)[None]
+    resized = F.interpolate(planes, size=(height, width), mode="bilinear", align_corners=False, antialias=True)
+    return resized[0].permute(1, 2, 0)

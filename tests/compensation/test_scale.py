@@ -1,0 +1,48 @@
+"""Pictures at other scales than the head was trained at: what is planned, and how corrections are resized."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sundae_ns.compensation import plan, resize
+from sundae_ns.compensation.scale import FADE, TOLERANCE
+
+FOCAL = st.floats(1.0, 1e5)
+
+
+@pytest.mark.parametrize("focal", [500.0, 1.0])
+def test_unknown_scale_is_taken_as_it_is(focal: float) -> None:
+    assert plan(focal, None) == (1.0, 1.0)
+
+
+@given(FOCAL, FOCAL, FOCAL)
+def test_the_head_runs_near_its_own_scale(focal: float, a: float, b: float) -> None:
+    low, high = min(a, b), max(a, b)
+    zoom, weight = plan(focal, (low, high))
+    assert 0 <= weight <= 1
+    assert low / (TOLERANCE + 1e-6) <= focal * zoom <= high * (TOLERANCE + 1e-6)
+    if low <= focal <= high:
+        assert (zoom, weight) == (1.0, 1.0)
+    assert plan(focal * zoom, (low, high)) == (1.0, 1.0)  # a picture made for the head is not remade
+
+
+def test_thumbnails_fade_out_without_a_jump() -> None:
+    shrinks = torch.linspace(1.3, 5, 200).tolist()
+    weights = [plan(1000 / shrink, (1000.0, 1000.0)).weight for shrink in shrinks]
+    assert weights[0] == 1
+    assert weights[-1] == 0
+    assert all(a >= b for a, b in zip(weights, weights[1:], strict=False))
+    assert max(a - b for a, b in zip(weights, weights[1:], strict=False)) < 0.02
+    assert plan(1000 / FADE[0], (1000.0, 1000.0)).weight == 0
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 64), (31, 90)])
+def test_resizing_keeps_the_mean(size: tuple[int, int]) -> None:
+    image = torch.rand(16, 24, 3, generator=torch.Generator().manual_seed(0))
+    out = resize(image, *size)
+    assert out.shape == (*size, 3)
+    assert out.mean() == pytest.approx(float(image.mean()), abs=0.03)
+    assert torch.equal(resize(image, 16, 24), image)
