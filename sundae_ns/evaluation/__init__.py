@@ -1,6 +1,7 @@
 """Measuring: image metrics in named variants, synchronised times, comparisons, tables, and records of runs. Floor 2."""
 
 from sundae_ns.evaluation import display
+from sundae_ns.evaluation.flicker import Change, Frame, change
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.evaluation.picture import ComparisonRow, comparison_sheet, save_comparison, side_by_side
@@ -10,13 +11,16 @@ from sundae_ns.evaluation.timing import Timing, median_ms
 
 __all__ = [
     "COLUMNS",
+    "Change",
     "ComparisonRow",
+    "Frame",
     "Lpips",
     "Quality",
     "RunFigures",
     "RunRow",
     "Timing",
     "append_row",
+    "change",
     "comparison_sheet",
     "display",
     "lpips_weights_available",
