@@ -24,7 +24,7 @@ class Response:
     """High-pass response of a field, and the graph it was taken on."""
 
     magnitude: Tensor
-    """Squared norm of the response, pi of the paper ``[N]``; NaN for primitives without neighbours."""
+    """Squared norm of the response, pi of the paper, float64 ``[N]``; NaN for primitives without neighbours."""
     tau: float
     """Threshold of the graph on squared distances, squared scene units."""
     sigma: float
@@ -52,7 +52,8 @@ def response(params: Mapping[str, Tensor], config: PruningConfig) -> Response:
         sigma=config.sigma,
     )
     signal = position_signal(params) if config.signal == "positions" else attribute_signal(params)
-    magnitude = response_magnitude(high_pass(graph, signal, isolated="nan"))
+    # Squared in float64: in float32 the squares of a small scene vanish, and its primitives would all tie.
+    magnitude = response_magnitude(high_pass(graph, signal, isolated="nan").double())
     return Response(magnitude, graph.tau, graph.sigma, int(graph.isolated.sum()))
 
 
