@@ -58,17 +58,25 @@ def nearest(coordinates: Floats, k: int, limit: float, dtype: DTypeLike) -> tupl
     indices[:, width:] = np.arange(n)[:, None]
     distances[:, width:] = np.inf
     positions = _distinct(coordinates)
+    first = positions.members[positions.starts]
     tree = cKDTree(positions.coordinates)
     # Queries that follow each other down the tree find it in the cache; in the order of a field they mostly do not.
     for rows in _parts(tree.indices, k + 2):
         # One more than needed shows whether the last one taken ties with the first one left out.
         found, lengths = _query(tree, rows, k + 2)
-        if len(positions.coordinates) == n:
+        if tree.n == n:
             # Nothing else lies where a point lies, so it is the first of its own neighbours.
             indices[rows, :width] = found[:, 1 : k + 1]
             distances[rows, :width] = lengths[:, 1 : k + 1]
         else:
-            _write(indices, distances, positions, rows, *_members(positions, found, lengths, k + 1))
+            crowded = (positions.counts[found] > 1).any(axis=1)
+            if not crowded.all():
+                own = first[rows[~crowded]]
+                indices[own, :width] = first[found[~crowded, 1 : k + 1]]
+                distances[own, :width] = lengths[~crowded, 1 : k + 1]
+            if crowded.any():
+                members = _members(positions, found[crowded], lengths[crowded], k + 1)
+                _write(indices, distances, positions, rows[crowded], *members)
         tied = (lengths[:, 1:] <= lengths[:, :-1] * (1 + ROUNDING)).any(axis=1)
         for settled in _settled(positions, tree, rows[tied], found[tied], lengths[tied], k + 1):
             _write(indices, distances, positions, *settled)

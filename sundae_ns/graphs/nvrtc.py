@@ -72,8 +72,8 @@ class Kernel:
         self._function = c_void_p()
         module = c_void_p()
         with torch.cuda.device(device):
-            # The driver's calls need torch's context, and torch makes it with the first memory that it takes.
-            torch.empty(1, device=device)
+            # The driver's calls need torch's context on this thread, and work on the device is what puts it there.
+            torch.zeros(1, device=device)
             self._check(self._driver.cuModuleLoadData(byref(module), code))
             self._check(self._driver.cuModuleGetFunction(byref(self._function), module, name.encode()))
 

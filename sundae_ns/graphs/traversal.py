@@ -42,8 +42,10 @@ __device__ __forceinline__ double box_distance(const REAL* boxes, int node, doub
     return dx * dx + dy * dy + dz * dz;
 }
 
-extern "C" __global__ void nearest(const REAL* points, const int* order, const REAL* boxes, const int* lowest, int n,
-                                   int depth, double limit, double missing, long long* indices, REAL* distances) {
+extern "C" __global__ void nearest(const REAL* __restrict__ points, const int* __restrict__ order,
+                                   const REAL* __restrict__ boxes, const int* __restrict__ lowest, int n, int depth,
+                                   double limit, double missing, long long* __restrict__ indices,
+                                   REAL* __restrict__ distances) {
     const int self = blockIdx.x * blockDim.x + threadIdx.x;
     if (self >= n) return;
     const double x = points[3 * (long long)self], y = points[3 * (long long)self + 1],

@@ -136,7 +136,8 @@ CASES: dict[str, tuple[Callable[[], Scene], int, float, float]] = {
 
 
 def difference(found: Tensor, exact: Tensor) -> float:
-    return float((found.double() - exact).norm()) / max(float(exact.norm()), FLOOR)
+    found, exact = found.detach().double(), exact.detach()
+    return float((found - exact).norm()) / max(float(exact.norm()), FLOOR)
 
 
 @pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
