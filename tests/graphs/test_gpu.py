@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -104,3 +105,22 @@ def test_a_side_stream_is_respected() -> None:
         found = knn(points, 8)
     stream.synchronize()
     assert torch.equal(found.indices, expected.indices)
+
+
+def test_without_the_kernel_the_cpu_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = torch.rand(5000, 3, device="cuda")
+    with_kernel = knn(points, 8)
+    monkeypatch.setattr(neighbors, "_kernel", lambda *_: None)
+    without = knn(points, 8)
+    assert without.indices.is_cuda
+    assert torch.equal(without.indices, with_kernel.indices)
+    assert torch.equal(without.distances, with_kernel.distances)
+
+
+def test_a_thread_that_has_done_nothing_yet_can_search() -> None:
+    points = torch.rand(5000, 3, device="cuda")
+    expected = knn(points, 8).indices
+    neighbors._kernel.cache_clear()
+    with ThreadPoolExecutor(1) as pool:
+        found = pool.submit(knn, points, 8).result().indices
+    assert torch.equal(found, expected)
