@@ -52,8 +52,7 @@ def response(params: Mapping[str, Tensor], config: PruningConfig) -> Response:
         sigma=config.sigma,
     )
     signal = position_signal(params) if config.signal == "positions" else attribute_signal(params)
-    # Squared in float64: in float32 the squares of a small scene vanish, and its primitives would all tie.
-    magnitude = response_magnitude(high_pass(graph, signal, isolated="nan").double())
+    magnitude = response_magnitude(high_pass(graph, signal, isolated="nan"))
     return Response(magnitude, graph.tau, graph.sigma, int(graph.isolated.sum()))
 
 
