@@ -49,9 +49,9 @@ def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Te
 
 
 def response_values(response: Tensor) -> Tensor:
-    """Response magnitudes ``[N]`` as values in [0, 1]: their rank, which shows fields of any scale alike; unknown is 0."""
+    """Response magnitudes ``[N]`` as values in [0, 1], float32: their rank, which shows fields of any scale; unknown is 0."""
     known = torch.isfinite(response)
     order = response[known].argsort().argsort()
-    values = torch.zeros_like(response)
-    values[known] = (order + 1).to(response) / max(int(known.sum()), 1)
+    values = torch.zeros_like(response, dtype=torch.float32)
+    values[known] = (order + 1).float() / max(int(known.sum()), 1)
     return values

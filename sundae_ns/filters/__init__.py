@@ -1,5 +1,23 @@
-"""Haar-like graph filters of the paper (section "Graph Filtering and Sampling") and their response. Floor 0."""
+"""Graph filters: the Haar-like ones of the paper and their response, and any kernel by Chebyshev polynomials. Floor 0.
 
+The paper's filters (section "Graph Filtering and Sampling") are I - A and I + A, see :mod:`sundae_ns.filters.haar`.
+"""
+
+from sundae_ns.filters.chebyshev import cheby_filter, compute_cheby_coeff, estimate_lmax, exact_filter
 from sundae_ns.filters.haar import Isolated, high_pass, low_pass, response_magnitude
+from sundae_ns.filters.kernels import Kernel, band_pass_kernel, high_pass_kernel, low_pass_kernel
 
-__all__ = ["Isolated", "high_pass", "low_pass", "response_magnitude"]
+__all__ = [
+    "Isolated",
+    "Kernel",
+    "band_pass_kernel",
+    "cheby_filter",
+    "compute_cheby_coeff",
+    "estimate_lmax",
+    "exact_filter",
+    "high_pass",
+    "high_pass_kernel",
+    "low_pass",
+    "low_pass_kernel",
+    "response_magnitude",
+]

@@ -16,8 +16,8 @@ from sundae_ns.graphs import NeighborGraph
 
 Isolated = Literal["nan", "zero"]
 
-CHUNK_ELEMENTS = 2**24
-"""Most elements of the gathered neighbours ``[rows, K, D]`` at a time; 64 MiB in float32."""
+CHUNK_ELEMENTS = 2**21
+"""Most elements of the gathered neighbours ``[rows, K, D]`` at a time: 8 MiB in float32, for a CPU's cache."""
 
 
 def high_pass(graph: NeighborGraph, signal: Tensor, *, isolated: Isolated = "nan") -> Tensor:
@@ -72,5 +72,12 @@ def low_pass(graph: NeighborGraph, signal: Tensor, *, isolated: Isolated = "nan"
 
 
 def response_magnitude(response: Tensor) -> Tensor:
-    """Squared norm per node, ``pi_i = |f_i|^2``: ``[N]`` from ``[N]`` or ``[N, D]``; NaN stays NaN."""
-    return response.square() if response.ndim == 1 else response.square().sum(dim=1)
+    """Squared norm per node, ``pi_i = |f_i|^2``: float64 ``[N]`` from ``[N]`` or ``[N, D]``; NaN stays NaN.
+
+    Squared in float64: in float32 the squares of a small scene vanish, and its nodes would all tie.
+    """
+    magnitude = torch.zeros(len(response), dtype=torch.float64, device=response.device)
+    # Channel by channel, for a copy of them all in float64 would be the largest thing in memory.
+    for channel in (response,) if response.ndim == 1 else response.unbind(dim=1):
+        magnitude += channel.double().square()
+    return magnitude

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from sundae_ns.graphs.bandwidth import BandwidthRule, bandwidth
@@ -85,8 +84,8 @@ def graph_from_neighbors(
     tau, sigma = bandwidth(distances, rule, tau=tau, sigma=sigma)
     if sigma > 0:
         # Divided before it is squared: the square of a small distance could underflow.
-        weights = torch.exp(-0.5 * (distances / sigma).square())
+        weights = (distances / sigma).square_().mul_(-0.5).exp_()
     else:
         weights = (distances == 0).to(distances.dtype)
-    weights = torch.where(distances < tau**0.5, weights, torch.zeros_like(weights))
+    weights.masked_fill_(distances >= tau**0.5, 0)
     return NeighborGraph(neighbors.indices, weights, weights.sum(dim=1), tau, sigma)

@@ -1,15 +1,29 @@
-"""Exact neighbour search: the one seam behind which another engine can be put."""
+"""Exact neighbour search: one interface, scipy's k-d tree on the CPU and our own kernel on a GPU behind it.
+
+Both order neighbours by squared distance in float64 and then by index, so that the same points have the same neighbours
+on every device. Coordinates are subtracted in float64, which is exact for float32 positions of like size: a scene far
+from the origin loses no digit that its positions still have.
+"""
 
 from __future__ import annotations
 
+import functools
+import logging
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.errors import BackendError, ConfigError, DataError
+from sundae_ns.graphs import host_search, traversal
+from sundae_ns.graphs.nvrtc import Kernel
+from sundae_ns.graphs.tree import build_tree
+
+MOST_EXTENT = 1e150
+"""Coordinates up to this have squared distances that float64 can hold."""
+
+_log = logging.getLogger(__name__)
 
 
 class Neighbors(NamedTuple):
@@ -24,31 +38,32 @@ class Neighbors(NamedTuple):
 def knn(points: Tensor, k: int) -> Neighbors:
     """Exact ``k`` nearest neighbours of every point, without the point itself.
 
-    Coincident points are neighbours of each other at distance 0. Which of several equally distant points is taken as
-    the last neighbour is left to the search. The search runs on the CPU; the result returns to the points' device.
+    Coincident points are neighbours of each other at distance 0. Of equally distant points the lower index comes first,
+    also where only some of them find room. The search runs on the points' device; where the kernel for a GPU cannot be
+    compiled, and beyond :data:`sundae_ns.graphs.traversal.MAX_NEIGHBORS` neighbours, it runs on the CPU.
 
     Args:
         points: positions in scene units, any floating dtype and device ``[N, 3]``.
         k: number of neighbours, at least 1 and less than N.
 
     Returns:
-        Indices and ascending distances ``[N, k]``.
+        Indices and ascending distances ``[N, k]``, on the points' device.
 
     Raises:
         ConfigError: ``k`` is less than 1.
-        DataError: there are not more than ``k`` points, or points have a wrong shape or are not finite.
+        DataError: there are not more than ``k`` points, or points have a wrong shape, are not finite, or lie farther
+            out than 1e150.
     """
     if k < 1:
         raise ConfigError(f"a neighbour search for {k} neighbours finds nothing: ask for at least 1")
-    coordinates = _coordinates(points)
-    n = len(coordinates)
+    _check(points)
+    n = len(points)
     if n <= k:
         raise DataError(
             f"{n} primitives cannot have {k} neighbours each: use at most {max(n - 1, 0)} neighbours, "
             "or a field with more primitives"
         )
-    distances, indices = cKDTree(coordinates).query(coordinates, k=k + 1, workers=-1)
-    return _without_self(points, indices, distances)
+    return _search(points, k, torch.inf)
 
 
 def radius_neighbors(points: Tensor, radius: float, max_neighbors: int) -> Neighbors:
@@ -57,57 +72,65 @@ def radius_neighbors(points: Tensor, radius: float, max_neighbors: int) -> Neigh
     Args:
         points: positions in scene units, any floating dtype and device ``[N, 3]``; N may be 0.
         radius: neighbours are strictly closer than this, scene units.
-        max_neighbors: width of the result; of more neighbours than this, the nearest are kept.
+        max_neighbors: width of the result; of more neighbours than this, the nearest are kept, as by :func:`knn`.
 
     Returns:
         Indices and ascending distances ``[N, max_neighbors]``; own index and ``inf`` where a neighbour is missing.
 
     Raises:
         ConfigError: ``radius`` is not positive or ``max_neighbors`` is less than 1.
-        DataError: points have a wrong shape or are not finite.
+        DataError: points have a wrong shape, are not finite, or lie farther out than 1e150.
     """
     if not radius > 0:
         raise ConfigError(f"a search radius of {radius} finds nothing: use a positive one")
     if max_neighbors < 1:
         raise ConfigError(f"room for {max_neighbors} neighbours holds nothing: use at least 1")
-    coordinates = _coordinates(points)
-    n = len(coordinates)
-    if n == 0:
+    _check(points)
+    if len(points) == 0:
         shape = (0, max_neighbors)
         return Neighbors(torch.empty(shape, dtype=torch.int64, device=points.device), points.new_empty(shape))
-    distances, indices = cKDTree(coordinates).query(
-        coordinates, k=max_neighbors + 1, distance_upper_bound=radius, workers=-1
-    )
-    indices = np.where(np.isinf(distances), np.arange(n)[:, None], indices)
-    return _without_self(points, indices, distances)
+    return _search(points, max_neighbors, radius * radius)
 
 
-def _coordinates(points: Tensor) -> np.ndarray:
-    """Points as float64 on the CPU ``[N, 3]``.
+def _search(points: Tensor, k: int, limit: float) -> Neighbors:
+    """The search itself, on the device that can do it; ``limit`` bounds squared distances."""
+    kernel = _kernel(points.device, _tree_dtype(points), k) if points.is_cuda else None
+    if kernel is None:
+        coordinates = points.detach().to(device="cpu", dtype=torch.float64).numpy()
+        dtype = np.float64 if points.dtype == torch.float64 else np.float32
+        indices, distances = host_search.nearest(np.ascontiguousarray(coordinates), k, limit, dtype)
+        found = torch.from_numpy(indices), torch.from_numpy(distances)
+        return Neighbors(found[0].to(points.device), found[1].to(points.device, points.dtype))
+    tree = build_tree(points.detach().to(_tree_dtype(points)))
+    on_device, lengths = traversal.search_tree(tree, k, limit, kernel)
+    return Neighbors(on_device, lengths.to(points.dtype))
 
-    The tree subtracts coordinates directly, so float64 alone keeps the digits of a scene far from the origin. Moving
-    the centroid to the origin would not help and could hurt: one floater at 1e20 would drag it there and erase the
-    scene.
-    """
+
+def _tree_dtype(points: Tensor) -> torch.dtype:
+    """The dtype that holds the points exactly and that the kernel knows."""
+    return torch.float64 if points.dtype == torch.float64 else torch.float32
+
+
+@functools.cache
+def _kernel(device: torch.device, dtype: torch.dtype, k: int) -> Kernel | None:
+    """The kernel for this device; None, and one logged line, where there is none. Cached, for compiling takes 0.1 s."""
+    if k > traversal.MAX_NEIGHBORS:
+        reason = f"{k} neighbours are more than the {traversal.MAX_NEIGHBORS} that it has room for"
+    else:
+        options = (*traversal.OPTIONS, *traversal.definitions(dtype, k))
+        try:
+            return Kernel(traversal.SOURCE, traversal.KERNEL, device, options, traversal.BLOCK)
+        except BackendError as error:
+            reason = str(error)
+    _log.warning("neighbours are searched on the CPU, not with the kernel for %s: %s", device, reason)
+    return None
+
+
+def _check(points: Tensor) -> None:
     if points.ndim != 2 or points.shape[1] != 3:
         raise DataError(f"positions have shape {list(points.shape)}: pass [N, 3]")
-    coordinates = points.detach().to(device="cpu", dtype=torch.float64).numpy()
-    bad = int((~np.isfinite(coordinates)).any(axis=1).sum())
+    bad = int((~torch.isfinite(points)).any(dim=1).sum())
     if bad:
-        raise DataError(f"{bad} of {len(coordinates)} positions are NaN or infinite: drop them before building a graph")
-    return coordinates
-
-
-def _without_self(points: Tensor, indices: np.ndarray, distances: np.ndarray) -> Neighbors:
-    """Remove one column per row: the own index with a finite distance or, where it is absent, the last one.
-
-    The own index need not come first among coincident points, and is absent where a row is filled with them: every
-    entry of such a row is at distance 0, so any one can go.
-    """
-    n, width = indices.shape
-    is_self = (indices == np.arange(n)[:, None]) & np.isfinite(distances)
-    is_self[:, -1] |= ~is_self.any(axis=1)
-    others = ~is_self
-    kept_indices = torch.from_numpy(indices[others].reshape(n, width - 1).astype(np.int64, copy=False))
-    kept_distances = torch.from_numpy(distances[others].reshape(n, width - 1))
-    return Neighbors(kept_indices.to(points.device), kept_distances.to(points.dtype).to(points.device))
+        raise DataError(f"{bad} of {len(points)} positions are NaN or infinite: drop them before building a graph")
+    if points.dtype == torch.float64 and len(points) and float(points.detach().abs().max()) > MOST_EXTENT:
+        raise DataError(f"positions lie farther out than {MOST_EXTENT:g}: their squared distances overflow, scale them")

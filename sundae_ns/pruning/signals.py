@@ -37,7 +37,7 @@ def _standardise(values: Tensor) -> Tensor:
     half of the rows are equal the median norm is 0, and the mean of the norms stands in for it.
     """
     centred = values - values.median(dim=0).values
-    norms = torch.linalg.vector_norm(centred, dim=1)
+    norms = torch.linalg.vector_norm(centred, dim=1, dtype=torch.float64)
     spread = norms.median()
     if spread == 0:
         spread = norms.mean()

@@ -76,4 +76,5 @@ def test_response_is_shown_by_rank() -> None:
     values = display.response_values(response)
     assert values.tolist() == [0.75, 0.0, 0.5, 1.0, 0.25]
     assert torch.equal(values, display.response_values(response * 1e-7))
+    assert torch.equal(values, display.response_values(response.double()))  # float32 whatever comes in, for the viewer
     assert display.response_values(torch.full((3,), torch.nan)).tolist() == [0.0] * 3

@@ -117,3 +117,13 @@ def test_wrong_signal_is_refused() -> None:
     for shape in ((59, 3), (60, 3, 1), ()):
         with pytest.raises(DataError, match="60 nodes"):
             high_pass(graph, torch.zeros(shape))
+
+
+def test_magnitudes_of_tiny_responses_do_not_vanish() -> None:
+    response = torch.tensor([[1e-30, 0.0], [3e-30, 4e-30], [torch.nan, 0.0]])
+    magnitude = response_magnitude(response)
+    assert magnitude.dtype == torch.float64
+    torch.testing.assert_close(magnitude[:2], torch.tensor([1e-60, 25e-60], dtype=torch.float64), rtol=1e-6, atol=0)
+    assert magnitude[2].isnan()
+    assert response_magnitude(torch.tensor([-3.0])).tolist() == [9.0]
+    assert response_magnitude(torch.zeros(0, 3)).shape == (0,)

@@ -18,6 +18,7 @@ from sundae_ns.graphs import (
     laplacian,
     radius_neighbors,
 )
+from sundae_ns.graphs.bandwidth import kth_smallest
 
 
 def cloud(n: int = 120, seed: int = 0) -> torch.Tensor:
@@ -74,6 +75,15 @@ def test_overrides_replace_the_rule() -> None:
     assert bandwidth(distances, "robust", sigma=2.0) == (36.0, 2.0)
     assert bandwidth(distances, "robust", tau=0.5).tau == 0.5
     assert bandwidth(distances, "literal", tau=0.5, sigma=0.25) == (0.5, 0.25)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_median_by_counting_is_the_median(dtype: torch.dtype) -> None:
+    values = torch.cat([cloud(300).abs().flatten(), torch.zeros(40), torch.tensor([1e-40, 1e-30, 1e30, torch.inf])])
+    values = values[torch.randperm(len(values))].to(dtype)
+    ordered = values.sort().values.tolist()
+    for k in (0, 30, 40, 41, 42, 500, len(values) - 2, len(values) - 1):
+        assert kth_smallest(values, k) == ordered[k]
 
 
 @pytest.mark.parametrize("options", [{"tau": -1.0}, {"tau": math.nan}, {"sigma": 0.0}, {"rule": "other"}])

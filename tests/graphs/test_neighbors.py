@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.graphs import knn, radius_neighbors
+from sundae_ns.errors import BackendError, ConfigError, DataError
+from sundae_ns.graphs import host_search, knn, neighbors, radius_neighbors
+from sundae_ns.graphs.traversal import MAX_NEIGHBORS
 
 
 def brute_force(points: torch.Tensor) -> torch.Tensor:
@@ -93,10 +96,64 @@ def test_radius_neighbors_of_almost_nothing(n: int) -> None:
     assert found.distances.isinf().all()
 
 
-@pytest.mark.gpu
-def test_knn_returns_to_the_gpu() -> None:
-    points = torch.rand(50, 3)
-    on_gpu = knn(points.cuda(), 4)
-    assert on_gpu.indices.is_cuda
-    assert on_gpu.distances.is_cuda
-    assert torch.equal(on_gpu.indices.cpu(), knn(points, 4).indices)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(("n", "k"), [(700, 16), (130, 3), (40, 39), (2, 1)])
+def test_neighbours_are_ordered_by_distance_and_then_by_index(
+    cloud: Callable, truth: Callable, dtype: torch.dtype, n: int, k: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points = cloud(n).to(dtype)
+    expected, expected_distances = truth(points, k)
+    for elements in (host_search.CHUNK_ELEMENTS, 100):
+        monkeypatch.setattr(host_search, "CHUNK_ELEMENTS", elements)
+        found = knn(points, k)
+        assert torch.equal(found.indices, expected)
+        assert torch.equal(found.distances, expected_distances)
+
+
+def test_radius_is_exclusive_and_ties_at_the_cap_go_to_the_lower_index(cloud: Callable, truth: Callable) -> None:
+    points = cloud(300).float()
+    everyone, distances = truth(points, 299)
+    radius = max(float(distances[:, 5].median()), 1e-6)
+    found = radius_neighbors(points, radius, 8)
+    _, exact = truth(points.double(), 8)
+    inside = exact < radius
+    assert torch.equal(found.distances, distances[:, :8].masked_fill(~inside, torch.inf))
+    assert torch.equal(found.indices, torch.where(inside, everyone[:, :8], torch.arange(300)[:, None]))
+
+
+def test_two_positions_of_one_hash_are_not_mixed_up(monkeypatch: pytest.MonkeyPatch, truth: Callable) -> None:
+    points = torch.randn(50, 3).repeat(3, 1)
+    monkeypatch.setattr(host_search, "_hash", lambda bits: bits[:, 0] % 7)
+    assert torch.equal(knn(points, 6).indices, truth(points, 6)[0])
+
+
+def test_positions_too_far_out_for_their_squares_are_refused() -> None:
+    points = torch.zeros(5, 3, dtype=torch.float64)
+    points[0, 0] = 1e200
+    with pytest.raises(DataError, match="1e.150"):
+        knn(points, 2)
+
+
+def test_without_a_kernel_the_cpu_searches_and_one_line_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def broken(*_: object) -> None:
+        raise BackendError("no compiler on board")
+
+    monkeypatch.setattr(neighbors, "Kernel", broken)
+    neighbors._kernel.cache_clear()
+    device = torch.device("cuda", 0)
+    with caplog.at_level("WARNING"):
+        assert [neighbors._kernel(device, torch.float32, 16) for _ in range(3)] == [None] * 3
+    assert [record.getMessage().count("\n") for record in caplog.records] == [0]
+    assert "searched on the CPU" in caplog.text
+    assert "no compiler on board" in caplog.text
+    neighbors._kernel.cache_clear()
+
+
+def test_more_neighbours_than_the_kernel_takes_go_to_the_cpu(caplog: pytest.LogCaptureFixture) -> None:
+    neighbors._kernel.cache_clear()
+    with caplog.at_level("WARNING"):
+        assert neighbors._kernel(torch.device("cuda", 0), torch.float32, MAX_NEIGHBORS + 1) is None
+    assert f"{MAX_NEIGHBORS + 1} neighbours" in caplog.text
+    neighbors._kernel.cache_clear()

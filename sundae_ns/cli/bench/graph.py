@@ -1,0 +1,189 @@
+"""``sundae bench graph``: the neighbour graph and the high-pass response, timed beside scipy's k-d tree."""
+
+from __future__ import annotations
+
+import json as jsonlib
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sundae_ns.cli.bench.points import Distribution, draw
+from sundae_ns.errors import BackendError, ConfigError
+from sundae_ns.filters import high_pass
+from sundae_ns.graphs import NeighborGraph, build_graph
+
+ROUNDING = 1e-12
+"""Relative difference of two float64 distances that counts as a tie."""
+
+
+def run_graph(
+    *,
+    points: int,
+    neighbors: int,
+    device: str,
+    distribution: Distribution,
+    field: Path | None,
+    reference: bool,
+    repeats: int,
+    seed: int,
+    json: bool,
+) -> int:
+    """Measure and print; options are those of the command."""
+    if repeats < 1:
+        raise ConfigError(f"{repeats} timed runs measure nothing: use at least 1")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise BackendError("there is no CUDA device here: use --device cpu")
+    if field is None:
+        positions = draw(distribution, points, seed)
+    else:
+        from sundae_ns.checkpoint import read_field
+
+        positions = read_field(field)[0]["means"]
+        positions = positions[torch.isfinite(positions).all(dim=1)]
+    result: dict[str, Any] = {
+        "benchmark": "graph",
+        "points": len(positions),
+        "neighbors": neighbors,
+        "device": device,
+        "device_name": torch.cuda.get_device_name() if device == "cuda" else f"CPU, {torch.get_num_threads()} threads",
+        "distribution": distribution if field is None else str(field),
+        **measure(positions, neighbors, device, repeats, reference),
+        "torch": torch.__version__,
+    }
+    if json:
+        print(jsonlib.dumps(result))
+    else:
+        for name, value in result.items():
+            print(f"{name:20} {value}")
+    return 0
+
+
+def measure(positions: Tensor, neighbors: int, device: str, repeats: int, reference: bool) -> dict[str, Any]:
+    """Times in seconds, memory in MiB, and the errors; what depends on the reference is None without it.
+
+    Args:
+        positions: float32 on the CPU ``[N, 3]``.
+        neighbors: neighbours of each point.
+        device: where to measure.
+        repeats: timed runs, after one that is not timed.
+        reference: whether to run cKDTree.
+    """
+    placed = positions.to(device)
+    stages: dict[str, float] = {}
+
+    def run() -> tuple[NeighborGraph, Tensor]:
+        started = _now(device)
+        found = build_graph(placed, num_neighbors=neighbors)
+        built = _now(device)
+        response = high_pass(found, placed)
+        stages.update(graph=built - started, response=_now(device) - built)
+        return found, response
+
+    run()
+    times, graphs, responses = [], [], []
+    for _ in range(repeats):
+        run()
+        times.append(sum(stages.values()))
+        graphs.append(stages["graph"])
+        responses.append(stages["response"])
+    (found, response), peak = _with_peak(run, device)
+    result: dict[str, Any] = {
+        "seconds": _rounded(statistics.median(times)),
+        "graph_seconds": _rounded(statistics.median(graphs)),
+        "response_seconds": _rounded(statistics.median(responses)),
+        "reference_seconds": None,
+        "speedup": None,
+        "index_mismatches": None,
+        "response_rel_error": float(f"{_response_error(placed, neighbors, response):.3g}"),
+        "peak_mib": round(peak / 2**20, 1),
+    }
+    if reference:
+        seconds, distances = _reference(positions, neighbors)
+        result["reference_seconds"] = _rounded(seconds)
+        result["speedup"] = _rounded(seconds / statistics.median(times))
+        result["index_mismatches"] = count_mismatches(positions, found.indices.cpu(), distances)
+    return result
+
+
+def count_mismatches(positions: Tensor, indices: Tensor, reference: np.ndarray) -> int:
+    """Rows of neighbours that are wrong beyond ties.
+
+    A row is right if its points are different ones, none the point itself, and as far away as those of the reference:
+    then the two sets differ in points of equal distance only.
+
+    Args:
+        positions: ``[N, 3]``.
+        indices: neighbours that were found, int64 ``[N, K]``.
+        reference: ascending distances to the true neighbours, float64 ``[N, K]``.
+    """
+    wrong = 0
+    coordinates = positions.double()
+    for start in range(0, len(positions), 2**18):
+        rows = slice(start, start + 2**18)
+        own = torch.arange(len(positions))[rows, None]
+        ordered = torch.cat([indices[rows], own], dim=1).sort(dim=1).values
+        repeated = (ordered[:, 1:] == ordered[:, :-1]).any(dim=1)
+        differences = coordinates[indices[rows]] - coordinates[rows, None]
+        distances = torch.linalg.vector_norm(differences, dim=2).sort(dim=1).values
+        true = torch.from_numpy(reference[rows])
+        wrong += int((repeated | ((distances - true).abs() > ROUNDING * true).any(dim=1)).sum())
+    return wrong
+
+
+def _reference(positions: Tensor, neighbors: int) -> tuple[float, np.ndarray]:
+    """Seconds of cKDTree's build and query on all cores, and the ascending distances without the point itself."""
+    from scipy.spatial import cKDTree
+
+    coordinates = positions.double().numpy()
+    started = time.perf_counter()
+    distances, _ = cKDTree(coordinates).query(coordinates, k=neighbors + 1, workers=-1)
+    return time.perf_counter() - started, distances[:, 1:]
+
+
+def _response_error(placed: Tensor, neighbors: int, response: Tensor) -> float:
+    """Norm of the difference between float32 and float64 over the norm in float64, of nodes with neighbours."""
+    double = placed.double()
+    exact = high_pass(build_graph(double, num_neighbors=neighbors), double)
+    known = ~(exact.isnan() | response.isnan())
+    norm = float(exact[known].norm())
+    return float((response.double() - exact)[known].norm()) / norm if norm > 0 else 0.0
+
+
+def _now(device: str) -> float:
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def _with_peak(run: Callable[[], Any], device: str) -> tuple[Any, int]:
+    """What a run gives, and the most memory that it took beside what was there before, in bytes."""
+    if device == "cuda":
+        torch.cuda.synchronize()
+        before = torch.cuda.memory_allocated()
+        torch.cuda.reset_peak_memory_stats()
+        result = run()
+        return result, torch.cuda.max_memory_allocated() - before
+    status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    try:
+        # Linux: 5 makes the peak of the resident memory start anew.
+        reset.write_text("5")
+        before = _resident(status, "VmRSS")
+        result = run()
+        return result, _resident(status, "VmHWM") - before
+    except OSError as error:
+        raise BackendError(f"memory cannot be measured here ({error}): use Linux") from error
+
+
+def _resident(status: Path, name: str) -> int:
+    line = next(line for line in status.read_text().splitlines() if line.startswith(f"{name}:"))
+    return 1024 * int(line.split()[1])
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")

@@ -1,0 +1,220 @@
+"""The search on the CPU: scipy's k-d tree over the distinct positions, with ties settled by index.
+
+A k-d tree cannot part points at one position: a search among a million clones would look at all of them for each. So
+clones are grouped first, the tree is built and searched once a position, and groups are written out afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+from scipy.spatial import cKDTree
+
+Floats = NDArray[np.floating]
+Ints = NDArray[np.int64]
+
+CHUNK_ELEMENTS = 2**20
+"""Most candidates at a time: 16 MiB of indices and distances, which stay in the cache."""
+
+ROUNDING = 4 * np.finfo(np.float64).eps
+"""Distances closer than this, relatively, may be the same or swapped: the tree's own sums may be rounded otherwise."""
+
+
+class _Positions(NamedTuple):
+    """The distinct positions of a field and the points at each."""
+
+    coordinates: Floats
+    """Distinct positions, float64 ``[U, 3]``."""
+    members: Ints
+    """Points by position, and by rising index at one position ``[N]``."""
+    starts: Ints
+    """Where each position's points begin among the members ``[U]``."""
+    counts: Ints
+    """How many points are at each position ``[U]``."""
+
+
+def nearest(coordinates: Floats, k: int, limit: float, dtype: DTypeLike) -> tuple[Ints, Floats]:
+    """The ``k`` nearest neighbours of every point, ordered by squared distance and then by index.
+
+    Squared distances are ``(dx dx + dy dy) + dz dz`` in float64, each step rounded: to the bit those of the search on a
+    GPU.
+
+    Args:
+        coordinates: finite positions, float64, at least one ``[N, 3]``.
+        k: number of neighbours.
+        limit: squared distances of neighbours are strictly below this, squared scene units; ``inf`` for no limit.
+        dtype: of the distances that are returned.
+
+    Returns:
+        Indices and distances ``[N, k]``; own index and ``inf`` where a neighbour is missing.
+    """
+    n = len(coordinates)
+    indices = np.empty((n, k), np.int64)
+    distances = np.empty((n, k), dtype)
+    width = min(k, n - 1)
+    indices[:, width:] = np.arange(n)[:, None]
+    distances[:, width:] = np.inf
+    positions = _distinct(coordinates)
+    first = positions.members[positions.starts]
+    tree = cKDTree(positions.coordinates)
+    # Queries that follow each other down the tree find it in the cache; in the order of a field they mostly do not.
+    for rows in _parts(tree.indices, k + 2):
+        # One more than needed shows whether the last one taken ties with the first one left out.
+        found, lengths = _query(tree, rows, k + 2)
+        if tree.n == n:
+            # Nothing else lies where a point lies, so it is the first of its own neighbours.
+            indices[rows, :width] = found[:, 1 : k + 1]
+            distances[rows, :width] = lengths[:, 1 : k + 1]
+        else:
+            crowded = (positions.counts[found] > 1).any(axis=1)
+            if not crowded.all():
+                own = first[rows[~crowded]]
+                indices[own, :width] = first[found[~crowded, 1 : k + 1]]
+                distances[own, :width] = lengths[~crowded, 1 : k + 1]
+            if crowded.any():
+                members = _members(positions, found[crowded], lengths[crowded], k + 1)
+                _write(indices, distances, positions, rows[crowded], *members)
+        tied = (lengths[:, 1:] <= lengths[:, :-1] * (1 + ROUNDING)).any(axis=1)
+        for settled in _settled(positions, tree, rows[tied], found[tied], lengths[tied], k + 1):
+            _write(indices, distances, positions, *settled)
+    if limit < np.inf:
+        _drop_far(coordinates, indices, distances, limit)
+    return indices, distances
+
+
+def _distinct(coordinates: Floats) -> _Positions:
+    """Group coincident points, by a 64-bit hash of their coordinates: sorting it is far cheaper than sorting those."""
+    n = len(coordinates)
+    # Adding 0 turns -0 into 0: the two are equal and must hash alike.
+    hashes = _hash((coordinates + 0.0).view(np.uint64))
+    ordered = np.sort(hashes)
+    if not (ordered[1:] == ordered[:-1]).any():
+        own = np.arange(n)
+        return _Positions(coordinates, own, own, np.ones(n, np.int64))
+    members = np.argsort(hashes, kind="stable")
+    equal = (coordinates[members[1:]] == coordinates[members[:-1]]).all(axis=1)
+    if (hashes[members[1:]] == hashes[members[:-1]]).sum() != equal.sum():
+        # Two positions share a hash, and their points may be mixed up.
+        members = np.lexsort(coordinates.T)
+        equal = (coordinates[members[1:]] == coordinates[members[:-1]]).all(axis=1)
+    starts = np.flatnonzero(np.concatenate([[True], ~equal]))
+    counts = np.diff(np.append(starts, n))
+    return _Positions(coordinates[members[starts]], members, starts, counts)
+
+
+def _hash(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Mix three words a row into one, by odd multipliers and shifts; ``[N, 3]`` to ``[N]``."""
+    mixed = np.zeros(len(bits), np.uint64)
+    for axis in range(3):
+        mixed = (mixed ^ bits[:, axis]) * np.uint64(0x9E3779B97F4A7C15)
+        mixed ^= mixed >> np.uint64(29)
+        mixed *= np.uint64(0xBF58476D1CE4E5B9)
+        mixed ^= mixed >> np.uint64(32)
+    return mixed
+
+
+def _query(tree: cKDTree, rows: Ints, asked: int) -> tuple[Ints, Floats]:
+    """The nearest positions of the positions ``rows``, nearest first, or all where there are not so many."""
+    lengths, found = tree.query(tree.data[rows], k=np.arange(1, min(asked, tree.n) + 1), workers=-1)
+    return found, lengths
+
+
+def _members(positions: _Positions, found: Ints, lengths: Floats, width: int) -> tuple[Ints, Floats]:
+    """Write positions out as the points at them: the first ``width`` of each row, or all N where there are not so many."""
+    counts = positions.counts[found]
+    room = width - (np.cumsum(counts, axis=1) - counts)
+    slots, points = _written_out(positions, found, np.clip(room, 0, counts))
+    return points.reshape(len(found), -1), lengths.ravel()[slots].reshape(len(found), -1)
+
+
+def _write(indices: Ints, distances: Floats, positions: _Positions, rows: Ints, points: Ints, lengths: Floats) -> None:
+    """Give every point at the positions ``rows`` the points of its row, without itself.
+
+    A point is absent from its own row where that is filled by clones of lower index; then the last one goes.
+    """
+    row, own = _written_out(positions, rows, positions.counts[rows])
+    width = points.shape[1] - 1
+    # Cut up once more, for all points of the field may lie at one position.
+    for part in _parts(np.arange(len(row)), width + 1):
+        others = points[row[part]] != own[part, None]
+        others[:, -1] &= ~others.all(axis=1)
+        indices[own[part], :width] = points[row[part]][others].reshape(-1, width)
+        distances[own[part], :width] = lengths[row[part]][others].reshape(-1, width)
+
+
+def _settled(
+    positions: _Positions, tree: cKDTree, rows: Ints, found: Ints, lengths: Floats, width: int
+) -> Iterator[tuple[Ints, Ints, Floats]]:
+    """For positions with ties, by squared distance and index: rows, and the first ``width`` points of each.
+
+    Asks for more and more neighbours until the last of them lies clearly behind the last one needed.
+    """
+    while True:
+        needed = lengths[:, min(width, found.shape[1]) - 1, None] * (1 + ROUNDING)
+        done = (lengths[:, -1:] > needed).ravel() | (found.shape[1] == tree.n)
+        if done.any():
+            near, ready = found[done], rows[done]
+            taken = np.where(lengths[done] <= needed[done], np.minimum(positions.counts[near], width), 0)
+            for part in _parts(np.arange(len(ready)), int(taken.sum(axis=1).max())):
+                yield ready[part], *_sorted_members(positions, ready[part], near[part], taken[part], width)
+        rows = rows[~done]
+        if not len(rows):
+            return
+        found, lengths = _query(tree, rows, asked=2 * found.shape[1])
+
+
+def _sorted_members(positions: _Positions, rows: Ints, found: Ints, taken: Ints, width: int) -> tuple[Ints, Floats]:
+    """The first ``width`` points by squared distance and index.
+
+    Args:
+        positions: positions and points.
+        rows: the positions that the search was for ``[R]``.
+        found: positions near them ``[R, C]``.
+        taken: how many points of those to look at ``[R, C]``; 0 for what is too far ``[R, C]``.
+        width: number of points wanted; all N where there are not so many.
+    """
+    x, y, z = np.moveaxis(positions.coordinates[found] - positions.coordinates[rows, None], 2, 0)
+    squared = x * x + y * y + z * z
+    totals = taken.sum(axis=1)
+    slots, points = _written_out(positions, found, taken)
+    room = np.arange(totals.max()) < totals[:, None]
+    distances = np.full(room.shape, np.inf)
+    distances[room] = squared.ravel()[slots]
+    indices = np.zeros(room.shape, np.int64)
+    indices[room] = points
+    order = np.argsort(distances, axis=1, kind="stable")
+    distances = np.take_along_axis(distances, order, axis=1)
+    # Number the runs of equal distances: then one key sorts by distance and index.
+    runs = np.zeros(room.shape, np.int64)
+    np.cumsum(distances[:, 1:] != distances[:, :-1], axis=1, out=runs[:, 1:])
+    runs *= len(positions.members)
+    keys = np.sort(runs + np.take_along_axis(indices, order, axis=1), axis=1)
+    wanted = min(width, len(positions.members))
+    return (keys - runs)[:, :wanted], np.sqrt(distances[:, :wanted])
+
+
+def _written_out(positions: _Positions, found: Ints, taken: Ints) -> tuple[Ints, Ints]:
+    """The first ``taken`` points at each position found, in one row after the other, and which position each is from."""
+    flat = taken.ravel()
+    slots = np.repeat(np.arange(flat.size), flat)
+    offsets = np.arange(len(slots)) - np.repeat(np.cumsum(flat) - flat, flat)
+    return slots, positions.members[positions.starts[found.ravel()[slots]] + offsets]
+
+
+def _parts(rows: Ints, columns: int) -> list[Ints]:
+    """Rows in parts of not many more than :data:`CHUNK_ELEMENTS` elements."""
+    return np.array_split(rows, min(len(rows), -(-len(rows) * columns // CHUNK_ELEMENTS)))
+
+
+def _drop_far(coordinates: Floats, indices: Ints, distances: Floats, limit: float) -> None:
+    """Put the own index and ``inf`` in place of neighbours that are not within the limit."""
+    step = max(1, CHUNK_ELEMENTS // indices.shape[1])
+    for start in range(0, len(indices), step):
+        rows = slice(start, start + step)
+        x, y, z = np.moveaxis(coordinates[indices[rows]] - coordinates[rows, None], 2, 0)
+        far = ~(x * x + y * y + z * z < limit)
+        indices[rows] = np.where(far, np.arange(len(indices))[rows, None], indices[rows])
+        distances[rows][far] = np.inf

@@ -1,0 +1,136 @@
+"""CUDA kernels compiled from source while the program runs: NVRTC and the driver, through their C interfaces.
+
+Both libraries come with every CUDA build of torch and its driver; no nvcc and no CUDA toolkit is needed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from ctypes import byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_void_p
+
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import BackendError
+
+
+def compile_cubin(source: str, architecture: str, options: Sequence[str] = ()) -> bytes:
+    """Compile CUDA C++ to machine code. Needs no device.
+
+    Args:
+        source: the program; kernels are ``extern "C"``.
+        architecture: ``sm_90`` for compute capability 9.0.
+        options: further options of the compiler.
+
+    Raises:
+        BackendError: NVRTC is missing, or the source does not compile.
+    """
+    nvrtc = _library("nvrtc")
+    program = c_void_p()
+    _check_nvrtc(nvrtc, nvrtc.nvrtcCreateProgram(byref(program), source.encode(), b"sundae.cu", 0, None, None))
+    try:
+        flags = [f"--gpu-architecture={architecture}".encode(), *(option.encode() for option in options)]
+        result = nvrtc.nvrtcCompileProgram(program, len(flags), (c_char_p * len(flags))(*flags))
+        if result != 0:
+            size = c_size_t()
+            _check_nvrtc(nvrtc, nvrtc.nvrtcGetProgramLogSize(program, byref(size)))
+            log = ctypes.create_string_buffer(size.value)
+            _check_nvrtc(nvrtc, nvrtc.nvrtcGetProgramLog(program, log))
+            reason = " ".join(log.value.decode(errors="replace").split()) or _nvrtc_text(nvrtc, result)
+            raise BackendError(f"a CUDA kernel does not compile for {architecture} ({reason}): update torch")
+        size = c_size_t()
+        _check_nvrtc(nvrtc, nvrtc.nvrtcGetCUBINSize(program, byref(size)))
+        code = ctypes.create_string_buffer(size.value)
+        _check_nvrtc(nvrtc, nvrtc.nvrtcGetCUBIN(program, code))
+        return code.raw
+    finally:
+        nvrtc.nvrtcDestroyProgram(byref(program))
+
+
+class Kernel:
+    """A kernel on one device, callable with tensors and numbers."""
+
+    def __init__(self, source: str, name: str, device: torch.device, options: Sequence[str] = (), block: int = 128):
+        """Compile and load.
+
+        Args:
+            source: the program.
+            name: its ``extern "C"`` kernel.
+            device: a CUDA device.
+            options: further options of the compiler.
+            block: threads of a block.
+
+        Raises:
+            BackendError: the kernel cannot be compiled or loaded here.
+        """
+        major, minor = torch.cuda.get_device_capability(device)
+        code = compile_cubin(source, f"sm_{major}{minor}", options)
+        self._driver = _library("cuda")
+        self._device = device
+        self._block = block
+        self._function = c_void_p()
+        module = c_void_p()
+        with torch.cuda.device(device):
+            # The driver's calls need torch's context on this thread, and work on the device is what puts it there.
+            torch.zeros(1, device=device)
+            self._check(self._driver.cuModuleLoadData(byref(module), code))
+            self._check(self._driver.cuModuleGetFunction(byref(self._function), module, name.encode()))
+
+    def __call__(self, threads: int, arguments: Sequence[Tensor | int | float]) -> None:
+        """Start the kernel on the current stream, for at least so many threads.
+
+        Args:
+            threads: threads in one row of blocks.
+            arguments: contiguous tensors on the kernel's device as pointers, integers as C ints, floats as doubles.
+
+        Raises:
+            BackendError: the driver refuses the call.
+        """
+        values = [_as_c(argument, self._device) for argument in arguments]
+        pointers = (c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
+        grid = (c_uint(-(-threads // self._block)), c_uint(1), c_uint(1))
+        block = (c_uint(self._block), c_uint(1), c_uint(1))
+        with torch.cuda.device(self._device):
+            stream = c_void_p(torch.cuda.current_stream(self._device).cuda_stream)
+            self._check(
+                self._driver.cuLaunchKernel(self._function, *grid, *block, c_uint(0), stream, pointers, c_void_p())
+            )
+
+    def _check(self, result: int) -> None:
+        if result != 0:
+            text = c_char_p()
+            self._driver.cuGetErrorString(result, byref(text))
+            reason = text.value.decode() if text.value else f"error {result}"
+            raise BackendError(f"a CUDA kernel does not run ({reason}): update the driver")
+
+
+def _as_c(argument: Tensor | int | float, device: torch.device) -> ctypes.c_void_p | ctypes.c_int | ctypes.c_double:
+    if isinstance(argument, Tensor):
+        if argument.device != device or not argument.is_contiguous():
+            raise BackendError(
+                f"a kernel on {device} was given a tensor on {argument.device}: pass contiguous ones there"
+            )
+        return c_void_p(argument.data_ptr())
+    return c_int(argument) if isinstance(argument, int) else c_double(argument)
+
+
+def _library(name: str) -> ctypes.CDLL:
+    """The NVRTC of torch's CUDA version, or the driver."""
+    if torch.version.cuda is None:
+        raise BackendError("this torch is built without CUDA: install one with it")
+    file = "libcuda.so.1" if name == "cuda" else f"libnvrtc.so.{torch.version.cuda.split('.')[0]}"
+    try:
+        return ctypes.CDLL(file)
+    except OSError as error:
+        raise BackendError(f"{file} cannot be loaded ({error}): install torch with its CUDA packages") from error
+
+
+def _nvrtc_text(nvrtc: ctypes.CDLL, result: int) -> str:
+    nvrtc.nvrtcGetErrorString.restype = c_char_p
+    return nvrtc.nvrtcGetErrorString(result).decode()
+
+
+def _check_nvrtc(nvrtc: ctypes.CDLL, result: int) -> None:
+    if result != 0:
+        raise BackendError(f"NVRTC fails ({_nvrtc_text(nvrtc, result)}): install torch with its CUDA packages")

@@ -1,0 +1,96 @@
+"""Point sets that break neighbour searches, and the truth about them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+Cloud = Callable[[int], Tensor]
+
+
+def _normal(n: int, seed: int = 0) -> Tensor:
+    return torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def _clusters(n: int) -> Tensor:
+    """Clusters of 1e-5 and of 1e-2 beside a background of 1e3."""
+    points = _normal(n)
+    points[: n // 2] = points[: n // 2] * 1e-5 + 0.5
+    points[n // 2 : 3 * n // 4] = points[n // 2 : 3 * n // 4] * 1e-2 - 0.25
+    points[3 * n // 4 :] *= 1e3
+    return points
+
+
+def _half_duplicated(n: int) -> Tensor:
+    points = _clusters(n)
+    points[torch.randperm(n, generator=torch.Generator().manual_seed(1))[: n // 2]] = points[: n // 2].clone()
+    return points
+
+
+def _piles(n: int) -> Tensor:
+    """Most points at three spots, one of them the origin with both signs of zero."""
+    points = _normal(n)
+    points[: n // 3] = 0.0
+    points[: n // 6] = -0.0
+    points[n // 3 : n // 2] = 1.0
+    points[n // 2 : 3 * n // 4] = torch.tensor([1.0, 1.0, 1.0 + 1e-9], dtype=torch.float64)
+    return points
+
+
+def _lattice(n: int) -> Tensor:
+    side = int(np.ceil(n ** (1 / 3)))
+    cells = torch.cartesian_prod(*[torch.arange(side, dtype=torch.float64)] * 3)
+    return cells[torch.randperm(len(cells), generator=torch.Generator().manual_seed(2))[:n]]
+
+
+def _sphere(n: int) -> Tensor:
+    """Points as far from the first one as rounding allows, and four times as many clones of them as places."""
+    points = torch.zeros(n, 3, dtype=torch.float64)
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
+    points[1:] = corners.repeat(n // 8 + 1, 1)[: n - 1]
+    return points
+
+
+def _line(n: int) -> Tensor:
+    return torch.linspace(-1, 1, n, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+
+
+CLOUDS: dict[str, Cloud] = {
+    "normal": _normal,
+    "clusters": _clusters,
+    "half duplicated": _half_duplicated,
+    "piles": _piles,
+    "all at one spot": lambda n: torch.full((n, 3), 0.1, dtype=torch.float64),
+    "lattice": _lattice,
+    "sphere": _sphere,
+    "line": _line,
+    "plane": lambda n: _normal(n) * torch.tensor([1.0, 0.0, 1.0], dtype=torch.float64),
+    "two clusters 1e6 apart": lambda n: _normal(n) + torch.arange(n)[:, None] % 2 * 1e6,
+    "far from the origin": lambda n: _normal(n) + 1e5,
+    "one floater": lambda n: torch.cat([_normal(n - 1), torch.full((1, 3), 1e20, dtype=torch.float64)]),
+    "tiny": lambda n: _normal(n) * 1e-30,
+}
+
+
+@pytest.fixture(params=CLOUDS, ids=[name.replace(" ", "-") for name in CLOUDS])
+def cloud(request: pytest.FixtureRequest) -> Cloud:
+    """One distribution: gives its first so many points, float64 ``[N, 3]``."""
+    return CLOUDS[request.param]
+
+
+@pytest.fixture
+def truth() -> Callable[[Tensor, int], tuple[Tensor, Tensor]]:
+    """All pairs, ordered by squared distance in float64 and then by index: indices and distances ``[N, k]``."""
+
+    def nearest(points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+        x, y, z = (points.double()[:, None] - points.double()[None]).unbind(2)
+        squared = (x * x + y * y + z * z).fill_diagonal_(torch.inf)
+        ordered = squared.sort(dim=1, stable=True)
+        # numpy's root is rounded correctly; torch's need not be.
+        return ordered.indices[:, :k], torch.from_numpy(np.sqrt(ordered.values[:, :k].numpy())).to(points.dtype)
+
+    return nearest
