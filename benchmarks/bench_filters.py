@@ -86,7 +86,7 @@ def measure(small: int, large: int, repeats: int, device: str) -> dict[str, Any]
         "benchmark": "filters",
         "small": small,
         "large": large,
-        "edges": int(L.nnz - large),
+        "directed_edges": int(L.nnz - large),
         "channels": 3,
         "device": device,
         "device_name": torch.cuda.get_device_name() if device == "cuda" else platform.machine(),
