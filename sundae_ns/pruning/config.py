@@ -12,7 +12,7 @@ ScoreName = Literal["response-contribution", "response", "contribution", "opacit
 SelectionName = Literal["sampled", "band", "top"]
 SignalName = Literal["attributes", "positions"]
 RuleName = Literal["robust", "literal"]
-SearchName = Literal["cpu", "field"]
+DeviceName = Literal["cpu", "field"]
 
 
 @dataclass
@@ -38,8 +38,8 @@ class PruningConfig:
     """Share of the kept primitives that the band selection takes from the high end, in [0, 1]; the rest is low end."""
     num_neighbors: int = 16
     """Most neighbours of a primitive in the graph."""
-    neighbor_search: SearchName = "cpu"
-    """Where neighbours are searched: on the CPU, or on the device of the field, which for CUDA is our own kernel."""
+    graph_device: DeviceName = "cpu"
+    """Where the graph is built and filtered: the CPU, or the device of the field, which for CUDA is our own kernel."""
     bandwidth: RuleName = "robust"
     """How the reach and the width of edges are found; the paper's literal rule gives an empty graph on most fields."""
     tau: float | None = None
@@ -81,7 +81,7 @@ class PruningConfig:
             ("score", ScoreName),
             ("signal", SignalName),
             ("bandwidth", RuleName),
-            ("neighbor_search", SearchName),
+            ("graph_device", DeviceName),
         ):
             value = getattr(self, name)
             if value not in get_args(choices):

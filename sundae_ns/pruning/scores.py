@@ -11,7 +11,7 @@ from torch import Tensor
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.filters import high_pass, response_magnitude
 from sundae_ns.gaussians.parameters import num_primitives
-from sundae_ns.graphs import Neighbors, graph_from_neighbors, knn
+from sundae_ns.graphs import build_graph
 from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.signals import attribute_signal, position_signal
 
@@ -44,12 +44,18 @@ def response(params: Mapping[str, Tensor], config: PruningConfig) -> Response:
     Raises:
         DataError: there are not more primitives than neighbours, or positions are not finite.
     """
-    means = params["means"].detach()
-    neighbors = knn(means.cpu() if config.neighbor_search == "cpu" else means, config.num_neighbors)
-    neighbors = Neighbors(*(found.to(means.device) for found in neighbors))
-    graph = graph_from_neighbors(neighbors, rule=config.bandwidth, tau=config.tau, sigma=config.sigma)
+    device = params["means"].device
+    if config.graph_device == "cpu":
+        params = {name: params[name].cpu() for name in ("means", "features_dc", "opacities", "scales")}
+    graph = build_graph(
+        params["means"],
+        num_neighbors=config.num_neighbors,
+        rule=config.bandwidth,
+        tau=config.tau,
+        sigma=config.sigma,
+    )
     signal = position_signal(params) if config.signal == "positions" else attribute_signal(params)
-    magnitude = response_magnitude(high_pass(graph, signal, isolated="nan"))
+    magnitude = response_magnitude(high_pass(graph, signal, isolated="nan")).to(device)
     return Response(magnitude, graph.tau, graph.sigma, int(graph.isolated.sum()))
 
 

@@ -217,7 +217,8 @@ def test_cpu_and_gpu_select_the_same_up_to_ties(rule: PruningConfig, name: str) 
     n = len(params["means"])
     contribution = torch.linspace(0.1, 1, n)
     on_cpu = decide(params, rule, lambda: contribution)
-    on_gpu = decide({key: value.cuda() for key, value in params.items()}, rule, contribution.cuda)
+    on_device = {key: value.cuda() for key, value in params.items()}
+    on_gpu = decide(on_device, replace(rule, graph_device="field"), contribution.cuda)
     differing = on_gpu.mask.cpu() != on_cpu.mask
     print(f"{name}: {int(differing.sum())} of {n} primitives differ")
     assert on_gpu.kept == on_cpu.kept
