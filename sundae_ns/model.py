@@ -44,6 +44,7 @@ from sundae_ns.rasterization import (
     spherical_harmonics,
 )
 from sundae_ns.schedulers import notify_pruned
+from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.transform import similarity
 
 NEAR_PLANE = 0.01
@@ -543,9 +544,11 @@ class SundaeModel(SplatfactoModel):
             return
         path = attributes.trainer.base_dir / "prune.json"
         reports = json.loads(path.read_text()) if path.exists() else []
+        # A run that was killed after a prune and before the next save does that prune again.
+        reports = [earlier for earlier in reports if earlier["step"] < report.step]
         reports.append({**asdict(report), "warm_up": before, "pruned": after})
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(reports, indent=2))
+        write_text(path, json.dumps(reports, indent=2))
 
     @torch.no_grad()
     def contribution(self, datamanager: SundaeDatamanager) -> Tensor:

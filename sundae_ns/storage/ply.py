@@ -8,7 +8,6 @@ feature vectors, nor for a head: what it shows are base colours.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives
+from sundae_ns.storage.atomic import replacing
 
 _COLUMNS = {
     "means": ("x", "y", "z"),
@@ -67,6 +67,7 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
 
     Raises:
         DataError: a parameter is missing or has the wrong shape.
+        StorageError: the disk is full, or may not be written to.
     """
     path = Path(path)
     _check(params)
@@ -89,12 +90,8 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
     table = np.ascontiguousarray(np.concatenate([values for _, values in blocks], axis=1), dtype="<f4")
     vertices = table.view([(name, "<f4") for name in names]).reshape(n)
     data = PlyData([PlyElement.describe(vertices, "vertex")], text=False, byte_order="<", comments=list(comments))
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
+    with replacing(path) as partial:
         data.write(str(partial))
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def load_ply(path: Path) -> PlyData:
