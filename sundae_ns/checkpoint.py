@@ -21,7 +21,7 @@ from torch import Tensor
 from sundae_ns.errors import CheckpointError, StorageError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.ply import read_ply
+from sundae_ns.storage.ply import read_ply, sh_degree_of
 from sundae_ns.storage.point_cloud import is_nerfstudio_ply
 
 EXTRA_STATE = "_extra_state"
@@ -181,27 +181,43 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], 
         raise CheckpointError(
             f"this is {kind}, not one of sundae; start from it with --pipeline.model.warm-start PATH, not --load-dir"
         )
-    if extra["format"] != FORMAT:
+    if extra.get("format") != FORMAT:
         raise CheckpointError(
-            f"the checkpoint has format {extra['format']}, this version reads {FORMAT}; use the version that wrote it"
+            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; use the version that wrote it"
         )
-    if extra["num_features"] != num_features:
+    features = extra.get("num_features")
+    if features != num_features:
         raise CheckpointError(
-            f"the checkpoint has feature vectors of length {extra['num_features']}, the model of length {num_features}; "
-            f"give --pipeline.model.head.num-features {extra['num_features']} (0 means a model without a head)"
+            f"the checkpoint has feature vectors of length {features}, the model of length {num_features}; "
+            f"give --pipeline.model.head.num-features {features} (0 means a model without a head)"
         )
     for name, value in expected.items():
         if not isinstance(value, Tensor) or name == EXTRA_STATE:
             continue
-        if name not in state:
+        if not isinstance(state.get(name), Tensor):
             raise CheckpointError(f"the checkpoint has no {name}; load it with the options that it was trained with")
         per_primitive = name.startswith(_PREFIX)
         theirs, ours = state[name].shape, value.shape
-        if (theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
+        if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
             raise CheckpointError(
                 f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; "
                 "load it with the options that it was trained with"
             )
+    rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
+    if len(rows) != 1 or rows[0] == 0:
+        raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")
+    _check_running_state(extra, rows[0])
+
+
+def _check_running_state(extra: Mapping[str, Any], n: int) -> None:
+    """Check what densification and pruning go on from, for ``n`` primitives."""
+    pruning, strategy = extra.get("pruning"), extra.get("strategy")
+    numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
+    if not all(isinstance(value, int) for value in numbers) or not isinstance(strategy, Mapping):
+        raise CheckpointError("the checkpoint does not say where training stopped; give another")
+    for name, value in strategy.items():
+        if isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] != n:
+            raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} primitives; give another")
 
 
 @contextmanager
@@ -240,10 +256,30 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
         path = newest_whole(folder)[0]
     if path.suffix == ".ply" and path.is_file():
-        return {name: value for name, value in read_ply(path).items() if name in SPLAT_NAMES}, is_nerfstudio_ply(path)
+        field = read_ply(path)
+        _check_field(field, path)
+        return field, is_nerfstudio_ply(path)
     state = load(path)["pipeline"]
     prefix = "_model.module." if f"_model.module.{_PREFIX}means" in state else "_model."
     keys = {name: f"{prefix}{_PREFIX}{name}" for name in SPLAT_NAMES}
-    if any(key not in state for key in keys.values()):
+    if not all(isinstance(state.get(key), Tensor) for key in keys.values()):
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
-    return {name: state[key].float() for name, key in keys.items()}, True
+    field = {name: state[key].float() for name, key in keys.items()}
+    _check_field(field, path)
+    return field, True
+
+
+def _check_field(field: Mapping[str, Tensor], path: Path) -> None:
+    """Check that there are primitives, and that each parameter has its shape."""
+    n = len(field["means"]) if field["means"].ndim else 0
+    if n == 0:
+        raise CheckpointError(f"{path} holds no primitives; give another file")
+    rest = field["features_rest"].shape
+    columns = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
+    shapes: dict[str, tuple[int, ...]] = {name: (n, *rows) for name, rows in columns.items()}
+    shapes["features_rest"] = (n, rest[1] if len(rest) > 1 else 0, 3)
+    wrong = [name for name, shape in shapes.items() if tuple(field[name].shape) != shape]
+    if wrong or sh_degree_of(shapes["features_rest"][1]) is None:
+        raise CheckpointError(
+            f"{path} has parameters of odd shapes ({', '.join(wrong) or 'features_rest'}); give another"
+        )
