@@ -7,6 +7,7 @@ the built-in exception that callers would catch anyway. Floor 0: imports nothing
 from __future__ import annotations
 
 import os
+import re
 import sys
 from pathlib import Path
 from types import TracebackType
@@ -41,6 +42,23 @@ class CheckpointError(SundaeError, ValueError):
 
     A ``ValueError`` on purpose: ``nerfstudio`` retries non-strictly when loading raises a ``RuntimeError``.
     """
+
+
+def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError:
+    """The error for a CUDA device without room: how many primitives there were, what was asked for, what to try.
+
+    Args:
+        error: ``torch.cuda.OutOfMemoryError``; its message states the size.
+        primitives: of the field, when it happened.
+    """
+    found = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", str(error))
+    asked = f"{found[1]} more were asked for" if found else "more was asked for than there is"
+    return MemoryExhaustedError(
+        f"the GPU's memory is full: {asked}, with {primitives:,} primitives; try --pipeline.datamanager.cache-images cpu "
+        "(pictures in host memory), --pipeline.datamanager.camera-res-scale-factor 0.5 (smaller pictures), or "
+        f"--pipeline.model.pruning.mode continuous --pipeline.model.pruning.max-primitives {max(primitives // 2, 1)} "
+        "(a lower peak); --load-dir goes on from the last checkpoint"
+    )
 
 
 def show_in_one_line() -> None:

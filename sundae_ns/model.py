@@ -6,9 +6,9 @@ The module path and the class names are written into every run's ``config.yml``:
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
@@ -31,7 +31,7 @@ from torch import Tensor
 from sundae_ns import checkpoint
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
-from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
+from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Lpips, display, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
@@ -70,6 +70,19 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Coordinates of the warm start: nerfstudio's model, or the capture's own (COLMAP). auto goes by the kind of file."""
     evaluate_prune: bool = True
     """Evaluate all test views right before and right after the prune, and record both."""
+
+
+def _names_full_memory(render: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
+    """Let a method of the model that runs out of the GPU's memory say how many primitives there were."""
+
+    @wraps(render)
+    def wrapper(model: SundaeModel, *arguments: Any, **options: Any) -> dict[str, Any]:
+        try:
+            return render(model, *arguments, **options)
+        except torch.cuda.OutOfMemoryError as error:
+            raise out_of_memory(error, model.num_points) from error
+
+    return wrapper
 
 
 class View(NamedTuple):
@@ -374,6 +387,7 @@ class SundaeModel(SplatfactoModel):
         }
         return pictures, splat
 
+    @_names_full_memory
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:  # type: ignore[override]
         """Render a camera.
 

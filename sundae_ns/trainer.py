@@ -11,13 +11,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sundae_ns import checkpoint
-from sundae_ns.errors import CheckpointError, SundaeError
+from sundae_ns.errors import CheckpointError, StorageError, SundaeError, out_of_memory
 from sundae_ns.storage.atomic import storage_error, write_text
 
 
@@ -34,8 +35,10 @@ class SundaeTrainerConfig(TrainerConfig):
             StorageError: there is no room or no right to write.
         """
         path = self.get_base_dir() / "config.yml"
-        with _named(f"cannot write the run's folder {path.parent}"):
+        try:
             path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"cannot make {path.parent} ({error.strerror}); choose another --output-dir") from error
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))
 
@@ -64,9 +67,13 @@ class SundaeTrainer(Trainer):
 
         Raises:
             StorageError: the run's folder cannot be written to any more.
+            MemoryExhaustedError: the GPU's memory is full.
         """
-        with _named(f"cannot write to the run's folder {self.base_dir}"):
-            super().train()
+        try:
+            with _named(f"cannot write to the run's folder {self.base_dir}"):
+                super().train()
+        except torch.cuda.OutOfMemoryError as error:
+            raise out_of_memory(error, getattr(self.pipeline.model, "num_points", 0)) from error
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:

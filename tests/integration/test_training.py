@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import tracemalloc
 from typing import Any
 
 import pytest
@@ -12,6 +14,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
+from sundae_ns.errors import MemoryExhaustedError
 from sundae_ns.gaussians import SPLAT_NAMES
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage import MODEL_FRAME, write_ply
@@ -176,6 +179,49 @@ def assert_same(whole: dict[str, Any], resumed: dict[str, Any]) -> None:
         assert resumed["schedulers"][name]["_last_lr"] == pytest.approx(state["_last_lr"])
         assert resumed["schedulers"][name]["last_epoch"] == state["last_epoch"]
     assert torch.equal(whole["random"]["torch"], resumed["random"]["torch"])
+
+
+def test_memory_does_not_grow_past_the_prune(tiny: Any, trainer_of: Any) -> None:
+    steps, settled = 60, 20
+
+    def change(config: Any) -> None:
+        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 60, steps
+
+    trainer = trainer_of(change)
+    seen: list[tuple[int, int]] = []
+    iterate = trainer.train_iteration
+
+    def watched(step: int) -> Any:
+        if step - 60 in (settled, steps):
+            gc.collect()
+            tensors = sum(isinstance(thing, Tensor) for thing in gc.get_objects())
+            seen.append((tensors, tracemalloc.get_traced_memory()[0]))
+        return iterate(step)
+
+    trainer.train_iteration = watched
+    tracemalloc.start()
+    try:
+        trainer.train()
+    finally:
+        tracemalloc.stop()
+    (tensors, before), (tensors_later, after) = seen
+    assert tensors_later <= tensors
+    # Bytes of Python and numpy; loggers keep a few hundred a step, one picture of the scene has 27,648.
+    assert (after - before) / (steps - settled) < 2000
+
+
+def test_full_memory_in_the_backward_pass(tiny: Any, trainer_of: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def change(config: Any) -> None:
+        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 60, 5
+
+    def full(*_: Any, **__: Any) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
+
+    trainer = trainer_of(change)
+    monkeypatch.setattr(Tensor, "backward", full)
+    count = trainer.pipeline.model.num_points
+    with pytest.raises(MemoryExhaustedError, match=rf"300\.00 MiB more were asked for, with {count:,} primitives"):
+        trainer.train()
 
 
 def warm(trainer_of: Any, path: Any) -> tuple[dict[str, Tensor], Any]:
