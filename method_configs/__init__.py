@@ -4,6 +4,7 @@ Keep this import light, and free of ``nerfstudio.configs.method_configs``: entry
 half imported, and an error here would break every ``ns-*`` command.
 """
 
+from sundae_ns.errors import show_in_one_line
 from sundae_ns.method_configs.sundae import (
     sundae,
     sundae_1,
@@ -15,6 +16,9 @@ from sundae_ns.method_configs.sundae import (
     sundae_paper,
     sundae_tiny,
 )
+
+# nerfstudio's commands have no place of their own for this, and all of them load the plug-in.
+show_in_one_line()
 
 __all__ = [
     "sundae",

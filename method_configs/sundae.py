@@ -8,7 +8,6 @@ import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -18,6 +17,7 @@ from sundae_ns.model import SundaeModelConfig
 from sundae_ns.optimizers import FusedAdamConfig
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.schedulers import PruneAwareDecayConfig
+from sundae_ns.trainer import SundaeTrainerConfig
 
 
 def _adam(lr: float, eps: float = 1e-15) -> FusedAdamConfig:
@@ -84,7 +84,7 @@ def method(
         trainer: more options of the trainer.
         model: more options of the model.
     """
-    config = TrainerConfig(
+    config = SundaeTrainerConfig(
         method_name=name,
         steps_per_eval_image=500,
         steps_per_eval_batch=0,

@@ -1,10 +1,14 @@
-"""Checkpoints: what a SUNDAE checkpoint says of itself, and fields read from other sources.
+"""Checkpoints: written whole, what a SUNDAE checkpoint says of itself, and fields read from other sources.
 
-Files are read with plain ``torch.load`` (weights only), never by running what a file asks for.
+Files are read weights-only, never by running what a file asks for, and only after their checksums have been found right.
 """
 
 from __future__ import annotations
 
+import pickle
+import random
+import re
+import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,14 +18,136 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import CheckpointError
+from sundae_ns.errors import CheckpointError, StorageError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
-from sundae_ns.storage.ply import read_ply
+from sundae_ns.storage.atomic import replacing
+from sundae_ns.storage.ply import read_ply, sh_degree_of
 from sundae_ns.storage.point_cloud import is_nerfstudio_ply
 
 EXTRA_STATE = "_extra_state"
 FORMAT = 1
 _PREFIX = "gauss_params."
+_NAME = re.compile(r"step-(\d+)\.ckpt")
+_PARTIAL = "partial--1.tmp"
+"""A checkpoint in the making. nerfstudio reads a step off the name of every file in the folder: off this one, step -1."""
+
+
+def random_state() -> dict[str, Any]:
+    """State of every generator of random numbers that training draws from, as plain numbers and tensors."""
+    kind, keys, position, has_gauss, gauss = np.random.get_state()
+    return {
+        "python": random.getstate(),
+        "numpy": (str(kind), [int(key) for key in keys], int(position), int(has_gauss), float(gauss)),
+        "torch": torch.get_rng_state(),
+        "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+    }
+
+
+def set_random_state(state: Mapping[str, Any]) -> None:
+    """Counterpart of :func:`random_state`; generators of another number of CUDA devices are left as they are."""
+    random.setstate(state["python"])
+    kind, keys, position, has_gauss, gauss = state["numpy"]
+    np.random.set_state((kind, np.array(keys, dtype=np.uint32), position, has_gauss, gauss))
+    torch.set_rng_state(state["torch"])
+    if len(state["cuda"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(list(state["cuda"]))
+
+
+def checkpoints(folder: Path) -> list[Path]:
+    """The checkpoints in a folder by step, the newest last; names that nerfstudio does not write are passed over."""
+    found = {path: match for path in folder.glob("*.ckpt") if (match := _NAME.fullmatch(path.name))}
+    return sorted(found, key=lambda path: int(found[path][1]))
+
+
+def save(state: Mapping[str, Any], path: Path) -> None:
+    """Write a checkpoint, whole or not at all; a file of that name stays as it is until the new one is on the disk.
+
+    Raises:
+        StorageError: no room or no right to write; says which older checkpoint is whole.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # A fixed name: what a killed run has left behind is written over by the next save.
+        with replacing(path, path.with_name(_PARTIAL)) as partial, partial.open("wb") as file:
+            # Through a Python file: torch's own writer hides from its caller why a write failed.
+            torch.save(dict(state), file)
+    except OSError as error:
+        older = [other for other in checkpoints(path.parent) if other != path]
+        kept = f"{older[-1].name} is whole, go on from it with --load-dir" if older else "no older checkpoint"
+        reason = str(error) if isinstance(error, StorageError) else f"cannot write {path}: {error.strerror or error}"
+        raise StorageError(f"{reason} ({kept})") from error
+
+
+def _damage(path: Path) -> str | None:
+    """What is wrong with a file that should be a checkpoint; None if its checksums are right.
+
+    torch neither checks them nor minds a file that unpacks to more than its own size.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = archive.infolist()
+            packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
+            if packed or sum(entry.file_size for entry in entries) > path.stat().st_size:
+                return "it would unpack to more than its size"
+            broken = archive.testzip()
+            return None if broken is None else f"{broken} in it is damaged"
+    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        return " ".join(reason.split()) or type(error).__name__
+
+
+def _check_extent(value: Any, path: Path) -> None:
+    """Refuse tensors that claim more elements than their storage holds: copying one would fill the memory."""
+    if isinstance(value, Tensor):
+        if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+            raise CheckpointError(f"{path} holds a tensor that claims more than it has; give another file")
+    elif isinstance(value, Mapping):
+        for inner in value.values():
+            _check_extent(inner, path)
+    elif isinstance(value, (list, tuple)):
+        for inner in value:
+            _check_extent(inner, path)
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Read a checkpoint of nerfstudio's trainer on the CPU, without running anything that it asks for.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, cut short, or of another kind.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path} does not exist; give a .ckpt file, or the folder of them")
+    reason = _damage(path)
+    if reason is None:
+        try:
+            with _numpy_numbers_allowed():
+                loaded = torch.load(path, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError:
+            reason = "it holds more than tensors and plain values, or nothing that can be read"
+        except Exception as error:  # torch.load raises many kinds; each means the same to the user
+            reason = str(error).partition("\n")[0] or type(error).__name__
+        else:
+            if isinstance(loaded, dict) and isinstance(loaded.get("pipeline"), Mapping):
+                _check_extent(loaded, path)
+                return loaded
+            reason = "it holds no model"
+    raise CheckpointError(f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file")
+
+
+def newest_whole(folder: Path) -> tuple[Path, list[str]]:
+    """The newest checkpoint of a folder that is whole, and a line for each newer one that is not.
+
+    Raises:
+        CheckpointError: there is none.
+    """
+    passed_over: list[str] = []
+    for path in reversed(checkpoints(folder)):
+        reason = _damage(path)
+        if reason is None:
+            return path, passed_over
+        passed_over.append(f"{path.name} is not whole ({reason})")
+    found = f" ({'; '.join(passed_over)})" if passed_over else ""
+    raise CheckpointError(f"{folder} holds no whole checkpoint{found}; leave --load-dir out to start anew")
 
 
 def extra_state(
@@ -60,27 +186,43 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], 
         raise CheckpointError(
             f"this is {kind}, not one of sundae; start from it with --pipeline.model.warm-start PATH, not --load-dir"
         )
-    if extra["format"] != FORMAT:
+    if extra.get("format") != FORMAT:
         raise CheckpointError(
-            f"the checkpoint has format {extra['format']}, this version reads {FORMAT}; use the version that wrote it"
+            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; use the version that wrote it"
         )
-    if extra["num_features"] != num_features:
+    features = extra.get("num_features")
+    if features != num_features:
         raise CheckpointError(
-            f"the checkpoint has feature vectors of length {extra['num_features']}, the model of length {num_features}; "
-            f"give --pipeline.model.head.num-features {extra['num_features']} (0 means a model without a head)"
+            f"the checkpoint has feature vectors of length {features}, the model of length {num_features}; "
+            f"give --pipeline.model.head.num-features {features} (0 means a model without a head)"
         )
     for name, value in expected.items():
         if not isinstance(value, Tensor) or name == EXTRA_STATE:
             continue
-        if name not in state:
+        if not isinstance(state.get(name), Tensor):
             raise CheckpointError(f"the checkpoint has no {name}; load it with the options that it was trained with")
         per_primitive = name.startswith(_PREFIX)
         theirs, ours = state[name].shape, value.shape
-        if (theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
+        if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
             raise CheckpointError(
                 f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; "
                 "load it with the options that it was trained with"
             )
+    rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
+    if len(rows) != 1 or rows[0] == 0:
+        raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")
+    _check_running_state(extra, rows[0])
+
+
+def _check_running_state(extra: Mapping[str, Any], n: int) -> None:
+    """Check what densification and pruning go on from, for ``n`` primitives."""
+    pruning, strategy = extra.get("pruning"), extra.get("strategy")
+    numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
+    if not all(isinstance(value, int) for value in numbers) or not isinstance(strategy, Mapping):
+        raise CheckpointError("the checkpoint does not say where training stopped; give another")
+    for name, value in strategy.items():
+        if isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] != n:
+            raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} primitives; give another")
 
 
 @contextmanager
@@ -114,25 +256,35 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
     """
     path = Path(path)
     if path.is_dir():
-        checkpoints = sorted(path.glob("*.ckpt")) or sorted(path.glob("nerfstudio_models/*.ckpt"))
-        if not checkpoints:
+        folder = path if any(path.glob("*.ckpt")) else path / "nerfstudio_models"
+        if not checkpoints(folder):
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
-        path = checkpoints[-1]
-    if not path.is_file():
-        raise CheckpointError(f"{path} does not exist; give a .ckpt file, the folder of them, or a .ply")
-    if path.suffix == ".ply":
-        return {name: value for name, value in read_ply(path).items() if name in SPLAT_NAMES}, is_nerfstudio_ply(path)
-    try:
-        with _numpy_numbers_allowed():
-            loaded = torch.load(path, map_location="cpu")
-        state = loaded["pipeline"]
-    except Exception as error:  # torch.load raises many kinds; each means the same to the user
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(
-            f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file"
-        ) from error
+        path = newest_whole(folder)[0]
+    if path.suffix == ".ply" and path.is_file():
+        field = read_ply(path)
+        _check_field(field, path)
+        return field, is_nerfstudio_ply(path)
+    state = load(path)["pipeline"]
     prefix = "_model.module." if f"_model.module.{_PREFIX}means" in state else "_model."
     keys = {name: f"{prefix}{_PREFIX}{name}" for name in SPLAT_NAMES}
-    if any(key not in state for key in keys.values()):
+    if not all(isinstance(state.get(key), Tensor) for key in keys.values()):
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
-    return {name: state[key].float() for name, key in keys.items()}, True
+    field = {name: state[key].float() for name, key in keys.items()}
+    _check_field(field, path)
+    return field, True
+
+
+def _check_field(field: Mapping[str, Tensor], path: Path) -> None:
+    """Check that there are primitives, and that each parameter has its shape."""
+    n = len(field["means"]) if field["means"].ndim else 0
+    if n == 0:
+        raise CheckpointError(f"{path} holds no primitives; give another file")
+    rest = field["features_rest"].shape
+    columns = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
+    shapes: dict[str, tuple[int, ...]] = {name: (n, *rows) for name, rows in columns.items()}
+    shapes["features_rest"] = (n, rest[1] if len(rest) > 1 else 0, 3)
+    wrong = [name for name, shape in shapes.items() if tuple(field[name].shape) != shape]
+    if wrong or sh_degree_of(shapes["features_rest"][1]) is None:
+        raise CheckpointError(
+            f"{path} has parameters of odd shapes ({', '.join(wrong) or 'features_rest'}); give another"
+        )

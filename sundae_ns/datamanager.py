@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
 
-from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.data.capture import check_picture, check_transforms, undecodable
+from sundae_ns.data.colmap import check_colmap
+from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.storage.point_cloud import read_point_cloud
 
 DATASET_FRAME = "sundae_dataset_frame"
@@ -37,6 +41,45 @@ class LightNerfstudioParser(Nerfstudio):
         return {"points3D_xyz": moved, "points3D_rgb": rgb}
 
 
+def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, pictures: bool = True) -> None:
+    """Check a capture in one of the two layouts that most captures have, before its parser sees it.
+
+    Args:
+        parser: configuration of the parser; captures of other parsers are left to them.
+        data: the capture: a folder, or a ``transforms.json``.
+        splits: splits that will be read.
+        pictures: whether the pictures will be needed; a finished run can be looked at without them.
+
+    Raises:
+        DataError: the first thing that cannot be used, and where it stands.
+    """
+    if not data.exists():
+        raise DataError(f"{data} does not exist; give the folder of a capture with --data")
+    if isinstance(parser, ColmapDataParserConfig):
+        if parser.load_3D_points and not any((data / parser.colmap_path).glob("points3D.*")):
+            parser.load_3D_points = False  # the model then warns, and starts from random points
+        images = data / parser.images_path if pictures else None
+        check_colmap(data / parser.colmap_path, images, points=parser.load_3D_points)
+    elif isinstance(parser, NerfstudioDataParserConfig):
+        path = data if data.suffix == ".json" else data / "transforms.json"
+        check_transforms(path, splits=splits, camera_models=CAMERA_MODEL_TO_TYPE)
+
+
+class CheckedDataset(InputDataset):
+    """nerfstudio's pictures; one that cannot be decoded is named."""
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
+        """Picture, and mask if there is one.
+
+        Raises:
+            DataError: a file of this view is damaged.
+        """
+        try:
+            return super().get_data(image_idx, image_type)
+        except Exception as error:  # decoders raise many kinds; each means the same to the user
+            raise undecodable(self.image_filenames[image_idx], error) from error
+
+
 @dataclass
 class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
     """Full images, in an order that depends on nothing but the seed and the step."""
@@ -46,7 +89,7 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
     """Hold back every n-th training view from training, for choosing budgets without touching test views. 0: none."""
 
 
-class SundaeDatamanager(FullImageDatamanager[InputDataset]):
+class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     """Serves whole images.
 
     Beyond the stock datamanager: it caches images on machines without CUDA; the view of a step is a function of seed and
@@ -57,7 +100,13 @@ class SundaeDatamanager(FullImageDatamanager[InputDataset]):
 
     config: SundaeDatamanagerConfig
 
-    def __init__(self, config: SundaeDatamanagerConfig, *args: Any, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        config: SundaeDatamanagerConfig,
+        device: torch.device | str = "cpu",
+        test_mode: Literal["test", "val", "inference"] = "val",
+        **kwargs: Any,
+    ) -> None:
         if config.train_cameras_sampling_strategy != "random":
             raise ConfigError(
                 "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run could not "
@@ -67,10 +116,28 @@ class SundaeDatamanager(FullImageDatamanager[InputDataset]):
             raise ConfigError(f"holdout-every is {config.holdout_every}; give 0 (none) or at least 2")
         if config.dataparser._target is Nerfstudio:
             config.dataparser._target = LightNerfstudioParser
-        super().__init__(config, *args, **kwargs)
+        data = config.dataparser.data if config.data is None else Path(config.data)
+        check_capture(
+            config.dataparser,
+            data,
+            ("train", "val" if test_mode == "val" else "test"),
+            pictures=test_mode != "inference",
+        )
+        try:
+            super().__init__(config, device, test_mode, **kwargs)
+        except SundaeError:
+            raise
+        except EOFError as error:
+            raise DataError(
+                "nerfstudio asks a question about this capture, and nobody is there to answer; start the command in a "
+                "terminal, or give --downscale-factor 1 to its parser if it is about smaller pictures"
+            ) from error
+        except Exception as error:  # parsers raise many kinds, assertions too; each means the same to the user
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise DataError(f"{data} cannot be parsed ({reason}); check the capture") from error
         self._order: tuple[int, list[int]] = (-1, [])
 
-    def create_train_dataset(self) -> InputDataset:
+    def create_train_dataset(self) -> CheckedDataset:
         """The training set, with the transform from the capture's frame to the model's in its metadata."""
         outputs = self.train_dataparser_outputs
         if len(outputs.image_filenames) == 0:
@@ -124,19 +191,21 @@ class SundaeDatamanager(FullImageDatamanager[InputDataset]):
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, torch.Tensor]]:
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        self._check_sizes(dataset)
+        self._check_pictures(dataset)
+        if split == "train" and self.eval_dataset:
+            # A test view that cannot be read should be known now, not at the prune.
+            self._check_pictures(self.eval_dataset)
         if cache_images_device == "cpu" and not torch.cuda.is_available():
             # The stock code pins the memory of "cpu" caches, which needs a driver; "gpu" means the model's device.
             cache_images_device = "gpu"
         return super()._load_images(split, cache_images_device)
 
-    def _check_sizes(self, dataset: InputDataset) -> None:
-        from PIL import Image
-
+    def _check_pictures(self, dataset: InputDataset) -> None:
         scale = dataset.scale_factor
-        for index, path in enumerate(dataset.image_filenames):
-            with Image.open(path) as image:
-                size = tuple(int(side * scale) for side in image.size)
+        masks: Sequence[Path | None] = dataset._dataparser_outputs.mask_filenames or [None] * len(dataset)
+        for index, (path, mask) in enumerate(zip(dataset.image_filenames, masks)):
+            full = check_picture(path)
+            size = tuple(int(side * scale) for side in full)
             camera = dataset.cameras[index]
             expected = (int(camera.width.item()), int(camera.height.item()))
             if size != expected:
@@ -144,3 +213,5 @@ class SundaeDatamanager(FullImageDatamanager[InputDataset]):
                     f"{path.name} is {size[0]} x {size[1]} px but its camera says {expected[0]} x {expected[1]}; "
                     "give each size its own camera, or resize the images"
                 )
+            if mask is not None and check_picture(mask, mask=True) != full:
+                raise DataError(f"{mask} has not the size of its picture {path.name}; make it {full[0]} x {full[1]} px")

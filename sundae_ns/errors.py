@@ -4,6 +4,14 @@ All derive from :class:`SundaeError`, so that the command line can show them wit
 the built-in exception that callers would catch anyway. Floor 0: imports nothing of the package.
 """
 
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+from types import TracebackType
+
 
 class SundaeError(Exception):
     """Base class of every error raised on purpose by ``sundae_ns``."""
@@ -21,8 +29,51 @@ class BackendError(SundaeError, RuntimeError):
     """A rasteriser or device was asked for that is not available here."""
 
 
+class StorageError(SundaeError, OSError):
+    """A file cannot be written: no room, or no right to."""
+
+
+class MemoryExhaustedError(SundaeError, RuntimeError):
+    """The device has not enough memory for the field or the picture."""
+
+
 class CheckpointError(SundaeError, ValueError):
     """A checkpoint does not fit the model.
 
     A ``ValueError`` on purpose: ``nerfstudio`` retries non-strictly when loading raises a ``RuntimeError``.
     """
+
+
+def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError:
+    """The error for a CUDA device without room: how many primitives there were, what was asked for, what to try.
+
+    Args:
+        error: ``torch.cuda.OutOfMemoryError``; its message states the size.
+        primitives: of the field, when it happened.
+    """
+    found = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", str(error))
+    asked = f"{found[1]} more were asked for" if found else "more was asked for than there is"
+    return MemoryExhaustedError(
+        f"the GPU's memory is full: {asked}, with {primitives:,} primitives; try --pipeline.datamanager.cache-images cpu "
+        "(pictures in host memory), --pipeline.datamanager.camera-res-scale-factor 0.5 (smaller pictures), or "
+        f"--pipeline.model.pruning.mode continuous --pipeline.model.pruning.max-primitives {max(primitives // 2, 1)} "
+        "(a lower peak); --load-dir goes on from the last checkpoint"
+    )
+
+
+def show_in_one_line() -> None:
+    """Inside a command of nerfstudio (``ns-*``), let an uncaught error of ours end it with one line on stderr.
+
+    Other errors, other programs, and everything where ``SUNDAE_TRACEBACK`` is set, are shown as before.
+    """
+    if not Path(sys.argv[0]).name.startswith("ns-") or os.environ.get("SUNDAE_TRACEBACK"):
+        return
+    before = sys.excepthook
+
+    def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if isinstance(error, SundaeError):
+            print(f"sundae: {error}", file=sys.stderr)
+        else:
+            before(kind, error, trace)
+
+    sys.excepthook = hook

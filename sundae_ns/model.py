@@ -6,9 +6,9 @@ The module path and the class names are written into every run's ``config.yml``:
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
@@ -31,7 +31,7 @@ from torch import Tensor
 from sundae_ns import checkpoint
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
-from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
+from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Lpips, display, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
@@ -44,6 +44,7 @@ from sundae_ns.rasterization import (
     spherical_harmonics,
 )
 from sundae_ns.schedulers import notify_pruned
+from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.transform import similarity
 
 NEAR_PLANE = 0.01
@@ -76,6 +77,19 @@ def _cut(image: Tensor, window: Window | None) -> Tensor:
     if window is None:
         return image
     return image[window.top : window.top + window.height, window.left : window.left + window.width]
+
+
+def _names_full_memory(render: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
+    """Let a method of the model that runs out of the GPU's memory say how many primitives there were."""
+
+    @wraps(render)
+    def wrapper(model: SundaeModel, *arguments: Any, **options: Any) -> dict[str, Any]:
+        try:
+            return render(model, *arguments, **options)
+        except torch.cuda.OutOfMemoryError as error:
+            raise out_of_memory(error, model.num_points) from error
+
+    return wrapper
 
 
 class View(NamedTuple):
@@ -410,6 +424,7 @@ class SundaeModel(SplatfactoModel):
         }
         return pictures, splat
 
+    @_names_full_memory
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:  # type: ignore[override]
         """Render a camera.
 
@@ -595,9 +610,11 @@ class SundaeModel(SplatfactoModel):
             return
         path = attributes.trainer.base_dir / "prune.json"
         reports = json.loads(path.read_text()) if path.exists() else []
+        # A run that was killed after a prune and before the next save does that prune again.
+        reports = [earlier for earlier in reports if earlier["step"] < report.step]
         reports.append({**asdict(report), "warm_up": before, "pruned": after})
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(reports, indent=2))
+        write_text(path, json.dumps(reports, indent=2))
 
     @torch.no_grad()
     def contribution(self, datamanager: SundaeDatamanager) -> Tensor:

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import HeadConfig, resize
 from sundae_ns.datamanager import DATASET_FRAME
-from sundae_ns.errors import BackendError, CheckpointError, ConfigError
+from sundae_ns.errors import BackendError, CheckpointError, ConfigError, MemoryExhaustedError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.optimizers import FusedAdamConfig
 from sundae_ns.pruning import PruningConfig
@@ -724,3 +724,31 @@ def test_the_head_remembers_its_scale() -> None:
     other = build(background_color="black")
     other.load_state_dict(training.model.state_dict())
     assert other.trained_focal == (30.0, 30.0)
+
+
+class FullBackend:
+    """A rasteriser on a device without room."""
+
+    name = "full"
+
+    def rasterize(self, *_: Any, **__: Any) -> Any:
+        raise torch.cuda.OutOfMemoryError(
+            "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 79.10 GiB of which 1 MiB is free."
+        )
+
+    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
+        return torch.zeros_like(directions)
+
+
+@pytest.mark.parametrize("training", [True, False], ids=["training", "rendering"])
+def test_full_memory_says_how_much_and_what_to_try(training: bool) -> None:
+    model = build().train(training)
+    model._backend = FullBackend()  # type: ignore[assignment]
+    with pytest.raises(
+        MemoryExhaustedError, match=rf"2\.50 GiB more were asked for, with {N} primitives; try"
+    ) as caught:
+        model.get_outputs_for_camera(camera())
+    text = str(caught.value)
+    assert "\n" not in text
+    for option in ("cache-images cpu", "camera-res-scale-factor", f"max-primitives {N // 2}"):
+        assert option in text

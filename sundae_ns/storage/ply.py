@@ -8,7 +8,6 @@ feature vectors, nor for a head: what it shows are base colours.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives
+from sundae_ns.storage.atomic import replacing
 
 _COLUMNS = {
     "means": ("x", "y", "z"),
@@ -67,6 +67,7 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
 
     Raises:
         DataError: a parameter is missing or has the wrong shape.
+        StorageError: the disk is full, or may not be written to.
     """
     path = Path(path)
     _check(params)
@@ -89,28 +90,58 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
     table = np.ascontiguousarray(np.concatenate([values for _, values in blocks], axis=1), dtype="<f4")
     vertices = table.view([(name, "<f4") for name in names]).reshape(n)
     data = PlyData([PlyElement.describe(vertices, "vertex")], text=False, byte_order="<", comments=list(comments))
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    try:
+    with replacing(path) as partial:
         data.write(str(partial))
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+
+
+_SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
+_SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
+_MAX_HEADER = 1 << 16
+
+
+def _damage(path: Path) -> str | None:
+    """Why a file cannot hold what its header states, or None; the parser allocates by what is stated."""
+    with path.open("rb") as file:
+        header, found, _ = file.read(_MAX_HEADER).partition(b"end_header")
+    lines = [line.split() for line in header.splitlines()]
+    if not found or lines[0] != [b"ply"]:
+        return "it has no header of a .ply"
+    text = [b"format", b"ascii", b"1.0"] in lines
+    # In ascii, each value takes a digit and a space.
+    elements: list[tuple[int, int]] = []
+    for words in lines:
+        if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
+            elements.append((int(words[2]), 0))
+        elif words[:1] == [b"property"] and elements and len(words) >= 3:
+            kind = words[2] if words[1] == b"list" else words[1]
+            count, size = elements[-1]
+            elements[-1] = (count, size + (2 if text else _SIZES.get(kind.decode("latin-1"), 1)))
+    if any(count > 0 and size == 0 for count, size in elements):
+        return "an element has no properties"
+    least = sum(count * size for count, size in elements)
+    room = path.stat().st_size - len(header)
+    return f"its header states at least {least:,} bytes, it has {room:,}" if least > room else None
 
 
 def load_ply(path: Path) -> PlyData:
-    """Parse a .ply file of any kind.
+    """Parse a .ply file of any kind, allocating no more than a few times its size.
 
     Raises:
         DataError: the file is missing, no .ply, cut short, or has no vertices.
     """
     try:
+        reason = _damage(path)
+        if reason is not None:
+            raise DataError(f"{path} is not a whole .ply file ({reason}); export it again.")
         # Maps the file: without a map, plyfile reads one vertex at a time (90 s a million instead of 1).
         data = PlyData.read(str(path))
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path.") from error
     except (PlyParseError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
         # Among the ValueErrors are bytes that are no text, where a header should be.
-        reason = " ".join(str(error).split())
+        reason = " ".join(str(error).split())[:200]
         raise DataError(f"{path} is not a whole .ply file ({reason}); export it again.") from error
     if "vertex" not in data:
         raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussian primitives.")
@@ -118,10 +149,17 @@ def load_ply(path: Path) -> PlyData:
 
 
 def stack_columns(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
-    """Properties of all vertices side by side: ``[N, len(columns)]`` float32."""
+    """Properties of all vertices side by side: ``[N, len(columns)]`` float32.
+
+    Raises:
+        DataError: a property is a list.
+    """
     table = np.empty((vertex.count, len(columns)), np.float32)
     for i, name in enumerate(columns):
-        table[:, i] = vertex[name]
+        if vertex[name].dtype.kind not in "iuf":
+            raise DataError(f"property {name} of the vertices is a list, not a number; export the .ply again.")
+        with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, and those are left out later
+            table[:, i] = vertex[name]
     return torch.from_numpy(table)
 
 

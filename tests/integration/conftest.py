@@ -108,11 +108,10 @@ def tiny(call: Call, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
         "logging.steps-per-log": 5,
         "pipeline.model.pruning.prune-at": prune_at,
         "pipeline.model.pruning.keep-ratio": keep_ratio,
-        # One round of densification, at step 30; nothing random after it, so that resuming can be compared.
+        # One round of densification, at step 30.
         "pipeline.model.warmup-length": 5,
         "pipeline.model.refine-every": 15,
         "pipeline.model.densify-grad-thresh": 0.0004,
-        "pipeline.model.background-color": "black",
         "pipeline.model.sh-degree-interval": 20,
     }
     arguments = [word for name, value in options.items() for word in (f"--{name}", value)]

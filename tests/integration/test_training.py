@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import tracemalloc
 from typing import Any
 
 import pytest
@@ -12,6 +14,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
+from sundae_ns.errors import MemoryExhaustedError
 from sundae_ns.gaussians import SPLAT_NAMES
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage import MODEL_FRAME, write_ply
@@ -65,7 +68,8 @@ def test_loss_falls(scalars: dict[str, dict[int, float]], tiny: Any) -> None:
     loss = scalars["Train Loss Dict/main_loss"]
     early = [value for step, value in loss.items() if step < 15]
     late = [value for step, value in loss.items() if step >= tiny.steps - 15]
-    assert sum(late) / len(late) < 0.7 * sum(early) / len(early)
+    # Backgrounds are random, so what a picture's empty part costs is too.
+    assert sum(late) / len(late) < 0.85 * sum(early) / len(early)
 
 
 def test_tensorboard_has_counts_and_both_psnrs(scalars: dict[str, dict[int, float]], tiny: Any) -> None:
@@ -138,15 +142,86 @@ def test_a_resumed_run_goes_on_as_if_never_stopped(tiny: Any, trainer_of: Any, s
     if start > tiny.prune_at:
         assert all((value.detach() - before[name]).abs().max() > 0 for name, value in model.gauss_params.items())
 
-    # Bit for bit on a CPU (measured); CUDA sums gradients in any order.
+    assert_same(load(tiny.checkpoint(end)), load(trainer.checkpoint_dir / f"step-{end:09d}.ckpt"))
+
+
+def test_a_run_stopped_right_at_the_prune_goes_on_as_if_never_stopped(tiny: Any, trainer_of: Any) -> None:
+    def to_the_prune(config: Any) -> None:
+        config.load_dir, config.load_step = tiny.checkpoints, 30
+        config.max_num_iterations = tiny.prune_at - 30
+
+    trainer = trainer_of(to_the_prune)
+    trainer.train()
+    torch.rand(100)  # whatever else a program draws
+
+    def onwards(config: Any) -> None:
+        config.load_dir, config.max_num_iterations = trainer.checkpoint_dir, 60 - tiny.prune_at
+
+    again = trainer_of(onwards)
+    assert again.pipeline.model.num_points == report(tiny)["after"]
+    assert again.pipeline.model.pruning_state["pruned_at"] == tiny.prune_at
+    again.train()
+    assert again.pipeline.model.pruning_state["num_prunes"] == 1
+    assert_same(load(tiny.checkpoint(60)), load(again.checkpoint_dir / "step-000000060.ckpt"))
+
+
+def assert_same(whole: dict[str, Any], resumed: dict[str, Any]) -> None:
+    """Tensors, moments, rates and random state of two checkpoints: bit for bit on a CPU; CUDA sums in any order."""
     tolerance = {"atol": 0.02, "rtol": 0.02} if torch.cuda.is_available() else {"atol": 0.0, "rtol": 0.0}
-    whole, resumed = load(tiny.checkpoint(end)), load(trainer.checkpoint_dir / f"step-{end:09d}.ckpt")
     for name, value in whole["pipeline"].items():
         if isinstance(value, Tensor):
             torch.testing.assert_close(resumed["pipeline"][name], value, **tolerance, msg=lambda m, n=name: f"{n}: {m}")
+    for name, state in whole["optimizers"].items():
+        for key, moments in state["state"].items():
+            for kind, value in moments.items():
+                torch.testing.assert_close(resumed["optimizers"][name]["state"][key][kind], value, **tolerance)
     for name, state in whole["schedulers"].items():
         assert resumed["schedulers"][name]["_last_lr"] == pytest.approx(state["_last_lr"])
         assert resumed["schedulers"][name]["last_epoch"] == state["last_epoch"]
+    assert torch.equal(whole["random"]["torch"], resumed["random"]["torch"])
+
+
+def test_memory_does_not_grow_past_the_prune(tiny: Any, trainer_of: Any) -> None:
+    steps, settled = 60, 20
+
+    def change(config: Any) -> None:
+        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 60, steps
+
+    trainer = trainer_of(change)
+    seen: list[tuple[int, int]] = []
+    iterate = trainer.train_iteration
+
+    def watched(step: int) -> Any:
+        if step - 60 in (settled, steps):
+            gc.collect()
+            tensors = sum(isinstance(thing, Tensor) for thing in gc.get_objects())
+            seen.append((tensors, tracemalloc.get_traced_memory()[0]))
+        return iterate(step)
+
+    trainer.train_iteration = watched
+    tracemalloc.start()
+    try:
+        trainer.train()
+    finally:
+        tracemalloc.stop()
+    (tensors, before), (tensors_later, after) = seen
+    assert tensors_later <= tensors
+    # Bytes of Python and numpy; loggers keep a few hundred a step, one picture of the scene has 27,648.
+    assert (after - before) / (steps - settled) < 2000
+
+
+def test_full_memory_in_the_backward_pass(tiny: Any, trainer_of: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def change(config: Any) -> None:
+        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 60, 5
+
+    def full(*_: Any, **__: Any) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
+
+    trainer = trainer_of(change)
+    monkeypatch.setattr(Tensor, "backward", full)
+    count = trainer.pipeline.model.num_points
+    with pytest.raises(MemoryExhaustedError, match=rf"300\.00 MiB more were asked for, with {count:,} primitives"):
+        trainer.train()
 
 
 def warm(trainer_of: Any, path: Any) -> tuple[dict[str, Tensor], Any]:

@@ -1,0 +1,239 @@
+"""What a capture has to be before it is parsed: ``transforms.json`` and pictures, checked one by one.
+
+nerfstudio's parsers take a well-formed capture for granted: elsewhere they end in an assertion, or train on NaN. Pure
+functions of files; they read text and the headers of pictures, no pixels.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from sundae_ns.errors import DataError
+
+MAX_SIDE = 65535
+"""Longest side of a picture, in pixels; JPEG's own limit."""
+_LARGEST = 1e12
+"""Largest coordinate or focal length that survives float32 arithmetic with squares in it."""
+_PIXELS_PER_BYTE = 4096
+"""More pixels a byte than any still-picture format reaches, even for one flat colour."""
+_SMALL_PICTURE = 1 << 20
+"""Pictures of up to this many pixels are decoded whatever the size of their file."""
+_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_ORIENTATIONS = ("pca", "up", "vertical", "none")
+
+
+def number(value: Any, name: str, where: str, *, positive: bool = False) -> float:
+    """``value`` as a finite float.
+
+    Raises:
+        DataError: it is no number, not finite, too large, or not positive where it must be.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise DataError(f"{where}: {name} is {_short(value)}; it must be a number")
+    if not abs(value) <= _LARGEST:
+        raise DataError(f"{where}: {name} is {_short(value)}; it must be finite, and at most {_LARGEST:g}")
+    if positive and not value > 1e-6:
+        raise DataError(f"{where}: {name} is {_short(value)}; it must be positive")
+    return float(value)
+
+
+def side(value: Any, name: str, where: str) -> int:
+    """``value`` as the side of a picture in pixels.
+
+    Raises:
+        DataError: it is no whole number from 1 to 65,535.
+    """
+    length = number(value, name, where)
+    if length != int(length) or not 1 <= length <= MAX_SIDE:
+        raise DataError(f"{where}: {name} is {_short(value)}; it must be a whole number of pixels from 1 to {MAX_SIDE}")
+    return int(length)
+
+
+def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray:
+    """``value`` as a finite float64 matrix ``[R, 4]`` with one of the given numbers of rows, its rotation part regular.
+
+    Raises:
+        DataError: it has another shape, entries that are not finite, or is singular.
+    """
+    if not isinstance(value, list) or len(value) not in rows:
+        raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
+    for row in value:
+        if not isinstance(row, list) or len(row) != 4:
+            raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
+        for entry in row:
+            number(entry, name, where)
+    found = np.array(value, dtype=np.float64)
+    if abs(np.linalg.det(found[:3, :3])) < 1e-9:
+        raise DataError(f"{where}: {name} is singular, so it is no camera pose; leave this view out")
+    return found
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Parse a JSON object.
+
+    Raises:
+        DataError: the file is missing, or holds no JSON object.
+    """
+    try:
+        found = json.loads(path.read_bytes())
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+    except (ValueError, RecursionError) as error:  # bytes that are no text, digits without end, nesting without end
+        reason = " ".join(str(error).split())
+        raise DataError(f"{path} is not JSON ({reason[:120]}); write it again") from error
+    if not isinstance(found, dict):
+        raise DataError(f"{path} holds no JSON object; give the transforms.json of a capture")
+    return found
+
+
+def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: Collection[str] = ()) -> None:
+    """Check the ``transforms.json`` of a capture.
+
+    Args:
+        path: the file.
+        splits: splits that will be read, ``"train"`` and the like; checked where the file lists pictures by split.
+        camera_models: values of ``camera_model`` that can be used; empty for any.
+
+    Raises:
+        DataError: the first entry that cannot be used, the frame that it stands in, and what it must be.
+    """
+    meta = read_json(path)
+    frames = meta.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise DataError(f"{path} lists no frames; a capture needs at least one picture with its pose")
+    shared = [name for name in _INTRINSICS if name in meta]
+    _check_camera(meta, shared, path.name)
+    models = {meta["camera_model"]} if isinstance(meta.get("camera_model"), str) else set()
+    if "camera_model" in meta and (not models or (camera_models and not models <= set(camera_models))):
+        raise DataError(
+            f"{path.name}: camera_model is {_short(meta['camera_model'])}; use one of {', '.join(camera_models)}"
+        )
+    extras: dict[str, int] = {"mask_path": 0, "depth_file_path": 0}
+    names = set()
+    for index, frame in enumerate(frames):
+        where = f"{path.name}, frame {index}"
+        if not isinstance(frame, dict):
+            raise DataError(f"{where}: it must be an object with file_path and transform_matrix")
+        name = _path(frame.get("file_path"), "file_path", where)
+        names.add(name)
+        where = f"{where} ({_short(name)})"
+        missing = [key for key in _INTRINSICS if key not in shared and key not in frame]
+        if missing:
+            raise DataError(f"{where}: {', '.join(missing)} missing; give them for each frame, or for all at the top")
+        _check_camera(frame, [key for key in _INTRINSICS if key not in shared], where)
+        matrix(frame.get("transform_matrix"), (4,), "transform_matrix", where)
+        for key in extras:
+            if key in frame:
+                _path(frame[key], key, where)
+                extras[key] += 1
+    for key, count in extras.items():
+        if count not in (0, len(frames)):
+            raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it for all or for none")
+    _check_splits(meta, names, splits, path.name)
+    _check_frame_of_capture(meta, path.name)
+
+
+def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -> None:
+    """Check those intrinsics of an entry that will be read from it, and its distortion."""
+    for key in keys:
+        if key in ("w", "h"):
+            side(entry[key], key, where)
+        else:
+            number(entry[key], key, where, positive=key.startswith("fl"))
+    for key in _DISTORTION:
+        if key in entry:
+            number(entry[key], key, where)
+    if "distortion_params" in entry:
+        values = entry["distortion_params"]
+        if not isinstance(values, list) or len(values) not in (4, 6, 12):
+            raise DataError(f"{where}: distortion_params must be a list of 4, 6 or 12 numbers")
+        for value in values:
+            number(value, "distortion_params", where)
+
+
+def _check_splits(meta: Mapping[str, Any], names: set[str], splits: Sequence[str], where: str) -> None:
+    listed = [split for split in ("train", "val", "test") if f"{split}_filenames" in meta]
+    for split in splits if listed else ():
+        files = meta.get(f"{split}_filenames")
+        if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
+            raise DataError(
+                f"{where} lists pictures for {', '.join(listed)}, but none for {split}; add {split}_filenames as a list "
+                "of paths, or remove all such lists"
+            )
+        known = {str(Path(name)) for name in names}
+        strange = [file for file in files if str(Path(file)) not in known]
+        if strange:
+            raise DataError(f"{where}: {split}_filenames has {_short(strange[0])}, which is the file_path of no frame")
+
+
+def _check_frame_of_capture(meta: Mapping[str, Any], where: str) -> None:
+    if "applied_transform" in meta:
+        matrix(meta["applied_transform"], (3,), "applied_transform", where)
+    if "applied_scale" in meta:
+        number(meta["applied_scale"], "applied_scale", where, positive=True)
+    if meta.get("orientation_override", "up") not in _ORIENTATIONS:
+        raise DataError(
+            f"{where}: orientation_override is {_short(meta['orientation_override'])}; "
+            f"use one of {', '.join(_ORIENTATIONS)}"
+        )
+    if "ply_file_path" in meta:
+        _path(meta["ply_file_path"], "ply_file_path", where)
+
+
+def _path(value: Any, name: str, where: str) -> str:
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise DataError(f"{where}: {name} is {_short(value)}; it must be the path of a file")
+    return value
+
+
+def check_picture(path: Path, *, mask: bool = False) -> tuple[int, int]:
+    """Check by its header that a picture can be trained on.
+
+    Args:
+        path: the file.
+        mask: whether it is a mask, which has one channel, rather than a photograph of 8 bits a channel.
+
+    Returns:
+        Width and height in pixels.
+
+    Raises:
+        DataError: it is missing, no picture, of another kind of pixels, or too large for its file to be whole.
+    """
+    try:
+        with Image.open(path) as image:
+            size, mode = image.size, image.mode
+        length = path.stat().st_size
+    except OSError as error:
+        reason = error.strerror or ("it is no picture" if isinstance(error, Image.UnidentifiedImageError) else error)
+        raise DataError(f"{path} cannot be read ({reason}); mend it, or leave the view out") from error
+    except Exception as error:  # decoders raise many kinds; each means the same to the user
+        raise DataError(f"{path} is no whole picture ({_line(error)}); mend it, or leave the view out") from error
+    fitting = ("1", "L") if mask else ("L", "RGB", "RGBA")
+    if mode not in fitting:
+        wanted = "one channel of 8 bits" if mask else "RGB, RGBA or grey with 8 bits a channel"
+        raise DataError(f"{path} has pixels of kind {mode}; save it with {wanted}")
+    if size[0] * size[1] > max(_PIXELS_PER_BYTE * length, _SMALL_PICTURE):
+        raise DataError(f"{path} claims {size[0]} x {size[1]} px in {length:,} bytes; it is not whole, save it again")
+    return size
+
+
+def undecodable(path: Path, error: Exception) -> DataError:
+    """The error for a picture whose header was fine and whose pixels were not."""
+    return DataError(f"{path} cannot be decoded ({_line(error)}); mend it, or leave the view out")
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _short(value: Any) -> str:
+    """A value for a message: one line, and not longer than a path."""
+    shown = repr(value)
+    return shown if len(shown) <= 80 else shown[:77] + "..."

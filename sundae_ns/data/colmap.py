@@ -1,0 +1,258 @@
+"""What a COLMAP model has to be before it is parsed: cameras, images and points, binary or text.
+
+nerfstudio's readers trust every count that a file states, and allocate by it. Here the files are walked once and nothing
+is kept. The formats are those of COLMAP's documentation ("Output Format").
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from sundae_ns.data.capture import number, side
+from sundae_ns.errors import DataError
+
+# Identifier, name, parameters, how many of those are focal lengths; the models that nerfstudio has a camera for.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3, 1),
+    1: ("PINHOLE", 4, 2),
+    2: ("SIMPLE_RADIAL", 4, 1),
+    3: ("RADIAL", 5, 1),
+    4: ("OPENCV", 8, 2),
+    5: ("OPENCV_FISHEYE", 8, 2),
+}
+_CONVERT = "undistort the capture (colmap image_undistorter), or calibrate it with OPENCV"
+_SHELL = set('"$`\\\n')
+"""Characters that end a quoted word: nerfstudio hands names of pictures to a shell when it scales them down."""
+_CAMERA, _IMAGE, _POINT, _COUNT = (
+    struct.Struct("<iiQQ"),
+    struct.Struct("<i7di"),
+    struct.Struct("<Q3d3Bd"),
+    struct.Struct("<Q"),
+)
+_OBSERVATION, _TRACK = 24, 8
+_MAX_NAME = 4096
+
+
+class _Bytes:
+    """A binary file that is walked from front to back and refuses to end early."""
+
+    def __init__(self, path: Path) -> None:
+        self.name = path.name
+        try:
+            self.content = path.read_bytes()
+        except OSError as error:
+            raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+        self.at = 0
+
+    def take(self, layout: struct.Struct) -> tuple[float, ...]:
+        """The next values of a layout."""
+        start = self.at
+        self.skip(layout.size)
+        return layout.unpack_from(self.content, start)
+
+    def skip(self, length: int) -> None:
+        self.at += length
+        if self.at > len(self.content):
+            raise DataError(f"{self.name} ends early, in a part of {length:,} bytes; copy or export it again")
+
+    def count(self, least: int, what: str) -> int:
+        """The next count, of items that take at least so many bytes each."""
+        (found,) = self.take(_COUNT)
+        if found * least > len(self.content) - self.at:
+            raise DataError(f"{self.name} states {found:,} {what}, more than it can hold; copy or export it again")
+        return int(found)
+
+    def text(self) -> str:
+        """The next text, which ends with a zero byte."""
+        end = self.content.find(b"\0", self.at, self.at + _MAX_NAME)
+        if end < 0:
+            raise DataError(f"{self.name} holds a name without an end; copy or export it again")
+        start, self.at = self.at, end + 1
+        try:
+            return self.content[start:end].decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise DataError(f"{self.name} holds a name that is no text; copy or export it again") from error
+
+
+def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> None:
+    """Check a COLMAP model, in the files that nerfstudio picks: text before binary, but binary points before text.
+
+    Args:
+        model: folder of the model, ``sparse/0`` for one.
+        images: folder of its pictures; None if they will not be needed.
+        points: whether the points will be read too.
+
+    Raises:
+        DataError: the first thing that cannot be used, and where it stands.
+    """
+    if not model.is_dir():
+        raise DataError(
+            f"{model} is no folder; say where the model lies with colmap --colmap-path (sparse/0, as a rule)"
+        )
+    if (model / "cameras.txt").exists():
+        cameras = _cameras_text(model / "cameras.txt")
+        names = _images_text(_existing(model / "images.txt"), cameras)
+    elif (model / "cameras.bin").exists():
+        cameras = _cameras_binary(model / "cameras.bin")
+        names = _images_binary(_existing(model / "images.bin"), cameras)
+    else:
+        raise DataError(
+            f"{model} holds neither cameras.bin nor cameras.txt; say where the model lies with --colmap-path"
+        )
+    if not names:
+        raise DataError(f"{model} has no images; the reconstruction has failed, run it again")
+    for name in names:
+        if _SHELL & set(name):
+            raise DataError(f"{model.name} names a picture {name!r}; rename it without quotes, $, ` and backslashes")
+        if images is not None and not (images / name).is_file():
+            raise DataError(f"{images / name} does not exist; check --images-path, or leave the view out of the model")
+    if points:
+        if (model / "points3D.bin").exists():
+            count = _points_binary(model / "points3D.bin")
+        elif (model / "points3D.txt").exists():
+            count = _points_text(model / "points3D.txt")
+        else:
+            raise DataError(f"{model} has no points3D.bin or .txt; add it, or start with colmap --load-3D-points False")
+        if count == 0:
+            raise DataError(f"{model} has no points; start without them by colmap --load-3D-points False")
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise DataError(f"{path} does not exist; copy or export the model again")
+    return path
+
+
+def _check_camera(
+    model: tuple[str, int, int], width: float, height: float, params: Sequence[float], where: str
+) -> None:
+    side(width, "width", where)
+    side(height, "height", where)
+    if len(params) != model[1]:
+        raise DataError(f"{where}: {model[0]} has {model[1]} parameters, not {len(params)}; export it again")
+    for index, value in enumerate(params):
+        number(value, f"parameter {index}", where, positive=index < model[2])
+
+
+def _check_pose(pose: Sequence[float], camera: int, cameras: set[int], where: str) -> None:
+    for value in pose:
+        number(value, "the pose", where)
+    if not abs(math.hypot(*pose[:4]) - 1) < 0.01:
+        raise DataError(f"{where}: its quaternion is not of length 1, so it is no rotation; leave it out")
+    if camera not in cameras:
+        raise DataError(f"{where}: its camera {camera} is not in the model; export it again")
+
+
+def _cameras_binary(path: Path) -> set[int]:
+    file, cameras = _Bytes(path), set()
+    for _ in range(file.count(_CAMERA.size, "cameras")):
+        identifier, kind, width, height = file.take(_CAMERA)
+        where = f"{path.name}, camera {identifier}"
+        if kind not in _MODELS:
+            raise DataError(f"{where}: nerfstudio has no camera of model {kind}; {_CONVERT}")
+        model = _MODELS[int(kind)]
+        _check_camera(model, width, height, file.take(struct.Struct(f"<{model[1]}d")), where)
+        if identifier in cameras:
+            raise DataError(f"{where}: it stands there twice; export it again")
+        cameras.add(int(identifier))
+    return cameras
+
+
+def _images_binary(path: Path, cameras: set[int]) -> list[str]:
+    file, names = _Bytes(path), []
+    for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size, "images")):
+        identifier, *pose, camera = file.take(_IMAGE)
+        _check_pose(pose, int(camera), cameras, f"{path.name}, image {identifier}")
+        names.append(file.text())
+        file.skip(_OBSERVATION * file.count(_OBSERVATION, "observations"))
+    return names
+
+
+def _points_binary(path: Path) -> int:
+    file = _Bytes(path)
+    count = file.count(_POINT.size + _COUNT.size, "points")
+    for _ in range(count):
+        file.skip(_POINT.size)
+        file.skip(_TRACK * file.count(_TRACK, "observations"))
+    return count
+
+
+@contextmanager
+def _line(path: Path, index: int) -> Iterator[None]:
+    """Name the line in which a word is missing or is no number."""
+    try:
+        yield
+    except DataError:
+        raise
+    except (ValueError, IndexError, OverflowError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise DataError(f"{path.name}, line {index + 1} cannot be used ({reason}); export it again") from error
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Lines that are neither empty nor comments, with their numbers."""
+    return [(i, line) for i, line in enumerate(_all_lines(path)) if line.strip() and not line.strip().startswith("#")]
+
+
+def _all_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").split("\n")
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path} is no text; export it again") from error
+
+
+def _cameras_text(path: Path) -> set[int]:
+    models = {model[0]: model for model in _MODELS.values()}
+    cameras = set()
+    for index, line in _lines(path):
+        with _line(path, index):
+            identifier, name, *numbers = line.split()
+            where = f"{path.name}, camera {identifier}"
+            if name not in models:
+                raise DataError(f"{where}: nerfstudio has no camera of model {name}; {_CONVERT}")
+            width, height = int(numbers[0]), int(numbers[1])
+            _check_camera(models[name], width, height, [float(value) for value in numbers[2:]], where)
+            cameras.add(int(identifier))
+    return cameras
+
+
+def _images_text(path: Path, cameras: set[int]) -> list[str]:
+    lines, names, index = _all_lines(path), [], 0
+    while index < len(lines):
+        line = lines[index].strip()
+        index += 1
+        if not line or line.startswith("#"):
+            continue
+        with _line(path, index - 1):
+            words = line.split()
+            _check_pose([float(w) for w in words[1:8]], int(words[8]), cameras, f"{path.name}, image {int(words[0])}")
+            if len(words) > 10:
+                raise DataError(
+                    f"{path.name}, line {index}: nerfstudio does not read names with spaces; rename the picture"
+                )
+            names.append(words[9])
+        with _line(path, index):
+            observations = lines[index].split() if index < len(lines) else []
+            if len(observations) % 3:
+                raise ValueError("observations come in threes")
+            for x, y, point in zip(observations[0::3], observations[1::3], observations[2::3]):
+                float(x), float(y), int(point)
+        index += 1
+    return names
+
+
+def _points_text(path: Path) -> int:
+    lines = _lines(path)
+    for index, line in lines:
+        with _line(path, index):
+            words = line.split()
+            int(words[0]), [float(w) for w in words[1:4]], float(words[7]), [int(w) for w in words[8:]]
+            if not all(0 <= int(w) <= 255 for w in words[4:7]):
+                raise ValueError("colours go from 0 to 255")
+    return len(lines)

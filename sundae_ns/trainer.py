@@ -1,0 +1,138 @@
+"""nerfstudio's trainer, with saves that are whole, resuming that is exact, and faults that are said in one line.
+
+The module path and the class names are written into every run's ``config.yml``: moving them breaks saved runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from sundae_ns import checkpoint
+from sundae_ns.errors import CheckpointError, StorageError, SundaeError, out_of_memory
+from sundae_ns.storage.atomic import storage_error, write_text
+
+
+@dataclass
+class SundaeTrainerConfig(TrainerConfig):
+    """nerfstudio's configuration of a run, for the trainer of this module."""
+
+    _target: type = field(default_factory=lambda: SundaeTrainer)
+
+    def save_config(self) -> None:
+        """Write ``config.yml`` into the run's folder, whole or not at all.
+
+        Raises:
+            StorageError: there is no room or no right to write.
+        """
+        path = self.get_base_dir() / "config.yml"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"cannot make {path.parent} ({error.strerror}); choose another --output-dir") from error
+        CONSOLE.log(f"Saving config to: {path}")
+        write_text(path, yaml.dump(self))
+
+
+@contextmanager
+def _named(what: str) -> Iterator[None]:
+    """Turn an error of the file system that a user can mend into one of ours."""
+    try:
+        yield
+    except SundaeError:
+        raise
+    except OSError as error:
+        ours = storage_error(what, error)
+        if ours is None:
+            raise
+        raise ours from error
+
+
+class SundaeTrainer(Trainer):
+    """Saves atomically, resumes from the newest whole checkpoint, and takes random numbers up where they were left."""
+
+    config: SundaeTrainerConfig
+
+    def train(self) -> None:
+        """Train.
+
+        Raises:
+            StorageError: the run's folder cannot be written to any more.
+            MemoryExhaustedError: the GPU's memory is full.
+        """
+        try:
+            with _named(f"cannot write to the run's folder {self.base_dir}"):
+                super().train()
+        except torch.cuda.OutOfMemoryError as error:
+            raise out_of_memory(error, getattr(self.pipeline.model, "num_points", 0)) from error
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Save model, optimizers, schedules and random state; older checkpoints go once the new one is on the disk.
+
+        Raises:
+            StorageError: no room or no right to write; what was there before is whole.
+        """
+        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
+        state = {
+            "step": step,
+            "pipeline": self.pipeline.state_dict(),
+            "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
+            "schedulers": {name: value.state_dict() for name, value in self.optimizers.schedulers.items()},
+            "scalers": self.grad_scaler.state_dict(),
+            "random": checkpoint.random_state(),
+        }
+        checkpoint.save(state, path)
+        if self.config.save_only_latest_checkpoint:
+            for other in self.checkpoint_dir.glob("*.ckpt"):
+                if other != path:
+                    other.unlink(missing_ok=True)
+
+    def _load_checkpoint(self) -> None:
+        path = self._source()
+        if path is None:
+            CONSOLE.print("No checkpoint to load: training from scratch.")
+            return
+        loaded = checkpoint.load(path)
+        try:
+            self._restore(loaded)
+        except SundaeError:
+            raise
+        except Exception as error:  # torch and nerfstudio raise many kinds; each means that the parts do not fit
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise CheckpointError(
+                f"{path} does not fit this run ({reason}); load it with the options that it was trained with"
+            ) from error
+        CONSOLE.print(f"Going on after step {loaded['step']}, from {path}")
+
+    def _source(self) -> Path | None:
+        """The checkpoint to go on from, if any."""
+        folder, step = self.config.load_dir, self.config.load_step
+        if folder is None:
+            return self.config.load_checkpoint
+        if step is not None:
+            return folder / f"step-{step:09d}.ckpt"
+        path, passed_over = checkpoint.newest_whole(folder)
+        for line in passed_over:
+            CONSOLE.print(f"[yellow]Warning: passed over a checkpoint: {line}", highlight=False)
+        return path
+
+    def _restore(self, loaded: dict[str, Any]) -> None:
+        self.step = int(loaded["step"])  # a run of no further step would else be saved as step 0, over this one
+        self._start_step = self.step + 1
+        self.pipeline.load_pipeline(loaded["pipeline"], loaded["step"])
+        self.optimizers.load_optimizers(loaded["optimizers"])
+        if "schedulers" in loaded and self.config.load_scheduler:
+            self.optimizers.load_schedulers(loaded["schedulers"])
+        self.grad_scaler.load_state_dict(loaded["scalers"])
+        if "random" in loaded:  # nerfstudio's own trainer saves none
+            checkpoint.set_random_state(loaded["random"])

@@ -1,0 +1,467 @@
+"""Bad captures: transforms.json, COLMAP models and pictures, through the datamanager that training uses."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from PIL import Image
+
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.data import write_scene
+from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.errors import DataError
+from sundae_ns.model import SundaeModelConfig
+
+VIEWS, WIDTH, HEIGHT = 4, 20, 16
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("capture") / "scene"
+    return write_scene(out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40, samples=1)
+
+
+def write_model(folder: Path, names: list[str], *, observations: int = 2) -> None:
+    """A COLMAP model of binary files: cameras on a line, as many points as views."""
+    folder.mkdir(parents=True, exist_ok=True)
+    focal = 18.0
+    cameras = struct.pack("<QiiQQ4d", 1, 1, 1, WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2)
+    images = struct.pack("<Q", len(names))
+    points = struct.pack("<Q", len(names))
+    for index, name in enumerate(names):
+        images += struct.pack("<i7di", index + 1, 1, 0, 0, 0, 0.3 * index, 0.1, 3.0, 1) + name.encode() + b"\0"
+        images += struct.pack("<Q", observations) + struct.pack("<ddq", 3.0, 4.0, index) * observations
+        points += struct.pack("<Q3d3Bd", index, 0.1 * index, 0.2, 0.3, 10, 20, 30, 0.5)
+        points += struct.pack("<Q", 2) + struct.pack("<ii", 1, 0) * 2
+    for file, content in (("cameras", cameras), ("images", images), ("points3D", points)):
+        (folder / f"{file}.bin").write_bytes(content)
+
+
+def write_text_model(folder: Path, names: list[str]) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    cameras = f"# cameras\n1 PINHOLE {WIDTH} {HEIGHT} 18 18 {WIDTH / 2} {HEIGHT / 2}\n"
+    images, points = "# images\n", "# points\n"
+    for index, name in enumerate(names):
+        images += f"{index + 1} 1 0 0 0 {0.3 * index} 0.1 3.0 1 {name}\n3.0 4.0 {index}\n"
+        points += f"{index} {0.1 * index} 0.2 0.3 10 20 30 0.5 1 0 2 0\n"
+    for file, text in (("cameras", cameras), ("images", images), ("points3D", points)):
+        (folder / f"{file}.txt").write_text(text, encoding="utf-8")
+
+
+@pytest.fixture
+def capture(scene: Path, tmp_path: Path) -> Path:
+    """An own copy, in both layouts."""
+    copy = Path(shutil.copytree(scene, tmp_path / "scene"))
+    write_model(copy / "sparse" / "0", sorted(path.name for path in (copy / "images").iterdir()))
+    return copy
+
+
+def manager(data: Path, *, colmap: bool = False) -> SundaeDatamanager:
+    parser: Any = NerfstudioDataParserConfig(load_3D_points=True)
+    if colmap:
+        parser = ColmapDataParserConfig(colmap_path=Path("sparse/0"), eval_mode="all")
+    return SundaeDatamanagerConfig(data=data, dataparser=parser, cache_images_type="uint8").setup(
+        device="cpu", test_mode="val"
+    )
+
+
+def load(data: Path, *, colmap: bool = False) -> SundaeDatamanager:
+    """All that training does to a capture before its first step."""
+    made = manager(data, colmap=colmap)
+    for step in range(len(made.train_indices)):
+        made.next_train(step)
+    assert torch.isfinite(made.train_dataset.cameras.camera_to_worlds).all()
+    return made
+
+
+def bytes_of(data: Path) -> int:
+    return sum(path.stat().st_size for path in data.rglob("*") if path.is_file())
+
+
+def meta_of(data: Path) -> dict[str, Any]:
+    return json.loads((data / "transforms.json").read_text())
+
+
+# ------------------------------------------------------------------------------------------------- transforms.json
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_harmed_transforms(capture: Path, harmed: Any, verdict: Any, seed: int) -> None:
+    path = capture / "transforms.json"
+    path.write_bytes(harmed(path.read_bytes(), seed))
+    verdict(lambda: load(capture), bytes_of(capture))
+
+
+VALUES: tuple[Any, ...] = (
+    *(None, True, "", "word", "0", [], {}, [[]], 0, -1, 0.5, 1e-300, 1e30, 1e308, float("nan"), float("inf")),
+    *(10**400, [float("nan")] * 4, [[0.0] * 4] * 4, "../../x.png", "\0", "ünï cöde.png", [[1, 2], [3]]),
+)
+
+
+def places(value: Any) -> list[tuple[Any, Any]]:
+    """Every container in a parsed file with each of its keys."""
+    keys: Any = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    found = [(value, key) for key in keys]
+    for key in keys:
+        found += places(value[key])
+    return found
+
+
+@pytest.mark.parametrize("seed", range(90))
+def test_strange_values_in_transforms(capture: Path, verdict: Any, seed: int) -> None:
+    rng = Random(seed)
+    meta = meta_of(capture)
+    holder, key = rng.choice([place for place in places(meta) if not isinstance(place[1], int) or rng.random() < 0.2])
+    if rng.random() < 0.25:
+        del holder[key]
+    else:
+        holder[key] = VALUES[seed % len(VALUES)]
+    (capture / "transforms.json").write_text(json.dumps(meta))
+    verdict(lambda: load(capture), bytes_of(capture))
+
+
+def _frame(**changes: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda meta: meta["frames"][1].update(changes)
+
+
+def _top(**changes: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda meta: meta.update(changes)
+
+
+def _pose(row: int, column: int, value: float) -> Callable[[dict[str, Any]], None]:
+    return lambda meta: meta["frames"][1]["transform_matrix"][row].__setitem__(column, value)
+
+
+REFUSED: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
+    "NaN in a pose": (_pose(0, 3, float("nan")), r"frame 1 .*transform_matrix is nan; it must be finite"),
+    "infinity in a pose": (_pose(2, 1, float("inf")), "frame 1 .*finite"),
+    "a pose of zeros": (_frame(transform_matrix=[[0.0] * 4] * 4), "frame 1 .*singular"),
+    "a pose of 3 rows": (_frame(transform_matrix=[[1.0, 0, 0, 0]] * 3), "4 rows of 4"),
+    "no pose": (lambda meta: meta["frames"][1].pop("transform_matrix"), "4 rows of 4"),
+    "zero focal length": (_top(fl_x=0.0), "fl_x is 0.0; it must be positive"),
+    "negative focal length": (_top(fl_y=-3), "fl_y is -3; it must be positive"),
+    "focal length NaN": (_top(fl_x=float("nan")), "fl_x is nan"),
+    "no focal length": (lambda meta: meta.pop("fl_x"), "fl_x missing"),
+    "zero width": (_top(w=0), "w is 0; .*whole number of pixels"),
+    "a huge width": (_top(w=10**9), "w is 1000000000"),
+    "half a pixel": (_top(h=16.5), "h is 16.5"),
+    "no frames": (_top(frames=[]), "no frames"),
+    "frames that are none": (_top(frames=[1, 2]), "frame 0"),
+    "an unknown camera": (_top(camera_model="BRAIN"), "camera_model is 'BRAIN'; use one of SIMPLE_PINHOLE"),
+    "distortion NaN": (_top(k1=float("nan")), "k1 is nan"),
+    "distortion of 3 numbers": (_top(distortion_params=[0, 0, 0]), "4, 6 or 12"),
+    "a split of other pictures": (_frame(file_path="images/none.png"), "which is the file_path of no frame"),
+    "a missing split": (_top(train_filenames=["images/a.png"], val_filenames=None), "train_filenames|val_filenames"),
+    "no list of test pictures": (lambda meta: [meta.pop(f"{s}_filenames", 0) for s in ("val", "test")], "none for val"),
+    "a mask for one": (_frame(mask_path="images/frame_00001.png"), "1 of .* frames have a mask_path"),
+    "a scale of zero": (_top(applied_scale=0), "applied_scale"),
+    "a frame of NaN": (_top(applied_transform=[[float("nan")] * 4] * 3), "applied_transform"),
+    "an unknown orientation": (_top(orientation_override="sideways"), "orientation_override"),
+    "a cloud that is a number": (_top(ply_file_path=3), "ply_file_path"),
+    "a cloud that is not there": (_top(ply_file_path="none.ply"), r"none\.ply does not exist"),
+}
+
+
+@pytest.mark.parametrize("kind", REFUSED)
+def test_transforms_are_refused_by_name(capture: Path, verdict: Any, kind: str) -> None:
+    change, cause = REFUSED[kind]
+    meta = meta_of(capture)
+    change(meta)
+    (capture / "transforms.json").write_text(json.dumps(meta))
+    error = verdict(lambda: load(capture), bytes_of(capture))
+    assert error is not None
+    assert isinstance(error, DataError)
+    assert re.search(cause, str(error)), error
+
+
+TEXTS = {
+    "empty": "",
+    "a list": "[1, 2]",
+    "nested without end": "[" * 200_000,
+    "digits without end": '{"frames": ' + "9" * 5000 + "}",
+    "half": '{"frames": [',
+    "no text": "\udcff",
+}
+
+
+@pytest.mark.parametrize("kind", TEXTS)
+def test_what_is_no_transforms(capture: Path, verdict: Any, kind: str) -> None:
+    (capture / "transforms.json").write_text(TEXTS[kind], errors="surrogateescape")
+    assert verdict(lambda: load(capture), bytes_of(capture)) is not None
+
+
+def test_no_capture(verdict: Any, tmp_path: Path) -> None:
+    assert verdict(lambda: load(tmp_path / "none"), 0) is not None
+    assert verdict(lambda: load(tmp_path), 0) is not None
+    assert verdict(lambda: load(tmp_path, colmap=True), 0) is not None
+
+
+# -------------------------------------------------------------------------------------------------------- COLMAP
+
+
+def test_good_models_are_read(capture: Path, verdict: Any) -> None:
+    assert verdict(lambda: load(capture, colmap=True), bytes_of(capture)) is None
+    binary = load(capture, colmap=True)
+    names = sorted(path.name for path in (capture / "images").iterdir())
+    shutil.rmtree(capture / "sparse")
+    write_text_model(capture / "sparse" / "0", names)
+    text = load(capture, colmap=True)
+    assert torch.equal(binary.train_dataset.cameras.camera_to_worlds, text.train_dataset.cameras.camera_to_worlds)
+
+
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
+@pytest.mark.parametrize("seed", range(40))
+def test_harmed_model(capture: Path, harmed: Any, verdict: Any, file: str, seed: int) -> None:
+    path = capture / "sparse" / "0" / file
+    path.write_bytes(harmed(path.read_bytes(), seed))
+    verdict(lambda: load(capture, colmap=True), bytes_of(capture))
+
+
+@pytest.mark.parametrize("file", ["cameras.txt", "images.txt", "points3D.txt"])
+@pytest.mark.parametrize("seed", range(20))
+def test_harmed_text_model(capture: Path, harmed: Any, verdict: Any, file: str, seed: int) -> None:
+    names = sorted(path.name for path in (capture / "images").iterdir())
+    shutil.rmtree(capture / "sparse")
+    write_text_model(capture / "sparse" / "0", names)
+    path = capture / "sparse" / "0" / file
+    path.write_bytes(harmed(path.read_bytes(), seed))
+    verdict(lambda: load(capture, colmap=True), bytes_of(capture))
+
+
+def _patch(file: str, at: int, content: bytes) -> Callable[[Path], None]:
+    def change(model: Path) -> None:
+        data = bytearray((model / file).read_bytes())
+        data[at : at + len(content)] = content
+        (model / file).write_bytes(data)
+
+    return change
+
+
+_NAME = 8 + 64 + len("frame_00001.png") + 1  # offset of the first image's number of observations
+MODELS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "2^63 cameras": (_patch("cameras.bin", 0, struct.pack("<Q", 1 << 63)), "cameras.bin states"),
+    "2^40 images": (_patch("images.bin", 0, struct.pack("<Q", 1 << 40)), "images.bin states"),
+    "2^30 observations": (
+        _patch("images.bin", _NAME, struct.pack("<Q", 1 << 30)),
+        "observations, more than it can hold",
+    ),
+    "2^60 points": (_patch("points3D.bin", 0, struct.pack("<Q", 1 << 60)), "points3D.bin states"),
+    "a track of 2^31": (_patch("points3D.bin", 8 + 43, struct.pack("<Q", 1 << 31)), "points3D.bin states"),
+    "zero focal length": (_patch("cameras.bin", 8 + 24, struct.pack("<d", 0.0)), "camera 1: parameter 0 is 0.0"),
+    "NaN focal length": (_patch("cameras.bin", 8 + 24, struct.pack("<d", float("nan"))), "parameter 0 is nan"),
+    "zero width": (_patch("cameras.bin", 8 + 8, struct.pack("<Q", 0)), "width is 0"),
+    "an unknown camera model": (_patch("cameras.bin", 8 + 4, struct.pack("<i", 10)), "no camera of model 10"),
+    "a zero quaternion": (_patch("images.bin", 8 + 4, struct.pack("<4d", 0, 0, 0, 0)), "image 1: its quaternion"),
+    "a NaN position": (_patch("images.bin", 8 + 36, struct.pack("<d", float("nan"))), "image 1: the pose is nan"),
+    "a camera that is not there": (_patch("images.bin", 8 + 60, struct.pack("<i", 9)), "camera 9 is not in the model"),
+    "a name for a shell": (_patch("images.bin", 8 + 64, b"$(reboot).png!!"), "rename it without quotes"),
+    "a name without end": (_patch("images.bin", 8 + 64, b"a" * 10**4), "without an end"),
+    "no images": (lambda model: (model / "images.bin").write_bytes(struct.pack("<Q", 0)), "has no images"),
+    "no points": (lambda model: (model / "points3D.bin").write_bytes(struct.pack("<Q", 0)), "has no points"),
+    "no file of images": (lambda model: (model / "images.bin").unlink(), "images.bin does not exist"),
+    "no files": (shutil.rmtree, "is no folder"),
+    "no picture": (lambda model: next((model.parents[1] / "images").iterdir()).unlink(), "does not exist"),
+}
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_models_are_refused_by_name(capture: Path, verdict: Any, kind: str) -> None:
+    change, cause = MODELS[kind]
+    change(capture / "sparse" / "0")
+    error = verdict(lambda: load(capture, colmap=True), bytes_of(capture))
+    assert error is not None
+    assert isinstance(error, DataError)
+    assert re.search(cause, str(error)), error
+
+
+def test_a_model_without_points_starts_without_them(capture: Path, verdict: Any) -> None:
+    (capture / "sparse" / "0" / "points3D.bin").unlink()
+    assert verdict(lambda: load(capture, colmap=True), bytes_of(capture)) is None
+    assert "points3D_xyz" not in load(capture, colmap=True).train_dataset.metadata
+
+
+# ------------------------------------------------------------------------------------------------------- pictures
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+@pytest.mark.parametrize("seed", range(24))
+def test_harmed_picture(capture: Path, harmed: Any, verdict: Any, suffix: str, seed: int) -> None:
+    meta = meta_of(capture)
+    source = capture / meta["frames"][0]["file_path"]
+    target = source.with_suffix(f".{suffix}")
+    with Image.open(source) as image:
+        image.convert("RGB").save(target)
+    target.write_bytes(harmed(target.read_bytes(), seed))
+    old, new = meta["frames"][0]["file_path"], str(target.relative_to(capture))
+    (capture / "transforms.json").write_text((capture / "transforms.json").read_text().replace(old, new))
+    verdict(lambda: load(capture), bytes_of(capture))
+
+
+def bomb(width: int, height: int) -> bytes:
+    """A PNG whose header claims far more pixels than follow."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 99)) + chunk(b"IEND", b"")
+    )
+
+
+def _saved(kind: str, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Callable[[Path], Any]:
+    return lambda path: Image.new(kind, size).save(path)
+
+
+PICTURES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "16 bits": (_saved("I;16"), "pixels of kind I;16"),
+    "a palette": (_saved("P"), "pixels of kind P"),
+    "grey with alpha": (_saved("LA"), "pixels of kind LA"),
+    "one pixel": (_saved("RGB", (1, 1)), "1 x 1 px but its camera says"),
+    "empty": (lambda path: path.write_bytes(b""), "no picture"),
+    "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
+    "missing": (lambda path: path.unlink(), "cannot be read|none"),
+    "a bomb": (lambda path: path.write_bytes(bomb(30000, 30000)), "claims|exceeds limit|30000"),
+    "a smaller bomb": (lambda path: path.write_bytes(bomb(9000, 9000)), "claims 9000 x 9000 px"),
+    "right header, no pixels": (lambda path: path.write_bytes(bomb(WIDTH, HEIGHT)), "cannot be decoded"),
+}
+
+
+@pytest.mark.parametrize("which", ["train", "test"])
+@pytest.mark.parametrize("kind", PICTURES)
+def test_pictures_are_refused_by_name(capture: Path, verdict: Any, kind: str, which: str) -> None:
+    make, cause = PICTURES[kind]
+    meta = meta_of(capture)
+    name = meta["train_filenames"][-1] if which == "train" else meta["test_filenames"][0]
+    make(capture / name)
+    if (kind, which) == ("right header, no pixels", "test"):
+        return  # found when the test views are decoded
+    error = verdict(lambda: load(capture), bytes_of(capture))
+    assert error is not None
+    assert Path(name).name in str(error)
+    assert isinstance(error, DataError)
+    assert re.search(cause, str(error)), error
+
+
+# --------------------------------------------------------------------------------- odd, and yet to be trained on
+
+
+def _each_picture(change: Callable[[Image.Image], Image.Image]) -> Callable[[Path], None]:
+    def make(data: Path) -> None:
+        for path in (data / "images").iterdir():
+            with Image.open(path) as image:
+                changed = change(image)
+            changed.save(path)
+
+    return make
+
+
+def _one_pixel(data: Path) -> None:
+    _each_picture(lambda image: image.resize((1, 1)))(data)
+    meta = meta_of(data)
+    meta.update(w=1, h=1, cx=0.5, cy=0.5)
+    (data / "transforms.json").write_text(json.dumps(meta))
+
+
+def _masks(data: Path) -> None:
+    meta = meta_of(data)
+    (data / "masks").mkdir()
+    for index, frame in enumerate(meta["frames"]):
+        frame["mask_path"] = f"masks/{index}.png"
+        half = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+        half[:, : WIDTH // 2] = 255
+        Image.fromarray(half).save(data / frame["mask_path"])
+    (data / "transforms.json").write_text(json.dumps(meta))
+
+
+def _renamed(data: Path) -> None:
+    meta = meta_of(data)
+    for frame in meta["frames"]:
+        path = data / frame["file_path"]
+        path.rename(path.with_name("ünï cöde 像 " + path.name))
+    text = json.dumps(meta, ensure_ascii=False).replace("images/", "images/ünï cöde 像 ")
+    (data / "transforms.json").write_text(text, encoding="utf-8")
+
+
+def _no_points(data: Path) -> None:
+    meta = meta_of(data)
+    del meta["ply_file_path"]
+    (data / "transforms.json").write_text(json.dumps(meta))
+
+
+def _one_view(data: Path) -> None:
+    meta = meta_of(data)
+    meta["frames"] = meta["frames"][:1]
+    for split in ("train", "val", "test"):
+        meta.pop(f"{split}_filenames", None)
+    meta["frames"][0]["transform_matrix"][0][3] += 1.0
+    (data / "transforms.json").write_text(json.dumps(meta))
+
+
+FINE: dict[str, Callable[[Path], None]] = {
+    "as it is": lambda data: None,
+    "grey": _each_picture(lambda image: image.convert("L")),
+    "with alpha": _each_picture(lambda image: image.convert("RGBA")),
+    "one pixel": _one_pixel,
+    "masks": _masks,
+    "unicode and spaces in names": _renamed,
+    "no points": _no_points,
+}
+
+
+@pytest.mark.parametrize("folder", ["scene", "a folder, with spaces", "ünï cöde 像"])
+@pytest.mark.parametrize("kind", FINE)
+def test_odd_captures_train(capture: Path, verdict: Any, kind: str, folder: str) -> None:
+    data = capture.rename(capture.with_name(folder))
+    FINE[kind](data)
+
+    def step() -> None:
+        made = load(data)
+        metadata = made.train_dataset.metadata
+        points = metadata.get("points3D_xyz")
+        config = SundaeModelConfig(
+            head=HeadConfig(size="tiny"),
+            camera_optimizer=CameraOptimizerConfig(mode="off"),
+            sh_degree=1,
+            num_random=50,
+            num_downscales=0,
+        )
+        model = config.setup(
+            scene_box=made.train_dataset.scene_box,
+            num_train_data=VIEWS,
+            metadata=metadata,
+            seed_points=None if points is None else (points, metadata["points3D_rgb"]),
+        )
+        model.train()
+        model.step = config.pruning.prune_at + 1
+        camera, batch = made.next_train(0)
+        outputs = model(camera)
+        losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
+        loss = torch.stack(list(losses.values())).sum()
+        loss.backward()
+        assert torch.isfinite(loss)
+        model.eval()
+        for camera, batch in made.fixed_indices_eval_dataloader:
+            metrics, _ = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
+            assert np.isfinite(metrics["psnr"])
+
+    assert verdict(step, bytes_of(data)) is None
+
+
+def test_one_view_is_success_or_one_line(capture: Path, verdict: Any) -> None:
+    _one_view(capture)
+    verdict(lambda: load(capture), bytes_of(capture))

@@ -1,0 +1,198 @@
+"""Bad checkpoints: damaged, of odd contents, and such that ask for code to be run."""
+
+from __future__ import annotations
+
+import io
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.optimizers import Optimizers
+from torch.amp import GradScaler
+
+from sundae_ns import checkpoint
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.model import SundaeModel, SundaeModelConfig
+from sundae_ns.optimizers import FusedAdamConfig
+from sundae_ns.trainer import SundaeTrainer
+
+
+def small_model() -> SundaeModel:
+    points = torch.rand(30, 3, generator=torch.Generator().manual_seed(0))
+    config = SundaeModelConfig(
+        head=HeadConfig(size="tiny", num_features=5), camera_optimizer=CameraOptimizerConfig(mode="off"), sh_degree=1
+    )
+    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    return config.setup(scene_box=box, num_train_data=4, metadata={}, seed_points=(points, points * 255))
+
+
+class Pipeline(torch.nn.Module):
+    """What nerfstudio's pipeline is to a checkpoint."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._model = small_model()
+
+    def load_pipeline(self, state: dict[str, Any], step: int) -> None:
+        self._model.load_state_dict({name.removeprefix("_model."): value for name, value in state.items()})
+
+
+def trainer(path: Path | None = None) -> SundaeTrainer:
+    """A trainer with nothing but what saving and resuming touch."""
+    made = SundaeTrainer.__new__(SundaeTrainer)
+    made.pipeline = Pipeline()  # type: ignore[assignment]
+    groups = made.pipeline._model.get_param_groups()
+    made.optimizers = Optimizers({n: {"optimizer": FusedAdamConfig(), "scheduler": None} for n in groups}, groups)
+    made.grad_scaler = GradScaler(enabled=False)
+    made.config = SimpleNamespace(  # type: ignore[assignment]
+        load_dir=None, load_step=None, load_checkpoint=path, load_scheduler=True, save_only_latest_checkpoint=True
+    )
+    return made
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    made = trainer()
+    made.checkpoint_dir = tmp_path_factory.mktemp("good")
+    made.save_checkpoint(7)
+    return (made.checkpoint_dir / "step-000000007.ckpt").read_bytes()
+
+
+def contents(good: bytes) -> dict[str, Any]:
+    return torch.load(io.BytesIO(good), weights_only=True)
+
+
+def resume(path: Path) -> None:
+    trainer(path)._load_checkpoint()
+
+
+def start_warm(path: Path) -> None:
+    checkpoint.read_field(path)
+
+
+def test_the_good_one_is_good(good: bytes, verdict: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.ckpt"
+    path.write_bytes(good)
+    assert verdict(lambda: resume(path), len(good)) is None
+    assert verdict(lambda: start_warm(path), len(good)) is None
+
+
+@pytest.mark.parametrize("read", [resume, start_warm])
+@pytest.mark.parametrize("seed", range(30))
+def test_harmed_file(good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int, read: Any) -> None:
+    path = tmp_path / "a.ckpt"
+    path.write_bytes(harmed(good, seed))
+    verdict(lambda: read(path), path.stat().st_size)
+
+
+def rezipped(good: bytes, change: Callable[[str, bytes], bytes]) -> bytes:
+    """The archive with entries changed and all checksums right again."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(good)) as source, zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as target:
+        for entry in source.namelist():
+            target.writestr(entry, change(entry, source.read(entry)))
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_harmed_pickle_with_right_checksums(good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
+    path = tmp_path / "a.ckpt"
+    path.write_bytes(rezipped(good, lambda name, data: harmed(data, seed) if name.endswith("data.pkl") else data))
+    verdict(lambda: resume(path), path.stat().st_size)
+    verdict(lambda: start_warm(path), path.stat().st_size)
+
+
+def test_tensors_without_their_bytes(good: bytes, verdict: Any, tmp_path: Path) -> None:
+    path = tmp_path / "a.ckpt"
+    path.write_bytes(rezipped(good, lambda name, data: b"" if "/data/" in name else data))
+    assert verdict(lambda: resume(path), path.stat().st_size) is not None
+
+
+def _at(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    def change(state: dict[str, Any]) -> None:
+        if value is None:
+            del state[key]
+        else:
+            state[key] = value
+
+    return change
+
+
+def _extra(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda state: _at(key, value)(state["pipeline"]["_model._extra_state"])
+
+
+def _param(name: str, change: Callable[[torch.Tensor], Any]) -> Callable[[dict[str, Any]], None]:
+    key = f"_model.gauss_params.{name}"
+    return lambda state: _at(key, change(state["pipeline"][key]))(state["pipeline"])
+
+
+def _moments(state: dict[str, Any]) -> None:
+    state["optimizers"]["means"]["param_groups"].append({"lr": 1.0})
+
+
+ODD: dict[str, Callable[[dict[str, Any]], None]] = {
+    "no step": _at("step", None),
+    "a step that is no number": _at("step", "many"),
+    "no model": _at("pipeline", None),
+    "a model that is a list": _at("pipeline", [1, 2]),
+    "no optimizers": _at("optimizers", None),
+    "optimizers of another field": _moments,
+    "a generator that is none": _at("random", {"python": 1, "numpy": 2, "torch": 3, "cuda": 4}),
+    "no format": _extra("format", None),
+    "no features": _extra("num_features", None),
+    "no pruning state": _extra("pruning", None),
+    "a pruning state of words": _extra("pruning", {"pruned_at": "yesterday"}),
+    "no strategy state": _extra("strategy", None),
+    "a strategy of other rows": _extra("strategy", {"grad2d": torch.zeros(7), "count": torch.zeros(7)}),
+    "no extra state": lambda state: _at("_model._extra_state", None)(state["pipeline"]),
+    "no primitives": lambda state: [_param(n, lambda v: v[:0])(state) for n in ("means", "scales")] and None,
+    "fewer centres than sizes": _param("means", lambda value: value[:5]),
+    "a flat centre": _param("means", lambda value: value.flatten()),
+    "a centre that is a number": _param("means", lambda value: torch.tensor(1.0)),
+    "a centre that is a word": _param("means", lambda value: "here"),
+    "two dimensions": _param("means", lambda value: value[:, :2]),
+    "colours of no degree": _param("features_rest", lambda value: value.new_zeros(30, 7, 3)),
+    "a billion primitives in 12 bytes": _param("means", lambda value: torch.zeros(1, 3).expand(10**9, 3)),
+}
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_odd_contents_are_refused(good: bytes, verdict: Any, tmp_path: Path, kind: str) -> None:
+    state = contents(good)
+    ODD[kind](state)
+    path = tmp_path / "a.ckpt"
+    torch.save(state, path)
+    assert verdict(lambda: resume(path), path.stat().st_size) is not None
+    verdict(lambda: start_warm(path), path.stat().st_size)
+
+
+class Burglar:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize("place", ["pipeline", "optimizers", "random", "schedulers", "scalers"])
+def test_nothing_in_a_checkpoint_is_run(good: bytes, verdict: Any, tmp_path: Path, place: str) -> None:
+    stolen, path = tmp_path / "stolen", tmp_path / "a.ckpt"
+    state = contents(good)
+    state[place] = {**state[place], "extra": Burglar(stolen)}
+    torch.save(state, path)
+    torch.load(path, weights_only=False)
+    assert stolen.exists(), "the trap does not work"
+    stolen.rmdir()
+    for read in (resume, start_warm):
+        assert verdict(lambda read=read: read(path), path.stat().st_size) is not None
+    assert not stolen.exists()

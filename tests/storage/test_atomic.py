@@ -1,0 +1,94 @@
+"""Files are whole or not there, whatever happens while they are written."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+
+from sundae_ns.errors import StorageError
+from sundae_ns.gaussians import from_points
+from sundae_ns.storage import replacing, write_ply, write_text
+
+
+@contextmanager
+def small_disk(limit: int) -> Iterator[None]:
+    """Refuse to write past ``limit`` bytes of any file, as a full disk does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+
+
+def test_the_new_text_takes_the_place_of_the_old(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+    write_text(tmp_path / "a.txt", "new, ünïcode")
+    assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "new, ünïcode"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_an_error_in_the_middle_leaves_the_old(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+
+    def fail() -> None:
+        with replacing(tmp_path / "a.txt") as partial:
+            partial.write_text("half")
+            assert (tmp_path / "a.txt").read_text() == "old"
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_what_is_renamed_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+    sync, replace = os.fsync, Path.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: (order.append("sync"), sync(handle))[1])
+    monkeypatch.setattr(Path, "replace", lambda path, to: (order.append("rename"), replace(path, to))[1])
+    write_text(tmp_path / "a.txt", "new")
+    assert order == ["sync", "rename", "sync"]
+
+
+def test_full_disk(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.ply", "old")
+    points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0))
+    field = from_points(points, points, sh_degree=1, num_features=0)
+    with small_disk(10_000), pytest.raises(StorageError, match=r"cannot write .*a\.ply: .*ulimit") as caught:
+        write_ply(tmp_path / "a.ply", field)
+    assert "\n" not in str(caught.value)
+    assert (tmp_path / "a.ply").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.ply"]
+
+
+@pytest.mark.parametrize(
+    ("number", "mend"),
+    [(errno.ENOSPC, "disk is full; make room"), (errno.EROFS, "read-only"), (errno.EACCES, "permission denied")],
+)
+def test_what_the_system_says_becomes_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, mend: str
+) -> None:
+    def refuse(_: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(StorageError, match=mend):
+        write_text(tmp_path / "a.txt", "new")
+    assert os.listdir(tmp_path) == []
+
+
+def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        write_text(tmp_path / "nowhere" / "a.txt", "new")

@@ -1,0 +1,190 @@
+"""Saving and finding checkpoints: whole ones only, and a full disk costs none."""
+
+from __future__ import annotations
+
+import os
+import random
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sundae_ns import checkpoint
+from sundae_ns.errors import CheckpointError, StorageError
+from sundae_ns.method_configs import sundae_tiny
+from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
+
+
+def state(step: int, n: int = 50) -> dict[str, Any]:
+    return {"step": step, "pipeline": {"_model.gauss_params.means": torch.full((n, 3), float(step))}}
+
+
+def name(step: int) -> str:
+    return f"step-{step:09d}.ckpt"
+
+
+def saved(folder: Path, *steps: int) -> None:
+    for step in steps:
+        checkpoint.save(state(step), folder / name(step))
+
+
+def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
+    saved(tmp_path / "models", 7)
+    loaded = checkpoint.load(tmp_path / "models" / name(7))
+    assert loaded["step"] == 7
+    assert torch.equal(loaded["pipeline"]["_model.gauss_params.means"], torch.full((50, 3), 7.0))
+
+
+def test_newest_is_by_step_not_by_letters(tmp_path: Path) -> None:
+    saved(tmp_path, 999, 1_000_000_000)
+    (tmp_path / "step-best.ckpt").write_text("a user's own file")
+    assert checkpoint.newest_whole(tmp_path) == (tmp_path / name(1_000_000_000), [])
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def flip(path: Path) -> None:
+    """One bit of a tensor, which torch would load without a word."""
+    content = bytearray(path.read_bytes())
+    with zipfile.ZipFile(path) as archive:
+        (entry,) = (entry for entry in archive.infolist() if entry.filename.endswith("data/0"))
+    content[entry.header_offset + 300] ^= 1
+    path.write_bytes(content)
+    torch.load(path, weights_only=True)
+
+
+@pytest.mark.parametrize("harm", [cut, empty, flip])
+def test_what_is_not_whole_is_passed_over(tmp_path: Path, harm: Any) -> None:
+    saved(tmp_path, 10, 20, 30)
+    harm(tmp_path / name(30))
+    path, passed_over = checkpoint.newest_whole(tmp_path)
+    assert path == tmp_path / name(20)
+    (line,) = passed_over
+    assert name(30) in line
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        checkpoint.load(tmp_path / name(30))
+    for step in (10, 20):
+        harm(tmp_path / name(step))
+    with pytest.raises(CheckpointError, match="no whole checkpoint.*start anew") as caught:
+        checkpoint.newest_whole(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_full_disk_leaves_the_older_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved(tmp_path, 10)
+
+    def full(state: Any, file: Any) -> None:
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(StorageError, match=rf"disk is full; make room \({name(10)} is whole") as caught:
+        saved(tmp_path, 20)
+    assert "\n" not in str(caught.value)
+    assert os.listdir(tmp_path) == [name(10)]
+    assert checkpoint.newest_whole(tmp_path)[0] == tmp_path / name(10)
+
+
+def test_no_right_to_write_and_nothing_saved_before(tmp_path: Path) -> None:
+    (tmp_path / "models").write_text("a file where the folder should be")
+    with pytest.raises(StorageError, match="no older checkpoint"):
+        saved(tmp_path / "models", 10)
+
+
+def test_nerfstudio_finds_its_newest_beside_a_killed_save(tmp_path: Path) -> None:
+    """nerfstudio's own commands read a step off every name in the folder."""
+    saved(tmp_path, 10, 20)
+    (tmp_path / checkpoint._PARTIAL).write_bytes(b"half")
+    steps = sorted(int(x[x.find("-") + 1 : x.find(".")]) for x in os.listdir(tmp_path))
+    assert steps[-1] == 20
+    saved(tmp_path, 30)
+    assert sorted(os.listdir(tmp_path)) == [name(10), name(20), name(30)]
+
+
+def test_random_numbers_go_on_where_they_were_left(tmp_path: Path) -> None:
+    def draw() -> list[Any]:
+        return [random.random(), random.gauss(0, 1), np.random.rand(), np.random.randn(), torch.randn(3).tolist()]
+
+    draw()
+    checkpoint.save({**state(1), "random": checkpoint.random_state()}, tmp_path / name(1))
+    expected = draw()
+    assert draw() != expected
+    checkpoint.set_random_state(checkpoint.load(tmp_path / name(1))["random"])
+    assert draw() == expected
+
+
+def test_a_tensor_that_claims_more_than_it_has(tmp_path: Path) -> None:
+    bomb = {"step": 1, "pipeline": {"_model.gauss_params.means": torch.zeros(1).expand(10**12, 3)}}
+    torch.save(bomb, tmp_path / name(1))
+    with pytest.raises(CheckpointError, match="claims more than it has"):
+        checkpoint.load(tmp_path / name(1))
+
+
+def test_an_archive_that_unpacks_to_more_than_its_size(tmp_path: Path) -> None:
+    saved(tmp_path, 1)
+    with zipfile.ZipFile(tmp_path / name(1)) as archive:
+        entries = {entry: archive.read(entry) for entry in archive.namelist()}
+    with zipfile.ZipFile(tmp_path / name(2), "w", zipfile.ZIP_DEFLATED) as archive:
+        for entry, content in entries.items():
+            archive.writestr(entry, content)
+    with pytest.raises(CheckpointError, match="unpack to more"):
+        checkpoint.load(tmp_path / name(2))
+
+
+def test_methods_train_with_it() -> None:
+    config = sundae_tiny.config
+    assert isinstance(config, SundaeTrainerConfig)
+    assert config._target is SundaeTrainer
+
+
+def test_config_in_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
+    config = SundaeTrainerConfig(method_name="m", experiment_name="e", timestamp="t", output_dir=tmp_path)
+    config.save_config()
+    assert (tmp_path / "e" / "m" / "t" / "config.yml").read_text().startswith("!!python/object:sundae_ns.trainer.")
+    (tmp_path / "file").write_text("")
+    config.output_dir = tmp_path / "file"
+    with pytest.raises(StorageError, match="cannot make .*--output-dir"):
+        config.save_config()
+
+
+HOOK = """
+import sys
+sys.argv = [{program!r}]
+from sundae_ns.errors import {error}, show_in_one_line
+show_in_one_line()
+raise {error}("the cause; the mend")
+"""
+
+
+@pytest.mark.parametrize(
+    ("program", "error", "variables", "lines"),
+    [
+        ("/usr/bin/ns-train", "DataError", {}, ["sundae: the cause; the mend"]),
+        ("/usr/bin/ns-train", "DataError", {"SUNDAE_TRACEBACK": "1"}, None),
+        ("/usr/bin/other", "DataError", {}, None),
+        ("/usr/bin/ns-train", "os", {}, None),
+    ],
+)
+def test_one_line_in_nerfstudios_commands_only(
+    program: str, error: str, variables: dict[str, str], lines: list[str] | None
+) -> None:
+    code = HOOK.format(program=program, error=error)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, **variables}, check=False
+    )
+    assert result.returncode == 1
+    if lines is None:
+        assert "Traceback" in result.stderr
+    else:
+        assert result.stderr.splitlines() == lines
