@@ -15,10 +15,11 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
-import tomllib
 import venv
 import zipfile
 from pathlib import Path
+
+import tomllib
 
 ROOT = Path(__file__).parents[1]
 LOOK = """
@@ -46,7 +47,9 @@ def run(*words: object, cwd: Path, **variables: str) -> str:
         [str(word) for word in words], cwd=cwd, env=environment, capture_output=True, text=True, check=False
     )
     if result.returncode != 0:
-        raise SystemExit(f"{' '.join(map(str, words))}\nfailed with {result.returncode}:\n{result.stdout}\n{result.stderr}")
+        raise SystemExit(
+            f"{' '.join(map(str, words))}\nfailed with {result.returncode}:\n{result.stdout}\n{result.stderr}"
+        )
     return result.stdout
 
 
