@@ -29,8 +29,11 @@ class Hang(BaseException):
 
 
 @pytest.fixture
-def verdict() -> Callable[..., SundaeError | None]:
-    """Call a reader under limits of time and memory: None if it succeeded, or the error of ours in which it ended."""
+def verdict(record_property: Callable[[str, object], None]) -> Callable[..., SundaeError | None]:
+    """Call a reader under limits of time and memory: None if it succeeded, or the error of ours in which it ended.
+
+    ``benchmarks/corpus.py`` counts what is recorded.
+    """
 
     def stop(*_: Any) -> None:
         raise Hang
@@ -56,6 +59,7 @@ def verdict() -> Callable[..., SundaeError | None]:
             resource.setrlimit(resource.RLIMIT_AS, limits)
             signal.signal(signal.SIGALRM, before)
         assert peak <= room, f"took {peak:,} bytes of memory for {size:,} bytes of input"
+        record_property("verdict", "success" if error is None else type(error).__name__)
         if error is not None:
             assert "\n" not in str(error)
             assert 10 < len(str(error)) < 600

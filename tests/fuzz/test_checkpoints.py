@@ -6,6 +6,7 @@ import io
 import os
 import zipfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -44,15 +45,16 @@ class Pipeline(torch.nn.Module):
         self._model.load_state_dict({name.removeprefix("_model."): value for name, value in state.items()})
 
 
-def trainer(path: Path | None = None) -> SundaeTrainer:
-    """A trainer with nothing but what saving and resuming touch."""
+@cache
+def trainer() -> SundaeTrainer:
+    """A trainer with nothing but what saving and resuming touch; one for all cases, since each is loaded anew."""
     made = SundaeTrainer.__new__(SundaeTrainer)
     made.pipeline = Pipeline()  # type: ignore[assignment]
     groups = made.pipeline._model.get_param_groups()
     made.optimizers = Optimizers({n: {"optimizer": FusedAdamConfig(), "scheduler": None} for n in groups}, groups)
     made.grad_scaler = GradScaler(enabled=False)
     made.config = SimpleNamespace(  # type: ignore[assignment]
-        load_dir=None, load_step=None, load_checkpoint=path, load_scheduler=True, save_only_latest_checkpoint=True
+        load_dir=None, load_step=None, load_checkpoint=None, load_scheduler=True, save_only_latest_checkpoint=True
     )
     return made
 
@@ -70,7 +72,9 @@ def contents(good: bytes) -> dict[str, Any]:
 
 
 def resume(path: Path) -> None:
-    trainer(path)._load_checkpoint()
+    made = trainer()
+    made.config.load_checkpoint = path
+    made._load_checkpoint()
 
 
 def start_warm(path: Path) -> None:

@@ -1,0 +1,198 @@
+"""Break the code that decides and applies a prune, one small change at a time, and count how many the tests notice.
+
+    python benchmarks/mutants.py --count 120 --seed 0 > benchmarks/results/reliability/mutants.json
+
+A change is one of: another comparison; ``+ -``, ``* /``, ``and or``, ``True False``, ``min max``, ``any all`` or ``floor ceil``
+swapped; a ``not`` dropped; a whole number one higher, another number doubled; a call left out whose result nobody takes.
+Left alone: docstrings, annotations, texts of errors, decorators, and default values of options, which are choices.
+
+Each changed module is tried in a process of its own that has torch and pytest imported already; nothing on disk is touched.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib.abc
+import importlib.util
+import json
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+# Imported here so that the processes need not: all but the package and its tests.
+import hypothesis  # noqa: F401
+import numpy  # noqa: F401
+import pytest
+import scipy.spatial  # noqa: F401
+import torch
+from rich.progress import track
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "sundae_ns"
+FILES = (*sorted((PACKAGE / "pruning").glob("[!_]*.py")), PACKAGE / "gaussians" / "surgery.py")
+TESTS = ("tests/gaussians/test_surgery.py", "tests/pruning")
+SECONDS = 120
+"""A changed module that takes longer than this is noticed too: its tests hang."""
+
+_COMPARE: dict[type[ast.cmpop], type[ast.cmpop]] = {
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+}
+_ARITHMETIC: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.Mult,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+}
+_NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "floor": "ceil", "ceil": "floor"}
+_LEFT_ALONE = (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
+
+
+def sites(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """Every place that can be changed, by its number in :func:`walk`, and what is done to it."""
+    for index, node in enumerate(walk(tree)):
+        if isinstance(node, ast.Compare):
+            yield index, "compare"
+        elif isinstance(node, (ast.BinOp, ast.AugAssign)) and type(node.op) in _ARITHMETIC:
+            yield index, "arithmetic"
+        elif isinstance(node, ast.BoolOp):
+            yield index, "and or"
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.Not, ast.Invert)):
+            yield index, "not"
+        elif isinstance(node, ast.Constant) and isinstance(node.value, (bool, int, float)):
+            yield index, "constant"
+        elif (isinstance(node, ast.Name) and node.id in _NAMES) or (
+            isinstance(node, ast.Attribute) and node.attr in _NAMES
+        ):
+            yield index, "name"
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+            yield index, "left out"
+
+
+def walk(node: ast.AST) -> Iterator[ast.AST]:
+    """Nodes that are worth changing, in a fixed order."""
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns", "decorator_list"):
+            continue
+        if (
+            isinstance(node, ast.AnnAssign)
+            and name == "value"
+            and isinstance(getattr(node, "parent", None), ast.ClassDef)
+        ):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST) and not isinstance(child, _LEFT_ALONE):
+                child.parent = node  # type: ignore[attr-defined]
+                yield from walk(child)
+
+
+def change(tree: ast.AST, index: int, kind: str) -> str:
+    """Change one place in ``tree``, and describe it."""
+    node: Any = next(node for i, node in enumerate(walk(tree)) if i == index)
+    before = ast.unparse(node)
+    if kind == "compare":
+        node.ops[0] = _COMPARE[type(node.ops[0])]()
+    elif kind == "arithmetic":
+        node.op = _ARITHMETIC[type(node.op)]()
+    elif kind == "and or":
+        node.op = ast.Or() if isinstance(node.op, ast.And) else ast.And()
+    elif kind == "not":
+        node.operand = ast.UnaryOp(node.op, node.operand)  # twice is not at all
+    elif kind == "constant":
+        value = node.value
+        node.value = (
+            (not value) if isinstance(value, bool) else value + 1 if isinstance(value, int) else value * 2 + 1e-3
+        )
+    elif kind == "name":
+        field = "id" if isinstance(node, ast.Name) else "attr"
+        setattr(node, field, _NAMES[getattr(node, field)])
+    else:
+        node.value = ast.Constant(None)
+    return f"line {node.lineno}: {before}  ->  {ast.unparse(node)}"
+
+
+class Changed(importlib.abc.SourceLoader, importlib.abc.MetaPathFinder):
+    """Imports one module of the package from a changed tree."""
+
+    def __init__(self, path: Path, tree: ast.AST) -> None:
+        self.path, self.source = path, ast.unparse(tree)
+        self.name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+
+    def find_spec(self, name: str, *_: Any) -> Any:
+        return importlib.util.spec_from_loader(name, self, origin=str(self.path)) if name == self.name else None
+
+    def get_filename(self, fullname: str) -> str:
+        return str(self.path) + " (changed)"
+
+    def get_data(self, path: str) -> bytes:
+        return self.source.encode()
+
+
+def noticed(finder: Changed | None) -> bool:
+    """Whether the tests fail with the changed module."""
+    child = os.fork()
+    if child == 0:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.dup2(1, 2)
+        signal.alarm(SECONDS)  # ends the process, which counts as noticed
+        if finder is not None:
+            sys.meta_path.insert(0, finder)
+        os.chdir(ROOT)
+        os._exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *TESTS]) != 0))
+    return os.waitpid(child, 0)[1] != 0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=120)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    trees = {path: ast.parse(path.read_text()) for path in FILES}
+    places = [(path, *site) for path, tree in trees.items() for site in sites(tree)]
+    sample = sorted(random.Random(options.seed).sample(range(len(places)), min(options.count, len(places))))
+    began = time.monotonic()
+    if noticed(None):
+        raise SystemExit("the tests fail on the code as it is")
+    survivors = []
+    for number in track(sample, description="Changing and testing", transient=True):
+        path, index, kind = places[number]
+        tree = deepcopy(trees[path])
+        what = change(tree, index, kind)
+        if not noticed(Changed(path, tree)):
+            survivors.append(f"{path.relative_to(ROOT)}, {what}")
+    killed = len(sample) - len(survivors)
+    result = {
+        "places": len(places),
+        "mutants": len(sample),
+        "seed": options.seed,
+        "killed": killed,
+        "killed_percent": round(100 * killed / len(sample), 1),
+        "seconds": round(time.monotonic() - began),
+        "survivors": survivors,
+    }
+    print(json.dumps(result, indent=1))
+
+
+if __name__ == "__main__":
+    main()
