@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nerfstudio.engine.trainer import Trainer
 
 from sundae_ns import checkpoint
-from sundae_ns.errors import CheckpointError, StorageError
+from sundae_ns.errors import CheckpointError, DataError, StorageError
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 
@@ -156,6 +157,27 @@ def test_config_in_a_folder_that_cannot_be_made(tmp_path: Path) -> None:
     config.output_dir = tmp_path / "file"
     with pytest.raises(StorageError, match="cannot make .*--output-dir"):
         config.save_config()
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "cause"),
+    [
+        (OSError(28, "No space left on device"), StorageError, "cannot write to the run's folder .*disk is full"),
+        (DataError("a picture; mend it"), DataError, "a picture; mend it"),
+        (ConnectionResetError(104, "reset"), ConnectionResetError, "reset"),
+    ],
+)
+def test_faults_while_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, kind: type[Exception], cause: str
+) -> None:
+    def fail(_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(Trainer, "train", fail)
+    made = SundaeTrainer.__new__(SundaeTrainer)
+    made.base_dir = tmp_path
+    with pytest.raises(kind, match=cause):
+        made.train()
 
 
 HOOK = """

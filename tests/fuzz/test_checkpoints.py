@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -94,6 +94,34 @@ def test_harmed_file(good: bytes, harmed: Any, verdict: Any, tmp_path: Path, see
     path = tmp_path / "a.ckpt"
     path.write_bytes(harmed(good, seed))
     verdict(lambda: read(path), path.stat().st_size)
+
+
+@pytest.fixture
+def folder(good: bytes, tmp_path: Path) -> Iterator[Path]:
+    """Two checkpoints, the newer one damaged; the trainer looks there."""
+    (tmp_path / "step-000000007.ckpt").write_bytes(good)
+    (tmp_path / "step-000000008.ckpt").write_bytes(good[:-1000])
+    made = trainer()
+    made.config.load_dir, made.config.load_checkpoint = tmp_path, None
+    yield tmp_path
+    made.config.load_dir = made.config.load_step = None
+
+
+def test_training_goes_on_from_the_newest_whole_one(
+    folder: Path, verdict: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = trainer()
+    assert verdict(made._load_checkpoint, 10**6) is None
+    assert made._start_step == 8
+    assert "passed over a checkpoint: step-000000008.ckpt is not whole" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("step", [8, 9])
+def test_a_step_that_was_asked_for_is_not_replaced(folder: Path, verdict: Any, step: int) -> None:
+    made = trainer()
+    made.config.load_step = step
+    error = verdict(made._load_checkpoint, 10**6)
+    assert f"step-{step:09d}.ckpt" in str(error)
 
 
 def rezipped(good: bytes, change: Callable[[str, bytes], bytes]) -> bytes:
