@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import math
@@ -11,6 +12,9 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from sundae_ns.errors import DataError
+
+with contextlib.suppress(ImportError):  # Windows has none.
+    import fcntl
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,8 @@ def _check_header(path: Path, header: list[str]) -> None:
 def append_row(path: Path, row: RunRow) -> None:
     """Append a run to a CSV file, which is created with its header where there is none.
 
-    The line goes out in one write to the file's end, so that a crash, or another process that appends, cannot leave
-    half a row.
+    The line goes out in one write to the file's end, so that a crash cannot leave half a row; the file is locked
+    meanwhile (where the system has ``flock``), so that appends of several processes wait for each other.
 
     Args:
         path: the file; missing folders are created.
@@ -99,22 +103,25 @@ def append_row(path: Path, row: RunRow) -> None:
     line = _line([_cell(getattr(row, name)) for name in COLUMNS])
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and path.stat().st_size > 0:
-            with path.open(newline="", encoding="utf-8") as file:
-                _check_header(path, next(csv.reader(file)))
-            with path.open("rb") as file:
+        with path.open("a+b") as file:
+            _lock(file.fileno())
+            file.seek(0)
+            if first := file.readline().decode("utf-8", errors="replace"):
+                _check_header(path, next(csv.reader([first])))
                 file.seek(-1, os.SEEK_END)
                 # An editor may have dropped the last line's end.
                 line = line if file.read(1) == b"\n" else "\n" + line
-        else:
-            line = _line(list(COLUMNS)) + line
-        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-        try:
-            os.write(descriptor, line.encode("utf-8"))
-        finally:
-            os.close(descriptor)
+            else:
+                line = _line(list(COLUMNS)) + line
+            file.write(line.encode("utf-8"))
     except OSError as error:
         raise DataError(f"{path} cannot be written ({error.strerror}); name another file.") from error
+
+
+def _lock(descriptor: int) -> None:
+    """Wait for a file's lock, which goes with the descriptor; nothing where the system has no ``flock`` (Windows)."""
+    if os.name == "posix":
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
 
 
 def read_rows(path: Path) -> list[RunRow]:

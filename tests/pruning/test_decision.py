@@ -178,3 +178,10 @@ def test_decision_on_the_gpu_keeps_the_same_primitives() -> None:
     on_gpu = decide({name: value.cuda() for name, value in params.items()}, config)
     assert on_gpu.mask.is_cuda
     assert torch.equal(on_gpu.mask.cpu(), decide(params, config).mask)
+
+
+def test_a_contribution_of_nan_counts_as_none() -> None:
+    config = PruningConfig(score="contribution")
+    values = score(field(), config, None, lambda: torch.arange(60.0).index_fill(0, torch.tensor([7]), torch.nan))
+    assert values[7] == 0
+    assert values[8] == 8

@@ -239,6 +239,25 @@ def test_report_is_one_line_of_plain_numbers() -> None:
     summary = report.summary()
     assert "\n" not in summary
     assert summary.startswith("step 0: kept 10 of 100 primitives in ")
+    assert f"sigma {report.sigma:.3g}, tau {report.tau:.3g}, {report.isolated:,} isolated" in summary
+    (unscored,), _ = run(make_policy(PruningConfig(prune_at=0, score="opacity")), field(), range(1))
+    assert "sigma" not in unscored.summary()
+
+
+def test_the_last_options_that_work() -> None:
+    edge = {"num_neighbors": 1, "every": 1, "start": 4, "stop": 4, "max_primitives": 1, "keep_ratio": 1.0, "gamma": 1.0}
+    PruningConfig(mode="continuous", **edge).validate()  # type: ignore[arg-type]
+
+
+def test_continuous_leaves_a_field_alone_that_holds_the_cap() -> None:
+    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=1, max_primitives=100))
+    state = policy.initialize_state()
+    assert [policy.due(state, 0, n) for n in (99, 100, 101)] == [False, False, True]
+
+
+def test_continuous_prunes_a_step_once() -> None:
+    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=1))
+    assert [policy.due({**policy.initialize_state(), "pruned_at": 5}, step, 100) for step in (5, 6)] == [False, True]
 
 
 @pytest.mark.parametrize(
