@@ -27,6 +27,7 @@ FLOORS = {
     "checkpoint": 3,
     "model": 3,
     "trainer": 3,
+    "opening": 3,
     "measure": 3,
     "method_configs": 4,
     "cli": 4,

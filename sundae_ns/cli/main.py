@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -80,6 +80,30 @@ def demo(out: Annotated[Path, tyro.conf.Positional] = Path(".demo"), steps: int 
     from sundae_ns.cli.demo import run_demo
 
     return run_demo(out, steps=steps)
+
+
+@app.command
+def report(
+    runs: Annotated[list[Path], tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    data: Path | None = None,
+    lpips_net: Literal["alex", "vgg", "squeeze"] = "alex",
+    warmup: int = 3,
+    repeats: int = 5,
+) -> int:
+    """Evaluate finished runs on their test views, speed beside error: tables, plots, curves over training.
+
+    Args:
+        runs: folders of runs of sundae and splatfacto, or their config.yml, which are programs: open your own.
+        out: folder to write.
+        data: where the capture is, if it is not where the runs say.
+        lpips_net: net of LPIPS, which is taken where its weights are at hand; values of different nets do not compare.
+        warmup: untimed renderings of each picture.
+        repeats: timed renderings of each picture; 0 takes no times.
+    """
+    from sundae_ns.cli.report import run_report
+
+    return run_report(runs, out, data=data, lpips_net=lpips_net, warmup=warmup, repeats=repeats)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

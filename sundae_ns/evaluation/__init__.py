@@ -2,7 +2,9 @@
 
 from sundae_ns.evaluation import display
 from sundae_ns.evaluation.flicker import Change, Frame, change
+from sundae_ns.evaluation.flip import flip, flip_available
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
+from sundae_ns.evaluation.measured import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.evaluation.picture import ComparisonRow, comparison_sheet, save_comparison, side_by_side
 from sundae_ns.evaluation.records import COLUMNS, RunRow, append_row, read_rows
@@ -11,18 +13,25 @@ from sundae_ns.evaluation.timing import Timing, median_ms
 
 __all__ = [
     "COLUMNS",
+    "HEAD_OFF",
+    "HEAD_ON",
     "Change",
     "ComparisonRow",
+    "Configuration",
     "Frame",
     "Lpips",
+    "Measured",
     "Quality",
     "RunFigures",
     "RunRow",
     "Timing",
+    "ViewQuality",
     "append_row",
     "change",
     "comparison_sheet",
     "display",
+    "flip",
+    "flip_available",
     "lpips_weights_available",
     "lpips_weights_path",
     "lpips_weights_url",
