@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sundae_ns.cli.demo import _comparison, _run
+from sundae_ns.cli.demo import _comparison
+from sundae_ns.cli.process import run_logged
 from sundae_ns.errors import SundaeError
 
 
@@ -17,14 +18,14 @@ def test_a_failing_command_shows_its_end_and_keeps_its_log(tmp_path: Path) -> No
     log = tmp_path / "train.log"
     script = "import sys; print('first'); print('the cause', file=sys.stderr); sys.exit(3)"
     with pytest.raises(SundaeError, match="failed with 3") as error:
-        _run([sys.executable, "-c", script], log)
+        run_logged([sys.executable, "-c", script], log)
     assert "the cause" in str(error.value)
     assert "first" in log.read_text()
 
 
 def test_lines_reach_the_progress_bar(tmp_path: Path) -> None:
     lines: list[str] = []
-    _run([sys.executable, "-c", "print('10 (50.00%)'); print('20 (100.00%)')"], tmp_path / "log", lines.append)
+    run_logged([sys.executable, "-c", "print('10 (50.00%)'); print('20 (100.00%)')"], tmp_path / "log", lines.append)
     assert [line.strip() for line in lines] == ["10 (50.00%)", "20 (100.00%)"]
 
 
