@@ -36,36 +36,47 @@ from sundae_ns import checkpoint
 from sundae_ns.evaluation import RunRow, append_row
 from sundae_ns.measure import sizes
 from sundae_ns.model import SundaeModel
-from sundae_ns.pruning import make_policy
+from sundae_ns.pruning import field_graph, make_policy
+from sundae_ns.pruning.scores import on_graph_device
 from sundae_ns.schedulers import Decay
 
 RESULTS = Path(__file__).parent / "results" / "rules.jsonl"
 COLMAP = "colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8"
 
 PAPER = {"selection": "band", "score": "response", "signal": "positions"}
+SYSTEMATIC = {"score": "contribution", "selection": "systematic"}
+RESPONSE = {"selection": "systematic"}
 DETAIL = {"score": "detail-contribution", "selection": "systematic"}
-RULES: dict[str, dict[str, Any]] = {
+MERGE = {"redistribution": "merge", "edges": "appearance"}
+CONTROLS: dict[str, dict[str, Any]] = {
     "random": {"score": "random"},
-    "paper": PAPER,
     "opacity-top": {"score": "opacity", "selection": "top"},
     "contribution-top": {"score": "contribution", "selection": "top"},
     "contribution": {"score": "contribution"},
+}
+"""Rules without a spectrum, by the name of their rows: what others have to beat."""
+RULES: dict[str, dict[str, Any]] = {
+    **CONTROLS,
+    "paper": PAPER,
     "response-contribution": {},
     "color-response": {"signal": "colors"},
-    "systematic": {"score": "contribution", "selection": "systematic"},
-    "response-systematic": {"selection": "systematic"},
-    "shared": {"selection": "shared"},
     "coherence": {"score": "coherence-contribution", "selection": "systematic"},
     "coherence-appearance": {"score": "coherence-contribution", "selection": "systematic", "edges": "appearance"},
     "detail": {"score": "detail-contribution"},
+    "systematic": SYSTEMATIC,
+    "response-systematic": RESPONSE,
+    "response-shared": {"selection": "shared"},
     "detail-systematic": DETAIL,
-    "detail-merge": {**DETAIL, "redistribution": "merge"},
-    "detail-merge-appearance": {**DETAIL, "redistribution": "merge", "edges": "appearance"},
+    "random-merge": {"score": "random", **MERGE},
+    "systematic-merge": {**SYSTEMATIC, **MERGE},
+    "response-merge": {**RESPONSE, **MERGE},
+    "detail-merge": {**DETAIL, **MERGE},
+    "detail-merge-centres": {**DETAIL, "redistribution": "merge"},
     "detail-grow": {**DETAIL, "redistribution": "grow"},
-    "random-merge": {"score": "random", "redistribution": "merge"},
-    "random-grow": {"score": "random", "redistribution": "grow"},
+    "detail-rounds": {**DETAIL, "rounds": 3},
+    "detail-merge-rounds": {**DETAIL, **MERGE, "rounds": 3},
 }
-"""Rule name, as in the table's rows, to the options of pruning that make it."""
+"""All rules, by the name of their rows, with the options of pruning that make them."""
 
 
 class Branch(NamedTuple):
@@ -84,7 +95,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--method", default="sundae")
     parser.add_argument("--warmup", type=int, help="steps before the prune, in place of the method's own")
     parser.add_argument("--steps", type=int, default=1500, help="steps of a branch after its prune; 0: none")
-    parser.add_argument("--keep", type=float, nargs="+", default=[0.01, 0.1, 0.3])
+    parser.add_argument("--keep", type=float, nargs="+", help="default: 0.01 0.1 0.3; 0.01 for a sweep")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--rules", nargs="+", default=list(RULES), choices=list(RULES))
     parser.add_argument("--sweep", choices=list(SWEEPS), help="this in place of the rules")
@@ -103,20 +114,25 @@ def _gamma() -> dict[str, dict[str, Any]]:
 
 
 def _tau() -> dict[str, dict[str, Any]]:
-    # The robust rule's reach is 3 widths, tau its square; factors are on the width.
-    return {f"paper reach x{f:g}": {**PAPER, "reach": f} for f in (0.25, 0.5, 1.0, 2.0, 4.0)}
+    # Factors on the distance that edges reach by the robust rule; tau is its square.
+    factors = (0.25, 0.5, 1.0, 2.0, 4.0)
+    return {f"{name} reach x{f:g}": {**RULES[name], REACH: f} for name in SWEPT for f in factors}
 
 
 def _neighbors() -> dict[str, dict[str, Any]]:
-    return {f"{name} k {k}": {**RULES[name], "num_neighbors": k} for name in ("paper",) for k in (4, 8, 16, 32, 64)}
+    return {f"{name} k {k}": {**RULES[name], "num_neighbors": k} for name in SWEPT for k in (4, 8, 16, 32, 64)}
 
 
 SWEEPS = {"gamma": _gamma, "tau": _tau, "k": _neighbors}
+SWEPT = ("paper", "response-contribution", "detail-merge")
+REACH = "reach"
+"""Not an option of pruning: becomes tau and sigma when the field is known."""
 
 
 def branches(options: argparse.Namespace) -> list[Branch]:
     rules = SWEEPS[options.sweep]() if options.sweep else {name: RULES[name] for name in options.rules}
-    return [Branch(n, k, s, o) for s in options.seeds for k in options.keep for n, o in rules.items()]
+    keeps = options.keep or ([0.01] if options.sweep else [0.01, 0.1, 0.3])
+    return [Branch(n, k, s, o) for s in options.seeds for k in keeps for n, o in rules.items()]
 
 
 class Bench:
@@ -204,6 +220,12 @@ class Bench:
         options = self.options
         self._rewind(branch.seed, options.steps)
         choice = dict(branch.options)
+        if REACH in choice:
+            graph = field_graph(on_graph_device(self.model.gaussians, self.pruning), self.pruning)
+            choice |= {"sigma": graph.sigma, "tau": graph.tau * choice.pop(REACH) ** 2}
+        if choice.get("rounds", 1) > 1:
+            # A tenth of the branch apart: all branches are trained for the same time in all.
+            choice.setdefault("round_every", max(options.steps // 10, 1))
         config = replace(self.pruning, keep_ratio=branch.keep, seed=branch.seed, **choice)
         self.model.config.pruning, self.model.policy = config, make_policy(config)
         self.model.contribution = self._contribution  # type: ignore[method-assign]
@@ -226,7 +248,7 @@ class Bench:
         tuned = run.evaluate(self.trainer.pipeline) if options.steps else pruned
         return {
             **key_of(options, branch, self.step),
-            "options": branch.options,
+            "options": choice,
             "before": before,
             "primitives": self.model.num_points,
             "psnr_pruned": pruned["psnr"],
@@ -286,6 +308,10 @@ def key_of(options: argparse.Namespace, branch: Branch, warmup: int) -> dict[str
     }
 
 
+def is_finished(path: Path, key: dict[str, Any]) -> bool:
+    return any(all(line[name] == value for name, value in key.items()) for line in finished(path))
+
+
 def finished(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
@@ -308,7 +334,7 @@ def main() -> None:
     bench = Bench(options)
     for branch in mine:
         key = key_of(options, branch, bench.step)
-        if any(all(line[name] == value for name, value in key.items()) for line in finished(options.results)):
+        if is_finished(options.results, key):
             continue
         line = bench.branch(branch)
         append(options.results, line)

@@ -80,12 +80,11 @@ def decide(
 
     usable = params if n_finite == n else {name: value.detach()[finite] for name, value in params.items()}
     weights = _once(contribution, finite)
-    on_device = on_graph_device(usable, config)
-    graph = field_graph(on_device, config) if config.uses_graph else None
+    graph = field_graph(on_graph_device(usable, config), config) if config.uses_graph else None
     found = response(usable, config, graph) if config.uses_response else None
     coherent = coherence(graph, count, config, finite.device) if graph is not None and config.uses_coherence else None
     values = score(usable, config, found, weights, coherent)
-    selected = _select(values, config, count, found, on_device["means"])
+    selected = _select(values, config, count, found, usable["means"])
     mask = finite.clone()
     mask[finite] = selected.to(mask.device)
     return Decision(
