@@ -337,7 +337,12 @@ class SundaeModel(SplatfactoModel):
             camera: nerfstudio camera, camera-to-world with OpenGL axes.
             downscale: divide the resolution by this.
         """
-        pose = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
+        if self.training:
+            pose = self.camera_optimizer.apply_to_camera(camera)
+        else:
+            # Small sums on single numbers: on a GPU each would cost a launch, and each number read back a wait.
+            camera = camera.to("cpu")
+            pose = camera.camera_to_worlds
         pose = pose.reshape(-1, 3, 4)[0]
         rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
         top = torch.cat([rotation.T, -rotation.T @ pose[:, 3:]], dim=1)
@@ -424,6 +429,11 @@ class SundaeModel(SplatfactoModel):
             "feature_image": features,
         }
         return pictures, splat
+
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> _Outputs:  # type: ignore[override]
+        """Render a camera, or what of it lies in a box; unlike splatfacto's, this leaves the camera on its device."""
+        self.set_crop(obb_box)
+        return self.get_outputs(camera)
 
     @_names_full_memory
     def get_outputs(self, camera: Cameras) -> _Outputs:  # type: ignore[override]
