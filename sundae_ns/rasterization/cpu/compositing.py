@@ -9,7 +9,7 @@ blended in a pixel, it knows from the number of the last one.
 from __future__ import annotations
 
 from math import exp
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -21,13 +21,14 @@ from torch.autograd.function import once_differentiable
 
 from sundae_ns.rasterization.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
 from sundae_ns.rasterization.cpu.parallel import as_array, compiled, compiled_for_simd, share
-from sundae_ns.rasterization.cpu.tiles import HALF_XX, HALF_YY, OPACITY, REACH, U, V, XY, Lists
+from sundae_ns.rasterization.cpu.tiles import HALF_XX, HALF_YY, OPACITY, XY, Lists, U, V
 from sundae_ns.rasterization.tiles import MIN_ALPHA, TILE
 
 _PIXELS = TILE * TILE
 _LOOK = 8  # list entries between two looks at whether a tile is opaque
 _FAINTEST = 20.0  # exponents end here, far beyond log(255)
 _WORTH_A_THREAD = 8  # tiles
+_ABREAST = 4  # channels that a loop over pixels takes together
 _MOMENTS = 6  # of a primitive in a tile, behind its channels
 _WORTH_A_THREAD_TO_SUM = 2000  # primitives
 
@@ -62,6 +63,8 @@ class _Composite(torch.autograd.Function):
         image = colors.new_zeros(height, width, colors.shape[1])
         alpha = colors.new_zeros(height, width, 1)
         tiles = lists.columns * lists.rows
+        packed = np.zeros((len(lists.ids), -(-colors.shape[1] // _ABREAST) * _ABREAST), lists.table.dtype)
+        packed[:, : colors.shape[1]] = as_array(colors)[lists.ids]
         left = np.empty((tiles, _PIXELS), lists.table.dtype)
         last = np.empty((tiles, _PIXELS), np.int32)
         share(
@@ -70,9 +73,8 @@ class _Composite(torch.autograd.Function):
             lists.busiest,
             lists.starts,
             lists.ranks,
-            lists.ids,
             lists.table,
-            as_array(colors),
+            packed,
             lists.columns,
             as_array(image),
             as_array(alpha),
@@ -81,6 +83,7 @@ class _Composite(torch.autograd.Function):
             at_least=_WORTH_A_THREAD,
         )
         ctx.save_for_backward(means2d, conics, opacities, colors)
+        ctx.packed = packed
         ctx.lists, ctx.left, ctx.last, ctx.absgrad = lists, left, last, absgrad
         return image, alpha
 
@@ -91,9 +94,8 @@ class _Composite(torch.autograd.Function):
         lists: Lists = ctx.lists
         want_geometry, want_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
         absgrad = ctx.absgrad and want_geometry
-        channels = colors.shape[1]
         # A tile that became opaque leaves the slots of its later entries alone.
-        parts = np.zeros((len(lists.slots), channels + _MOMENTS + 2 * absgrad), lists.table.dtype)
+        parts = np.zeros((len(lists.slots), ctx.packed.shape[1] + _MOMENTS + 2 * absgrad), lists.table.dtype)
         share(
             _blend_backward,
             len(lists.busiest),
@@ -101,9 +103,8 @@ class _Composite(torch.autograd.Function):
             lists.starts,
             lists.ranks,
             lists.slots,
-            lists.ids,
             lists.table,
-            as_array(colors),
+            ctx.packed,
             lists.columns,
             ctx.left,
             ctx.last,
@@ -116,7 +117,7 @@ class _Composite(torch.autograd.Function):
             at_least=_WORTH_A_THREAD,
         )
         outputs = [torch.zeros_like(value, memory_format=torch.contiguous_format) for value in ctx.saved_tensors]
-        absolute = torch.zeros_like(outputs[0])
+        absolute = torch.zeros_like(outputs[0]) if absgrad else outputs[0].new_zeros(0, 0, 0)
         share(
             _sum_slots,
             len(lists.ids),
@@ -128,12 +129,12 @@ class _Composite(torch.autograd.Function):
             at_least=_WORTH_A_THREAD_TO_SUM,
         )
         if ctx.absgrad:
-            means2d.absgrad = absolute
+            means2d.absgrad = absolute if absgrad else torch.zeros_like(outputs[0])
         geometry = outputs[:3] if want_geometry else (None, None, None)
         return *geometry, outputs[3] if want_colors else None, None, None, None, None
 
 
-@intrinsic
+@cast(Any, intrinsic)
 def _fused(typing: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c, rounded once: so that the way back computes the very alphas of the way there."""
 
@@ -143,7 +144,7 @@ def _fused(typing: Any, a: Any, b: Any, c: Any) -> Any:
     return a(a, a, a), generate
 
 
-@intrinsic
+@cast(Any, intrinsic)
 def _power_of_two(typing: Any, exponent: Any) -> Any:
     """2 to the power of an int32, float32: its bits are the exponent, shifted."""
 
@@ -162,8 +163,8 @@ def _exp(x: Any) -> Any:
 
 @overload(_exp)
 def _exp_by_type(x: Any) -> Any:
-    if x != types.float32:
-        return lambda x: exp(x)
+    def double(x: Any) -> Any:
+        return exp(x)
 
     def single(x: Any) -> Any:
         number = np.float32
@@ -182,7 +183,7 @@ def _exp_by_type(x: Any) -> Any:
         value = _fused(value, rest, number(1.0))
         return value * _power_of_two(np.int32(whole))
 
-    return single
+    return single if x == types.float32 else double
 
 
 @compiled
@@ -198,7 +199,6 @@ def _blend(
     tiles: Any,
     starts: Any,
     ranks: Any,
-    ids: Any,
     table: Any,
     colors: Any,
     columns: int,
@@ -215,7 +215,7 @@ def _blend(
     for p in range(_PIXELS):
         across[p], down[p] = number(p % TILE + 0.5), number(p // TILE + 0.5)
     through, weights = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
-    summed, blended = np.empty(_PIXELS, table.dtype), np.empty((channels, _PIXELS), table.dtype)
+    summed, blended = np.empty(_PIXELS, table.dtype), np.empty((colors.shape[1], _PIXELS), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
@@ -250,10 +250,14 @@ def _blend(
                 summed[p] += weight
                 total += weight
             if total > zero:
-                for c in range(channels):
-                    color = colors[ids[rank], c]
+                for c in range(0, len(blended), _ABREAST):
+                    c0, c1, c2, c3 = colors[rank, c], colors[rank, c + 1], colors[rank, c + 2], colors[rank, c + 3]
                     for p in range(_PIXELS):
-                        blended[c, p] += color * weights[p]
+                        weight = weights[p]
+                        blended[c, p] += c0 * weight
+                        blended[c + 1, p] += c1 * weight
+                        blended[c + 2, p] += c2 * weight
+                        blended[c + 3, p] += c3 * weight
             if place % _LOOK == 0:
                 light = zero
                 for p in range(_PIXELS):
@@ -275,7 +279,6 @@ def _blend_backward(
     starts: Any,
     ranks: Any,
     slots: Any,
-    ids: Any,
     table: Any,
     colors: Any,
     columns: int,
@@ -298,7 +301,7 @@ def _blend_backward(
         across[p], down[p] = number(p % TILE + 0.5), number(p // TILE + 0.5)
     through, weights = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
     behind, pulls = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
-    grads, alpha_grads = np.zeros((channels, _PIXELS), table.dtype), np.zeros(_PIXELS, table.dtype)
+    grads, alpha_grads = np.zeros((colors.shape[1], _PIXELS), table.dtype), np.zeros(_PIXELS, table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
@@ -323,10 +326,12 @@ def _blend_backward(
             if want_geometry:
                 for p in range(_PIXELS):
                     pulls[p] = alpha_grads[p]
-                for c in range(channels):
-                    color = colors[ids[rank], c]
-                    for p in range(_PIXELS):
-                        pulls[p] += color * grads[c, p]  # becomes <g, c>
+                for c in range(0, len(grads), _ABREAST):
+                    c0, c1, c2, c3 = colors[rank, c], colors[rank, c + 1], colors[rank, c + 2], colors[rank, c + 3]
+                    for p in range(_PIXELS):  # becomes <g, c>
+                        pulls[p] += (
+                            c0 * grads[c, p] + c1 * grads[c + 1, p] + c2 * grads[c + 2, p] + c3 * grads[c + 3, p]
+                        )
             m = mx = my = mxx = mxy = myy = zero
             total = zero
             for p in range(_PIXELS):
@@ -354,13 +359,17 @@ def _blend_backward(
             if not total > zero:
                 continue
             if want_colors:
-                for c in range(channels):
-                    gradient = zero
+                for c in range(0, len(grads), _ABREAST):
+                    g0 = g1 = g2 = g3 = zero
                     for p in range(_PIXELS):
-                        gradient += weights[p] * grads[c, p]
-                    parts[slot, c] = gradient
+                        weight = weights[p]
+                        g0 += weight * grads[c, p]
+                        g1 += weight * grads[c + 1, p]
+                        g2 += weight * grads[c + 2, p]
+                        g3 += weight * grads[c + 3, p]
+                    parts[slot, c], parts[slot, c + 1], parts[slot, c + 2], parts[slot, c + 3] = g0, g1, g2, g3
             if want_geometry:
-                moments = parts[slot, channels:]
+                moments = parts[slot, len(grads) :]
                 moments[0], moments[1], moments[2] = m, mx, my
                 moments[3], moments[4], moments[5] = mxx, mxy, myy
             if absgrad:
@@ -370,8 +379,8 @@ def _blend_backward(
                     dx, dy = across[p] - u, down[p] - v
                     absolute_x += abs(pulls[p] * (xx * dx + xy * dy))
                     absolute_y += abs(pulls[p] * (xy * dx + yy * dy))
-                parts[slot, channels + _MOMENTS] = absolute_x
-                parts[slot, channels + _MOMENTS + 1] = absolute_y
+                parts[slot, len(grads) + _MOMENTS] = absolute_x
+                parts[slot, len(grads) + _MOMENTS + 1] = absolute_y
 
 
 @compiled
@@ -389,7 +398,7 @@ def _sum_slots(
     absolute: Any,
 ) -> None:
     """Add up the slots of each primitive, in float64, and turn moments into gradients."""
-    channels, width = grad_colors.shape[1], parts.shape[1]
+    channels, width = parts.shape[1] - _MOMENTS - (2 if len(absolute) > 0 else 0), parts.shape[1]
     sums = np.empty(width)
     for rank in range(begin, end):
         i = ids[rank]
@@ -397,7 +406,7 @@ def _sum_slots(
         for slot in range(first_slots[rank], first_slots[rank + 1]):
             for d in range(width):
                 sums[d] += parts[slot, d]
-        for c in range(channels):
+        for c in range(grad_colors.shape[1]):
             grad_colors[i, c] = sums[c]
         xx, xy, yy = 2 * float(table[rank, HALF_XX]), table[rank, XY], 2 * float(table[rank, HALF_YY])
         mx, my = sums[channels + 1], sums[channels + 2]
@@ -406,6 +415,6 @@ def _sum_slots(
         grad_conics[i, 1] = -sums[channels + 4]
         grad_conics[i, 2] = -0.5 * sums[channels + 5]
         grad_opacities[i] = sums[channels] / table[rank, OPACITY]
-        if width > channels + _MOMENTS:
+        if len(absolute) > 0:
             absolute[0, i, 0] = sums[channels + _MOMENTS]
             absolute[0, i, 1] = sums[channels + _MOMENTS + 1]

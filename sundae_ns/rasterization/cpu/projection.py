@@ -135,7 +135,9 @@ def _project(
         _rotation(quats, i, turn)
         for r in range(3):
             for c in range(3):
-                root[r, c] = (view[r, 0] * turn[0, c] + view[r, 1] * turn[1, c] + view[r, 2] * turn[2, c]) * scales[i, c]
+                root[r, c] = (view[r, 0] * turn[0, c] + view[r, 1] * turn[1, c] + view[r, 2] * turn[2, c]) * scales[
+                    i, c
+                ]
         slope_x, slope_y = min(max(x / z, min_x), max_x), min(max(y / z, min_y), max_y)
         for c in range(3):
             row_x[c] = lens[0] / z * (root[0, c] - slope_x * root[2, c])

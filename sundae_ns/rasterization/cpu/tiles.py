@@ -88,20 +88,20 @@ def _visible_by_depth(keys: Any, radii: Any, opacities: Any) -> Any:
             count += 1
     ids = ids[:count].copy()
     other = np.empty_like(ids)
-    ends = np.empty(1 << _DIGIT, np.int64)
+    ends: Any = np.empty(1 << _DIGIT, np.int64)
     for shift in range(0, 8 * keys.itemsize, _DIGIT):
         ends[:] = 0
         for i in ids:
             ends[(np.int64(keys[i]) >> shift) & ((1 << _DIGIT) - 1)] += 1
-        total = 0
+        total: Any = 0
         for digit in range(1 << _DIGIT):
             size = ends[digit]
             ends[digit] = total
             total += size
         for i in ids:
-            digit = (np.int64(keys[i]) >> shift) & ((1 << _DIGIT) - 1)
-            other[ends[digit]] = i
-            ends[digit] += 1
+            place = (np.int64(keys[i]) >> shift) & ((1 << _DIGIT) - 1)
+            other[ends[place]] = i
+            ends[place] += 1
         ids, other = other, ids
     return ids
 
