@@ -5,7 +5,7 @@ Numbers are read and written in the tensors' dtype; between, everything is float
 
 from __future__ import annotations
 
-from math import ceil, sqrt
+from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -157,7 +157,7 @@ def _project(
         compensations[i] = sqrt(sharp_det / det)
 
         spread = sqrt(max(0.25 * (xx - yy) * (xx - yy) + xy * xy, 0.01))
-        radius = min(ceil(3.0 * sqrt(0.5 * (xx + yy) + spread)), MAX_RADIUS)
+        radius = min(np.ceil(3.0 * sqrt(0.5 * (xx + yy) + spread)), MAX_RADIUS)
         seen_x = centre_x + radius > 0 and centre_x - radius < size[0]
         seen_y = centre_y + radius > 0 and centre_y - radius < size[1]
         radii[i] = np.int32(radius) if seen_x and seen_y else 0

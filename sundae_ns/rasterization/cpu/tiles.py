@@ -8,7 +8,7 @@ the sum over a primitive's tiles is one over neighbours in memory, always in the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, floor, log, sqrt
+from math import log, sqrt
 from typing import Any
 
 import numpy as np
@@ -132,8 +132,8 @@ def _measure(
         for axis in range(2):
             centre = means2d[i, axis]
             half = number(sqrt(number(2) * reach * covars2d[i, 2 * axis]))
-            low = max(floor((centre - radius) / BIN) * per_bin, floor((centre - half) / TILE))
-            high = min(ceil((centre + radius) / BIN) * per_bin, ceil((centre + half) / TILE))
+            low = max(np.floor((centre - radius) / BIN) * per_bin, np.floor((centre - half) / TILE))
+            high = min(np.ceil((centre + radius) / BIN) * per_bin, np.ceil((centre + half) / TILE))
             most = columns if axis == 0 else rows
             spans[rank, axis] = np.int32(min(max(low, 0), most))
             spans[rank, 2 + axis] = np.int32(min(max(high, 0), most))
