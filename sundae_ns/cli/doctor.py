@@ -107,7 +107,7 @@ def rasterizer(kernels_finding: Finding) -> Finding:
     elif problem := numba_problem():
         cause, mend = problem.rsplit("; ", 1)
         detail = f"auto takes reference, in plain PyTorch: several times as slow as cpu, since {cause}"
-        return Finding("rasteriser", False, detail, f"pip {mend}", needed=False)
+        return Finding("rasteriser", False, detail, mend, needed=False)
     else:
         return Finding("rasteriser", True, "auto takes cpu, compiled by numba: for small scenes; a capture needs CUDA")
     return Finding("rasteriser", True, "auto takes reference, in plain PyTorch: slow; mend gsplat's kernels")

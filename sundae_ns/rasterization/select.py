@@ -52,11 +52,35 @@ def _cpu_problem_on(device: torch.device) -> str | None:
 
 @lru_cache(maxsize=1)
 def numba_problem() -> str | None:
-    """Import numba, half a second; the cause and mend if it fails, else None."""
+    """Render one pixel with compiled loops; the cause and mend if that fails, else None.
+
+    It takes half a second, or some seconds where the loops were never compiled before.
+    """
     try:
-        _cpu_backend()
-    except Exception as error:  # numba refuses versions of Python and numpy with errors of several kinds
-        return f"numba does not import ({_first_line(error)}); install numba"
+        ones = torch.ones(1, 4)
+        _cpu_backend().rasterize(
+            ones[:, :3],
+            ones,
+            ones[:, :3],
+            ones[:, 0],
+            ones[:, :1],
+            torch.eye(4),
+            torch.eye(3),
+            1,
+            1,
+            near_plane=0.01,
+            far_plane=1e10,
+            antialiased=False,
+            absgrad=False,
+            render_depth=False,
+        )
+    except ImportError as error:
+        return f"numba does not import ({_first_line(error)}); pip install numba"
+    except (
+        Exception
+    ) as error:  # numba refuses versions of Python and numpy, processors and settings with errors of many kinds
+        mend = "pip install --force-reinstall numba, and unset NUMBA_DISABLE_JIT"
+        return f"numba does not compile ({_first_line(error)}); {mend}"
     return None
 
 

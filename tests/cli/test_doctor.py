@@ -54,7 +54,7 @@ def test_without_cuda_auto_takes_the_compiled_loops(no_cuda: None) -> None:
 
 
 def test_without_numba_auto_takes_the_reference(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = "numba does not import (x; y); install numba"
+    problem = "numba does not import (x; y); pip install numba"
     monkeypatch.setattr("sundae_ns.rasterization.numba_problem", lambda: problem)
     found = finding("rasteriser")
     assert not found.ok

@@ -296,6 +296,25 @@ def test_scales_that_vanish_and_centres_far_away_are_finite() -> None:
             assert torch.isfinite(value).all(), name
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("scale", [1e9, 1e18, 1e30, math.inf, math.nan], ids=str)
+def test_footprints_beyond_all_integers(dtype: torch.dtype, scale: float) -> None:
+    """What is wide is there if it can be told, and nothing that is broken harms the others."""
+    scene, view = make_scene(40), make_view(20, 20, dtype)
+    scene["opacities"][:] = 0.0
+    scene["scales"][:10] = math.log(scale) if scale > 0 else math.nan
+    found = render(scene, view, dtype, CPU)
+    for name, value in found.items():
+        # Behind the activation, where no gradient times infinity is no number.
+        assert torch.isfinite(value[10:] if name == "dscales" else value).all(), name
+    if scale <= 1e18:
+        assert (found["radii"][:10] > 10**9 - 100).all()
+        assert (found["alpha"] > 0.99).all()
+    others = {name: value[10:] for name, value in scene.items()}
+    if math.isnan(scale):
+        assert torch.equal(found["alpha"], render(others, view, dtype, CPU)["alpha"])
+
+
 @settings(max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 2**32),
@@ -326,7 +345,9 @@ def test_any_scene(
 # ---------------------------------------------------------------------------------------------------------- promises
 
 
-def test_every_number_is_the_same_on_any_number_of_threads(threads: None) -> None:
+def test_every_number_is_the_same_on_any_number_of_threads(threads: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("projection._WORTH_A_THREAD", "tiles._WORTH_A_THREAD", "compositing._WORTH_A_THREAD_TO_SUM"):
+        monkeypatch.setattr(f"sundae_ns.rasterization.cpu.{name}", 100)
     scene, view = make_scene(3000, channels=8), make_view(130, 70, torch.float32)
     results = []
     for count in (1, 2, 3, 7, 1):

@@ -50,7 +50,7 @@ except BackendError as error:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     (line,) = done.stdout.splitlines()
     assert line.startswith("the cpu backend cannot rasterize: numba does not import (")
-    assert line.endswith("; install numba; or use the backend 'reference'")
+    assert line.endswith("; pip install numba; or use the backend 'reference'")
 
 
 def test_cpu_backend_off_the_cpu_is_refused() -> None:

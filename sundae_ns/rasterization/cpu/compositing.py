@@ -30,7 +30,7 @@ _FAINTEST = 20.0  # exponents end here, far beyond log(255)
 _WORTH_A_THREAD = 8  # tiles
 _ABREAST = 4  # channels that a loop over pixels takes together
 _MOMENTS = 6  # of a primitive in a tile, behind its channels
-_WORTH_A_THREAD_TO_SUM = 2000  # primitives
+_WORTH_A_THREAD_TO_SUM = 20_000  # primitives
 
 
 def composite(

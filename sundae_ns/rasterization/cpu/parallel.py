@@ -105,7 +105,9 @@ def _compile_now(loop: Callable[..., None], arguments: tuple[Any, ...]) -> None:
 @lru_cache(maxsize=1)
 def _say_that_it_compiles() -> None:
     """Once in a process, however many loops there are."""
-    print("sundae: compiling the CPU rasteriser, some ten seconds, once for each precision", file=sys.stderr, flush=True)
+    print(
+        "sundae: compiling the CPU rasteriser, some ten seconds, once for each precision", file=sys.stderr, flush=True
+    )
 
 
 @lru_cache(maxsize=1)

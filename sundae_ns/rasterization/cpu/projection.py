@@ -17,7 +17,7 @@ from sundae_ns.rasterization.cpu.parallel import as_array, compiled, share
 from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN, MAX_RADIUS, Projection
 from sundae_ns.rasterization.projection import project as project_with_autograd
 
-_WORTH_A_THREAD = 500  # primitives
+_WORTH_A_THREAD = 10_000  # primitives: below a millisecond, waking a thread costs more than it saves
 _SHORTEST = 1e-12  # quaternions that are shorter are divided by this, as torch's normalize() does
 
 

@@ -19,10 +19,10 @@ from sundae_ns.rasterization.cpu.parallel import as_array, compiled, share
 from sundae_ns.rasterization.projection import Projection
 from sundae_ns.rasterization.tiles import BIN, MIN_ALPHA, ROUNDING, TILE
 
-U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, REACH = range(8)
-"""Columns of the table: centre, conic, opacity, the largest exponent that counts, and how far down or up that is."""
+U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT = range(7)
+"""Columns of the table: centre, conic, opacity, and the largest exponent that counts."""
 
-_WORTH_A_THREAD = 500  # primitives
+_WORTH_A_THREAD = 10_000  # primitives: below a millisecond, waking a thread costs more than it saves
 _DIGIT = 11  # bits that one pass of the sort looks at
 
 
@@ -33,7 +33,7 @@ class Lists:
     columns: int
     rows: int
     ids: Any  # [V], int32: primitive of each rank
-    table: Any  # [V, 8]: see the names of the columns
+    table: Any  # [V, 7]: see the names of the columns
     first_slots: Any  # [V + 1], int64: the slots of a rank begin here
     starts: Any  # [T + 1], int64: the list of a tile begins here
     ranks: Any  # [L], int32: in the order of the lists
@@ -50,7 +50,7 @@ def build_lists(projection: Projection, opacities: Tensor, width: int, height: i
     keys = depths.view(np.uint32 if depths.dtype == np.float32 else np.uint64)
     ids = _visible_by_depth(keys, radii, opacity)
     count = len(ids)
-    table, spans = np.empty((count, 8), depths.dtype), np.empty((count, 4), np.int32)
+    table, spans = np.empty((count, 7), depths.dtype), np.empty((count, 4), np.int32)
     first_slots = np.zeros(count + 1, np.int64)
     inputs = [as_array(value) for value in (projection.means2d, projection.covars2d, projection.conics)]
     share(
@@ -137,7 +137,6 @@ def _measure(
             most = columns if axis == 0 else rows
             spans[rank, axis] = np.int32(min(max(low, 0), most))
             spans[rank, 2 + axis] = np.int32(min(max(high, 0), most))
-        table[rank, REACH] = half  # of the last axis, which is down
         table[rank, U], table[rank, V] = means2d[i, 0], means2d[i, 1]
         table[rank, HALF_XX] = number(0.5) * conics[i, 0]
         table[rank, XY] = conics[i, 1]
