@@ -34,7 +34,7 @@ from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
-from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
+from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, pixel_detail, response
 from sundae_ns.rasterization import (
     Backend,
     Rasterization,
@@ -265,7 +265,7 @@ class SundaeModel(SplatfactoModel):
     def _pruning_end(self) -> int:
         """Step of the schedule after which the field keeps its primitives."""
         pruning = self.config.pruning
-        return pruning.stop if pruning.mode == "continuous" else pruning.prune_at
+        return pruning.stop if pruning.mode == "continuous" else pruning.last_prune
 
     @property
     def head_active(self) -> bool:
@@ -598,8 +598,9 @@ class SundaeModel(SplatfactoModel):
                 attributes.trainer.save_checkpoint(step)
             raise
         self._refresh(optimizers)
-        if self.schedule_step >= self._pruning_end:
-            notify_pruned(optimizers.schedulers, step)
+        last = self.schedule_step >= self._pruning_end
+        if last or (self._prune_at is not None and self.pruning_state["num_prunes"] > 0):
+            notify_pruned(optimizers.schedulers, step, last=last)
         if report is None:
             return
         CONSOLE.log(report.summary())
@@ -643,12 +644,22 @@ class SundaeModel(SplatfactoModel):
 
     @torch.no_grad()
     def contribution(self, datamanager: SundaeDatamanager) -> Tensor:
-        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``."""
-        params = self.gaussians
+        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``.
+
+        Where the score asks for it, pixels count by the detail of the rendering, for as many cells as primitives seen in it
+        are going to be kept.
+        """
+        params, pruning = self.gaussians, self.config.pruning
         total = torch.zeros(self.num_points, device=self.device)
+        # Not the one of training, which may be random: the choice is to be the same from run to run.
+        background = self.background_color.to(self.device)
         cameras = list(datamanager.training_cameras())
         for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
             view = self.view_of(camera)
+            pixels = None
+            if pruning.uses_detail:
+                pictures, splat = self.render(params, view, background, depth=False, compensate=False)
+                pixels = pixel_detail(pictures["base_rgb"], pruning.keep_ratio * float((splat.radii > 0).sum()))
             total += blending_weights(
                 params["means"],
                 params["quats"],
@@ -658,6 +669,7 @@ class SundaeModel(SplatfactoModel):
                 view.K,
                 view.width,
                 view.height,
+                pixels=pixels,
                 backend=self.backend,
             )
         return total
