@@ -36,7 +36,9 @@ def test_a_row_for_every_case(bench: Callable[..., Rows]) -> None:
         (n, name, dtype) for n in (40, 90) for name in ("cpu", "reference") for dtype in ("float32", "float64")
     ]
     for row in rows:
+        assert row["forward_ms"] > 0
         assert row["forward_backward_ms"] > 0
+        assert row["forward_backward_cpu_ms"] > 0
         assert row["mean_error"] <= row["max_error"]
         assert row["gradient_error"] == max(v for k, v in row.items() if k.startswith("gradient_error_"))
         limit = 1e-12 if row["dtype"] == "float64" else 1e-4
