@@ -61,8 +61,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """When to prune, how many primitives to keep, and which."""
     head: HeadConfig = field(default_factory=HeadConfig)
     """The compensation head."""
-    rasterizer: Literal["auto", "gsplat", "reference"] = "auto"
-    """auto takes gsplat where CUDA works, else the reference in plain PyTorch, which also runs on a CPU."""
+    rasterizer: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
+    """auto takes gsplat where CUDA works, and on a CPU the loops that numba compiles; reference is slow, in plain PyTorch."""
     base_loss_weight: float = 0.2
     """Weight of the loss on the picture without the head, which keeps exported .ply files valid."""
     warm_start: Path | None = None

@@ -505,7 +505,7 @@ def test_gsplat_without_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(BackendError, match="CUDA is not available") as caught:
         Training(model)
     assert "\n" not in str(caught.value)
-    assert build(rasterizer="auto").backend.name == "reference"
+    assert build(rasterizer="auto").backend.name == "cpu"
 
 
 # -------------------------------------------------------------------------------------------------- initialisation
