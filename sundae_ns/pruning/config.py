@@ -30,27 +30,28 @@ DeviceName = Literal["cpu", "field"]
 class PruningConfig:
     """When to prune, how much, and by which score.
 
-    The defaults are what ``sundae`` uses: sampling in proportion to response times contribution. The paper's rule is
-    ``selection="band", score="response", signal="positions"``.
+    The defaults are what ``sundae`` uses: one draw in each stretch of space, in proportion to the contribution to pixels
+    with detail, and what is dropped is merged into what stays. The paper's rule is ``selection="band", score="response",
+    signal="positions", edges="centres", redistribution="none"``.
     """
 
     mode: Mode = "one-shot"
     """Prune once (the paper's main strategy), periodically while densifying (lower peak memory), or never."""
     keep_ratio: float = 0.1
     """Share of the primitives to keep at each prune, in (0, 1]; the kept count is exactly round(keep_ratio * N)."""
-    selection: SelectionName = "sampled"
+    selection: SelectionName = "systematic"
     """How a score becomes a choice: sampled in proportion to it by independent draws, one draw in each stretch of space
     (systematic), the same with a share for every band of the response (shared), its highest and lowest band, or the highest
     only."""
-    score: ScoreName = "response-contribution"
+    score: ScoreName = "detail-contribution"
     """Importance of a primitive: high-pass response; local coherence, its energy in the low band that the budget spans;
     contribution, its blending weight over the training views, by itself, times either of the two, or with pixels weighted by
     the detail of the renderings; opacity; or alike for all (random)."""
     signal: SignalName = "attributes"
     """Graph signal that is filtered: position, colour, opacity and size together, colour, or the paper's positions alone."""
-    edges: EdgesName = "centres"
+    edges: EdgesName = "appearance"
     """What the weights of edges say: distance of the centres alone, or also overlap and likeness of colour."""
-    redistribution: RedistributionName = "none"
+    redistribution: RedistributionName = "merge"
     """What becomes of the dropped: nothing, merged into the kept along the edges, or the kept grow into the gaps."""
     rounds: int = 1
     """Prunes of the one-shot mode, each by the same factor, down to the keep ratio; training goes on in between."""
@@ -105,6 +106,10 @@ class PruningConfig:
     def uses_detail(self) -> bool:
         """Whether the score weighs the pixels of the contribution by the detail of the renderings."""
         return self.score == "detail-contribution"
+
+    def share(self, n: int) -> float:
+        """Share of ``n`` primitives that a prune keeps: the keep ratio, or what the cap leaves."""
+        return self.keep_ratio if self.max_primitives is None else min(1.0, self.max_primitives / n)
 
     @property
     def last_prune(self) -> int:
