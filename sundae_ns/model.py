@@ -508,7 +508,7 @@ class SundaeModel(SplatfactoModel):
         if of != key:
             try:
                 values = display.response_values(response(field, self.config.pruning).magnitude)
-            except DataError:  # too few primitives for a graph: nothing to show
+            except DataError:  # one primitive has no neighbour: nothing to show
                 values = None
             self._response = (key, values)
         return values
@@ -650,6 +650,7 @@ class SundaeModel(SplatfactoModel):
         are going to be kept.
         """
         params, pruning = self.gaussians, self.config.pruning
+        share = pruning.share(self.num_points)
         total = torch.zeros(self.num_points, device=self.device)
         # Not the one of training, which may be random: the choice is to be the same from run to run.
         background = self.background_color.to(self.device)
@@ -659,7 +660,7 @@ class SundaeModel(SplatfactoModel):
             pixels = None
             if pruning.uses_detail:
                 pictures, splat = self.render(params, view, background, depth=False, compensate=False)
-                pixels = pixel_detail(pictures["base_rgb"], pruning.keep_ratio * float((splat.radii > 0).sum()))
+                pixels = pixel_detail(pictures["base_rgb"], share * float((splat.radii > 0).sum()))
             total += blending_weights(
                 params["means"],
                 params["quats"],
