@@ -287,6 +287,6 @@ def test_training_on_a_gpu_is_that_of_the_layers(mode: str) -> None:
             # bf16 rounds on both sides, at different places; where it turns an activation's sign, small pictures differ by
             # several percent.
             error, allowed = (float((result - expected).norm()) for result in (found, by_layers))
-            assert error < 4 * allowed + 1e-2 * float(expected.norm())
+            assert error <= 4 * allowed + 1e-2 * float(expected.norm())
         assert quick._can_fuse
     assert len(quick._training._recorded) == fused.MAX_SIZES
