@@ -29,10 +29,11 @@ from rich.progress import track
 from torch import Tensor
 
 from sundae_ns import checkpoint
+from sundae_ns.budget import Budget
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
-from sundae_ns.evaluation import Lpips, display, psnr, ssim
+from sundae_ns.evaluation import Lpips, display, peak_memory, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
 from sundae_ns.rasterization import (
@@ -161,6 +162,7 @@ class SundaeModel(SplatfactoModel):
         )
 
         self.policy = make_policy(config.pruning)
+        self.budget = Budget(config.pruning, config.head) if config.pruning.mode == "auto" else None
         self.pruning_state: dict[str, Any] = self.policy.initialize_state()
         self.strategy = DefaultStrategy(
             prune_opa=config.cull_alpha_thresh,
@@ -252,8 +254,8 @@ class SundaeModel(SplatfactoModel):
 
     @property
     def _prune_at(self) -> int | None:
-        """Step of the one-shot prune; None with another mode."""
-        return self.config.pruning.prune_at if self.config.pruning.mode == "one-shot" else None
+        """Step of the prune that follows densification; None where there is none."""
+        return self.config.pruning.prune_at if self.config.pruning.mode in ("one-shot", "auto") else None
 
     @property
     def schedule_step(self) -> int:
@@ -268,7 +270,9 @@ class SundaeModel(SplatfactoModel):
 
     @property
     def head_active(self) -> bool:
-        """Whether the head takes part: it starts when pruning has ended, unless told otherwise."""
+        """Whether the head takes part: it starts when pruning has ended, unless told otherwise, or when auto lets it."""
+        if self.budget is not None:
+            return self.head is not None and self.budget.search.head
         start = self.config.head.start_at
         return self.head is not None and self.schedule_step > (self._pruning_end if start is None else start)
 
@@ -298,15 +302,18 @@ class SundaeModel(SplatfactoModel):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Step, states of densification and pruning, and the head's scale: what goes on needs beside the tensors."""
-        return checkpoint.extra_state(
+        state = checkpoint.extra_state(
             self.step, self.num_features, self.strategy_state, self.pruning_state, self.trained_focal
         )
+        return state if self.budget is None else {**state, "budget": self.budget.state()}
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`get_extra_state`; tensors move to the device of the field."""
         self.step = int(state["step"])
         focal = state.get("trained_focal")  # older checkpoints do not know it
         self.trained_focal = None if focal is None else (float(focal[0]), float(focal[1]))
+        if self.budget is not None:
+            self.budget.load_state(state.get("budget"))
         for own, theirs in ((self.strategy_state, state["strategy"]), (self.pruning_state, state["pruning"])):
             own.clear()
             own.update({k: v.to(self.means.device) if isinstance(v, Tensor) else v for k, v in theirs.items()})
@@ -319,10 +326,15 @@ class SundaeModel(SplatfactoModel):
         Raises:
             CheckpointError: it is another method's checkpoint, or one of another feature width or head.
         """
-        checkpoint.check_model_state(state_dict, self.state_dict(), self.num_features)
+        expected: Mapping[str, Any] = self.state_dict()
+        if self.budget is not None:
+            expected = self.budget.shapes(state_dict.get(checkpoint.EXTRA_STATE), expected)
+        checkpoint.check_model_state(state_dict, expected, self.num_features)
         n = state_dict["gauss_params.means"].shape[0]
-        for value in self.gauss_params.values():
-            value.data = value.data.new_zeros(n, *value.shape[1:])
+        for name, value in self.gauss_params.items():
+            value.data = value.data.new_zeros(n, *expected[f"gauss_params.{name}"].shape[1:])
+        if not any(name.startswith("head.") for name in expected):
+            self.head = None
         self._warm_start_error = None
         # Past SplatfactoModel's own loader on purpose: it replaces parameters and resets the step.
         return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
@@ -368,7 +380,7 @@ class SundaeModel(SplatfactoModel):
         """Colours ``[N, 3]`` of the primitives as this view sees them."""
         if self.config.sh_degree == 0:
             return params["features_dc"].sigmoid()
-        degree = self.config.sh_degree
+        degree = round((params["features_rest"].shape[1] + 1) ** 0.5) - 1
         if self.config.warm_start is None:
             degree = min(self.step // self.config.sh_degree_interval, degree)
         center = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
@@ -533,10 +545,15 @@ class SundaeModel(SplatfactoModel):
         backend = self.backend  # an unusable rasteriser should be known before the first step
         CONSOLE.log(f"rasteriser: {backend.name} on {self.device}")
         self.attached = True
+        if self.budget is not None:
+            self.budget.check(cast(Any, training_callback_attributes.pipeline).datamanager)
         callbacks = super().get_training_callbacks(training_callback_attributes)
         prune = partial(self._prune_if_due, training_callback_attributes)
         prune.__name__ = "prune_if_due"  # type: ignore[attr-defined]
         callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], prune))
+        finish = partial(self._finish, training_callback_attributes)
+        finish.__name__ = "finish"  # type: ignore[attr-defined]
+        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], finish))
         return callbacks
 
     def step_post_backward(self, step: int) -> None:
@@ -573,7 +590,9 @@ class SundaeModel(SplatfactoModel):
                 attributes.trainer.save_checkpoint(step)
             raise
         self._refresh(optimizers)
-        if self.schedule_step >= self._pruning_end:
+        if self.budget is not None:
+            self.budget.after_step(self, attributes)
+        elif self.schedule_step >= self._pruning_end:
             notify_pruned(optimizers.schedulers, step)
         if report is None:
             return
@@ -582,6 +601,15 @@ class SundaeModel(SplatfactoModel):
             CONSOLE.print(f"[yellow]Warning: dropped {report.dropped_nonfinite} primitives that were not finite")
         after = self._evaluate(pipeline, "pruned", step) if evaluate else {}
         self._record(attributes, report, before, after, step)
+
+    def _finish(self, attributes: TrainingCallbackAttributes, step: int) -> None:
+        """Say what training took at its peak, and whether a budget was met."""
+        primitives, memory = self.pruning_state["peak"], peak_memory(self.device) / 1e6
+        CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {self.device.type} memory")
+        writer.put_dict(name="Peak", scalar_dict={"primitives": primitives, "memory_mb": memory}, step=step)
+        if self.budget is not None:
+            self.budget.finish(self, attributes)
+        writer.write_out_storage()
 
     def _refresh(self, optimizers: Optimizers) -> None:
         """Surgery makes new parameters; nerfstudio's own list of them would go stale."""
@@ -619,23 +647,26 @@ class SundaeModel(SplatfactoModel):
     @torch.no_grad()
     def contribution(self, datamanager: SundaeDatamanager) -> Tensor:
         """Blending weight of each primitive, summed over the pixels of all training views ``[N]``."""
-        params = self.gaussians
         total = torch.zeros(self.num_points, device=self.device)
         cameras = list(datamanager.training_cameras())
         for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
-            view = self.view_of(camera)
-            total += blending_weights(
-                params["means"],
-                params["quats"],
-                params["scales"].exp(),
-                params["opacities"].sigmoid().squeeze(-1),
-                view.viewmat,
-                view.K,
-                view.width,
-                view.height,
-                backend=self.backend,
-            )
+            total += self.weights_of(self.view_of(camera))
         return total
+
+    def weights_of(self, view: View) -> Tensor:
+        """Blending weight of each primitive, summed over the pixels of one view ``[N]``."""
+        params = self.gaussians
+        return blending_weights(
+            params["means"],
+            params["quats"],
+            params["scales"].exp(),
+            params["opacities"].sigmoid().squeeze(-1),
+            view.viewmat,
+            view.K,
+            view.width,
+            view.height,
+            backend=self.backend,
+        )
 
     # --------------------------------------------------------------------------------------------- losses and metrics
 

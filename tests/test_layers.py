@@ -25,6 +25,7 @@ FLOORS = {
     "optimizers": 3,
     "datamanager": 3,
     "checkpoint": 3,
+    "budget": 3,
     "model": 3,
     "trainer": 3,
     "measure": 3,

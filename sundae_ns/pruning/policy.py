@@ -158,25 +158,29 @@ class OneShotPruning(PruningPolicy):
 
 
 class ContinuousPruning(PruningPolicy):
-    """Periodic pruning while densification goes on: a lower peak, a loosely held final count.
+    """Periodic pruning while densification goes on: a lower peak of memory.
 
-    The alternative strategy of the paper (section "Continuous Pruning as a Strategy"). With ``max_primitives`` it
-    prunes down to that cap where there are more; without, by ``keep_ratio`` each time.
+    The alternative strategy of the paper (section "Continuous Pruning as a Strategy"), whose final count is loosely held:
+    each prune goes by ``keep_ratio``. With ``target_primitives`` each goes down to exactly that count, the last one when
+    densification has ended, which makes it the final count. ``max_primitives`` caps every step in between: densification
+    has to be bounded by it (:class:`sundae_ns.densification.CappedStrategy`), so that no prune has to.
     """
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """At ``start`` and each ``every`` steps from there until ``stop``, if the count is above the cap."""
-        config = self.config
+        """At ``start`` and each ``every`` steps from there until ``stop``; with a count to go down to also at ``stop``."""
+        config, goal = self.config, self._count()
         scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
-        above = config.max_primitives is None or n > config.max_primitives
-        return scheduled and above and step > state["pruned_at"]
+        last = goal is not None and step >= config.stop
+        above = goal is None or n > goal
+        return (scheduled or last) and above and step > state["pruned_at"]
 
     def _config_at(self, step: int) -> PruningConfig:
         # Another draw each time, and after a resume the same as without it.
         return replace(self.config, seed=self.config.seed + step)
 
     def _count(self) -> int | None:
-        return self.config.max_primitives
+        config = self.config
+        return config.max_primitives if config.target_primitives is None else config.target_primitives
 
 
 def make_policy(config: PruningConfig) -> PruningPolicy:
@@ -186,7 +190,8 @@ def make_policy(config: PruningConfig) -> PruningPolicy:
         ConfigError: an option cannot work.
     """
     config.validate()
-    policies = {"off": NoPruning, "one-shot": OneShotPruning, "continuous": ContinuousPruning}
+    # Under auto a search cuts (pruning.search), and the policy counts.
+    policies = {"off": NoPruning, "auto": NoPruning, "one-shot": OneShotPruning, "continuous": ContinuousPruning}
     return policies[config.mode](config)
 
 

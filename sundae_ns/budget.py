@@ -1,0 +1,572 @@
+"""The budget finds itself: cuts the field during training as :mod:`sundae_ns.pruning.search` decides.
+
+Held-back training views judge; test views are never looked at. After the warm-up:
+
+1. bands of the harmonics that held-back views do not miss go, for the whole scene;
+2. the field is cut, trained, looked at, and cut again, on its base colours alone;
+3. where the network that corrects them would be smaller than the field that came out, it joins, and the field is cut on;
+   it stays only if field, features and network together are then smaller;
+4. primitives whose colour does not depend on the view lose their bands above 0.
+
+A budget in bytes or primitives takes the place of 2 and 3: then the count follows from it.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+from torch.nn import Parameter
+
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.datamanager import SundaeDatamanager
+from sundae_ns.errors import CheckpointError, ConfigError, DataError
+from sundae_ns.evaluation import psnr
+from sundae_ns.gaussians import FEATURES, finite_mask, keep
+from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, narrow, restore, restore_module, snapshot
+from sundae_ns.pruning import PruneReport, PruningConfig, decide
+from sundae_ns.pruning.bands import fold, mean_basis, view_dependence
+from sundae_ns.pruning.search import Point, Search, curve_text
+from sundae_ns.rasterization.harmonics import harmonic_basis
+from sundae_ns.schedulers import notify_pruned
+from sundae_ns.storage import accounting, megabytes
+from sundae_ns.storage.atomic import write_text
+
+if TYPE_CHECKING:
+    from sundae_ns.model import SundaeModel
+
+MAX_VIEWS = 64
+"""Training views, evenly chosen, that each scoring looks at: it is repeated at each cut."""
+MAX_REJECTED = 3
+"""Cuts that may be taken back."""
+HEAD_SHARE = 0.25
+"""Under a budget of bytes or primitives the head stays if it takes at most this share of what is stored."""
+FLAT_SHARE = 0.25
+"""Share of the tolerated drop that flat colours may cost, right when bands go."""
+
+
+def bytes_of(field: Mapping[str, Tensor], head: HeadConfig | None) -> int:
+    """Bytes that a field and its head are stored in. The one place where a budget counts bytes.
+
+    Args:
+        field: the parameters, rows and columns as they would be stored.
+        head: the head; None, or its mode off, for none.
+    """
+    return accounting.bytes_of(field) + head_bytes(head)
+
+
+def head_bytes(head: HeadConfig | None) -> int:
+    """Bytes of a head, without building its weights."""
+    if head is None or head.mode == "off":
+        return 0
+    with torch.device("meta"):
+        return accounting.bytes_of_module(CompensationHead(head))
+
+
+class _Run(NamedTuple):
+    """What a step of the search works on."""
+
+    model: SundaeModel
+    attributes: TrainingCallbackAttributes
+    datamanager: SundaeDatamanager
+
+    @property
+    def optimizers(self) -> Optimizers:
+        assert self.attributes.optimizers is not None
+        return self.attributes.optimizers
+
+    @property
+    def params(self) -> Any:
+        return self.model.gaussians
+
+
+class Budget:
+    """The search of one run: its state, and the fields that it may go back to.
+
+    Args:
+        config: options of pruning, mode auto.
+        head: configuration of the head that may take part.
+    """
+
+    def __init__(self, config: PruningConfig, head: HeadConfig) -> None:
+        self.config = config
+        self.head_config = None if head.mode == "off" else head
+        self.search = Search()
+        self._accepted: dict[str, Snapshot] | None = None
+        self._fallback: dict[str, Snapshot] | None = None
+        self._flat: Tensor | None = None
+
+    # ------------------------------------------------------------------------------------------------- checkpoints
+
+    def state(self) -> dict[str, Any]:
+        """State for a checkpoint: numbers, and copies of the fields to go back to while the search goes on."""
+        return {
+            "numbers": self.search.state(),
+            "accepted": self._accepted,
+            "fallback": self._fallback,
+            "flat": self._flat,
+        }
+
+    def load_state(self, state: Any) -> None:
+        """Counterpart of :meth:`state`.
+
+        Raises:
+            CheckpointError: it is not what :meth:`state` gives.
+        """
+        search = self._search_of(state)
+        if search.searching and not isinstance(state.get("accepted"), Mapping):
+            raise CheckpointError("the checkpoint lacks the field that its search would go back to; give another")
+        self.search = search
+        self._accepted, self._fallback, self._flat = state.get("accepted"), state.get("fallback"), state.get("flat")
+
+    @staticmethod
+    def _search_of(state: Any) -> Search:
+        if not isinstance(state, Mapping) or not isinstance(state.get("numbers"), Mapping):
+            raise CheckpointError(
+                "the checkpoint is of a run without a search for a budget; load it with its own method"
+            )
+        return Search.from_state(state["numbers"])
+
+    @staticmethod
+    def shapes(extra: Any, expected: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """``expected`` state of a model, in the shapes that the search of a checkpoint has given it.
+
+        Args:
+            extra: what the checkpoint carries beside the tensors; of another method's, nothing is known.
+            expected: ``state_dict`` of the model as it is configured.
+
+        Raises:
+            CheckpointError: see :meth:`load_state`.
+        """
+        if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
+            return dict(expected)
+        search = Budget._search_of(extra.get("budget"))
+        shaped = dict(expected)
+        rest = "gauss_params.features_rest"
+        if search.degree >= 0:
+            shaped[rest] = shaped[rest][:, : (search.degree + 1) ** 2 - 1]
+        if search.head_dropped:
+            shaped = {name: value for name, value in shaped.items() if not name.startswith("head.")}
+            if "gauss_params.features" in shaped:
+                shaped["gauss_params.features"] = shaped["gauss_params.features"][:, :0]
+        return shaped
+
+    # ---------------------------------------------------------------------------------------------------- training
+
+    def check(self, datamanager: SundaeDatamanager) -> None:
+        """Check that there are views to judge by.
+
+        Raises:
+            ConfigError: no training view is held back.
+        """
+        if not datamanager.holdout_indices:
+            raise ConfigError(
+                "pruning.mode auto judges by training views that are held back, and there are none: give "
+                "--pipeline.datamanager.holdout-every 8, less where there are fewer training views"
+            )
+
+    def after_step(self, model: SundaeModel, attributes: TrainingCallbackAttributes) -> None:
+        """Act after a step of training, once densification has had its say.
+
+        Raises:
+            DataError: the budget is too small for one primitive, or the field cannot be scored.
+        """
+        config, search, step = self.config, self.search, model.schedule_step
+        assert attributes.pipeline is not None
+        run = _Run(model, attributes, attributes.pipeline.datamanager)  # type: ignore[arg-type]
+        if self._flat is not None:
+            rest = run.params["features_rest"]
+            rest.data.mul_((~self._flat.to(rest.device))[:, None, None])
+        started = time.perf_counter()
+        if search.phase == "before" and step >= config.prune_at:
+            self._begin(run)
+        elif search.searching and ((step - search.began) % config.search_every == 0 or step >= config.stop):
+            self._look(run)
+        else:
+            return
+        model._refresh(run.optimizers)
+        search.seconds += time.perf_counter() - started
+        self._write(run)
+
+    def finish(self, model: SundaeModel, attributes: TrainingCallbackAttributes) -> None:
+        """Measure what came out against the target, and say whether it was reached."""
+        search = self.search
+        if search.phase == "before":
+            CONSOLE.print("[yellow]Warning: training ended before the search for a budget began (pruning.prune-at)")
+            return
+        assert attributes.pipeline is not None
+        run = _Run(model, attributes, attributes.pipeline.datamanager)  # type: ignore[arg-type]
+        point = self._point(run, self._measure(run), "final", "reached")
+        drop, stored, count = search.reference - point.psnr, point.bytes, model.num_points
+        wanted = self._wanted()
+        reached = {
+            "max_psnr_drop": drop <= self.config.tolerated_drop,
+            "max_bytes": stored <= (self.config.max_bytes or 0),
+            "max_primitives": count <= (self.config.max_primitives or 0),
+        }[wanted]
+        point.verdict = "reached" if reached else "missed"
+        search.curve = [old for old in search.curve if old.phase != "final"] + [point]
+        unfinished = f" The search had not ended: train on to step {self.config.stop}." if search.searching else ""
+        limit = getattr(self.config, wanted) or self.config.tolerated_drop
+        CONSOLE.log(
+            f"budget {wanted} {limit:,}: {point.verdict}. {count:,} of {search.before:,} primitives, "
+            f"{megabytes(stored)}, harmonics of degree {self._degree(run)}, "
+            f"{'with' if search.head else 'no'} head, {drop:+.3f} dB lost on {search.views} held-back views.{unfinished}"
+        )
+        self._write(run)
+
+    # ---------------------------------------------------------------------------------------------------- the steps
+
+    def _wanted(self) -> str:
+        given = [name for name in ("max_bytes", "max_primitives") if getattr(self.config, name) is not None]
+        return given[0] if given else "max_psnr_drop"
+
+    def _begin(self, run: _Run) -> None:
+        model, search = run.model, self.search
+        self._keep(run, finite_mask(run.params))
+        # Densification has ended, and what it counted would not follow a field that goes back to more primitives.
+        model.strategy_state.clear()
+        model.strategy_state.update(model.strategy.initialize_state(scene_scale=1.0))
+        search.began, search.before = model.schedule_step, model.num_points
+        search.views = len(run.datamanager.holdout_indices)
+        search.reference = self._measure(run)
+        search.target = search.reference - self.config.tolerated_drop
+        CONSOLE.log(
+            f"step {model.step}: warm-up field of {model.num_points:,} primitives, PSNR {search.reference:.3f} dB on "
+            f"{search.views} held-back training views"
+        )
+        self._choose_degree(run)
+        self._notify(run, head=False)
+        if self._wanted() == "max_psnr_drop":
+            search.begin("field", model.num_points)
+            self._accepted = self._snapshot(run)
+            self._cut(run)
+        else:
+            self._fit(run)
+            self._done(run)
+
+    def _look(self, run: _Run) -> None:
+        search, step = self.search, run.model.schedule_step
+        # Half of the time is the head's, if it may join.
+        head_to_come = search.phase == "field" and self._head_may_pay(run)
+        deadline = (search.began + self.config.stop) // 2 if head_to_come else self.config.stop
+        last = step >= deadline
+        first_with_head = search.phase == "head" and search.accepted == self._rows(self._fallback)
+        patience = self.config.patience * (2 if first_with_head else 1)
+        value = self._measure(run)
+        verdict = search.judge(value, step, patience, last=last, steady=not first_with_head)
+        point = self._point(run, value, search.phase, verdict)
+        search.curve.append(point)
+        CONSOLE.log(
+            f"step {run.model.step}: {point.primitives:,} primitives, {value - search.target:+.3f} dB to the target, "
+            f"{point.since_cut} steps after the cut: {verdict}"
+        )
+        writer.put_dict(
+            name="Budget",
+            scalar_dict={"primitives": point.primitives, "psnr": value, "to_target": value - search.target},
+            step=run.model.step,
+        )
+        if verdict == "waiting":
+            return
+        if verdict == "accepted":
+            search.accepted = run.model.num_points
+            self._accepted = self._snapshot(run)
+        else:
+            self._restore(run, self._accepted)
+        # A head to come has cuts of its own to try.
+        allowed = MAX_REJECTED - 1 if search.phase == "head" or head_to_come else MAX_REJECTED
+        if last or search.rejected >= allowed:
+            self._end_phase(run)
+        else:
+            self._cut(run)
+
+    def _cut(self, run: _Run) -> None:
+        """Cut on, or end the phase where there is nothing left to cut."""
+        config = self.config
+        count = self.search.next_count(config.num_neighbors + 1 if config.uses_graph else 1)
+        if count is None:
+            self._end_phase(run)
+            return
+        self._cut_to(run, count)
+
+    def _cut_to(self, run: _Run, count: int) -> None:
+        step = run.model.schedule_step
+        options = replace(self.config, seed=self.config.seed + step)
+        decision = decide(run.params, options, lambda: self._contribution(run), count=count)
+        self._keep(run, decision.mask)
+        run.model.pruning_state["pruned_at"] = step
+        run.model.pruning_state["num_prunes"] += 1
+        self.search.cut(step)
+
+    def _end_phase(self, run: _Run) -> None:
+        search, step = self.search, run.model.schedule_step
+        if search.phase == "field" and self._head_may_pay(run) and step < self.config.stop:
+            self._fallback = self._accepted
+            search.head = True
+            search.begin("head", search.accepted)
+            self._notify(run, head=True)
+            self._accepted = self._snapshot(run)
+            self._cut(run)
+            return
+        if search.phase == "head":
+            assert self._fallback is not None
+            without = {name: entry["value"] for name, entry in self._fallback["field"].items() if name != FEATURES}
+            if bytes_of(run.params, self.head_config) >= bytes_of(without, None):
+                self._restore(run, self._fallback)
+                search.head = False
+        if not search.head:
+            self._drop_head(run)
+        self._done(run)
+
+    def _fit(self, run: _Run) -> None:
+        """The count that follows from a budget of bytes or primitives."""
+        config, model = self.config, run.model
+        bare = {name: value for name, value in run.params.items() if name != FEATURES}
+        network = head_bytes(self.head_config)
+        if config.max_bytes is not None:
+            whole = min(config.max_bytes, bytes_of(run.params, self.head_config))
+        else:
+            kept = min(config.max_primitives or 1, model.num_points)
+            whole = bytes_of({name: value[:kept] for name, value in run.params.items()}, self.head_config)
+        self.search.head = self.head_config is not None and network <= HEAD_SHARE * whole
+        head, field = (self.head_config, run.params) if self.search.head else (None, bare)
+        if config.max_bytes is None:
+            count = config.max_primitives or 1
+        else:
+            count = accounting.rows_within(field, config.max_bytes, lambda rows: bytes_of(rows, head))
+            if count == 0:
+                one = bytes_of({name: value[:1] for name, value in field.items()}, head)
+                raise DataError(
+                    f"pruning.max-bytes is {config.max_bytes:,}, and one primitive takes {one:,}; give more"
+                )
+        if self.search.head:
+            self._notify(run, head=True)
+        else:
+            self._drop_head(run)
+        if count < model.num_points:
+            self._cut_to(run, count)
+        self.search.accepted = model.num_points
+        self.search.curve.append(self._point(run, self._measure(run), "field", "cut"))
+
+    def _done(self, run: _Run) -> None:
+        search, model = self.search, run.model
+        search.phase = "done"
+        self._accepted = self._fallback = None
+        self._flatten(run)
+        report = PruneReport(
+            step=model.schedule_step,
+            before=search.before,
+            after=model.num_points,
+            dropped_nonfinite=0,
+            peak=model.pruning_state["peak"],
+            seconds=search.seconds,
+            tau=None,
+            sigma=None,
+            isolated=None,
+        )
+        CONSOLE.log(report.summary())
+        model._record(run.attributes, report, {}, {}, model.step)
+
+    # --------------------------------------------------------------------------------------------------- the head
+
+    def _head_may_pay(self, run: _Run) -> bool:
+        """Whether the network would be smaller than the field without it."""
+        bare = {name: value for name, value in run.params.items() if name != FEATURES}
+        return self.head_config is not None and head_bytes(self.head_config) < bytes_of(bare, None)
+
+    def _drop_head(self, run: _Run) -> None:
+        if self.head_config is None:
+            return
+        run.model.head = None
+        run.optimizers.optimizers["compensation"].state.clear()
+        narrow(run.params, run.optimizers.optimizers, FEATURES, 0)
+        self.search.head_dropped = True
+
+    def _notify(self, run: _Run, *, head: bool) -> None:
+        """Restart the rates of the field, or those of the head."""
+        schedulers = {
+            name: value for name, value in run.optimizers.schedulers.items() if (name == "compensation") == head
+        }
+        notify_pruned(schedulers, run.model.step)
+
+    # ---------------------------------------------------------------------------------------------- the harmonics
+
+    def _degree(self, run: _Run) -> int:
+        return round((run.params["features_rest"].shape[1] + 1) ** 0.5) - 1
+
+    def _choose_degree(self, run: _Run) -> None:
+        """Take away the bands that held-back views do not miss, without any training: a bound on what it costs."""
+        search, top = self.search, self._degree(run)
+        search.degree, search.degrees = top, {str(top): search.reference}
+        if top == 0:
+            return
+        mean, _ = self._view_basis(run, top)
+        dc, rest = run.params["features_dc"], run.params["features_rest"]
+        found = dc.data
+        for degree in range(top - 1, -1, -1):
+            folded, kept = fold(dc.data, rest.data, mean, degree)
+            tried = torch.zeros_like(rest)
+            tried[:, : kept.shape[1]] = kept
+            with _values(dc, folded), _values(rest, tried):
+                value = self._measure(run)
+            search.degrees[str(degree)] = value
+            if value < search.target:
+                break
+            search.degree, found = degree, folded
+        dc.data.copy_(found)
+        narrow(run.params, run.optimizers.optimizers, "features_rest", (search.degree + 1) ** 2 - 1)
+        levels = ", ".join(f"{degree}: {value:.3f}" for degree, value in search.degrees.items())
+        CONSOLE.log(f"harmonics of degree {search.degree} (PSNR by degree, before any training: {levels} dB)")
+
+    def _flatten(self, run: _Run) -> None:
+        """Set the bands of those primitives to 0 that look the same from everywhere, as many as held-back views allow."""
+        search, degree = self.search, self._degree(run)
+        if degree == 0:
+            return
+        dc, rest = run.params["features_dc"], run.params["features_rest"]
+        weight = self._contribution(run)
+        mean, square = self._view_basis(run, degree)
+        order = view_dependence(rest.data, mean, square, weight).cpu().argsort(stable=True).to(rest.device)
+        folded, _ = fold(dc.data, rest.data, mean, 0)
+        least = self._measure(run) - FLAT_SHARE * self.config.tolerated_drop
+
+        def flattened(count: int) -> tuple[Tensor, Tensor, Tensor]:
+            flat = torch.zeros(len(order), dtype=torch.bool, device=rest.device)
+            flat[order[:count]] = True
+            return flat, torch.where(flat[:, None], folded, dc.data), rest.data * ~flat[:, None, None]
+
+        low, high = 0, len(order)
+        for _ in range(6):
+            middle = (low + high + 1) // 2
+            _, colours, bands = flattened(middle)
+            with _values(dc, colours), _values(rest, bands):
+                good = self._measure(run) >= least
+            low, high = (middle, high) if good else (low, middle)
+        flat, colours, bands = flattened(low)
+        dc.data.copy_(colours)
+        rest.data.copy_(bands)
+        self._flat, search.zeroed = flat, low
+        CONSOLE.log(f"{low:,} of {len(order):,} primitives look the same from everywhere: their harmonics are 0")
+
+    # ------------------------------------------------------------------------------------------------------- views
+
+    def _weights(self, run: _Run) -> Iterator[tuple[Any, Tensor]]:
+        cameras = list(run.datamanager.training_cameras())
+        stride = -(-len(cameras) // MAX_VIEWS)
+        for camera in cameras[::stride]:
+            view = run.model.view_of(camera)
+            yield view, run.model.weights_of(view)
+
+    @torch.no_grad()
+    def _contribution(self, run: _Run) -> Tensor:
+        total = torch.zeros(run.model.num_points, device=run.model.device)
+        for _, weight in self._weights(run):
+            total += weight
+        return total
+
+    @torch.no_grad()
+    def _view_basis(self, run: _Run, degree: int) -> tuple[Tensor, Tensor]:
+        def weighted() -> Iterator[tuple[Tensor, Tensor]]:
+            means = run.params["means"].data
+            for view, weight in self._weights(run):
+                centre = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
+                directions = torch.nn.functional.normalize(means - centre, dim=-1)
+                yield weight, harmonic_basis(degree, directions)
+
+        return mean_basis(weighted())
+
+    @torch.no_grad()
+    def _measure(self, run: _Run) -> float:
+        """Mean PSNR over the held-back views, dB, the head included where it takes part."""
+        model = run.model
+        training = model.training
+        model.eval()
+        background = model._get_background_color()
+        values = []
+        for camera, batch in run.datamanager.holdout_views:
+            pictures, _ = model.render(run.params, model.view_of(camera), background, depth=False)
+            target = model.composite_with_background(model.get_gt_img(batch["image"]), background)
+            values.append(psnr(pictures["rgb"], target))
+        model.train(training)
+        return float(torch.stack([torch.as_tensor(value) for value in values]).mean())
+
+    # ------------------------------------------------------------------------------------------------------ fields
+
+    def _keep(self, run: _Run, mask: Tensor) -> None:
+        keep(run.params, run.optimizers.optimizers, run.model.pruning_state, mask)
+
+    def _snapshot(self, run: _Run) -> dict[str, Snapshot]:
+        optimizers = run.optimizers.optimizers
+        saved = {"field": snapshot(run.params, optimizers)}
+        if self.search.head:
+            assert run.model.head is not None
+            saved["head"] = module_snapshot(run.model.head.parameters(), optimizers["compensation"])
+        return saved
+
+    def _restore(self, run: _Run, saved: dict[str, Snapshot] | None) -> None:
+        assert saved is not None
+        restore(run.params, run.optimizers.optimizers, saved["field"])
+        if "head" in saved:
+            assert run.model.head is not None
+            restore_module(run.model.head.parameters(), run.optimizers.optimizers["compensation"], saved["head"])
+        # Whatever is kept per count of primitives is stale.
+        run.model.pruning_state["num_prunes"] += 1
+
+    @staticmethod
+    def _rows(saved: dict[str, Snapshot] | None) -> int:
+        return 0 if saved is None else len(saved["field"]["means"]["value"])
+
+    def _point(self, run: _Run, value: float, phase: str, verdict: str) -> Point:
+        stored = run.params if self.search.head else {k: v for k, v in run.params.items() if k != FEATURES}
+        return Point(
+            step=run.model.step,
+            phase=phase,
+            primitives=run.model.num_points,
+            bytes=bytes_of(stored, self.head_config if self.search.head else None),
+            psnr=value,
+            verdict=verdict,
+            since_cut=run.model.schedule_step - self.search.cut_at,
+        )
+
+    def _write(self, run: _Run) -> None:
+        """``budget.json`` and ``budget.txt`` in the run's folder: the curve, the choice, and what it cost."""
+        trainer, search = run.attributes.trainer, self.search
+        if trainer is None:
+            return
+        wanted = self._wanted()
+        steps = trainer.config.max_num_iterations
+        content = {
+            "budget": {wanted: getattr(self.config, wanted) or self.config.tolerated_drop},
+            **asdict(search),
+            "primitives": run.model.num_points,
+            "cost": {
+                "steps_lost": search.steps_lost,
+                "share_of_steps": search.steps_lost / steps,
+                "seconds": search.seconds,
+            },
+        }
+        folder = trainer.base_dir
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(folder / "budget.json", json.dumps(content, indent=2))
+        write_text(folder / "budget.txt", curve_text(search.curve, search.target) + "\n")
+
+
+@contextmanager
+def _values(parameter: Parameter, value: Tensor) -> Iterator[None]:
+    """Another value for a while."""
+    before = parameter.data
+    parameter.data = value
+    try:
+        yield
+    finally:
+        parameter.data = before
