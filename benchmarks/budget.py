@@ -26,7 +26,7 @@ from sundae_ns.data import write_scene
 from sundae_ns.measure import sizes
 from sundae_ns.method_configs import sundae_auto, sundae_tiny
 
-TINY = ("num_downscales", "sh_degree_interval", "warmup_length", "stop_screen_size_at", "reset_alpha_every")
+TINY = ("num_downscales", "warmup_length", "stop_screen_size_at", "reset_alpha_every")
 TINY += ("densify_grad_thresh", "cull_alpha_thresh")
 
 
@@ -42,7 +42,8 @@ def small_config(steps: int) -> Any:
         setattr(model, name, getattr(tiny.pipeline.model, name))
     model.pruning.prune_at = model.stop_split_at = steps // 2
     model.pruning.stop = round(0.8 * steps)
-    model.pruning.search_every = max(round(steps / 120), 1)
+    model.pruning.search_every = max(round(steps / 60), 1)
+    model.sh_degree_interval = max(steps // 10, 1)  # all bands take part before the warm-up ends
     model.head.size, model.head.pixel_unshuffle, model.head.num_features = "tiny", 1, 5
     for group in config.optimizers.values():
         if group["scheduler"] is not None:
@@ -82,6 +83,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=96, help="pixels a side")
     parser.add_argument("--views", type=int, default=48)
     parser.add_argument("--points", type=int, default=2000)
+    parser.add_argument("--sensor-noise", type=float, default=0.015)
     parser.add_argument("--max-psnr-drop", type=float)
     parser.add_argument("--max-bytes", type=int)
     parser.add_argument("--max-primitives", type=int)
@@ -104,6 +106,7 @@ def main() -> None:
                     width=options.size,
                     height=options.size,
                     points=options.points,
+                    sensor_noise=options.sensor_noise,
                 )
                 config = small_config(options.steps)
             config.machine.seed = 42 + seed
@@ -115,10 +118,12 @@ def main() -> None:
             found, seconds = train(config)
             rows.append({"kind": kind, "seed": seed, "seconds": seconds, **found})
             last = found["curve"][-1]
+            cost = found["cost"]
             print(
                 f"{kind} seed {seed}: {found['before']} -> {found['primitives']} primitives, degree {found['degree']}, "
-                f"head {found['head']}, {last['bytes']} bytes, {found['reference'] - last['psnr']:+.3f} dB ({last['verdict']}), "
-                f"{found['cost']['share_of_steps']:.1%} of the steps and {found['cost']['seconds']:.0f} s of {seconds:.0f} s lost"
+                f"head {found['head']}, {last['bytes']} bytes, {found['reference'] - last['psnr']:+.3f} dB "
+                f"({last['verdict']}); {cost['share_of_steps']:.1%} of the steps lost, {cost['seconds']:.0f} s of "
+                f"{seconds:.0f} s for looking and cutting"
             )
     if options.out:
         content = {

@@ -2,7 +2,8 @@
 
 Held-back training views judge; test views are never looked at. After the warm-up:
 
-1. bands of the harmonics that held-back views do not miss go, for the whole scene;
+1. the field is trained on with all bands of its harmonics, and for as long with fewer: those that held-back views do not
+   miss go, for the whole scene;
 2. the field is cut, trained, looked at, and cut again, on its base colours alone;
 3. where the network that corrects them would be smaller than the field that came out, it joins, and the field is cut on;
    it stays only if field, features and network together are then smaller;
@@ -14,6 +15,7 @@ A budget in bytes or primitives takes the place of 2 and 3: then the count follo
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -48,7 +50,9 @@ if TYPE_CHECKING:
 MAX_VIEWS = 64
 """Training views, evenly chosen, that each scoring looks at: it is repeated at each cut."""
 MAX_REJECTED = 3
-"""Cuts that may be taken back."""
+"""Cuts that may be taken back, before and after the head has joined."""
+TRIAL_LOOKS = 3
+"""Length, in looks, of the training that is compared with other bands."""
 HEAD_SHARE = 0.25
 """Under a budget of bytes or primitives the head stays if it takes at most this share of what is stored."""
 FLAT_SHARE = 0.25
@@ -190,7 +194,9 @@ class Budget:
         started = time.perf_counter()
         if search.phase == "before" and step >= config.prune_at:
             self._begin(run)
-        elif search.searching and ((step - search.began) % config.search_every == 0 or step >= config.stop):
+        elif search.phase == "bands" and step - search.cut_at >= TRIAL_LOOKS * config.search_every:
+            self._end_trial(run)
+        elif search.phase in ("field", "head") and (step - search.began) % config.search_every == 0:
             self._look(run)
         else:
             return
@@ -245,26 +251,30 @@ class Budget:
             f"step {model.step}: warm-up field of {model.num_points:,} primitives, PSNR {search.reference:.3f} dB on "
             f"{search.views} held-back training views"
         )
-        self._choose_degree(run)
         self._notify(run, head=False)
-        if self._wanted() == "max_psnr_drop":
-            search.begin("field", model.num_points)
-            self._accepted = self._snapshot(run)
-            self._cut(run)
+        search.degree = self._degree(run)
+        if search.degree > 0:
+            search.phase = "bands"
+            self._fallback = self._snapshot(run)
+            self._start_trial(run, search.degree)
         else:
+            self._after_bands(run)
+
+    def _after_bands(self, run: _Run) -> None:
+        if self._wanted() != "max_psnr_drop":
             self._fit(run)
             self._done(run)
+            return
+        self.search.begin("field", run.model.num_points)
+        self._cut_or_rest(run, self._measure(run))
 
     def _look(self, run: _Run) -> None:
-        search, step = self.search, run.model.schedule_step
+        search, config, step = self.search, self.config, run.model.schedule_step
         # Half of the time is the head's, if it may join.
         head_to_come = search.phase == "field" and self._head_may_pay(run)
-        deadline = (search.began + self.config.stop) // 2 if head_to_come else self.config.stop
-        last = step >= deadline
-        first_with_head = search.phase == "head" and search.accepted == self._rows(self._fallback)
-        patience = self.config.patience * (2 if first_with_head else 1)
+        deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
         value = self._measure(run)
-        verdict = search.judge(value, step, patience, last=last, steady=not first_with_head)
+        verdict = search.judge(value, step, config.patience)
         point = self._point(run, value, search.phase, verdict)
         search.curve.append(point)
         CONSOLE.log(
@@ -278,26 +288,26 @@ class Budget:
         )
         if verdict == "waiting":
             return
-        if verdict == "accepted":
-            search.accepted = run.model.num_points
-            self._accepted = self._snapshot(run)
-        else:
+        if verdict == "rejected":
             self._restore(run, self._accepted)
-        # A head to come has cuts of its own to try.
-        allowed = MAX_REJECTED - 1 if search.phase == "head" or head_to_come else MAX_REJECTED
-        if last or search.rejected >= allowed:
+            value = search.target + search.margin
+        # A network that does not help, or that waits for its turn, is not waited for.
+        tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
+        over = step + config.patience * config.search_every > deadline or search.looks >= tired * config.patience
+        if over or search.rejected >= MAX_REJECTED:
             self._end_phase(run)
         else:
-            self._cut(run)
+            self._cut_or_rest(run, value)
 
-    def _cut(self, run: _Run) -> None:
-        """Cut on, or end the phase where there is nothing left to cut."""
+    def _cut_or_rest(self, run: _Run, value: float) -> None:
+        """Cut on as far as the margin allows; nothing where it allows nothing."""
         config = self.config
-        count = self.search.next_count(config.num_neighbors + 1 if config.uses_graph else 1)
+        count = self.search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1)
         if count is None:
-            self._end_phase(run)
             return
+        self._accepted = self._snapshot(run)
         self._cut_to(run, count)
+        self.search.cut(value, count, run.model.schedule_step)
 
     def _cut_to(self, run: _Run, count: int) -> None:
         step = run.model.schedule_step
@@ -306,24 +316,23 @@ class Budget:
         self._keep(run, decision.mask)
         run.model.pruning_state["pruned_at"] = step
         run.model.pruning_state["num_prunes"] += 1
-        self.search.cut(step)
 
     def _end_phase(self, run: _Run) -> None:
         search, step = self.search, run.model.schedule_step
         if search.phase == "field" and self._head_may_pay(run) and step < self.config.stop:
-            self._fallback = self._accepted
+            self._fallback = self._snapshot(run)
             search.head = True
             search.begin("head", search.accepted)
+            search.head_at = step
             self._notify(run, head=True)
-            self._accepted = self._snapshot(run)
-            self._cut(run)
             return
         if search.phase == "head":
             assert self._fallback is not None
             without = {name: entry["value"] for name, entry in self._fallback["field"].items() if name != FEATURES}
             if bytes_of(run.params, self.head_config) >= bytes_of(without, None):
-                self._restore(run, self._fallback)
+                search.steps_lost += step - search.head_at
                 search.head = False
+                self._restore(run, self._fallback)
         if not search.head:
             self._drop_head(run)
         self._done(run)
@@ -404,29 +413,36 @@ class Budget:
     def _degree(self, run: _Run) -> int:
         return round((run.params["features_rest"].shape[1] + 1) ** 0.5) - 1
 
-    def _choose_degree(self, run: _Run) -> None:
-        """Take away the bands that held-back views do not miss, without any training: a bound on what it costs."""
-        search, top = self.search, self._degree(run)
-        search.degree, search.degrees = top, {str(top): search.reference}
-        if top == 0:
+    def _start_trial(self, run: _Run, degree: int) -> None:
+        """Train on from the warm-up field with the bands up to ``degree``."""
+        search = self.search
+        if degree < search.degree:
+            dc, rest = run.params["features_dc"], run.params["features_rest"]
+            mean, _ = self._view_basis(run, search.degree)
+            dc.data.copy_(fold(dc.data, rest.data, mean, degree)[0])
+            narrow(run.params, run.optimizers.optimizers, "features_rest", (degree + 1) ** 2 - 1)
+            search.degree = degree
+        search.cut_at = run.model.schedule_step
+
+    def _end_trial(self, run: _Run) -> None:
+        search, tolerated = self.search, self.config.tolerated_drop
+        search.degrees[str(search.degree)] = self._measure(run)
+        top = max(int(name) for name in search.degrees)
+        if search.degree == search.lowest_degree(top, tolerated):
+            self._accepted = self._snapshot(run)
+        degree = search.next_degree(top, tolerated)
+        if len(search.degrees) > 1:  # this trial, or the one that it has replaced
+            search.steps_lost += run.model.schedule_step - search.cut_at
+        if degree is not None:
+            self._restore(run, self._fallback)
+            self._start_trial(run, degree)
             return
-        mean, _ = self._view_basis(run, top)
-        dc, rest = run.params["features_dc"], run.params["features_rest"]
-        found = dc.data
-        for degree in range(top - 1, -1, -1):
-            folded, kept = fold(dc.data, rest.data, mean, degree)
-            tried = torch.zeros_like(rest)
-            tried[:, : kept.shape[1]] = kept
-            with _values(dc, folded), _values(rest, tried):
-                value = self._measure(run)
-            search.degrees[str(degree)] = value
-            if value < search.target:
-                break
-            search.degree, found = degree, folded
-        dc.data.copy_(found)
-        narrow(run.params, run.optimizers.optimizers, "features_rest", (search.degree + 1) ** 2 - 1)
-        levels = ", ".join(f"{degree}: {value:.3f}" for degree, value in search.degrees.items())
-        CONSOLE.log(f"harmonics of degree {search.degree} (PSNR by degree, before any training: {levels} dB)")
+        if search.degree != search.lowest_degree(top, tolerated):
+            self._restore(run, self._accepted)
+        self._fallback = None
+        levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
+        CONSOLE.log(f"harmonics of degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
+        self._after_bands(run)
 
     def _flatten(self, run: _Run) -> None:
         """Set the bands of those primitives to 0 that look the same from everywhere, as many as held-back views allow."""
@@ -519,12 +535,9 @@ class Budget:
         if "head" in saved:
             assert run.model.head is not None
             restore_module(run.model.head.parameters(), run.optimizers.optimizers["compensation"], saved["head"])
+        self.search.degree = self._degree(run)
         # Whatever is kept per count of primitives is stale.
         run.model.pruning_state["num_prunes"] += 1
-
-    @staticmethod
-    def _rows(saved: dict[str, Snapshot] | None) -> int:
-        return 0 if saved is None else len(saved["field"]["means"]["value"])
 
     def _point(self, run: _Run, value: float, phase: str, verdict: str) -> Point:
         stored = run.params if self.search.head else {k: v for k, v in run.params.items() if k != FEATURES}

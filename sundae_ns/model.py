@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
 import torch
-from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
@@ -32,10 +31,11 @@ from sundae_ns import checkpoint
 from sundae_ns.budget import Budget
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
+from sundae_ns.densification import CappedStrategy, ChainStrategy
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Lpips, display, peak_memory, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
-from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
+from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response, select_random
 from sundae_ns.rasterization import (
     Backend,
     Rasterization,
@@ -50,6 +50,8 @@ from sundae_ns.storage.transform import similarity
 
 NEAR_PLANE = 0.01
 SSIM_WINDOW = 11
+MCMC_REGULARISER = 0.01
+"""Weights of opacities and sizes in the loss while the field grows by MCMC (lambda_o and lambda_Sigma of the paper)."""
 
 
 @dataclass
@@ -69,6 +71,10 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Start from a finished field instead of warming up: a splatfacto or sundae .ckpt (or the folder), or a 3DGS .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
     """Coordinates of the warm start: nerfstudio's model, or the capture's own (COLMAP). auto goes by the kind of file."""
+    warmup: Literal["densify", "mcmc"] = "densify"
+    """How the field grows: by gradients (3DGS), or as a Markov chain with an exact cap (3DGS-MCMC)."""
+    mcmc_cap: int = 1_000_000
+    """Most primitives of a warm-up by mcmc, at any step."""
     evaluate_prune: bool = True
     """Evaluate all test views right before and right after the prune, and record both."""
 
@@ -144,6 +150,8 @@ class SundaeModel(SplatfactoModel):
         config.pruning.validate()
         if config.head.mode != "off":
             config.head.validate()
+        if config.mcmc_cap < 1:
+            raise ConfigError(f"mcmc-cap is {config.mcmc_cap}; give the most primitives that the field may have")
         if config.base_loss_weight < 0:
             raise ConfigError(f"base-loss-weight is {config.base_loss_weight}; give 0 or more")
         if config.warm_start is not None and config.pruning.mode == "continuous":
@@ -164,23 +172,7 @@ class SundaeModel(SplatfactoModel):
         self.policy = make_policy(config.pruning)
         self.budget = Budget(config.pruning, config.head) if config.pruning.mode == "auto" else None
         self.pruning_state: dict[str, Any] = self.policy.initialize_state()
-        self.strategy = DefaultStrategy(
-            prune_opa=config.cull_alpha_thresh,
-            grow_grad2d=config.densify_grad_thresh,
-            grow_scale3d=config.densify_size_thresh,
-            grow_scale2d=config.split_screen_size,
-            prune_scale3d=config.cull_scale_thresh,
-            prune_scale2d=config.cull_screen_size,
-            refine_scale2d_stop_iter=config.stop_screen_size_at,
-            refine_start_iter=config.warmup_length,
-            # Densification after a one-shot prune would undo it.
-            refine_stop_iter=min(config.stop_split_at, self._prune_at or config.stop_split_at),
-            reset_every=config.reset_alpha_every * config.refine_every,
-            refine_every=config.refine_every,
-            pause_refine_after_reset=self.num_train_data + config.refine_every,
-            absgrad=config.use_absgrad,
-            verbose=False,
-        )
+        self.strategy = self._strategy()
         self.strategy_state: dict[str, Any] = self.strategy.initialize_state(scene_scale=1.0)
 
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
@@ -223,6 +215,11 @@ class SundaeModel(SplatfactoModel):
                     "points. Results are better with one (COLMAP, or ply_file_path in transforms.json)."
                 )
             xyz, rgb = random_points(config.num_random, config.random_scale)
+        cap = getattr(self._strategy(), "cap", None)
+        if cap is not None and len(xyz) > cap:
+            CONSOLE.print(f"[yellow]Warning: {len(xyz):,} points are more than the cap; starting from {cap:,} of them")
+            chosen = select_random(len(xyz), cap, config.pruning.seed, xyz.device)
+            xyz, rgb = xyz[chosen], rgb[chosen]
         return from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=self.num_features)
 
     def _warm_field(self, source: Path) -> dict[str, Tensor]:
@@ -246,6 +243,37 @@ class SundaeModel(SplatfactoModel):
             params[FEATURES] = initial_features(params["features_dc"], self.num_features)
         CONSOLE.log(f"warm start: {len(params['means'])} primitives from {source}")
         return params
+
+    def _strategy(self) -> CappedStrategy | ChainStrategy:
+        """How the field grows, until the prune that would be undone by it."""
+        config, pruning = self.config, self.config.pruning
+        continuous = pruning.mode == "continuous"
+        stop = min(config.stop_split_at, pruning.stop if continuous else self._prune_at or config.stop_split_at)
+        cap = pruning.max_primitives if continuous else None
+        if config.warmup == "mcmc":
+            return ChainStrategy(
+                cap=min(config.mcmc_cap, cap or config.mcmc_cap),
+                refine_start_iter=config.warmup_length,
+                refine_stop_iter=stop,
+                refine_every=config.refine_every,
+            )
+        return CappedStrategy(
+            cap=cap,
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            grow_scale2d=config.split_screen_size,
+            prune_scale3d=config.cull_scale_thresh,
+            prune_scale2d=config.cull_screen_size,
+            refine_scale2d_stop_iter=config.stop_screen_size_at,
+            refine_start_iter=config.warmup_length,
+            refine_stop_iter=stop,
+            reset_every=config.reset_alpha_every * config.refine_every,
+            refine_every=config.refine_every,
+            pause_refine_after_reset=self.num_train_data + config.refine_every,
+            absgrad=config.use_absgrad,
+            verbose=False,
+        )
 
     @property
     def gaussians(self) -> MutableMapping[str, torch.nn.Parameter]:
@@ -411,7 +439,7 @@ class SundaeModel(SplatfactoModel):
         compensate = compensate and self.head_active
         colors = self._colors(params, view)
         channels = torch.cat([colors, params[FEATURES]], dim=1) if compensate else colors
-        absgrad = self.training and self.config.use_absgrad and self._densifying
+        absgrad = self.training and self.config.use_absgrad and self._densifying and self.config.warmup == "densify"
         splat = self._splat(params, view, channels, render_depth=depth, absgrad=absgrad)
         blended, features = splat.colors[..., :3], splat.colors[..., 3:]
         base = (blended + (1 - splat.alpha) * background).clamp(0.0, 1.0)
@@ -572,6 +600,9 @@ class SundaeModel(SplatfactoModel):
         optimizers, pipeline = attributes.optimizers, attributes.pipeline
         assert optimizers is not None
         assert pipeline is not None
+        # Between growing and culling there were more than now.
+        peaks = (self.pruning_state["peak"], self.strategy_state.get("peak", 0))
+        self.pruning_state["peak"] = max(peaks)
         due = self.policy.due(self.pruning_state, self.schedule_step, self.num_points)
         evaluate = due and self.config.evaluate_prune and self._prune_at is not None
         before = self._evaluate(pipeline, "warm-up", step) if evaluate else {}
@@ -708,6 +739,10 @@ class SundaeModel(SplatfactoModel):
             losses["base_loss"] = self.config.base_loss_weight * (base - target).abs().mean()
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
+            if self.config.warmup == "mcmc" and self._densifying:
+                # What nothing needs becomes transparent and small, and can be moved (equation 10 of 3DGS-MCMC).
+                losses["opacity_loss"] = MCMC_REGULARISER * self.gauss_params["opacities"].sigmoid().mean()
+                losses["scale_loss"] = MCMC_REGULARISER * self.gauss_params["scales"].exp().mean()
         return losses
 
     def get_image_metrics_and_images(

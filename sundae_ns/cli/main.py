@@ -38,6 +38,7 @@ def scene(
     height: int = 128,
     points: int = 2000,
     kind: Literal["still-life", "wall"] = "still-life",
+    sensor_noise: float = 0.0,
 ) -> int:
     """Write the embedded scene: a small ray-traced capture in nerfstudio format, with a sparse point cloud.
 
@@ -50,6 +51,7 @@ def scene(
         height: pixels.
         points: size of the sparse point cloud.
         kind: the still life, or one flat painted wall, which needs next to nothing.
+        sensor_noise: standard deviation of the noise of each pixel, in [0, 1].
     """
     from rich.progress import Progress
 
@@ -66,6 +68,7 @@ def scene(
             height=height,
             points=points,
             kind=kind,
+            sensor_noise=sensor_noise,
             progress=lambda done, total: progress.update(task, completed=done, total=total),
         )
     print(f"wrote {train_views} training and {test_views} test views to {out}")

@@ -103,6 +103,7 @@ def write_scene(
     outliers: float = 0.01,
     samples: int = 2,
     kind: Kind = "still-life",
+    sensor_noise: float = 0.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Render the embedded still life, or a plain wall, and write it as a nerfstudio data set.
@@ -123,6 +124,8 @@ def write_scene(
         outliers: fraction of wrong points.
         samples: each pixel is the mean of ``samples`` x ``samples`` rays.
         kind: the still life, or one flat painted wall, which needs few primitives.
+        sensor_noise: standard deviation of the noise of each pixel and colour, in [0, 1]; a phone's camera in a room has
+            about 0.015.
         progress: called with (views done, views in all) after each view.
 
     Returns:
@@ -142,6 +145,7 @@ def write_scene(
         ("samples", samples, 1),
         ("point_noise", point_noise, 0),
         ("outliers", outliers, 0),
+        ("sensor_noise", sensor_noise, 0),
     ):
         if not value >= least:
             raise ConfigError(f"{name} is {value}; it must be {least} or more.")
@@ -160,9 +164,12 @@ def write_scene(
 
     scene, cameras_of = (still_life(seed), orbit) if kind == "still-life" else (wall(seed), facing)
     cameras = cameras_of(total, width=width, height=height, rng=np.random.default_rng([seed, 2]))
+    grain = np.random.default_rng([seed, 5])
     pictures = []
     for i, (camera, name) in enumerate(zip(cameras, names, strict=True)):
         picture = render(scene, camera, samples=samples)
+        if sensor_noise:
+            picture = np.clip(picture + grain.normal(scale=sensor_noise, size=picture.shape), 0, 1)
         Image.fromarray(np.round(picture * 255).astype(np.uint8)).save(out / name)
         pictures.append(picture)
         if progress is not None:

@@ -6,6 +6,9 @@ taken back if they have not after ``patience`` looks, or cannot any more at the 
 down, so that this rate is the best to be hoped for). Steps behind an accepted cut are the fine-tuning itself; only those
 behind a cut that is taken back are lost.
 
+How deep to cut follows from the cut before: what it cost once recovered, per halving, against the margin that there is.
+Where the margin is too small for a cut worth its while, training goes on until it has grown.
+
 This module holds the decisions, as plain numbers; :mod:`sundae_ns.budget` acts on them.
 """
 
@@ -18,13 +21,13 @@ from typing import Any, Literal
 
 from sundae_ns.errors import CheckpointError
 
-FIRST_FACTOR = 0.5
-"""Share of the primitives that the first cut keeps; each cut that is taken back is followed by a gentler one."""
+DEEPEST, SHALLOWEST = 1.0, 0.15
+"""Halvings of the deepest cut (a half goes), and of the least that is worth a cut (a tenth goes)."""
 
 _KINDS: dict[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "bool": (bool,)}
 
-Phase = Literal["before", "field", "head", "done"]
-Verdict = Literal["accepted", "waiting", "rejected"]
+Phase = Literal["before", "bands", "field", "head", "done"]
+Verdict = Literal["accepted", "waiting", "rejected", "resting"]
 
 
 @dataclass
@@ -56,26 +59,37 @@ class Search:
     """PSNR that has to be kept, dB."""
     began: int = 0
     """Step of the schedule at which the search began."""
-    factor: float = FIRST_FACTOR
+    trying: bool = False
+    """Whether a cut waits for its verdict."""
     looks: int = 0
-    """Looks since the last cut."""
+    """Looks since the last cut, or since the last verdict."""
     last_psnr: float = math.nan
+    margin: float = math.nan
+    """What the field was above the target before the last cut, dB."""
+    slope: float = 0.0
+    """What a halving cost after recovery, dB, by the last verdict."""
     rejected: int = 0
     """Cuts taken back in this phase."""
+    cuts: int = 0
+    """Cuts accepted in this phase."""
     accepted: int = 0
     """Primitives of the field that training would go back to."""
+    tried: int = 0
+    """Primitives after the last cut."""
     cut_at: int = 0
     """Step of the schedule of the last cut."""
     head: bool = False
     """Whether the head takes part."""
+    head_at: int = 0
+    """Step of the schedule at which it joined."""
     head_dropped: bool = False
     """Whether it was decided that this scene needs no head."""
     degree: int = -1
-    """Degree of the spherical harmonics that was chosen; -1 before."""
+    """Degree of the harmonics of the field at hand; -1 before the search."""
     before: int = 0
     """Primitives of the warm-up field."""
     steps_lost: int = 0
-    """Steps of training behind cuts that were taken back."""
+    """Steps of training behind what was taken back."""
     seconds: float = 0.0
     """Time that looking, scoring and cutting took, training not counted."""
     views: int = 0
@@ -83,50 +97,78 @@ class Search:
     zeroed: int = 0
     """Primitives whose bands above 0 were found to carry nothing, and were set to 0."""
     degrees: dict[str, float] = field(default_factory=dict)
-    """PSNR of the warm-up field by degree of its harmonics, dB."""
+    """PSNR by degree of the harmonics, dB, each after the same training of the warm-up field."""
     curve: list[Point] = field(default_factory=list)
 
     @property
     def searching(self) -> bool:
-        """Whether cuts are being tried."""
-        return self.phase in ("field", "head")
+        """Whether something is being tried."""
+        return self.phase in ("bands", "field", "head")
 
     def begin(self, phase: Literal["field", "head"], accepted: int) -> None:
-        """Start a phase from a field that meets the target."""
-        self.phase, self.accepted = phase, accepted
-        self.factor, self.rejected, self.looks, self.last_psnr = FIRST_FACTOR, 0, 0, math.nan
+        """Start to cut a field that meets the target; what a halving costs is remembered from an earlier phase."""
+        self.phase, self.accepted, self.trying = phase, accepted, False
+        self.rejected, self.cuts, self.looks = 0, 0, 0
 
-    def next_count(self, least: int) -> int | None:
-        """Primitives after the next cut; None if there is nothing to cut any more."""
-        count = max(int(self.accepted * self.factor), least)
-        return count if count < self.accepted else None
+    def next_degree(self, top: int, tolerated: float) -> int | None:
+        """The degree to try next, None when the lowest that does is known: bisection, all bands first.
 
-    def cut(self, step: int) -> None:
-        """A cut was made after this step of the schedule."""
-        self.cut_at, self.looks, self.last_psnr = step, 0, math.nan
+        Args:
+            top: degree of the warm-up field.
+            tolerated: what may be lost against all bands, dB.
+        """
+        if str(top) not in self.degrees:
+            return top
+        best, worst = self.lowest_degree(top, tolerated), -1
+        for name, value in self.degrees.items():
+            if value < self.degrees[str(top)] - tolerated:
+                worst = max(worst, int(name))
+        return None if best - worst <= 1 else (best + worst) // 2
 
-    def judge(self, psnr: float, step: int, patience: int, *, last: bool, steady: bool = True) -> Verdict:
-        """Judge the last cut by a look at the held-back views.
+    def lowest_degree(self, top: int, tolerated: float) -> int:
+        """The lowest degree among those tried that loses no more than is tolerated."""
+        return min(int(name) for name, value in self.degrees.items() if value >= self.degrees[str(top)] - tolerated)
+
+    def next_count(self, psnr: float, least: int) -> int | None:
+        """Primitives after the next cut; None if the margin is too small for one, or there is nothing left to cut.
+
+        Args:
+            psnr: of the field that would be cut, dB.
+            least: fewest primitives.
+        """
+        margin = psnr - self.target
+        halvings = DEEPEST if margin >= self.slope * DEEPEST else max(margin, 0.0) / self.slope
+        count = max(int(self.accepted * 0.5**halvings), least)
+        return count if halvings >= SHALLOWEST and count < self.accepted else None
+
+    def cut(self, psnr: float, count: int, step: int) -> None:
+        """A field was cut to ``count`` primitives after this step of the schedule."""
+        self.margin, self.tried, self.cut_at, self.trying, self.looks = psnr - self.target, count, step, True, 0
+
+    def judge(self, psnr: float, step: int, patience: int) -> Verdict:
+        """Judge the last cut, if it waits for it, by a look at the held-back views.
 
         Args:
             psnr: mean over the views, dB.
             step: of the schedule.
             patience: looks that a cut may take to recover.
-            last: no further look is left.
-            steady: recovery only slows down, so that a cut that cannot make it any more may be taken back early; not so
-                while a network joins.
         """
         self.looks += 1
-        left = 0 if last else patience - self.looks
         # The first look has nothing to compare with: what a cut costs is not what training gains.
-        gain = psnr - self.last_psnr if self.looks > 1 and steady else math.inf
+        gain = psnr - self.last_psnr if self.looks > 1 else math.inf
         self.last_psnr = psnr
-        if psnr >= self.target:
-            return "accepted"
-        if left > 0 and psnr + gain * left >= self.target:
+        if not self.trying:
+            return "resting"
+        left, margin = patience - self.looks, psnr - self.target
+        if margin < 0 and left > 0 and margin + gain * left >= 0:
             return "waiting"
+        self.trying, self.looks = False, 0
+        # Training gains meanwhile, and a lucky cut does not make the next one cheap.
+        self.slope = max((self.margin - margin) / math.log2(self.accepted / self.tried), self.slope / 2)
+        if margin >= 0:
+            self.accepted, self.cuts = self.tried, self.cuts + 1
+            return "accepted"
         self.rejected += 1
-        self.factor = math.sqrt(self.factor)
         self.steps_lost += step - self.cut_at
         return "rejected"
 
@@ -145,7 +187,7 @@ class Search:
             if set(state) != {f.name for f in fields(cls)}:
                 raise ValueError("other entries")
             search = cls(**{**state, "curve": [Point(**point) for point in state["curve"]]})
-            if search.phase not in ("before", "field", "head", "done") or not -1 <= search.degree <= 4:
+            if search.phase not in ("before", "bands", "field", "head", "done") or not -1 <= search.degree <= 4:
                 raise ValueError("unknown phase or degree")
             for f in fields(cls):
                 kinds = _KINDS.get(str(f.type))
