@@ -5,7 +5,7 @@ Held-back training views judge; test views are never looked at. After the warm-u
 1. the field is trained on with all bands of its harmonics, and for as long with fewer: those that held-back views do not
    miss go, for the whole scene;
 2. the field is cut, trained, looked at, and cut again, on its base colours alone;
-3. where the network that corrects them would be smaller than the field that came out, it joins, and the field is cut on;
+3. where the network that corrects them is small beside the field that came out, it joins, and the field is cut on;
    it stays only if field, features and network together are then smaller;
 4. primitives whose colour does not depend on the view lose their bands above 0.
 
@@ -34,7 +34,7 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError
 from sundae_ns.evaluation import psnr
-from sundae_ns.gaussians import FEATURES, finite_mask, keep
+from sundae_ns.gaussians import FEATURES, finite_mask, from_points, keep
 from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, narrow, restore, restore_module, snapshot
 from sundae_ns.pruning import PruneReport, PruningConfig, decide
 from sundae_ns.pruning.bands import fold, mean_basis, view_dependence
@@ -54,7 +54,7 @@ MAX_REJECTED = 3
 TRIAL_LOOKS = 3
 """Length, in looks, of the training that is compared with other bands."""
 HEAD_SHARE = 0.25
-"""Under a budget of bytes or primitives the head stays if it takes at most this share of what is stored."""
+"""The head may join where it is at most this share of the field, under a budget of bytes or primitives of the whole."""
 FLAT_SHARE = 0.25
 """Share of the tolerated drop that flat colours may cost, right when bands go."""
 
@@ -168,11 +168,16 @@ class Budget:
     # ---------------------------------------------------------------------------------------------------- training
 
     def check(self, datamanager: SundaeDatamanager) -> None:
-        """Check that there are views to judge by.
+        """Check, before the first step, that there are views to judge by, and bytes for a primitive at all.
 
         Raises:
-            ConfigError: no training view is held back.
+            ConfigError: no training view is held back, or the budget is too small.
         """
+        least = bytes_of(from_points(torch.zeros(1, 3), torch.zeros(1, 3), sh_degree=0, num_features=0), None)
+        if self.config.max_bytes is not None and self.config.max_bytes < least:
+            raise ConfigError(
+                f"pruning.max-bytes is {self.config.max_bytes:,}, and one primitive takes {least}; give more"
+            )
         if not datamanager.holdout_indices:
             raise ConfigError(
                 "pruning.mode auto judges by training views that are held back, and there are none: give "
@@ -389,9 +394,9 @@ class Budget:
     # --------------------------------------------------------------------------------------------------- the head
 
     def _head_may_pay(self, run: _Run) -> bool:
-        """Whether the network would be smaller than the field without it."""
+        """Whether the network is small beside the field without it."""
         bare = {name: value for name, value in run.params.items() if name != FEATURES}
-        return self.head_config is not None and head_bytes(self.head_config) < bytes_of(bare, None)
+        return self.head_config is not None and head_bytes(self.head_config) <= HEAD_SHARE * bytes_of(bare, None)
 
     def _drop_head(self, run: _Run) -> None:
         if self.head_config is None:

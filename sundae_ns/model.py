@@ -576,12 +576,13 @@ class SundaeModel(SplatfactoModel):
         if self.budget is not None:
             self.budget.check(cast(Any, training_callback_attributes.pipeline).datamanager)
         callbacks = super().get_training_callbacks(training_callback_attributes)
-        prune = partial(self._prune_if_due, training_callback_attributes)
-        prune.__name__ = "prune_if_due"  # type: ignore[attr-defined]
-        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], prune))
-        finish = partial(self._finish, training_callback_attributes)
-        finish.__name__ = "finish"  # type: ignore[attr-defined]
-        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], finish))
+        for location, act in (
+            (TrainingCallbackLocation.AFTER_TRAIN, self._finish),
+            (TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._prune_if_due),
+        ):
+            callback = partial(act, training_callback_attributes)
+            callback.__name__ = act.__name__.lstrip("_")  # type: ignore[attr-defined]
+            callbacks.append(TrainingCallback([location], callback))
         return callbacks
 
     def step_post_backward(self, step: int) -> None:
@@ -615,15 +616,15 @@ class SundaeModel(SplatfactoModel):
                 strategy_state=self.strategy_state,
                 contribution=partial(self.contribution, cast(SundaeDatamanager, pipeline.datamanager)),
             )
+            if self.budget is not None:
+                self.budget.after_step(self, attributes)
         except SundaeError:
             # The warm-up should not be lost to an option that can be mended: resuming prunes at the first step.
             if attributes.trainer is not None:
                 attributes.trainer.save_checkpoint(step)
             raise
         self._refresh(optimizers)
-        if self.budget is not None:
-            self.budget.after_step(self, attributes)
-        elif self.schedule_step >= self._pruning_end:
+        if self.budget is None and self.schedule_step >= self._pruning_end:
             notify_pruned(optimizers.schedulers, step)
         if report is None:
             return

@@ -137,7 +137,9 @@ class Search:
             least: fewest primitives.
         """
         margin = psnr - self.target
-        halvings = DEEPEST if margin >= self.slope * DEEPEST else max(margin, 0.0) / self.slope
+        if margin < 0:
+            return None
+        halvings = DEEPEST if margin >= self.slope * DEEPEST else margin / self.slope
         count = max(int(self.accepted * 0.5**halvings), least)
         return count if halvings >= SHALLOWEST and count < self.accepted else None
 
