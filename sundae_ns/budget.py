@@ -35,6 +35,7 @@ from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians import FEATURES, finite_mask, from_points, keep
+from sundae_ns.gaussians.rewriting import rewrite
 from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, narrow, restore, restore_module, snapshot
 from sundae_ns.pruning import PruneReport, PruningConfig, decide
 from sundae_ns.pruning.bands import fold, mean_basis, view_dependence
@@ -317,8 +318,11 @@ class Budget:
     def _cut_to(self, run: _Run, count: int) -> None:
         step = run.model.schedule_step
         options = replace(self.config, seed=self.config.seed + step)
-        decision = decide(run.params, options, lambda: self._contribution(run), count=count)
+        ratio = count / run.model.num_points if options.uses_detail else None
+        decision = decide(run.params, options, lambda: self._contribution(run, ratio), count=count)
         self._keep(run, decision.mask)
+        if decision.values is not None:
+            rewrite(run.params, run.optimizers.optimizers, decision.values)
         run.model.pruning_state["pruned_at"] = step
         run.model.pruning_state["num_prunes"] += 1
 
@@ -481,17 +485,17 @@ class Budget:
 
     # ------------------------------------------------------------------------------------------------------- views
 
-    def _weights(self, run: _Run) -> Iterator[tuple[Any, Tensor]]:
+    def _weights(self, run: _Run, keep_ratio: float | None = None) -> Iterator[tuple[Any, Tensor]]:
         cameras = list(run.datamanager.training_cameras())
         stride = -(-len(cameras) // MAX_VIEWS)
         for camera in cameras[::stride]:
             view = run.model.view_of(camera)
-            yield view, run.model.weights_of(view)
+            yield view, run.model.weights_of(view, keep_ratio)
 
     @torch.no_grad()
-    def _contribution(self, run: _Run) -> Tensor:
+    def _contribution(self, run: _Run, keep_ratio: float | None = None) -> Tensor:
         total = torch.zeros(run.model.num_points, device=run.model.device)
-        for _, weight in self._weights(run):
+        for _, weight in self._weights(run, keep_ratio):
             total += weight
         return total
 

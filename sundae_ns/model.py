@@ -35,7 +35,7 @@ from sundae_ns.densification import CappedStrategy, ChainStrategy
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, peak_memory, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
-from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response, select_random
+from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, pixel_detail, response, select_random
 from sundae_ns.rasterization import (
     Backend,
     Rasterization,
@@ -295,7 +295,7 @@ class SundaeModel(SplatfactoModel):
     def _pruning_end(self) -> int:
         """Step of the schedule after which the field keeps its primitives."""
         pruning = self.config.pruning
-        return pruning.stop if pruning.mode == "continuous" else pruning.prune_at
+        return pruning.stop if pruning.mode == "continuous" else pruning.last_prune
 
     @property
     def head_active(self) -> bool:
@@ -649,8 +649,10 @@ class SundaeModel(SplatfactoModel):
                 attributes.trainer.save_checkpoint(step)
             raise
         self._refresh(optimizers)
-        if self.budget is None and self.schedule_step >= self._pruning_end:
-            notify_pruned(optimizers.schedulers, step)
+        last = self.schedule_step >= self._pruning_end
+        pruned = last or (self._prune_at is not None and self.pruning_state["num_prunes"] > 0)
+        if self.budget is None and pruned:
+            notify_pruned(optimizers.schedulers, step, last=last)
         if report is None:
             return
         CONSOLE.log(report.summary())
@@ -703,16 +705,31 @@ class SundaeModel(SplatfactoModel):
 
     @torch.no_grad()
     def contribution(self, datamanager: SundaeDatamanager) -> Tensor:
-        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``."""
+        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``.
+
+        Where the score asks for it, pixels count by the detail of the rendering, for as many cells as primitives seen in it
+        are going to be kept.
+        """
+        pruning = self.config.pruning
         total = torch.zeros(self.num_points, device=self.device)
         cameras = list(datamanager.training_cameras())
         for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
-            total += self.weights_of(self.view_of(camera))
+            total += self.weights_of(self.view_of(camera), pruning.keep_ratio if pruning.uses_detail else None)
         return total
 
-    def weights_of(self, view: View) -> Tensor:
-        """Blending weight of each primitive, summed over the pixels of one view ``[N]``."""
-        params = self.gaussians
+    def weights_of(self, view: View, keep_ratio: float | None = None) -> Tensor:
+        """Blending weight of each primitive, summed over the pixels of one view ``[N]``.
+
+        Args:
+            view: the camera.
+            keep_ratio: share of the primitives that will stay; given, pixels count by the detail that so many can show.
+        """
+        params, pixels = self.gaussians, None
+        if keep_ratio is not None:
+            # Not the background of training, which may be random: the choice is to be the same from run to run.
+            background = self.background_color.to(self.device)
+            pictures, splat = self.render(params, view, background, depth=False, compensate=False)
+            pixels = pixel_detail(pictures["base_rgb"], keep_ratio * float((splat.radii > 0).sum()))
         return blending_weights(
             params["means"],
             params["quats"],
@@ -722,6 +739,7 @@ class SundaeModel(SplatfactoModel):
             view.K,
             view.width,
             view.height,
+            pixels=pixels,
             backend=self.backend,
         )
 

@@ -469,6 +469,33 @@ def test_contribution_is_the_weight_in_the_pictures() -> None:
     assert float(total.sum()) == pytest.approx(float(torch.stack(alphas).sum()), rel=1e-4)
 
 
+def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time() -> None:
+    plain, weighted = (build(pruning={"score": f"{name}contribution"}) for name in ("", "detail-"))
+    weighted.gauss_params.load_state_dict(plain.gauss_params.state_dict())
+    found = [model.contribution(FakeDatamanager()) for model in (plain, weighted, weighted)]  # type: ignore[arg-type]
+    assert torch.equal(found[1], found[2])
+    assert torch.equal(found[1] > 0, found[0] > 0)
+    seen = found[0] > 0
+    ratio = found[1][seen] / found[0][seen]
+    assert float(ratio.max()) > 1.1
+    assert float(ratio.min()) < 0.9
+
+
+@pytest.mark.parametrize("redistribution", ["merge", "grow"])
+def test_rounds_prune_to_the_count_and_the_head_waits_for_the_last(redistribution: str) -> None:
+    options = {"rounds": 3, "round_every": 2, "keep_ratio": 0.4, "redistribution": redistribution, "num_neighbors": 5}
+    training = Training(build(pruning={**options, "selection": "systematic", "edges": "appearance"}))
+    counts, active = [], []
+    for step in range(11):
+        training.step(step)
+        counts.append(training.model.num_points)
+        active.append(training.model.head_active)
+        assert training.live()
+    assert counts == [60] * 3 + [44] * 2 + [33] * 2 + [24] * 4
+    assert active == [False] * 8 + [True] * 3
+    assert all(torch.isfinite(value).all() for value in training.model.gauss_params.values())
+
+
 @pytest.mark.parametrize(
     ("options", "cause"),
     [

@@ -8,9 +8,20 @@ from typing import Literal, get_args
 from sundae_ns.errors import ConfigError
 
 Mode = Literal["one-shot", "continuous", "auto", "off"]
-ScoreName = Literal["response-contribution", "response", "contribution", "opacity", "random"]
-SelectionName = Literal["sampled", "band", "top"]
-SignalName = Literal["attributes", "positions"]
+ScoreName = Literal[
+    "response-contribution",
+    "coherence-contribution",
+    "detail-contribution",
+    "response",
+    "coherence",
+    "contribution",
+    "opacity",
+    "random",
+]
+SelectionName = Literal["sampled", "systematic", "shared", "band", "top"]
+SignalName = Literal["attributes", "colors", "positions"]
+EdgesName = Literal["centres", "appearance"]
+RedistributionName = Literal["none", "merge", "grow"]
 RuleName = Literal["robust", "literal"]
 DeviceName = Literal["cpu", "field"]
 
@@ -29,12 +40,23 @@ class PruningConfig:
     keep_ratio: float = 0.1
     """Share of the primitives to keep at each prune, in (0, 1]; the kept count is exactly round(keep_ratio * N)."""
     selection: SelectionName = "sampled"
-    """How a score becomes a choice: sampled in proportion to it, its highest and lowest band, or the highest only."""
+    """How a score becomes a choice: sampled in proportion to it by independent draws, one draw in each stretch of space
+    (systematic), the same with a share for every band of the response (shared), its highest and lowest band, or the highest
+    only."""
     score: ScoreName = "response-contribution"
-    """Importance of a primitive: high-pass response, blending weight over the training views, their product, opacity,
-    or uniformly random (which leaves nothing for the selection to choose)."""
+    """Importance of a primitive: high-pass response; local coherence, its energy in the low band that the budget spans;
+    contribution, its blending weight over the training views, by itself, times either of the two, or with pixels weighted by
+    the detail of the renderings; opacity; or alike for all (random)."""
     signal: SignalName = "attributes"
-    """Graph signal that is filtered: position, colour, opacity and size together, or the paper's positions alone."""
+    """Graph signal that is filtered: position, colour, opacity and size together, colour, or the paper's positions alone."""
+    edges: EdgesName = "centres"
+    """What the weights of edges say: distance of the centres alone, or also overlap and likeness of colour."""
+    redistribution: RedistributionName = "none"
+    """What becomes of the dropped: nothing, merged into the kept along the edges, or the kept grow into the gaps."""
+    rounds: int = 1
+    """Prunes of the one-shot mode, each by the same factor, down to the keep ratio; training goes on in between."""
+    round_every: int = 500
+    """Steps from one round to the next."""
     gamma: float = 0.5
     """Share of the kept primitives that the band selection takes from the high end, in [0, 1]; the rest is low end."""
     num_neighbors: int = 16
@@ -79,13 +101,33 @@ class PruningConfig:
 
     @property
     def uses_contribution(self) -> bool:
-        """Whether the score needs the blending weights over the training views."""
-        return self.score in ("contribution", "response-contribution")
+        """Whether the blending weights over the training views are needed, by the score or by the merge."""
+        return self.score.endswith("contribution") or self.redistribution == "merge"
 
     @property
     def uses_graph(self) -> bool:
-        """Whether the score needs the neighbour graph."""
-        return self.score in ("response", "response-contribution")
+        """Whether the neighbour graph is needed, by the score, the selection or the merge."""
+        return self.uses_response or self.uses_coherence or self.redistribution == "merge"
+
+    @property
+    def uses_response(self) -> bool:
+        """Whether the high-pass response is needed, by the score or for its bands."""
+        return self.score.startswith("response") or self.selection == "shared"
+
+    @property
+    def uses_coherence(self) -> bool:
+        """Whether the score needs the local coherence."""
+        return self.score.startswith("coherence")
+
+    @property
+    def uses_detail(self) -> bool:
+        """Whether the score weighs the pixels of the contribution by the detail of the renderings."""
+        return self.score == "detail-contribution"
+
+    @property
+    def last_prune(self) -> int:
+        """Step of the one-shot mode's last round."""
+        return self.prune_at + (self.rounds - 1) * self.round_every
 
     def validate(self) -> None:
         """Check every option.
@@ -98,6 +140,8 @@ class PruningConfig:
             ("selection", SelectionName),
             ("score", ScoreName),
             ("signal", SignalName),
+            ("edges", EdgesName),
+            ("redistribution", RedistributionName),
             ("bandwidth", RuleName),
             ("graph_device", DeviceName),
         ):
@@ -108,22 +152,16 @@ class PruningConfig:
             raise ConfigError(f"keep_ratio is {self.keep_ratio}: use a share in (0, 1], 0.1 to keep a tenth")
         if not 0 <= self.gamma <= 1:
             raise ConfigError(f"gamma is {self.gamma}: use a share in [0, 1]")
-        for name, least in (
-            ("num_neighbors", 1),
-            ("every", 1),
-            ("prune_at", 0),
-            ("start", 0),
-            ("max_primitives", 1),
-            ("target_primitives", 1),
-            ("max_bytes", 1),
-            ("search_every", 1),
-            ("patience", 1),
-        ):
+        at_least = {"num_neighbors": 1, "every": 1, "prune_at": 0, "start": 0, "rounds": 1, "round_every": 1}
+        budgets = {"max_primitives": 1, "target_primitives": 1, "max_bytes": 1, "search_every": 1, "patience": 1}
+        for name, least in {**at_least, **budgets}.items():
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ConfigError(f"{name} is {value}: use at least {least}")
         if self.mode != "auto" and self.stop < self.start:
             raise ConfigError(f"stop ({self.stop}) lies before start ({self.start}): swap them, or set mode to off")
+        if self.rounds > 1 and self.mode in ("continuous", "auto"):
+            raise ConfigError(f"rounds is {self.rounds} but mode is {self.mode}: set mode to one-shot, or drop rounds")
         for name in ("tau", "sigma"):
             value = getattr(self, name)
             if value is not None and not value > 0:

@@ -105,3 +105,15 @@ def test_blending_weights_work_without_grad() -> None:
         weights = blending_weights(**arguments)
     assert weights.shape == (3,)
     assert not weights.requires_grad
+
+
+def test_blending_weights_count_pixels_by_their_weight() -> None:
+    arguments = {**_arguments(), "scales": torch.full((3, 3), 0.3), "opacities": torch.full((3,), 0.5), "height": 5}
+    arguments.pop("colors")
+    left = torch.zeros(5, 4)
+    left[:, :2] = 2.5
+    total, of_left, of_right = (blending_weights(**arguments, pixels=p) for p in (None, left, 2.5 - left))
+    torch.testing.assert_close(of_left + of_right, 2.5 * total)
+    assert not torch.equal(of_left, of_right)
+    with pytest.raises(DataError, match="pixels has shape"):
+        blending_weights(**arguments, pixels=left[1:])
