@@ -129,7 +129,8 @@ class Budget:
             CheckpointError: it is not what :meth:`state` gives.
         """
         search = self._search_of(state)
-        if search.searching and not isinstance(state.get("accepted"), Mapping):
+        needed = {"accepted": search.trying, "fallback": search.phase in ("bands", "head")}
+        if any(wanted and not isinstance(state.get(name), Mapping) for name, wanted in needed.items()):
             raise CheckpointError("the checkpoint lacks the field that its search would go back to; give another")
         self.search = search
         self._accepted, self._fallback, self._flat = state.get("accepted"), state.get("fallback"), state.get("flat")
@@ -174,7 +175,9 @@ class Budget:
         Raises:
             ConfigError: no training view is held back, or the budget is too small.
         """
-        least = bytes_of(from_points(torch.zeros(1, 3), torch.zeros(1, 3), sh_degree=0, num_features=0), None)
+        # With a generator of its own: this is called after the random state of a checkpoint has been restored.
+        origin, generator = torch.zeros(1, 3), torch.Generator()
+        least = bytes_of(from_points(origin, origin, sh_degree=0, num_features=0, generator=generator), None)
         if self.config.max_bytes is not None and self.config.max_bytes < least:
             raise ConfigError(
                 f"pruning.max-bytes is {self.config.max_bytes:,}, and one primitive takes {least}; give more"

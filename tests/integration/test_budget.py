@@ -56,6 +56,7 @@ def set_up(scene: Path, out: Path, *, head: str = "residual", **pruning: Any) ->
         load_into = config if name.startswith("load_") or name == "max_num_iterations" else model.pruning
         setattr(load_into, name, value)
     torch.manual_seed(7)
+    config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     # Test views are not to be looked at.
