@@ -6,6 +6,7 @@ growing, before anything is culled.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import Any
@@ -61,6 +62,16 @@ class CappedStrategy(DefaultStrategy):
         grown = super()._grow_gs(params, optimizers, state, step)
         state["peak"] = max(state.get("peak", 0), len(params["means"]))
         return grown
+
+
+def start_of_chain(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The field that the chain starts from: opacities of one half, and a tenth of the width, as in its paper.
+
+    Args:
+        params: the field from points ``[N, ...]``; it is not changed.
+    """
+    scales = params["scales"] + math.log(0.1)
+    return {**params, "opacities": torch.zeros_like(params["opacities"]), "scales": scales}
 
 
 @dataclass

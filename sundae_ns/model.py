@@ -31,7 +31,7 @@ from sundae_ns import checkpoint
 from sundae_ns.budget import Budget
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
-from sundae_ns.densification import CappedStrategy, ChainStrategy
+from sundae_ns.densification import CappedStrategy, ChainStrategy, start_of_chain
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, peak_memory, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
@@ -221,7 +221,8 @@ class SundaeModel(SplatfactoModel):
             CONSOLE.print(f"[yellow]Warning: {len(xyz):,} points are more than the cap; starting from {cap:,} of them")
             chosen = select_random(len(xyz), cap, config.pruning.seed, xyz.device)
             xyz, rgb = xyz[chosen], rgb[chosen]
-        return from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=self.num_features)
+        params = from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=self.num_features)
+        return start_of_chain(params) if config.warmup == "mcmc" else params
 
     def _warm_field(self, source: Path) -> dict[str, Tensor]:
         config = self.config

@@ -9,7 +9,7 @@ import torch
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from sundae_ns.densification import CappedStrategy, ChainStrategy, limit_growth
+from sundae_ns.densification import CappedStrategy, ChainStrategy, limit_growth, start_of_chain
 
 FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
 N = 40
@@ -54,6 +54,14 @@ def test_densification_stops_at_the_cap(cap: int | None, expected: int) -> None:
     strategy.step_post_backward(params, optimizers, state, 1, info, packed=False)
     assert len(params["means"]) == expected
     assert state["peak"] == expected
+
+
+def test_a_chain_starts_half_opaque_and_thin() -> None:
+    params, _ = field()
+    start = start_of_chain(params)
+    torch.testing.assert_close(start["opacities"].sigmoid(), torch.full((N, 1), 0.5))
+    torch.testing.assert_close(start["scales"].exp(), params["scales"].exp() / 10)
+    assert start["means"] is params["means"]
 
 
 def test_a_chain_grows_to_its_cap_and_no_further() -> None:

@@ -82,8 +82,8 @@ class PruningConfig:
     max_primitives: int | None = None
     """Continuous: never more than this many at any step, densification included. Auto: keep at most this many."""
     target_primitives: int | None = None
-    """Continuous: each prune goes down to exactly this count where there are more, the last one after densification, instead
-    of by the keep ratio."""
+    """Continuous: each prune goes down to exactly this count where there are more, instead of by the keep ratio; the last one
+    comes after densification, and where that has left fewer, the field is filled up."""
     max_psnr_drop: float | None = None
     """Auto: keep as few as lose at most this many dB against the warm-up field on held-back training views, after
     fine-tuning. 0.1 if no other budget is given."""

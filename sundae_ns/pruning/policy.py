@@ -19,6 +19,7 @@ from torch.optim import Optimizer
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, num_primitives
+from sundae_ns.gaussians.relocation import grow
 from sundae_ns.gaussians.rewriting import rewrite
 from sundae_ns.gaussians.surgery import check_wiring, keep, keep_state
 from sundae_ns.pruning.config import PruningConfig
@@ -29,6 +30,8 @@ from sundae_ns.pruning.selection import kept_count
 
 NEVER = -1
 """Value of ``state["pruned_at"]`` before the first prune."""
+LEAST_OPACITY = 0.005
+"""Of primitives that share one's looks; 3DGS-MCMC takes those below it for dead."""
 
 
 @dataclass(frozen=True)
@@ -202,6 +205,36 @@ class ContinuousPruning(PruningPolicy):
     def _config_at(self, step: int) -> PruningConfig:
         # Another draw each time, and after a resume the same as without it.
         return replace(self.config, seed=self.config.seed + step)
+
+    @torch.no_grad()
+    def step_post_backward(
+        self,
+        params: MutableMapping[str, Parameter],
+        optimizers: Mapping[str, Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Mapping[str, Any] | None = None,
+        *,
+        contribution: Contribution | None = None,
+        strategy_state: MutableMapping[str, Any] | None = None,
+    ) -> PruneReport | None:
+        """Prune if it is due; where densification has ended with too few for ``target_primitives``, add those that lack.
+
+        They are added on top of others, whose looks they share, so that no picture changes. What densification counted per
+        primitive is forgotten then: it has ended.
+        """
+        report = super().step_post_backward(
+            params, optimizers, state, step, info, contribution=contribution, strategy_state=strategy_state
+        )
+        n = num_primitives(params)
+        lacking = (self.config.target_primitives or 0) - n
+        if step >= self.config.stop and lacking > 0:
+            grow(params, optimizers, lacking, LEAST_OPACITY)
+            if strategy_state is not None:
+                stale = [k for k, v in strategy_state.items() if isinstance(v, Tensor) and v.shape[:1] == (n,)]
+                strategy_state.update(dict.fromkeys(stale))
+            state["peak"] = max(state["peak"], n + lacking)
+        return report
 
     @property
     def _goal(self) -> int | None:

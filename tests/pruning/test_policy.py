@@ -146,6 +146,28 @@ def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
     assert run(policy, few, range(4))[0] == []
 
 
+@pytest.mark.parametrize("last", [60, 90])
+def test_continuous_ends_at_exactly_the_target(last: int) -> None:
+    config = PruningConfig(
+        mode="continuous", start=0, every=2, stop=3, target_primitives=80, max_primitives=120, num_neighbors=4
+    )
+    policy = make_policy(config)
+    made = field()
+    reports, state = run(policy, made, range(2))
+    assert [report.after for report in reports] == [80]
+    params, optimizers = field(last)  # what densification has made of it meanwhile
+    densification = {"grad2d": torch.zeros(last), "count": torch.zeros(last), "scene_scale": 1.0}
+    for step in (3, 4):
+        policy.step_post_backward(
+            params, optimizers, state, step, contribution=lambda: torch.ones(last), strategy_state=densification
+        )
+        assert {len(value) for value in params.values()} == {80}
+        assert all(optimizers[name].param_groups[0]["params"] == [params[name]] for name in optimizers)
+        rows = [len(value) for value in densification.values() if isinstance(value, Tensor)]
+        assert set(rows) <= {80}
+    assert state["peak"] == 100
+
+
 def test_a_resumed_continuous_run_goes_on_as_if_never_stopped() -> None:
     config = PruningConfig(mode="continuous", start=1, every=2, stop=7, keep_ratio=0.8, num_neighbors=4)
     whole, halves = field(), field()
