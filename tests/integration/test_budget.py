@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from pathlib import Path
@@ -39,7 +41,7 @@ def tidy() -> None:
     profiler.PROFILER.clear()
 
 
-def set_up(scene: Path, out: Path, *, head: str = "residual", **pruning: Any) -> Trainer:
+def set_up(scene: Path, out: Path, *, model_options: dict[str, Any] | None = None, **pruning: Any) -> Trainer:
     config = deepcopy(sundae_auto.config)
     config.data = config.pipeline.datamanager.data = scene
     config.pipeline.datamanager.holdout_every = 4
@@ -50,10 +52,12 @@ def set_up(scene: Path, out: Path, *, head: str = "residual", **pruning: Any) ->
     config.viewer.quit_on_train_completion = True
     model = config.pipeline.model
     model.num_downscales, model.sh_degree, model.sh_degree_interval, model.warmup_length = 0, 1, 5, 10**9
-    model.head.mode, model.head.size, model.head.pixel_unshuffle, model.head.num_features = head, "tiny", 1, 5
+    model.head.mode, model.head.size, model.head.pixel_unshuffle, model.head.num_features = "residual", "tiny", 1, 5
+    for name, value in (model_options or {}).items():
+        setattr(model, name, value)
     options = {"prune_at": PRUNE_AT, "stop": STOP, "search_every": 4, "patience": 2, "max_psnr_drop": 0.5, **pruning}
     for name, value in options.items():
-        load_into = config if name.startswith("load_") or name == "max_num_iterations" else model.pruning
+        load_into = config if hasattr(config, name) else model.pruning
         setattr(load_into, name, value)
     torch.manual_seed(7)
     config.save_config()
@@ -186,6 +190,27 @@ def test_primitives_are_kept_exactly(make: Make) -> None:
     trainer.train()
     assert trainer.pipeline.model.num_points == 37
     assert Run(trainer).found["curve"][-1]["primitives"] == 37
+
+
+def test_a_warm_up_by_mcmc_ends_at_its_cap(make: Make) -> None:
+    chain = {"warmup": "mcmc", "mcmc_cap": 260, "warmup_length": 0, "refine_every": 3}
+    trainer = make(model_options=chain, max_psnr_drop=None, max_primitives=37)
+    trainer.train()
+    model: Any = trainer.pipeline.model
+    assert (Run(trainer).found["before"], model.pruning_state["peak"], model.num_points) == (260, 260, 37)
+
+
+def test_a_plain_wall_comes_out_tiny(tmp_path: Path) -> None:
+    """At the same allowed drop a flat, painted wall keeps a tenth of what the embedded scene keeps, and fewer bands."""
+    script, out = Path(__file__).parents[2] / "benchmarks" / "budget.py", tmp_path / "budget.json"
+    options = ["--out", str(out), "--work", str(tmp_path), "--steps", "800"]
+    subprocess.run([sys.executable, str(script), *options], check=True, stdout=subprocess.DEVNULL)
+    still, wall = json.loads(out.read_text())["rows"]
+    assert (still["kind"], wall["kind"]) == ("still-life", "wall")
+    assert 10 * wall["primitives"] <= still["primitives"]
+    assert wall["degree"] < still["degree"]
+    assert wall["stored_bytes"] < still["stored_bytes"] / 20
+    assert wall["curve"][-1]["verdict"] == still["curve"][-1]["verdict"] == "reached"
 
 
 def test_bytes_too_few_for_one_primitive(make: Make) -> None:
