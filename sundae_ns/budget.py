@@ -5,8 +5,9 @@ Held-back training views judge; test views are never looked at. After the warm-u
 1. the field is trained on with all bands of its harmonics, and for as long with fewer: those that held-back views do not
    miss go, for the whole scene;
 2. the field is cut, trained, looked at, and cut again, on its base colours alone;
-3. where the network that corrects them is small beside the field that came out, it joins, and the field is cut on;
-   it stays only if field, features and network together are then smaller;
+3. where a network that corrects them is small beside the field that came out, the largest such joins, with features as
+   wide as are small beside a primitive, and the field is cut on; it stays only if field, features and network together
+   are then smaller;
 4. primitives whose colour does not depend on the view lose their bands above 0.
 
 A budget in bytes or primitives takes the place of 2 and 3: then the count follows from it.
@@ -31,6 +32,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.compensation.head import SIZES
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError
 from sundae_ns.evaluation import psnr
@@ -55,7 +57,9 @@ MAX_REJECTED = 3
 TRIAL_LOOKS = 3
 """Length, in looks, of the training that is compared with other bands."""
 HEAD_SHARE = 0.25
-"""The head may join where it is at most this share of the field, under a budget of bytes or primitives of the whole."""
+"""A head may join that is at most this share of the field, with features that are at most this share of a primitive."""
+WIDTHS = (1, 5, 13, 29)
+"""Feature widths that splat without padding."""
 FLAT_SHARE = 0.25
 """Share of the tolerated drop that flat colours may cost, right when bands go."""
 
@@ -76,6 +80,25 @@ def head_bytes(head: HeadConfig | None) -> int:
         return 0
     with torch.device("meta"):
         return accounting.bytes_of_module(CompensationHead(head))
+
+
+def head_for(stored: int, primitives: int, largest: HeadConfig) -> HeadConfig | None:
+    """The largest head, up to the one given, that is small beside a field; None if not one is.
+
+    Args:
+        stored: bytes of the field without features.
+        primitives: how many these are.
+        largest: the head that would be taken for a field of any size.
+    """
+    narrower = [width for width in WIDTHS if width < largest.num_features]
+    room = HEAD_SHARE * stored / primitives / accounting.BYTES_PER_FLOAT
+    widths = [width for width in (*narrower, largest.num_features) if width <= room]
+    sizes = list(SIZES)[: list(SIZES).index(largest.size) + 1]
+    for size in reversed(sizes if widths else []):
+        config = replace(largest, size=size, num_features=widths[-1])  # type: ignore[arg-type]
+        if head_bytes(config) <= HEAD_SHARE * stored:
+            return config
+    return None
 
 
 class _Run(NamedTuple):
@@ -105,11 +128,16 @@ class Budget:
 
     def __init__(self, config: PruningConfig, head: HeadConfig) -> None:
         self.config = config
-        self.head_config = None if head.mode == "off" else head
+        self._largest = None if head.mode == "off" else head
         self.search = Search()
         self._accepted: dict[str, Snapshot] | None = None
         self._fallback: dict[str, Snapshot] | None = None
         self._flat: Tensor | None = None
+
+    @property
+    def head_config(self) -> HeadConfig | None:
+        """The head that was chosen, before that the one asked for; None for none at all."""
+        return _chosen(self.search, self._largest)
 
     # ------------------------------------------------------------------------------------------------- checkpoints
 
@@ -143,8 +171,7 @@ class Budget:
             )
         return Search.from_state(state["numbers"])
 
-    @staticmethod
-    def shapes(extra: Any, expected: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def shapes(self, extra: Any, expected: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """``expected`` state of a model, in the shapes that the search of a checkpoint has given it.
 
         Args:
@@ -163,9 +190,25 @@ class Budget:
             shaped[rest] = shaped[rest][:, : (search.degree + 1) ** 2 - 1]
         if search.head_dropped:
             shaped = {name: value for name, value in shaped.items() if not name.startswith("head.")}
-            if "gauss_params.features" in shaped:
-                shaped["gauss_params.features"] = shaped["gauss_params.features"][:, :0]
+        chosen, features = _chosen(search, self._largest), "gauss_params.features"
+        if features in shaped:
+            shaped[features] = shaped[features][
+                :, : 0 if search.head_dropped or chosen is None else chosen.num_features
+            ]
+        if chosen is not None and not search.head_dropped:
+            with torch.device("meta"):
+                shaped.update({f"head.{name}": value for name, value in CompensationHead(chosen).state_dict().items()})
         return shaped
+
+    def prepare_head(self, extra: Mapping[str, Any], head: CompensationHead | None) -> CompensationHead | None:
+        """The head of a model as a checkpoint has it, its values still to be loaded; None where it has none."""
+        search = self._search_of(extra.get("budget"))
+        chosen = _chosen(search, self._largest)
+        if head is None or chosen is None or search.head_dropped:
+            return None
+        if head.config != chosen:
+            head.resize(chosen)
+        return head
 
     # ---------------------------------------------------------------------------------------------------- training
 
@@ -333,10 +376,9 @@ class Budget:
         search, step = self.search, run.model.schedule_step
         if search.phase == "field" and self._head_may_pay(run) and step < self.config.stop:
             self._fallback = self._snapshot(run)
-            search.head = True
             search.begin("head", search.accepted)
             search.head_at = step
-            self._notify(run, head=True)
+            self._join(run, run.model.num_points * self._row(run), run.model.num_points)
             return
         if search.phase == "head":
             assert self._fallback is not None
@@ -352,28 +394,18 @@ class Budget:
     def _fit(self, run: _Run) -> None:
         """The count that follows from a budget of bytes or primitives."""
         config, model = self.config, run.model
-        bare = {name: value for name, value in run.params.items() if name != FEATURES}
-        network = head_bytes(self.head_config)
+        row, count = self._row(run), min(config.max_primitives or model.num_points, model.num_points)
         if config.max_bytes is not None:
-            whole = min(config.max_bytes, bytes_of(run.params, self.head_config))
-        else:
-            kept = min(config.max_primitives or 1, model.num_points)
-            whole = bytes_of({name: value[:kept] for name, value in run.params.items()}, self.head_config)
-        self.search.head = self.head_config is not None and network <= HEAD_SHARE * whole
-        head, field = (self.head_config, run.params) if self.search.head else (None, bare)
-        if config.max_bytes is None:
-            count = config.max_primitives or 1
-        else:
-            count = accounting.rows_within(field, config.max_bytes, lambda rows: bytes_of(rows, head))
+            count = min(config.max_bytes // row, model.num_points)
             if count == 0:
-                one = bytes_of({name: value[:1] for name, value in field.items()}, head)
                 raise DataError(
-                    f"pruning.max-bytes is {config.max_bytes:,}, and one primitive takes {one:,}; give more"
+                    f"pruning.max-bytes is {config.max_bytes:,}, and one primitive takes {row:,}; give more"
                 )
-        if self.search.head:
-            self._notify(run, head=True)
-        else:
+        if not self._join(run, count * row, count):
             self._drop_head(run)
+        if config.max_bytes is not None:
+            head = self.head_config if self.search.head else None
+            count = accounting.rows_within(run.params, config.max_bytes, lambda rows: bytes_of(rows, head))
         if count < model.num_points:
             self._cut_to(run, count)
         self.search.accepted = model.num_points
@@ -400,18 +432,37 @@ class Budget:
 
     # --------------------------------------------------------------------------------------------------- the head
 
+    def _row(self, run: _Run) -> int:
+        """Bytes of a primitive without features."""
+        return bytes_of({name: value[:1] for name, value in run.params.items() if name != FEATURES}, None)
+
     def _head_may_pay(self, run: _Run) -> bool:
-        """Whether the network is small beside the field without it."""
-        bare = {name: value for name, value in run.params.items() if name != FEATURES}
-        return self.head_config is not None and head_bytes(self.head_config) <= HEAD_SHARE * bytes_of(bare, None)
+        """Whether a network is small beside the field without it."""
+        count = run.model.num_points
+        return self._largest is not None and head_for(count * self._row(run), count, self._largest) is not None
+
+    def _join(self, run: _Run, stored: int, primitives: int) -> bool:
+        """Let the head that suits a field take part, if one does."""
+        head = run.model.head
+        config = None if self._largest is None else head_for(stored, primitives, self._largest)
+        if config is None or head is None:
+            return False
+        search = self.search
+        search.head, search.head_size, search.num_features = True, config.size, config.num_features
+        if config != head.config:
+            head.resize(config)
+            narrow(run.params, run.optimizers.optimizers, FEATURES, config.num_features)
+        CONSOLE.log(f"a {config.size} head joins, with {config.num_features} features a primitive")
+        self._notify(run, head=True)
+        return True
 
     def _drop_head(self, run: _Run) -> None:
-        if self.head_config is None:
+        if self._largest is None:
             return
         run.model.head = None
         run.optimizers.optimizers["compensation"].state.clear()
         narrow(run.params, run.optimizers.optimizers, FEATURES, 0)
-        self.search.head_dropped = True
+        self.search.head_dropped, self.search.head_size, self.search.num_features = True, "", 0
 
     def _notify(self, run: _Run, *, head: bool) -> None:
         """Restart the rates of the field, or those of the head."""
@@ -584,6 +635,12 @@ class Budget:
         folder.mkdir(parents=True, exist_ok=True)
         write_text(folder / "budget.json", json.dumps(content, indent=2))
         write_text(folder / "budget.txt", curve_text(search.curve, search.target) + "\n")
+
+
+def _chosen(search: Search, largest: HeadConfig | None) -> HeadConfig | None:
+    if largest is None or not search.head_size:
+        return largest
+    return replace(largest, size=search.head_size, num_features=search.num_features)  # type: ignore[arg-type]
 
 
 @contextmanager

@@ -363,8 +363,8 @@ class SundaeModel(SplatfactoModel):
         n = state_dict["gauss_params.means"].shape[0]
         for name, value in self.gauss_params.items():
             value.data = value.data.new_zeros(n, *expected[f"gauss_params.{name}"].shape[1:])
-        if not any(name.startswith("head.") for name in expected):
-            self.head = None
+        if self.budget is not None:
+            self.head = self.budget.prepare_head(state_dict[checkpoint.EXTRA_STATE], self.head)
         self._warm_start_error = None
         # Past SplatfactoModel's own loader on purpose: it replaces parameters and resets the step.
         return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)

@@ -97,6 +97,16 @@ class CompensationHead(nn.Module):
         self._graphed = GraphedTraining(self.net, PRECISIONS[config.precision])
         self._replayed = GraphedInference(self.net)
 
+    @torch.no_grad()
+    def resize(self, config: HeadConfig) -> None:
+        """Become the head of another size or feature width, with fresh weights, before it is first used.
+
+        The parameters stay the same objects, which an optimizer may hold.
+        """
+        for own, new in zip(self.parameters(), CompensationHead(config).parameters(), strict=True):
+            own.data, own.grad = new.data.to(own), None
+        self.config = config
+
     def forward(self, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
         """Compensate one picture.
 

@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
+from sundae_ns.compensation.head import SIZES
 from sundae_ns.errors import CheckpointError
 
 DEEPEST, SHALLOWEST = 1.0, 0.15
@@ -82,6 +83,10 @@ class Search:
     """Whether the head takes part."""
     head_at: int = 0
     """Step of the schedule at which it joined."""
+    head_size: str = ""
+    """Size that was chosen for it; empty before."""
+    num_features: int = -1
+    """Length of the feature vectors that was chosen; -1 before."""
     head_dropped: bool = False
     """Whether it was decided that this scene needs no head."""
     degree: int = -1
@@ -191,6 +196,8 @@ class Search:
             search = cls(**{**state, "curve": [Point(**point) for point in state["curve"]]})
             if search.phase not in ("before", "bands", "field", "head", "done") or not -1 <= search.degree <= 4:
                 raise ValueError("unknown phase or degree")
+            if search.head_size not in ("", *SIZES) or not -1 <= search.num_features <= 1024:
+                raise ValueError("unknown head")
             for f in fields(cls):
                 kinds = _KINDS.get(str(f.type))
                 if kinds is not None and not isinstance(getattr(search, f.name), kinds):

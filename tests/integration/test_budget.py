@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ from nerfstudio.utils import profiler, writer
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
+from sundae_ns import budget
 from sundae_ns.budget import Budget, bytes_of
+from sundae_ns.compensation import HeadConfig
 from sundae_ns.data import write_scene
 from sundae_ns.errors import CheckpointError, ConfigError, DataError
 from sundae_ns.measure import sizes
@@ -190,6 +193,57 @@ def test_primitives_are_kept_exactly(make: Make) -> None:
     trainer.train()
     assert trainer.pipeline.model.num_points == 37
     assert Run(trainer).found["curve"][-1]["primitives"] == 37
+
+
+@pytest.fixture
+def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """A head of half a megabyte, with 5 features, joins a field of a few kilobytes, in place of a larger one."""
+    monkeypatch.setattr(
+        budget, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
+    )
+    return {"head": HeadConfig(size="small", pixel_unshuffle=1, num_features=13)}
+
+
+def test_a_head_of_the_chosen_size_joins_and_is_loaded_again(make: Make, small_head: dict[str, Any]) -> None:
+    options = {"model_options": small_head, "max_psnr_drop": None, "max_primitives": 37}
+    trainer = make(**options)
+    weights = list(trainer.pipeline.model.head.parameters())
+    trainer.train()
+    run, model = Run(trainer), trainer.pipeline.model
+    assert (run.found["head"], run.found["head_size"], run.found["num_features"]) == (True, "tiny", 5)
+    assert model.gauss_params["features"].shape == (37, 5)
+    assert all(a is b for a, b in zip(weights, model.head.parameters())), "the optimizer holds these"
+    assert sizes(model).total == run.found["curve"][-1]["bytes"]
+    whole = run.checkpoint(STEPS - 1)
+    tidy()
+    start = STEPS - SAVE
+    again = make(**options, load_dir=trainer.checkpoint_dir, load_step=start, max_num_iterations=STEPS - 1 - start)
+    assert again.pipeline.model.head.config.size == "tiny"
+    again.train()
+    for part in ("pipeline", "optimizers", "random"):
+        same(whole[part], Run(again).checkpoint(STEPS - 1)[part], part)
+
+
+def test_a_head_that_does_not_pay_goes_again(make: Make, small_head: dict[str, Any]) -> None:
+    trainer = make(model_options=small_head)
+    trainer.train()
+    found = Run(trainer).found
+    assert found["head_at"] > PRUNE_AT
+    assert (found["head"], found["head_dropped"], found["head_size"]) == (False, True, "")
+    assert trainer.pipeline.model.head is None
+    assert found["curve"][-1]["verdict"] == "reached"
+
+
+@pytest.mark.parametrize(
+    ("primitives", "row", "expected"),
+    [(10**6, 236, ("compact", 13)), (40_000, 236, ("compact", 13)), (20_000, 236, ("tiny", 13)), (20_000, 152, ("tiny", 5)),
+     (60_000, 56, ("tiny", 1)), (3_000, 236, None)],
+)  # fmt: skip
+def test_the_head_that_suits_a_field(primitives: int, row: int, expected: tuple[str, int] | None) -> None:
+    found = budget.head_for(primitives * row, primitives, HeadConfig())
+    assert (found and (found.size, found.num_features)) == expected
+    if found is not None:
+        assert budget.head_bytes(found) <= budget.HEAD_SHARE * primitives * row
 
 
 def test_a_warm_up_by_mcmc_ends_at_its_cap(make: Make) -> None:
