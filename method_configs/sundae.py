@@ -134,7 +134,7 @@ sundae_100 = _keep(100)
 
 sundae_continuous = method(
     "sundae-continuous",
-    "SUNDAE with continuous pruning while densifying: a lower peak of memory, a loosely held final count.",
+    "SUNDAE with continuous pruning while densifying: a lower peak of memory; cap and final count exact, where given.",
     pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
 )
 

@@ -242,7 +242,8 @@ class Budget:
         run = _Run(model, attributes, attributes.pipeline.datamanager)  # type: ignore[arg-type]
         if self._flat is not None:
             rest = run.params["features_rest"]
-            rest.data.mul_((~self._flat.to(rest.device))[:, None, None])
+            self._flat = self._flat.to(rest.device)
+            rest.data.mul_(~self._flat[:, None, None])
         started = time.perf_counter()
         if search.phase == "before" and step >= config.prune_at:
             self._begin(run)

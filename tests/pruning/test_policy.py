@@ -316,3 +316,28 @@ def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> No
     with pytest.raises(ConfigError, match=next(iter(wrong))) as caught:
         make_policy(replace(PruningConfig(), **wrong))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "auto", "stop": 20000, "max_bytes": 1, "max_primitives": 1}, "max_bytes and max_primitives are both"),
+        ({"mode": "auto", "stop": 20000, "max_psnr_drop": 0.0}, "max_psnr_drop is 0.0"),
+        ({"mode": "auto", "stop": 14999}, "auto has no time to search"),
+        ({"mode": "auto", "stop": 20000, "rounds": 2}, "rounds is 2 but mode is auto"),
+        ({"mode": "auto", "stop": 20000, "target_primitives": 5}, "target_primitives is set but mode is auto"),
+        ({"max_bytes": 5}, "max_bytes is set but mode is one-shot: set mode to auto"),
+        ({"mode": "continuous", "max_psnr_drop": 0.1}, "max_psnr_drop is set but mode is continuous"),
+        ({"mode": "continuous", "max_primitives": 4, "target_primitives": 5}, "is more than max_primitives"),
+        ({"mode": "auto", "stop": 20000, "search_every": 0}, "search_every is 0"),
+    ],
+)
+def test_budgets_that_cannot_work_name_the_mend(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        PruningConfig(**options).validate()  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("budget", [{}, {"max_psnr_drop": 0.5}, {"max_bytes": 100}, {"max_primitives": 1}])
+def test_one_budget_is_enough(budget: dict[str, object]) -> None:
+    PruningConfig(mode="auto", stop=20000, **budget).validate()  # type: ignore[arg-type]
