@@ -2,13 +2,16 @@
 
     python benchmarks/bench_head.py
 
-Inference: fp16 weights and pictures, as a packed scene would hold them. Training: forward and backward in bf16 with fp32
-weights, as ``ns-train`` runs it.
+Inference: ``ms_HxW`` is the whole head in fp16 as the model runs it, from splatted fp32 pictures to the compensated one;
+``ms_layers_HxW`` the network alone, layer by layer, weights and picture in fp16. Training: forward and backward in bf16 with
+fp32 weights, as ``ns-train`` runs it.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -58,7 +61,13 @@ def main() -> None:
             picture = torch.rand(1, height, width, channels, device="cuda").half().permute(0, 3, 1, 2)
             with torch.no_grad():
                 graph = recorded(half, picture)
-            line[f"ms_{height}x{width}"] = median_ms(graph.replay, device=picture.device).median_ms
+            line[f"ms_layers_{height}x{width}"] = median_ms(graph.replay, device=picture.device).median_ms
+            head = CompensationHead(replace(config, precision="fp16")).cuda().eval()
+            splat = torch.rand(height, width, 3 + config.num_features, device="cuda")
+            pictures = torch.rand_like(splat[..., :3]), splat[..., :3], splat[..., 3:], torch.rand_like(splat[..., :1])
+            with torch.no_grad():
+                whole = median_ms(partial(head, *pictures), device=picture.device, warmup=10)
+            line[f"ms_{height}x{width}"] = whole.median_ms
             net = CompensationHead(config).net.cuda()
             training = GraphedTraining(net, torch.bfloat16)
             sample = picture.bfloat16().requires_grad_()

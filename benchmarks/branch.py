@@ -33,7 +33,7 @@ from sundae_ns.model import SundaeModel
 RESULTS = Path(__file__).parent / "results" / "branches.jsonl"
 FIELD = ("features_dc", "features_rest", "opacities", "scales", "quats", "features")
 
-EXPERIMENTS = "skip width flip rates cooldown picture_loss_on_base apart average weight_decay".split()
+EXPERIMENTS = "skip width flip rates cooldown picture_loss_on_base apart average weight_decay dropout".split()
 
 
 @dataclass
@@ -74,9 +74,20 @@ class FullResolutionSkip(nn.Module):
 def flipped(head_run: Any) -> Any:
     """The head sees mirrored pictures at random while it trains."""
 
-    def wrapped(self: CompensationHead, image: Tensor) -> Tensor:
+    def wrapped(self: CompensationHead, image: Tensor, dtype: torch.dtype) -> Tensor:
         sides = [side for side in (2, 3) if self.training and torch.rand(()) < 0.5]
-        return head_run(self, image.flip(sides)).flip(sides) if sides else head_run(self, image)
+        return head_run(self, image.flip(sides), dtype).flip(sides) if sides else head_run(self, image, dtype)
+
+    return wrapped
+
+
+def with_dropout(forward: Any, share: float) -> Any:
+    """Whole feature channels are hidden from the head at random while it trains."""
+
+    def wrapped(self: CompensationHead, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
+        if torch.is_grad_enabled():
+            features = features * ((torch.rand_like(features[0, 0]) >= share) / (1 - share))
+        return forward(self, base, colors, features, alpha)
 
     return wrapped
 
@@ -166,6 +177,7 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--apart", action="store_true", help="the head's loss does not move the field")
     parser.add_argument("--average", type=float, help="decay of a moving average of all parameters, which is evaluated")
     parser.add_argument("--weight-decay", type=float, help="decoupled, of the head's weights, times its rate")
+    parser.add_argument("--dropout", type=float, help="share of feature channels hidden from the head at random")
     own, extra = sys.argv[1:], []
     if "--" in own:
         cut = own.index("--")
@@ -205,6 +217,8 @@ def main() -> None:
         CompensationHead._run = flipped(CompensationHead._run)  # type: ignore[method-assign]
     if options.picture_loss_on_base:
         SundaeModel.get_loss_dict = with_picture_loss_on_base(SundaeModel.get_loss_dict)  # type: ignore[method-assign]
+    if options.dropout is not None:
+        CompensationHead.forward = with_dropout(CompensationHead.forward, options.dropout)  # type: ignore[method-assign]
     if options.apart:
         SundaeModel._splat = apart(SundaeModel._splat)  # type: ignore[method-assign]
         CompensationHead.forward = unmoved(CompensationHead.forward)  # type: ignore[method-assign]
@@ -215,7 +229,7 @@ def main() -> None:
             built(self, head)
             inputs = head.num_features + (4 if head.mode == "residual" else 0)
             self.net = FullResolutionSkip(self.net, inputs, options.skip)  # type: ignore[assignment]
-            self._graphed.net = self.net
+            self._graphed.net, self._can_fuse = self.net, False
 
         CompensationHead.__init__ = with_skip  # type: ignore[method-assign]
     run._set_random_seed(options.seed)

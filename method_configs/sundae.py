@@ -141,8 +141,15 @@ sundae_continuous = method(
 sundae_auto = method(
     "sundae-auto",
     "SUNDAE that finds its own budget: as few primitives, bands and network as lose 0.1 dB, or as many as bytes allow.",
-    # Each cut is to be close to what training will make of it: even draws, and the dropped merged into the kept.
-    pruning=PruningConfig(mode="auto", selection="systematic", redistribution="merge", stop=26000),
+    # Each cut is to be close to what training will make of it: the best of the rules measured, where the dropped are merged.
+    pruning=PruningConfig(
+        mode="auto",
+        score="detail-contribution",
+        selection="systematic",
+        redistribution="merge",
+        edges="appearance",
+        stop=26000,
+    ),
     datamanager={"holdout_every": 8},
 )
 

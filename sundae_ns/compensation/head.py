@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from sundae_ns.compensation.graphed import GraphedInference, GraphedTraining
+from sundae_ns.compensation.fused import FusedInference
+from sundae_ns.compensation.graphed import GraphedTraining
 from sundae_ns.compensation.unet import UNet
-from sundae_ns.errors import ConfigError
+from sundae_ns.errors import BackendError, ConfigError
 
 SIZES: dict[str, tuple[int, int | None]] = {
     "tiny": (8, None),
@@ -20,6 +22,8 @@ SIZES: dict[str, tuple[int, int | None]] = {
     "large": (128, None),
 }
 """Channels of the finest level, and the most that a coarser one may have. The last three are the paper's."""
+
+_log = logging.getLogger(__name__)
 
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -47,8 +51,9 @@ class HeadConfig:
     """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is meant for inference: it trains unscaled."""
     cuda_graph: bool = True
     """Replay the U-Net as one CUDA graph while training: the same numbers, without the time of launching each kernel."""
-    cuda_graph_inference: bool = False
-    """The same for pictures that are only looked at, once a size is shown for the third time in a row. Not measured yet."""
+    fused: bool = True
+    """Show pictures on CUDA through our own kernels between the convolutions, and as one CUDA graph once a size is shown
+    for the third time in a row. fp32 and a CPU run layer by layer."""
 
     def validate(self) -> None:
         """Check the values.
@@ -78,6 +83,9 @@ class CompensationHead(nn.Module):
 
     def __init__(self, config: HeadConfig) -> None:
         super().__init__()
+        self._build(config)
+
+    def _build(self, config: HeadConfig) -> None:
         config.validate()
         if config.mode == "off":
             raise ConfigError("head.mode is off: there is no compensation head to build; ask for residual or features")
@@ -94,18 +102,27 @@ class CompensationHead(nn.Module):
             zero_init=config.mode == "residual",
         )
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._graphed = GraphedTraining(self.net, PRECISIONS[config.precision])
-        self._replayed = GraphedInference(self.net)
+        self._accelerate()
+
+    def _accelerate(self) -> None:
+        self._graphed = GraphedTraining(self.net, PRECISIONS[self.config.precision])
+        self._fused = FusedInference(self.net, self.config.mode == "residual")
+        self._can_fuse = self.config.fused
 
     @torch.no_grad()
     def resize(self, config: HeadConfig) -> None:
-        """Become the head of another size or feature width, with fresh weights, before it is first used.
+        """Become the head of another size or feature width, with fresh weights.
 
-        The parameters stay the same objects, which an optimizer may hold.
+        The parameters stay the same objects, which an optimizer may hold; a state that it has of them is stale.
         """
-        for own, new in zip(self.parameters(), CompensationHead(config).parameters(), strict=True):
-            own.data, own.grad = new.data.to(own), None
-        self.config = config
+        held = list(self.parameters())
+        self._build(config)
+        places = [(module, name) for module in self.net.modules() for name in module._parameters]
+        for own, (module, name) in zip(held, places, strict=True):
+            own.data, own.grad = getattr(module, name).data.to(own), None
+            setattr(module, name, own)
+        self.net.train(self.training)
+        self._accelerate()
 
     def forward(self, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
         """Compensate one picture.
@@ -119,25 +136,26 @@ class CompensationHead(nn.Module):
         Returns:
             ``[H, W, 3]`` float32, not clamped. Where nothing was splatted the residual head returns ``base``.
         """
+        dtype = PRECISIONS[self.config.precision] if base.is_cuda else torch.float32
+        if self._can_fuse and dtype != torch.float32 and not torch.is_grad_enabled():
+            try:
+                return self._fused(base, colors, features, alpha, dtype)
+            except BackendError as error:
+                _log.warning("the head runs layer by layer, not with the kernels for %s: %s", base.device, error)
+                self._can_fuse = False
         residual = self.config.mode == "residual"
         image = torch.cat([colors, alpha, features], dim=-1) if residual else features
         # [H, W, C] is the channels-last layout of [1, C, H, W]: no copy.
-        out = self._run(image.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
+        out = self._run(image.permute(2, 0, 1)[None], dtype)[0].permute(1, 2, 0)
         if out.dtype == torch.float16:
             # Activations beyond its 65504 are infinite, and NaN in the next layer: no correction there.
             out = out.nan_to_num(0.0, 0.0, 0.0)
         return base + alpha * out.float() if residual else out.float()
 
-    def _run(self, image: Tensor) -> Tensor:
-        dtype = PRECISIONS[self.config.precision] if image.is_cuda else torch.float32
-        out = None
-        if image.is_cuda and not torch.is_grad_enabled() and self.config.cuda_graph_inference:
-            out = self._replayed(image, dtype)
-            # In fp32 the caller's float() would hand out the graph's own memory, which the next picture overwrites.
-            out = out.clone() if out is not None and dtype == torch.float32 else out
-        elif self.config.cuda_graph and image.is_cuda and image.requires_grad and self.training:
+    def _run(self, image: Tensor, dtype: torch.dtype) -> Tensor:
+        if self.config.cuda_graph and image.is_cuda and image.requires_grad and self.training:
             out = self._graphed(image.to(dtype))
-        if out is not None:
-            return out
+            if out is not None:
+                return out
         with torch.autocast(image.device.type, dtype=dtype, enabled=dtype != torch.float32):
             return self.net(image.to(dtype))

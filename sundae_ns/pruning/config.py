@@ -61,8 +61,8 @@ class PruningConfig:
     """Share of the kept primitives that the band selection takes from the high end, in [0, 1]; the rest is low end."""
     num_neighbors: int = 16
     """Most neighbours of a primitive in the graph."""
-    graph_device: DeviceName = "cpu"
-    """Where the graph is built and filtered: the CPU, or the device of the field, which for CUDA is our own kernel."""
+    graph_device: DeviceName = "field"
+    """Where the graph is built and filtered: on the device of the field, which for CUDA is our own kernel, or on the CPU."""
     bandwidth: RuleName = "robust"
     """How the reach and the width of edges are found; the paper's literal rule gives an empty graph on most fields."""
     tau: float | None = None
