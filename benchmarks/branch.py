@@ -84,10 +84,12 @@ def flipped(head_run: Any) -> Any:
 def with_dropout(forward: Any, share: float) -> Any:
     """Whole feature channels are hidden from the head at random while it trains."""
 
-    def wrapped(self: CompensationHead, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
+    def wrapped(self: CompensationHead, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
         if torch.is_grad_enabled():
-            features = features * ((torch.rand_like(features[0, 0]) >= share) / (1 - share))
-        return forward(self, base, colors, features, alpha)
+            kept = (torch.rand_like(splatted[0, 0]) >= share) / (1 - share)
+            kept[:3] = 1
+            splatted = splatted * kept
+        return forward(self, base, splatted, alpha)
 
     return wrapped
 
@@ -122,8 +124,9 @@ def apart(splat: Any) -> Any:
 def unmoved(forward: Any) -> Any:
     """The head adds to base colours without moving them."""
 
-    def wrapped(self: CompensationHead, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
-        return forward(self, base.detach(), colors.detach(), features, alpha.detach())
+    def wrapped(self: CompensationHead, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
+        splatted = torch.cat([splatted[..., :3].detach(), splatted[..., 3:]], dim=-1)
+        return forward(self, base.detach(), splatted, alpha.detach())
 
     return wrapped
 
@@ -214,7 +217,7 @@ def main() -> None:
     if options.width is not None:
         SIZES["compact"] = (options.width, SIZES["compact"][1])
     if options.flip:
-        CompensationHead._run = flipped(CompensationHead._run)  # type: ignore[method-assign]
+        CompensationHead._layers = flipped(CompensationHead._layers)  # type: ignore[method-assign]
     if options.picture_loss_on_base:
         SundaeModel.get_loss_dict = with_picture_loss_on_base(SundaeModel.get_loss_dict)  # type: ignore[method-assign]
     if options.dropout is not None:
@@ -229,7 +232,7 @@ def main() -> None:
             built(self, head)
             inputs = head.num_features + (4 if head.mode == "residual" else 0)
             self.net = FullResolutionSkip(self.net, inputs, options.skip)  # type: ignore[assignment]
-            self._graphed.net, self._can_fuse = self.net, False
+            self._can_fuse = False
 
         CompensationHead.__init__ = with_skip  # type: ignore[method-assign]
     run._set_random_seed(options.seed)

@@ -455,7 +455,7 @@ class SundaeModel(SplatfactoModel):
             assert self.head is not None
             zoom, weight = (1.0, 1.0) if self.training else plan(view.focal, self.trained_focal)
             if zoom == 1.0:
-                rgb = self.head(base, blended, features, splat.alpha)
+                rgb = self.head(base, splat.colors, splat.alpha)
             elif weight > 0:
                 at_scale, _ = self.render(params, view.zoomed(zoom), background, depth=False)
                 correction = at_scale["rgb"] - at_scale["base_rgb"]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from sundae_ns.compensation.fused import FusedInference
-from sundae_ns.compensation.graphed import GraphedTraining
+from sundae_ns.compensation.fused_training import FusedTraining
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, ConfigError
 
@@ -49,11 +49,9 @@ class HeadConfig:
     whole pictures."""
     precision: Literal["fp32", "bf16", "fp16"] = "bf16"
     """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is meant for inference: it trains unscaled."""
-    cuda_graph: bool = True
-    """Replay the U-Net as one CUDA graph while training: the same numbers, without the time of launching each kernel."""
     fused: bool = True
-    """Show pictures on CUDA through our own kernels between the convolutions, and as one CUDA graph once a size is shown
-    for the third time in a row. fp32 and a CPU run layer by layer."""
+    """On CUDA, in bf16 and fp16: run through our own kernels between the convolutions, and as one CUDA graph for each picture
+    size, both while training and for pictures that are only looked at. Otherwise layer by layer."""
 
     def validate(self) -> None:
         """Check the values.
@@ -105,8 +103,8 @@ class CompensationHead(nn.Module):
         self._accelerate()
 
     def _accelerate(self) -> None:
-        self._graphed = GraphedTraining(self.net, PRECISIONS[self.config.precision])
-        self._fused = FusedInference(self.net, self.config.mode == "residual")
+        residual = self.config.mode == "residual"
+        self._inference, self._training = FusedInference(self.net, residual), FusedTraining(self.net, residual)
         self._can_fuse = self.config.fused
 
     @torch.no_grad()
@@ -124,38 +122,40 @@ class CompensationHead(nn.Module):
         self.net.train(self.training)
         self._accelerate()
 
-    def forward(self, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
+    def forward(self, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
         """Compensate one picture.
 
         Args:
             base: ``[H, W, 3]`` spherical-harmonics picture over its background, in [0, 1].
-            colors: ``[H, W, 3]`` the same without background, so that the head does not depend on it.
-            features: ``[H, W, F]`` splatted features.
+            splatted: ``[H, W, 3 + F]`` the same colours without background, so that the head does not depend on it, and the
+                features.
             alpha: ``[H, W, 1]`` accumulation.
 
         Returns:
             ``[H, W, 3]`` float32, not clamped. Where nothing was splatted the residual head returns ``base``.
         """
         dtype = PRECISIONS[self.config.precision] if base.is_cuda else torch.float32
-        if self._can_fuse and dtype != torch.float32 and not torch.is_grad_enabled():
+        if self._can_fuse and dtype != torch.float32:
             try:
-                return self._fused(base, colors, features, alpha, dtype)
+                return self._fused(base, splatted, alpha, dtype)
             except BackendError as error:
                 _log.warning("the head runs layer by layer, not with the kernels for %s: %s", base.device, error)
                 self._can_fuse = False
         residual = self.config.mode == "residual"
-        image = torch.cat([colors, alpha, features], dim=-1) if residual else features
+        image = torch.cat([splatted[..., :3], alpha, splatted[..., 3:]], dim=-1) if residual else splatted[..., 3:]
         # [H, W, C] is the channels-last layout of [1, C, H, W]: no copy.
-        out = self._run(image.permute(2, 0, 1)[None], dtype)[0].permute(1, 2, 0)
+        out = self._layers(image.permute(2, 0, 1)[None], dtype)[0].permute(1, 2, 0)
         if out.dtype == torch.float16:
             # Activations beyond its 65504 are infinite, and NaN in the next layer: no correction there.
             out = out.nan_to_num(0.0, 0.0, 0.0)
         return base + alpha * out.float() if residual else out.float()
 
-    def _run(self, image: Tensor, dtype: torch.dtype) -> Tensor:
-        if self.config.cuda_graph and image.is_cuda and image.requires_grad and self.training:
-            out = self._graphed(image.to(dtype))
-            if out is not None:
-                return out
+    def _fused(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
+        if not torch.is_grad_enabled():
+            return self._inference(base, splatted, alpha, dtype)
+        out = self._training(splatted, alpha, dtype)
+        return base + out if self.config.mode == "residual" else out
+
+    def _layers(self, image: Tensor, dtype: torch.dtype) -> Tensor:
         with torch.autocast(image.device.type, dtype=dtype, enabled=dtype != torch.float32):
             return self.net(image.to(dtype))
