@@ -48,6 +48,11 @@ class McmcModel(SundaeModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
+        if self.num_points > self.config.most:
+            # Structure from motion may give more points than the cap allows, and the strategy takes none away.
+            chosen = torch.randperm(self.num_points)[: self.config.most]
+            for name, value in self.gauss_params.items():
+                self.gauss_params[name] = torch.nn.Parameter(value.detach()[chosen])
         self.strategy = MCMCStrategy(  # type: ignore[assignment]
             cap_max=self.config.most, refine_stop_iter=self.config.refine_until
         )

@@ -44,7 +44,7 @@ class HeadConfig:
     """Length F of the feature vector of each primitive. 1, 5, 13 and 29 splat without padding."""
     start_at: int | None = None
     """Training step at which the head starts; by default it starts with the prune."""
-    max_train_pixels: int = 2**20
+    max_train_pixels: int = 2**22
     """Train on a random window of at most this many pixels where pictures are larger, once the head takes part; 0 for
     whole pictures."""
     precision: Literal["fp32", "bf16", "fp16"] = "bf16"
