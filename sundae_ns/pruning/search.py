@@ -71,6 +71,8 @@ class Search:
     """What a halving cost after recovery, dB, by the last verdict."""
     rejected: int = 0
     """Cuts taken back in this phase."""
+    failed: int = 0
+    """Primitives of the last cut taken back in this phase; 0 before."""
     cuts: int = 0
     """Cuts accepted in this phase."""
     accepted: int = 0
@@ -113,7 +115,7 @@ class Search:
     def begin(self, phase: Literal["field", "head"], accepted: int) -> None:
         """Start to cut a field that meets the target; what a halving costs is remembered from an earlier phase."""
         self.phase, self.accepted, self.trying = phase, accepted, False
-        self.rejected, self.cuts, self.looks = 0, 0, 0
+        self.rejected, self.failed, self.cuts, self.looks = 0, 0, 0, 0
 
     def next_degree(self, top: int, tolerated: float) -> int | None:
         """The degree to try next, None when the lowest that does is known: bisection, all bands first.
@@ -145,6 +147,9 @@ class Search:
         if margin < 0:
             return None
         halvings = DEEPEST if margin >= self.slope * DEEPEST else margin / self.slope
+        if self.failed:
+            # Half the way to what has failed; no nearer to it, and beyond it, in the least steps: training may have gained.
+            halvings = min(halvings, max(0.5 * math.log2(self.accepted / self.failed), SHALLOWEST))
         count = max(int(self.accepted * 0.5**halvings), least)
         return count if halvings >= SHALLOWEST and count < self.accepted else None
 
@@ -175,7 +180,7 @@ class Search:
         if margin >= 0:
             self.accepted, self.cuts = self.tried, self.cuts + 1
             return "accepted"
-        self.rejected += 1
+        self.rejected, self.failed = self.rejected + 1, self.tried
         self.steps_lost += step - self.cut_at
         return "rejected"
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.pruning.search import DEEPEST, Point, Search, curve_text
+from sundae_ns.pruning.search import DEEPEST, SHALLOWEST, Point, Search, curve_text
 
 
 def search(accepted: int = 1000, **options: Any) -> Search:
@@ -82,6 +82,17 @@ def test_patience_ends() -> None:
     found.cut(30.1, 500, step=0)
     verdicts = [found.judge(psnr, step, patience=3) for step, psnr in enumerate((20.0, 27.0, 29.9))]
     assert verdicts == ["waiting", "waiting", "rejected"]
+
+
+def test_what_has_failed_is_come_up_to_from_above() -> None:
+    found = search()
+    found.cut(30.1, 500, step=0)
+    assert found.judge(29.0, 1, patience=1) == "rejected"
+    assert found.next_count(40.0, 1) == int(1000 * 0.5**0.5)
+    found.accepted = 520
+    assert found.next_count(40.0, 1) == found.next_count(30.5, 1) == int(520 * 0.5**SHALLOWEST)
+    found.begin("head", 520)
+    assert found.next_count(40.0, 1) == 260
 
 
 def test_how_deep_to_cut_follows_from_what_the_last_cut_cost() -> None:
