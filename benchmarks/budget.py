@@ -1,6 +1,6 @@
 """Every figure of docs/budget.md: made scenes anywhere, captures on a GPU.
 
-    python benchmarks/budget.py --seeds 0 1 2 --out benchmarks/results/budget.json     # a plain wall, and the still life
+    python benchmarks/budget.py --seeds 0 1 --out benchmarks/results/budget.json     # a plain wall, and the still life
     python benchmarks/budget.py --scene bonsai --data DIR                              # rows in results/runs.csv, and a table
     python benchmarks/budget.py --scene bonsai --data DIR --only continuous psnr       # some of them
     python benchmarks/budget.py --scene bonsai --data DIR --dry-run                    # the commands alone
