@@ -43,9 +43,11 @@ from sundae_ns.schedulers import Decay
 RESULTS = Path(__file__).parent / "results" / "rules.jsonl"
 COLMAP = "colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8"
 
+PLAIN = {"selection": "sampled", "edges": "centres", "redistribution": "none"}
+"""What rules differ from."""
 PAPER = {"selection": "band", "score": "response", "signal": "positions"}
 SYSTEMATIC = {"score": "contribution", "selection": "systematic"}
-RESPONSE = {"selection": "systematic"}
+RESPONSE = {"score": "response-contribution", "selection": "systematic"}
 DETAIL = {"score": "detail-contribution", "selection": "systematic"}
 MERGE = {"redistribution": "merge", "edges": "appearance"}
 CONTROLS: dict[str, dict[str, Any]] = {
@@ -58,14 +60,14 @@ CONTROLS: dict[str, dict[str, Any]] = {
 RULES: dict[str, dict[str, Any]] = {
     **CONTROLS,
     "paper": PAPER,
-    "response-contribution": {},
-    "color-response": {"signal": "colors"},
+    "response-contribution": {"score": "response-contribution"},
+    "color-response": {"score": "response-contribution", "signal": "colors"},
     "coherence": {"score": "coherence-contribution", "selection": "systematic"},
     "coherence-appearance": {"score": "coherence-contribution", "selection": "systematic", "edges": "appearance"},
     "detail": {"score": "detail-contribution"},
     "systematic": SYSTEMATIC,
     "response-systematic": RESPONSE,
-    "response-shared": {"selection": "shared"},
+    "response-shared": {"score": "response-contribution", "selection": "shared"},
     "detail-systematic": DETAIL,
     "random-merge": {"score": "random", **MERGE},
     "systematic-merge": {**SYSTEMATIC, **MERGE},
@@ -226,7 +228,7 @@ class Bench:
         if choice.get("rounds", 1) > 1:
             # A tenth of the branch apart: all branches are trained for the same time in all.
             choice.setdefault("round_every", max(options.steps // 10, 1))
-        config = replace(self.pruning, keep_ratio=branch.keep, seed=branch.seed, **choice)
+        config = replace(self.pruning, keep_ratio=branch.keep, seed=branch.seed, **{**PLAIN, **choice})
         self.model.config.pruning, self.model.policy = config, make_policy(config)
         self.model.contribution = self._contribution  # type: ignore[method-assign]
         before = self.model.num_points
@@ -264,7 +266,7 @@ class Bench:
 
     def row(self, line: dict[str, Any]) -> RunRow:
         bytes_, camera = sizes(self.model), self.trainer.pipeline.datamanager.eval_dataset.cameras[0]
-        flags = [f"--pipeline.model.pruning.{k.replace('_', '-')} {v}" for k, v in line["options"].items()]
+        flags = [f"--pipeline.model.pruning.{k.replace('_', '-')} {v}" for k, v in (PLAIN | line["options"]).items()]
         return RunRow(
             scene=line["scene"],
             method=line["method"],

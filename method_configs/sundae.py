@@ -141,22 +141,22 @@ sundae_continuous = method(
 sundae_auto = method(
     "sundae-auto",
     "SUNDAE that finds its own budget: as few primitives, bands and network as lose 0.1 dB, or as many as bytes allow.",
-    # Each cut is to be close to what training will make of it: the best of the rules measured, where the dropped are merged.
-    pruning=PruningConfig(
-        mode="auto",
-        score="detail-contribution",
-        selection="systematic",
-        redistribution="merge",
-        edges="appearance",
-        stop=26000,
-    ),
+    pruning=PruningConfig(mode="auto", stop=26000),
     datamanager={"holdout_every": 8},
 )
 
 sundae_paper = method(
     "sundae-paper",
     "SUNDAE as literal as the paper's text allows: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",
-    pruning=PruningConfig(keep_ratio=0.1, selection="band", score="response", signal="positions", gamma=0.5),
+    pruning=PruningConfig(
+        keep_ratio=0.1,
+        selection="band",
+        score="response",
+        signal="positions",
+        edges="centres",
+        redistribution="none",
+        gamma=0.5,
+    ),
     head=HeadConfig(
         mode="features", size="regular", pixel_unshuffle=1, num_features=13, precision="fp32", max_train_pixels=0
     ),

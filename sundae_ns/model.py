@@ -64,8 +64,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """When to prune, how many primitives to keep, and which."""
     head: HeadConfig = field(default_factory=HeadConfig)
     """The compensation head."""
-    rasterizer: Literal["auto", "gsplat", "reference"] = "auto"
-    """auto takes gsplat where CUDA works, else the reference in plain PyTorch, which also runs on a CPU."""
+    rasterizer: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
+    """auto takes gsplat where CUDA works, and on a CPU the loops that numba compiles; reference is slow, in plain PyTorch."""
     base_loss_weight: float = 0.2
     """Weight of the loss on the picture without the head, which keeps exported .ply files valid."""
     warm_start: Path | None = None
@@ -549,7 +549,7 @@ class SundaeModel(SplatfactoModel):
         if of != key:
             try:
                 values = display.response_values(response(field, self.config.pruning).magnitude)
-            except DataError:  # too few primitives for a graph: nothing to show
+            except DataError:  # one primitive has no neighbour: nothing to show
                 values = None
             self._response = (key, values)
         return values
@@ -712,10 +712,11 @@ class SundaeModel(SplatfactoModel):
         are going to be kept.
         """
         pruning = self.config.pruning
+        share = pruning.share(self.num_points) if pruning.uses_detail else None
         total = torch.zeros(self.num_points, device=self.device)
         cameras = list(datamanager.training_cameras())
         for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
-            total += self.weights_of(self.view_of(camera), pruning.keep_ratio if pruning.uses_detail else None)
+            total += self.weights_of(self.view_of(camera), share)
         return total
 
     def weights_of(self, view: View, keep_ratio: float | None = None) -> Tensor:

@@ -13,6 +13,9 @@ from sundae_ns.gaussians.covariance import covariances, mean_shadow, scales_and_
 MOST_OPACITY = 0.99
 """Opacities of merged primitives end here, where the logit still has a gradient."""
 
+ROWS = 1 << 16
+"""Primitives whose harmonics are added up at once."""
+
 
 @torch.no_grad()
 def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[str, Tensor]:
@@ -35,7 +38,7 @@ def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[st
 
     Returns:
         Parameters of those that stay, in order, computed in float64 on the CPU and returned like ``params``
-        ``[M, ...]``. One whose group is itself alone, or has no weight, stays as it is, to the bit.
+        ``[M, ...]``. One whose group is itself alone, has no weight or overflows stays as it is, to the bit.
     """
     source = {name: value.detach().cpu() for name, value in params.items()}
     heir, w = heir.cpu(), weight.detach().double().cpu().nan_to_num(0.0, posinf=0.0).clamp_min(0)
@@ -56,8 +59,12 @@ def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[st
     share = w / total(w)[group].clamp_min(torch.finfo(torch.float64).tiny)
 
     def mean(values: Tensor) -> Tensor:
-        flat = values[members].double().reshape(len(members), -1)
-        return total(share[:, None] * flat).reshape(count, *values.shape[1:])
+        result = torch.zeros(count, values[0].numel(), dtype=torch.float64)
+        # In pieces: all harmonics in float64 at once would be twice the field.
+        for part in torch.arange(len(members)).split(ROWS):
+            flat = values[members[part]].double().reshape(len(part), -1)
+            result.index_add_(0, group[part], share[part, None] * flat)
+        return result.reshape(count, *values.shape[1:])
 
     kept = {name: value[stays] for name, value in source.items()}
     origin = kept["means"].double()
@@ -66,7 +73,10 @@ def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[st
     spread = offset - shift[group]
     scales = source["scales"][members].double().exp()
     covariance = covariances(scales, source["quats"][members].double()) + spread[:, :, None] * spread[:, None, :]
-    deviations, quats = scales_and_quaternions(total(share[:, None, None] * covariance))
+    covariance = total(share[:, None, None] * covariance)
+    # Squares that overflow have no axes; the one that stays is left as it is.
+    bounded = covariance.isfinite().all(dim=2).all(dim=1)
+    deviations, quats = scales_and_quaternions(torch.where(bounded[:, None, None], covariance, 0.0))
     # An axis without any width would have no logarithm; none is made thinner than the thinnest member's.
     thinnest = torch.full((count,), torch.inf, dtype=torch.float64)
     thinnest = thinnest.scatter_reduce_(0, group, scales.amin(dim=1), "amin")
@@ -79,7 +89,7 @@ def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[st
     merged["scales"] = deviations.log()
     merged["quats"] = quats
     merged["opacities"] = _logit_of_depth(merged_depth)[:, None]
-    changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0)
+    changed = (torch.bincount(group, minlength=count) > 1) & (largest > 0) & bounded
     for value in merged.values():
         changed &= value.reshape(count, -1).isfinite().all(dim=1)
     result = {}

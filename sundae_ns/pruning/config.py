@@ -30,8 +30,9 @@ DeviceName = Literal["cpu", "field"]
 class PruningConfig:
     """When to prune, how much, and by which score.
 
-    The defaults are what ``sundae`` uses: sampling in proportion to response times contribution. The paper's rule is
-    ``selection="band", score="response", signal="positions"``.
+    The defaults are what ``sundae`` uses: one draw in each stretch of space, in proportion to the contribution to pixels
+    with detail, and what is dropped is merged into what stays. The paper's rule is ``selection="band", score="response",
+    signal="positions", edges="centres", redistribution="none"``.
     """
 
     mode: Mode = "one-shot"
@@ -39,20 +40,23 @@ class PruningConfig:
     needs (by max-psnr-drop, max-bytes or max-primitives), or never."""
     keep_ratio: float = 0.1
     """Share of the primitives to keep at each prune, in (0, 1]; the kept count is exactly round(keep_ratio * N)."""
-    selection: SelectionName = "sampled"
-    """How a score becomes a choice: sampled in proportion to it by independent draws, one draw in each stretch of space
-    (systematic), the same with a share for every band of the response (shared), its highest and lowest band, or the highest
-    only."""
-    score: ScoreName = "response-contribution"
-    """Importance of a primitive: high-pass response; local coherence, its energy in the low band that the budget spans;
-    contribution, its blending weight over the training views, by itself, times either of the two, or with pixels weighted by
-    the detail of the renderings; opacity; or alike for all (random)."""
+    selection: SelectionName = "systematic"
+    """How scores become a choice: one draw in each stretch of space (systematic), independent draws (sampled), a systematic
+    draw with a share for every band of the response (shared), the highest (top), or both ends as in the paper (band)."""
+    score: ScoreName = "detail-contribution"
+    """What a primitive is worth: its blending weight over the training views (contribution), or the same with pixels weighted
+    by the detail in them that the budget cannot show (detail-contribution); its high-pass response, or its energy in the
+    low band that the budget spans (coherence), by themselves or times contribution; opacity; or all alike (random)."""
     signal: SignalName = "attributes"
-    """Graph signal that is filtered: position, colour, opacity and size together, colour, or the paper's positions alone."""
-    edges: EdgesName = "centres"
-    """What the weights of edges say: distance of the centres alone, or also overlap and likeness of colour."""
-    redistribution: RedistributionName = "none"
-    """What becomes of the dropped: nothing, merged into the kept along the edges, or the kept grow into the gaps."""
+    """What the response is taken of, for the scores that have one: position, colour, opacity and size together, colour, or
+    the paper's positions alone."""
+    edges: EdgesName = "appearance"
+    """What makes neighbours near in the graph: overlap and likeness of colour beside distance (appearance), or distance alone
+    as in the paper (centres)."""
+    redistribution: RedistributionName = "merge"
+    """What becomes of the dropped: each is merged into the kept primitive that is nearest along the graph (merge), those that
+    stay grow into the gaps instead (grow), or nothing as in the paper (none). A merge needs a pass over the training
+    views."""
     rounds: int = 1
     """Prunes of the one-shot mode, each by the same factor, down to the keep ratio; training goes on in between."""
     round_every: int = 500
@@ -60,7 +64,7 @@ class PruningConfig:
     gamma: float = 0.5
     """Share of the kept primitives that the band selection takes from the high end, in [0, 1]; the rest is low end."""
     num_neighbors: int = 16
-    """Most neighbours of a primitive in the graph."""
+    """Most neighbours of a primitive in the graph; in a field of fewer primitives, all others."""
     graph_device: DeviceName = "field"
     """Where the graph is built and filtered: on the device of the field, which for CUDA is our own kernel, or on the CPU."""
     bandwidth: RuleName = "robust"
@@ -123,6 +127,11 @@ class PruningConfig:
     def uses_detail(self) -> bool:
         """Whether the score weighs the pixels of the contribution by the detail of the renderings."""
         return self.score == "detail-contribution"
+
+    def share(self, n: int) -> float:
+        """Share of ``n`` primitives that a prune keeps: the keep ratio, or what the target or the cap leaves."""
+        goal = self.max_primitives if self.target_primitives is None else self.target_primitives
+        return self.keep_ratio if goal is None else min(1.0, goal / n)
 
     @property
     def last_prune(self) -> int:

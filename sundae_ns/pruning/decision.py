@@ -53,7 +53,8 @@ def decide(
     """Decide which primitives of a field stay.
 
     Primitives with a NaN or infinite parameter go first; of the N that are left, exactly ``round(keep_ratio * N)``
-    stay. Where that is all of them, nothing is scored.
+    stay. Where that is all of them, nothing is scored, so that one primitive always stays. A field of no more primitives
+    than ``num_neighbors`` is pruned like any other: each is a neighbour of all others within reach.
 
     Args:
         params: the field.
@@ -64,7 +65,7 @@ def decide(
 
     Raises:
         ConfigError: an option cannot work, or the score needs a contribution and there is none.
-        DataError: no primitive is finite, or the field has not more primitives than the graph has neighbours.
+        DataError: no primitive is finite, or the contribution has not one value a primitive.
     """
     config.validate()
     n = num_primitives(params)

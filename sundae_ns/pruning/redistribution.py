@@ -25,13 +25,16 @@ def heirs(graph: NeighborGraph, mask: Tensor) -> Tensor:
     appearance; the cells are those of a Voronoi diagram on the graph. Found by relaxing all edges at once, hop by hop
     (Bellman and Ford). Of equally near heirs the one found over the earlier neighbour, and in fewer hops, counts.
 
+    Edges are followed from a primitive to its neighbours. Where nobody that stays is found so, they are followed either way:
+    of a thousand clones all have the same few for neighbours, and none of those need stay.
+
     Args:
         graph: N nodes.
         mask: True for primitives that stay, bool, any device ``[N]``.
 
     Returns:
-        Index of the heir, int64, on the graph's device ``[N]``: the own one for those that stay, -1 for those that no
-        kept primitive is joined to.
+        Index of the heir, int64, on the graph's device ``[N]``: the own one for those that stay, -1 for those that are
+        joined to no kept primitive.
     """
     device = graph.weights.device
     mask = mask.to(device)
@@ -39,14 +42,43 @@ def heirs(graph: NeighborGraph, mask: Tensor) -> Tensor:
     heir = torch.where(mask, own, -1)
     lengths = torch.where(graph.weights > 0, -graph.weights.double().log(), torch.inf).clamp_min(0)
     distance = torch.where(mask, 0.0, torch.inf).double()
+    changed = mask
     for _ in range(MOST_HOPS):
-        reached, over = (distance[graph.indices] + lengths).min(dim=1)
-        nearer = reached < distance
+        # Only what has a neighbour that has come nearer can come nearer itself.
+        rows = changed[graph.indices].any(dim=1).nonzero().squeeze(1)
+        near = graph.indices[rows]
+        reached, over = (distance[near] + lengths[rows]).min(dim=1)
+        nearer = reached < distance[rows]
         if not bool(nearer.any()):
             break
-        through = graph.indices.gather(1, over[:, None]).squeeze(1)
-        heir = torch.where(nearer, heir[through], heir)
-        distance = torch.where(nearer, reached, distance)
+        rows, through = rows[nearer], near.gather(1, over[:, None]).squeeze(1)[nearer]
+        heir[rows] = heir[through]
+        distance[rows] = reached[nearer]
+        changed = torch.zeros_like(mask)
+        changed[rows] = True
+    return _either_way(graph, heir, distance, lengths)
+
+
+def _either_way(graph: NeighborGraph, heir: Tensor, distance: Tensor, lengths: Tensor) -> Tensor:
+    """Heirs of those that have none, over edges of both directions."""
+    heirless = heir < 0
+    rows, slots = ((heirless[:, None] | heirless[graph.indices]) & (graph.weights > 0)).nonzero(as_tuple=True)
+    ends, length = graph.indices[rows, slots], lengths[rows, slots]
+    source, target, length = torch.cat([rows, ends]), torch.cat([ends, rows]), torch.cat([length, length])
+    wanted = heirless[target]
+    source, target, length = source[wanted], target[wanted], length[wanted]
+    heir, distance = heir.clone(), distance.clone()
+    for _ in range(MOST_HOPS):
+        over = distance[source] + length
+        reached = distance.scatter_reduce(0, target, over, "amin")
+        best = (over == reached[target]) & (over < distance[target])
+        if not bool(best.any()):
+            break
+        # The lowest index among equally near ones, on every device.
+        through = torch.full_like(heir, graph.N).scatter_reduce_(0, target[best], source[best], "amin")
+        nearer = reached < distance
+        heir[nearer] = heir[through[nearer]]
+        distance = reached
     return heir
 
 

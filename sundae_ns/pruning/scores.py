@@ -53,7 +53,7 @@ def response(params: Mapping[str, Tensor], config: PruningConfig, graph: Neighbo
         graph: the field's graph, where it is at hand.
 
     Raises:
-        DataError: there are not more primitives than neighbours, or positions are not finite.
+        DataError: there is only one primitive, or positions are not finite.
     """
     device = params["means"].device
     params = on_graph_device(params, config)

@@ -31,7 +31,7 @@ def rasterize(
 ) -> Rasterization:
     """Splat N Gaussian primitives into one pinhole view (EWA splatting, front-to-back blending; Kerbl et al. 2023).
 
-    Differentiable with respect to the primitives; not to ``K``, and to ``viewmat`` only under the reference.
+    Differentiable with respect to the primitives; not to ``K``, and to ``viewmat`` not under gsplat.
 
     Args:
         means: Centres in world units. ``[N, 3]``

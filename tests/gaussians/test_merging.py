@@ -104,6 +104,17 @@ def test_extremes_stay_finite() -> None:
     assert float(found["opacities"].sigmoid().max()) <= 0.99 + 1e-6
 
 
+def test_what_overflows_or_vanishes_stays_as_it_is() -> None:
+    params = field()
+    params["scales"][0], params["scales"][6] = 500.0, -500.0
+    params["scales"][7:] = -500.0
+    params["means"][6:] = 0
+    found = merge(params, torch.tensor([0] * 3 + [3] * 3 + [6] * 6), torch.ones(12))
+    assert all(torch.equal(found[name][[0, 2]], params[name][[0, 6]]) for name in params)
+    assert all(value.isfinite().all() for value in found.values())
+    assert not torch.equal(found["means"][1], params["means"][3])
+
+
 def test_overlap_is_one_with_oneself_falls_with_distance_and_has_no_unit() -> None:
     params = field(200)
     S, means = covariance_of(params), params["means"]
@@ -117,7 +128,40 @@ def test_overlap_is_one_with_oneself_falls_with_distance_and_has_no_unit() -> No
     apart = overlap(torch.tensor([[0.0, 0, 0], [2.0, 0, 0]]).double(), unit, torch.tensor([[1], [0]]), least_width=0.0)
     assert apart.squeeze(1).tolist() == pytest.approx([math.exp(-0.5)] * 2)
     flat = torch.diag(torch.tensor([1.0, 1.0, 0.0])).double().expand(2, 3, 3)
+    # Against the formula, with LAPACK's determinants and inverses.
+    S = S + 0.3**2 * torch.eye(3)
+    middle = (S + S.roll(1, dims=0)) / 2
+    offset = means - means.roll(1, dims=0)
+    exponent = -torch.einsum("ni,nij,nj->n", offset, torch.linalg.inv(middle), offset) / 8
+    ratio = (S.det() * S.roll(1, dims=0).det()) ** 0.25 / middle.det() ** 0.5
+    found = overlap(means, covariance_of(params), indices, least_width=0.3)
+    torch.testing.assert_close(found[:, 1], exponent.exp() * ratio)
     assert overlap(torch.zeros(2, 3).double(), flat, torch.tensor([[1], [0]]), least_width=0.0).isfinite().all()
+
+
+def test_overlap_of_needles_is_known_where_rounding_leaves_no_pivot() -> None:
+    # Two crossed needles of 1e6 by 1e-6 at one spot, turned so that no axis is an axis of the matrices.
+    turn = rotations(torch.tensor([[0.3, -0.5, 0.7, 0.2]]).double())
+    crossed = torch.diag_embed(torch.tensor([[1e6, 1e-6, 1e-6], [1e-6, 1e6, 1e-6]]).double().square())
+    found = overlap(
+        torch.zeros(2, 3).double(), turn @ crossed @ turn.mT, torch.tensor([[0, 1], [1, 0]]), least_width=1e-6
+    )
+    assert found[:, 0].tolist() == [1, 1]
+    assert found.isfinite().all()
+    assert float(found[:, 1].max()) < 1e-3
+
+
+def test_pieces_of_rows_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    params = field(50)
+    indices = torch.randint(50, (50, 4))
+    whole = overlap(params["means"], covariance_of(params), indices, least_width=0.1)
+    heir = torch.arange(50) // 5 * 5
+    merged = merge(params, heir, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    monkeypatch.setattr("sundae_ns.gaussians.covariance.PAIRS", 30)
+    monkeypatch.setattr("sundae_ns.gaussians.merging.ROWS", 7)
+    assert torch.equal(overlap(params["means"], covariance_of(params), indices, least_width=0.1), whole)
+    again = merge(params, heir, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    assert all(torch.equal(again[name], merged[name]) for name in merged)
 
 
 def test_quaternions_and_rotations_are_inverse_at_every_half_turn() -> None:

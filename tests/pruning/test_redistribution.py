@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
@@ -35,19 +35,40 @@ def weights(n: int = 300) -> Tensor:
 
 
 def test_heirs_are_the_nearest_along_the_edges() -> None:
-    graph = build_graph(field()["means"].double(), num_neighbors=6)
+    graph = build_graph(field()["means"].double(), num_neighbors=3)
     mask = torch.rand(300, generator=torch.Generator().manual_seed(1)) < 0.05
     found = heirs(graph, mask)
-    rows, lengths = np.repeat(np.arange(300), 6), -graph.weights.log().numpy().ravel()
+    rows, lengths = np.repeat(np.arange(300), 3), -graph.weights.log().numpy().ravel()
     edge = graph.weights.numpy().ravel() > 0
     # Edges are followed from the heirless to its neighbours: from the kept they are walked backwards.
     backwards = sp.csr_matrix((lengths[edge], (graph.indices.numpy().ravel()[edge], rows[edge])), shape=(300, 300))
     kept = mask.nonzero().squeeze(1).numpy()
     distance, _, source = dijkstra(backwards, indices=kept, min_only=True, return_predecessors=True)
-    expected = torch.from_numpy(np.where(np.isfinite(distance), source, -1)).long()
-    assert int((expected == -1).sum()) > 0
-    assert len(expected.unique()) > 5
-    assert torch.equal(found, expected)
+    expected = torch.from_numpy(source).long()
+    reached = torch.from_numpy(np.isfinite(distance))
+    assert not reached.all()
+    assert len(expected[reached].unique()) > 5
+    assert torch.equal(found[reached], expected[reached])
+    # Backwards too where there is no other way; then those are lost that share no component with a kept one.
+    _, component = connected_components(backwards, directed=False)
+    joined = torch.from_numpy(np.isin(component, component[kept]))
+    assert torch.equal(found >= 0, joined)
+    assert int((joined & ~reached).sum()) > 0
+    assert (component[found[joined]] == component[joined.numpy()]).all()
+
+
+def test_of_many_clones_whoever_stays_inherits() -> None:
+    graph = build_graph(torch.zeros(100, 3), num_neighbors=4)
+    for stays in (0, 3, 50, 99):
+        assert (heirs(graph, torch.arange(100) == stays) == stays).all()
+
+
+def test_backwards_the_nearest_and_then_the_lowest_index_inherits() -> None:
+    # Node 0 knows only itself; 1, 2 and 3 know it, and 3 as well as 2.
+    weights = torch.tensor([[0.0], [0.5], [0.9], [0.9]])
+    graph = NeighborGraph(torch.tensor([[0], [0], [0], [0]]), weights, weights[:, 0], 1.0, 1.0)
+    assert heirs(graph, torch.tensor([False, True, True, True])).tolist() == [2, 1, 2, 3]
+    assert heirs(graph, torch.tensor([False, True, False, False])).tolist() == [1, 1, 1, 1]
 
 
 def test_a_chain_hands_on_over_many_hops_and_islands_lose() -> None:
@@ -213,7 +234,7 @@ def test_rounds_end_at_the_exact_count_also_when_resumed(redistribution: Any) ->
 
 
 def test_a_late_first_round_keeps_the_distance_of_the_next() -> None:
-    policy = make_policy(PruningConfig(prune_at=2, rounds=2, round_every=5, score="random"))
+    policy = make_policy(PruningConfig(prune_at=2, rounds=2, round_every=5, score="random", redistribution="none"))
     params, optimizers = training()
     state = policy.initialize_state()
     done = [at for at in range(9, 20) if policy.step_post_backward(params, optimizers, state, at) is not None]
