@@ -289,6 +289,7 @@ class Bench:
             ms_head=None,
             train_s=line["train_s"],
             prune_s=line["prune_s"],
+            peak_primitives=None,
             peak_vram_mib=None,
             gpu=line["gpu"],
             resolution=f"{int(camera.width)}x{int(camera.height)}",

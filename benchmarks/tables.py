@@ -19,13 +19,15 @@ COLUMNS = (
     ("ms a frame", "ms_frame", "{:.2f}"),
     ("train s", "train_s", "{:.0f}"),
     ("prune s", "prune_s", "{:.1f}"),
+    ("peak primitives", "peak_primitives", "{:,.0f}"),
+    ("peak MiB", "peak_vram_mib", "{:,.0f}"),
     ("commit", "commit", "{}"),
 )
 
 
 def cell(row: dict[str, str], column: str, form: str) -> str:
     value = row[column]
-    if form == "{}":
+    if form == "{}" or not value:
         return value
     number = float(value) / (1e6 if column == "bytes_total" else 1)
     return form.format(number)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
 import torch
-from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
@@ -29,12 +28,14 @@ from rich.progress import track
 from torch import Tensor
 
 from sundae_ns import checkpoint
+from sundae_ns.budget import Budget
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
+from sundae_ns.densification import CappedStrategy, ChainStrategy, start_of_chain
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
-from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, psnr, ssim
+from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, peak_memory, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
-from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, pixel_detail, response
+from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, pixel_detail, response, select_random
 from sundae_ns.rasterization import (
     Backend,
     Rasterization,
@@ -49,6 +50,8 @@ from sundae_ns.storage.transform import similarity
 
 NEAR_PLANE = 0.01
 SSIM_WINDOW = 11
+MCMC_REGULARISER = 0.01
+"""Weights of opacities and sizes in the loss while the field grows by MCMC (lambda_o and lambda_Sigma of the paper)."""
 _Outputs = MutableMapping[str, Any]
 
 
@@ -69,6 +72,10 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Start from a finished field instead of warming up: a splatfacto or sundae .ckpt (or the folder), or a 3DGS .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
     """Coordinates of the warm start: nerfstudio's model, or the capture's own (COLMAP). auto goes by the kind of file."""
+    warmup: Literal["densify", "mcmc"] = "densify"
+    """How the field grows: by gradients (3DGS), or as a Markov chain with an exact cap (3DGS-MCMC)."""
+    mcmc_cap: int = 1_000_000
+    """Most primitives of a warm-up by mcmc, at any step."""
     evaluate_prune: bool = True
     """Evaluate all test views right before and right after the prune, and record both."""
 
@@ -144,6 +151,8 @@ class SundaeModel(SplatfactoModel):
         config.pruning.validate()
         if config.head.mode != "off":
             config.head.validate()
+        if config.mcmc_cap < 1:
+            raise ConfigError(f"mcmc-cap is {config.mcmc_cap}; give the most primitives that the field may have")
         if config.base_loss_weight < 0:
             raise ConfigError(f"base-loss-weight is {config.base_loss_weight}; give 0 or more")
         if config.warm_start is not None and config.pruning.mode == "continuous":
@@ -162,24 +171,9 @@ class SundaeModel(SplatfactoModel):
         )
 
         self.policy = make_policy(config.pruning)
+        self.budget = Budget(config.pruning, config.head) if config.pruning.mode == "auto" else None
         self.pruning_state: dict[str, Any] = self.policy.initialize_state()
-        self.strategy = DefaultStrategy(
-            prune_opa=config.cull_alpha_thresh,
-            grow_grad2d=config.densify_grad_thresh,
-            grow_scale3d=config.densify_size_thresh,
-            grow_scale2d=config.split_screen_size,
-            prune_scale3d=config.cull_scale_thresh,
-            prune_scale2d=config.cull_screen_size,
-            refine_scale2d_stop_iter=config.stop_screen_size_at,
-            refine_start_iter=config.warmup_length,
-            # Densification after a one-shot prune would undo it.
-            refine_stop_iter=min(config.stop_split_at, self._prune_at or config.stop_split_at),
-            reset_every=config.reset_alpha_every * config.refine_every,
-            refine_every=config.refine_every,
-            pause_refine_after_reset=self.num_train_data + config.refine_every,
-            absgrad=config.use_absgrad,
-            verbose=False,
-        )
+        self.strategy = self._strategy()
         self.strategy_state: dict[str, Any] = self.strategy.initialize_state(scene_scale=1.0)
 
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
@@ -222,7 +216,13 @@ class SundaeModel(SplatfactoModel):
                     "points. Results are better with one (COLMAP, or ply_file_path in transforms.json)."
                 )
             xyz, rgb = random_points(config.num_random, config.random_scale)
-        return from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=self.num_features)
+        cap = getattr(self._strategy(), "cap", None)
+        if cap is not None and len(xyz) > cap:
+            CONSOLE.print(f"[yellow]Warning: {len(xyz):,} points are more than the cap; starting from {cap:,} of them")
+            chosen = select_random(len(xyz), cap, config.pruning.seed, xyz.device)
+            xyz, rgb = xyz[chosen], rgb[chosen]
+        params = from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=self.num_features)
+        return start_of_chain(params) if config.warmup == "mcmc" else params
 
     def _warm_field(self, source: Path) -> dict[str, Tensor]:
         config = self.config
@@ -246,6 +246,37 @@ class SundaeModel(SplatfactoModel):
         CONSOLE.log(f"warm start: {len(params['means'])} primitives from {source}")
         return params
 
+    def _strategy(self) -> CappedStrategy | ChainStrategy:
+        """How the field grows, until the prune that would be undone by it."""
+        config, pruning = self.config, self.config.pruning
+        continuous = pruning.mode == "continuous"
+        stop = min(config.stop_split_at, pruning.stop if continuous else self._prune_at or config.stop_split_at)
+        cap = pruning.max_primitives if continuous else None
+        if config.warmup == "mcmc":
+            return ChainStrategy(
+                cap=min(config.mcmc_cap, cap or config.mcmc_cap),
+                refine_start_iter=config.warmup_length,
+                refine_stop_iter=stop,
+                refine_every=config.refine_every,
+            )
+        return CappedStrategy(
+            cap=cap,
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            grow_scale2d=config.split_screen_size,
+            prune_scale3d=config.cull_scale_thresh,
+            prune_scale2d=config.cull_screen_size,
+            refine_scale2d_stop_iter=config.stop_screen_size_at,
+            refine_start_iter=config.warmup_length,
+            refine_stop_iter=stop,
+            reset_every=config.reset_alpha_every * config.refine_every,
+            refine_every=config.refine_every,
+            pause_refine_after_reset=self.num_train_data + config.refine_every,
+            absgrad=config.use_absgrad,
+            verbose=False,
+        )
+
     @property
     def gaussians(self) -> MutableMapping[str, torch.nn.Parameter]:
         """The parameters of the field; a ``ParameterDict`` is a mapping in all but its declared type."""
@@ -253,8 +284,8 @@ class SundaeModel(SplatfactoModel):
 
     @property
     def _prune_at(self) -> int | None:
-        """Step of the one-shot prune; None with another mode."""
-        return self.config.pruning.prune_at if self.config.pruning.mode == "one-shot" else None
+        """Step of the prune that follows densification; None where there is none."""
+        return self.config.pruning.prune_at if self.config.pruning.mode in ("one-shot", "auto") else None
 
     @property
     def schedule_step(self) -> int:
@@ -269,7 +300,9 @@ class SundaeModel(SplatfactoModel):
 
     @property
     def head_active(self) -> bool:
-        """Whether the head takes part: it starts when pruning has ended, unless told otherwise."""
+        """Whether the head takes part: it starts when pruning has ended, unless told otherwise, or when auto lets it."""
+        if self.budget is not None:
+            return self.head is not None and self.budget.search.head
         start = self.config.head.start_at
         return self.head is not None and self.schedule_step > (self._pruning_end if start is None else start)
 
@@ -299,15 +332,18 @@ class SundaeModel(SplatfactoModel):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Step, states of densification and pruning, and the head's scale: what goes on needs beside the tensors."""
-        return checkpoint.extra_state(
+        state = checkpoint.extra_state(
             self.step, self.num_features, self.strategy_state, self.pruning_state, self.trained_focal
         )
+        return state if self.budget is None else {**state, "budget": self.budget.state()}
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`get_extra_state`; tensors move to the device of the field."""
         self.step = int(state["step"])
         focal = state.get("trained_focal")  # older checkpoints do not know it
         self.trained_focal = None if focal is None else (float(focal[0]), float(focal[1]))
+        if self.budget is not None:
+            self.budget.load_state(state.get("budget"))
         for own, theirs in ((self.strategy_state, state["strategy"]), (self.pruning_state, state["pruning"])):
             own.clear()
             own.update({k: v.to(self.means.device) if isinstance(v, Tensor) else v for k, v in theirs.items()})
@@ -320,10 +356,15 @@ class SundaeModel(SplatfactoModel):
         Raises:
             CheckpointError: it is another method's checkpoint, or one of another feature width or head.
         """
-        checkpoint.check_model_state(state_dict, self.state_dict(), self.num_features)
+        expected: Mapping[str, Any] = self.state_dict()
+        if self.budget is not None:
+            expected = self.budget.shapes(state_dict.get(checkpoint.EXTRA_STATE), expected)
+        checkpoint.check_model_state(state_dict, expected, self.num_features)
         n = state_dict["gauss_params.means"].shape[0]
-        for value in self.gauss_params.values():
-            value.data = value.data.new_zeros(n, *value.shape[1:])
+        for name, value in self.gauss_params.items():
+            value.data = value.data.new_zeros(n, *expected[f"gauss_params.{name}"].shape[1:])
+        if self.budget is not None:
+            self.head = self.budget.prepare_head(state_dict[checkpoint.EXTRA_STATE], self.head)
         self._warm_start_error = None
         # Past SplatfactoModel's own loader on purpose: it replaces parameters and resets the step.
         return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
@@ -374,7 +415,7 @@ class SundaeModel(SplatfactoModel):
         """Colours ``[N, 3]`` of the primitives as this view sees them."""
         if self.config.sh_degree == 0:
             return params["features_dc"].sigmoid()
-        degree = self.config.sh_degree
+        degree = round((params["features_rest"].shape[1] + 1) ** 0.5) - 1
         if self.config.warm_start is None:
             degree = min(self.step // self.config.sh_degree_interval, degree)
         center = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
@@ -405,7 +446,7 @@ class SundaeModel(SplatfactoModel):
         compensate = compensate and self.head_active
         colors = self._colors(params, view)
         channels = torch.cat([colors, params[FEATURES]], dim=1) if compensate else colors
-        absgrad = self.training and self.config.use_absgrad and self._densifying
+        absgrad = self.training and self.config.use_absgrad and self._densifying and self.config.warmup == "densify"
         splat = self._splat(params, view, channels, render_depth=depth, absgrad=absgrad)
         blended, features = splat.colors[..., :3], splat.colors[..., 3:]
         base = (blended + (1 - splat.alpha) * background).clamp(0.0, 1.0)
@@ -558,10 +599,16 @@ class SundaeModel(SplatfactoModel):
         backend = self.backend  # an unusable rasteriser should be known before the first step
         CONSOLE.log(f"rasteriser: {backend.name} on {self.device}")
         self.attached = True
+        if self.budget is not None:
+            self.budget.check(cast(Any, training_callback_attributes.pipeline).datamanager)
         callbacks = super().get_training_callbacks(training_callback_attributes)
-        prune = partial(self._prune_if_due, training_callback_attributes)
-        prune.__name__ = "prune_if_due"  # type: ignore[attr-defined]
-        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], prune))
+        for location, act in (
+            (TrainingCallbackLocation.AFTER_TRAIN, self._finish),
+            (TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._prune_if_due),
+        ):
+            callback = partial(act, training_callback_attributes)
+            callback.__name__ = act.__name__.lstrip("_")  # type: ignore[attr-defined]
+            callbacks.append(TrainingCallback([location], callback))
         return callbacks
 
     def step_post_backward(self, step: int) -> None:
@@ -580,6 +627,9 @@ class SundaeModel(SplatfactoModel):
         optimizers, pipeline = attributes.optimizers, attributes.pipeline
         assert optimizers is not None
         assert pipeline is not None
+        # Between growing and culling there were more than now.
+        peaks = (self.pruning_state["peak"], self.strategy_state.get("peak", 0))
+        self.pruning_state["peak"] = max(peaks)
         due = self.policy.due(self.pruning_state, self.schedule_step, self.num_points)
         evaluate = due and self.config.evaluate_prune and self._prune_at is not None
         before = self._evaluate(pipeline, "warm-up", step) if evaluate else {}
@@ -592,6 +642,8 @@ class SundaeModel(SplatfactoModel):
                 strategy_state=self.strategy_state,
                 contribution=partial(self.contribution, cast(SundaeDatamanager, pipeline.datamanager)),
             )
+            if self.budget is not None:
+                self.budget.after_step(self, attributes)
         except SundaeError:
             # The warm-up should not be lost to an option that can be mended: resuming prunes at the first step.
             if attributes.trainer is not None:
@@ -599,7 +651,8 @@ class SundaeModel(SplatfactoModel):
             raise
         self._refresh(optimizers)
         last = self.schedule_step >= self._pruning_end
-        if last or (self._prune_at is not None and self.pruning_state["num_prunes"] > 0):
+        pruned = last or (self._prune_at is not None and self.pruning_state["num_prunes"] > 0)
+        if self.budget is None and pruned:
             notify_pruned(optimizers.schedulers, step, last=last)
         if report is None:
             return
@@ -608,6 +661,15 @@ class SundaeModel(SplatfactoModel):
             CONSOLE.print(f"[yellow]Warning: dropped {report.dropped_nonfinite} primitives that were not finite")
         after = self._evaluate(pipeline, "pruned", step) if evaluate else {}
         self._record(attributes, report, before, after, step)
+
+    def _finish(self, attributes: TrainingCallbackAttributes, step: int) -> None:
+        """Say what training took at its peak, and whether a budget was met."""
+        primitives, memory = self.pruning_state["peak"], peak_memory(self.device) / 1e6
+        CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {self.device.type} memory")
+        writer.put_dict(name="Peak", scalar_dict={"primitives": primitives, "memory_mb": memory}, step=step)
+        if self.budget is not None:
+            self.budget.finish(self, attributes)
+        writer.write_out_storage()
 
     def _refresh(self, optimizers: Optimizers) -> None:
         """Surgery makes new parameters; nerfstudio's own list of them would go stale."""
@@ -649,31 +711,39 @@ class SundaeModel(SplatfactoModel):
         Where the score asks for it, pixels count by the detail of the rendering, for as many cells as primitives seen in it
         are going to be kept.
         """
-        params, pruning = self.gaussians, self.config.pruning
-        share = pruning.share(self.num_points)
+        pruning = self.config.pruning
+        share = pruning.share(self.num_points) if pruning.uses_detail else None
         total = torch.zeros(self.num_points, device=self.device)
-        # Not the one of training, which may be random: the choice is to be the same from run to run.
-        background = self.background_color.to(self.device)
         cameras = list(datamanager.training_cameras())
         for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
-            view = self.view_of(camera)
-            pixels = None
-            if pruning.uses_detail:
-                pictures, splat = self.render(params, view, background, depth=False, compensate=False)
-                pixels = pixel_detail(pictures["base_rgb"], share * float((splat.radii > 0).sum()))
-            total += blending_weights(
-                params["means"],
-                params["quats"],
-                params["scales"].exp(),
-                params["opacities"].sigmoid().squeeze(-1),
-                view.viewmat,
-                view.K,
-                view.width,
-                view.height,
-                pixels=pixels,
-                backend=self.backend,
-            )
+            total += self.weights_of(self.view_of(camera), share)
         return total
+
+    def weights_of(self, view: View, keep_ratio: float | None = None) -> Tensor:
+        """Blending weight of each primitive, summed over the pixels of one view ``[N]``.
+
+        Args:
+            view: the camera.
+            keep_ratio: share of the primitives that will stay; given, pixels count by the detail that so many can show.
+        """
+        params, pixels = self.gaussians, None
+        if keep_ratio is not None:
+            # Not the background of training, which may be random: the choice is to be the same from run to run.
+            background = self.background_color.to(self.device)
+            pictures, splat = self.render(params, view, background, depth=False, compensate=False)
+            pixels = pixel_detail(pictures["base_rgb"], keep_ratio * float((splat.radii > 0).sum()))
+        return blending_weights(
+            params["means"],
+            params["quats"],
+            params["scales"].exp(),
+            params["opacities"].sigmoid().squeeze(-1),
+            view.viewmat,
+            view.K,
+            view.width,
+            view.height,
+            pixels=pixels,
+            backend=self.backend,
+        )
 
     # --------------------------------------------------------------------------------------------- losses and metrics
 
@@ -715,6 +785,10 @@ class SundaeModel(SplatfactoModel):
             losses["base_loss"] = self.config.base_loss_weight * (base - target).abs().mean()
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
+            if self.config.warmup == "mcmc" and self._densifying:
+                # What nothing needs becomes transparent and small, and can be moved (equation 10 of 3DGS-MCMC).
+                losses["opacity_loss"] = MCMC_REGULARISER * self.gauss_params["opacities"].sigmoid().mean()
+                losses["scale_loss"] = MCMC_REGULARISER * self.gauss_params["scales"].exp().mean()
         return losses
 
     def get_image_metrics_and_images(

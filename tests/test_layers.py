@@ -26,6 +26,8 @@ FLOORS = {
     "optimizers": 3,
     "datamanager": 3,
     "checkpoint": 3,
+    "budget": 3,
+    "densification": 3,
     "model": 3,
     "trainer": 3,
     "measure": 3,

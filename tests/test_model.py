@@ -417,7 +417,14 @@ def test_nothing_goes_unless_asked_for(options: dict[str, Any]) -> None:
 def test_continuous_pruning_and_densification_share_a_field(head_start: int | None) -> None:
     model = build(
         head={"start_at": head_start},
-        pruning={"mode": "continuous", "start": 4, "stop": 12, "every": 4, "max_primitives": 40},
+        pruning={
+            "mode": "continuous",
+            "start": 4,
+            "stop": 12,
+            "every": 4,
+            "target_primitives": 40,
+            "max_primitives": 70,
+        },
         warmup_length=0,
         refine_every=3,
         reset_alpha_every=100,
@@ -439,8 +446,16 @@ def test_continuous_pruning_and_densification_share_a_field(head_start: int | No
         )
     assert [counts[step] for step in (4, 8, 12)] == [40, 40, 40]
     assert max(counts) > 40
-    assert model.pruning_state["peak"] >= max(counts)
+    # The cap holds at every step, and between growing and culling; densification ends with the last prune.
+    assert 40 < model.pruning_state["peak"] <= 70
+    assert counts[12:] == [40, 40, 40]
     assert model.head_active
+
+
+def test_a_cloud_above_the_cap_is_cut_before_the_first_step(capsys: pytest.CaptureFixture[str]) -> None:
+    model = build(pruning={"mode": "continuous", "max_primitives": 25})
+    assert model.num_points == 25
+    assert "starting from 25 of them" in " ".join(capsys.readouterr().out.split())
 
 
 def test_continuous_pruning_merges_and_leaves_adam_in_order(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -37,6 +37,8 @@ def scene(
     width: int = 128,
     height: int = 128,
     points: int = 2000,
+    kind: Literal["still-life", "wall"] = "still-life",
+    sensor_noise: float = 0.0,
 ) -> int:
     """Write the embedded scene: a small ray-traced capture in nerfstudio format, with a sparse point cloud.
 
@@ -48,6 +50,8 @@ def scene(
         width: pixels.
         height: pixels.
         points: size of the sparse point cloud.
+        kind: the still life, or one flat painted wall, which needs next to nothing.
+        sensor_noise: standard deviation of the noise of each pixel, in [0, 1].
     """
     from rich.progress import Progress
 
@@ -63,6 +67,8 @@ def scene(
             width=width,
             height=height,
             points=points,
+            kind=kind,
+            sensor_noise=sensor_noise,
             progress=lambda done, total: progress.update(task, completed=done, total=total),
         )
     print(f"wrote {train_views} training and {test_views} test views to {out}")

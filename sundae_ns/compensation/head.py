@@ -81,6 +81,9 @@ class CompensationHead(nn.Module):
 
     def __init__(self, config: HeadConfig) -> None:
         super().__init__()
+        self._build(config)
+
+    def _build(self, config: HeadConfig) -> None:
         config.validate()
         if config.mode == "off":
             raise ConfigError("head.mode is off: there is no compensation head to build; ask for residual or features")
@@ -97,9 +100,27 @@ class CompensationHead(nn.Module):
             zero_init=config.mode == "residual",
         )
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        residual = config.mode == "residual"
+        self._accelerate()
+
+    def _accelerate(self) -> None:
+        residual = self.config.mode == "residual"
         self._inference, self._training = FusedInference(self.net, residual), FusedTraining(self.net, residual)
-        self._can_fuse = config.fused
+        self._can_fuse = self.config.fused
+
+    @torch.no_grad()
+    def resize(self, config: HeadConfig) -> None:
+        """Become the head of another size or feature width, with fresh weights.
+
+        The parameters stay the same objects, which an optimizer may hold; a state that it has of them is stale.
+        """
+        held = list(self.parameters())
+        self._build(config)
+        places = [(module, name) for module in self.net.modules() for name in module._parameters]
+        for own, (module, name) in zip(held, places, strict=True):
+            own.data, own.grad = getattr(module, name).data.to(own), None
+            setattr(module, name, own)
+        self.net.train(self.training)
+        self._accelerate()
 
     def forward(self, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
         """Compensate one picture.

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from sundae_ns.errors import ConfigError
 
-Mode = Literal["one-shot", "continuous", "off"]
+Mode = Literal["one-shot", "continuous", "auto", "off"]
 ScoreName = Literal[
     "response-contribution",
     "coherence-contribution",
@@ -36,7 +36,8 @@ class PruningConfig:
     """
 
     mode: Mode = "one-shot"
-    """Prune once (the paper's main strategy), periodically while densifying (lower peak memory), or never."""
+    """Prune once (the paper's main strategy), periodically while densifying (lower peak memory), down to what the scene
+    needs (by max-psnr-drop, max-bytes or max-primitives), or never."""
     keep_ratio: float = 0.1
     """Share of the primitives to keep at each prune, in (0, 1]; the kept count is exactly round(keep_ratio * N)."""
     selection: SelectionName = "systematic"
@@ -79,11 +80,28 @@ class PruningConfig:
     start: int = 2000
     """First step at which continuous pruning may happen."""
     stop: int = 15000
-    """Last step at which continuous pruning may happen."""
+    """Last step at which continuous pruning may happen, or at which auto may look for a smaller field."""
     every: int = 2000
     """Steps from one continuous prune to the next."""
     max_primitives: int | None = None
-    """Cap for continuous pruning: prune down to this count where there are more, instead of by the keep ratio."""
+    """Continuous: never more than this many at any step, densification included. Auto: keep at most this many."""
+    target_primitives: int | None = None
+    """Continuous: each prune goes down to exactly this count where there are more, instead of by the keep ratio; the last one
+    comes after densification, and where that has left fewer, the field is filled up."""
+    max_psnr_drop: float | None = None
+    """Auto: keep as few as lose at most this many dB against the warm-up field on held-back training views, after
+    fine-tuning. 0.1 if no other budget is given."""
+    max_bytes: int | None = None
+    """Auto: keep as many as are stored in at most this many bytes, everything needed to show the scene counted."""
+    search_every: int = 250
+    """Auto: steps from one look at the held-back views to the next."""
+    patience: int = 4
+    """Auto: looks after which a cut that has not recovered is taken back."""
+
+    @property
+    def tolerated_drop(self) -> float:
+        """What auto may lose on held-back views, dB: for the count, or for the harmonics alone if that is given."""
+        return 0.1 if self.max_psnr_drop is None else self.max_psnr_drop
 
     @property
     def uses_contribution(self) -> bool:
@@ -111,8 +129,9 @@ class PruningConfig:
         return self.score == "detail-contribution"
 
     def share(self, n: int) -> float:
-        """Share of ``n`` primitives that a prune keeps: the keep ratio, or what the cap leaves."""
-        return self.keep_ratio if self.max_primitives is None else min(1.0, self.max_primitives / n)
+        """Share of ``n`` primitives that a prune keeps: the keep ratio, or what the target or the cap leaves."""
+        goal = self.max_primitives if self.target_primitives is None else self.target_primitives
+        return self.keep_ratio if goal is None else min(1.0, goal / n)
 
     @property
     def last_prune(self) -> int:
@@ -142,20 +161,46 @@ class PruningConfig:
             raise ConfigError(f"keep_ratio is {self.keep_ratio}: use a share in (0, 1], 0.1 to keep a tenth")
         if not 0 <= self.gamma <= 1:
             raise ConfigError(f"gamma is {self.gamma}: use a share in [0, 1]")
-        at_least = {"num_neighbors": 1, "every": 1, "prune_at": 0, "start": 0, "max_primitives": 1}
-        for name, least in {**at_least, "rounds": 1, "round_every": 1}.items():
+        at_least = {"num_neighbors": 1, "every": 1, "prune_at": 0, "start": 0, "rounds": 1, "round_every": 1}
+        budgets = {"max_primitives": 1, "target_primitives": 1, "max_bytes": 1, "search_every": 1, "patience": 1}
+        for name, least in {**at_least, **budgets}.items():
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ConfigError(f"{name} is {value}: use at least {least}")
-        if self.stop < self.start:
+        if self.mode != "auto" and self.stop < self.start:
             raise ConfigError(f"stop ({self.stop}) lies before start ({self.start}): swap them, or set mode to off")
-        if self.rounds > 1 and self.mode == "continuous":
-            raise ConfigError(f"rounds is {self.rounds} but mode is continuous: set mode to one-shot, or drop rounds")
+        if self.rounds > 1 and self.mode in ("continuous", "auto"):
+            raise ConfigError(f"rounds is {self.rounds} but mode is {self.mode}: set mode to one-shot, or drop rounds")
         for name in ("tau", "sigma"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ConfigError(f"{name} is {value}: use a positive number, or leave it out for the bandwidth rule")
-        if self.max_primitives is not None and self.mode != "continuous":
-            raise ConfigError(
-                f"max_primitives is set but mode is {self.mode}: set mode to continuous, or drop max_primitives"
-            )
+        self._validate_budgets()
+
+    def _validate_budgets(self) -> None:
+        homes = {
+            "max_primitives": ("continuous", "auto"),
+            "target_primitives": ("continuous",),
+            "max_psnr_drop": ("auto",),
+            "max_bytes": ("auto",),
+        }
+        for name, modes in homes.items():
+            if getattr(self, name) is not None and self.mode not in modes:
+                raise ConfigError(
+                    f"{name} is set but mode is {self.mode}: set mode to {' or '.join(modes)}, or drop {name}"
+                )
+        if self.mode == "auto":
+            given = [
+                name for name in ("max_psnr_drop", "max_bytes", "max_primitives") if getattr(self, name) is not None
+            ]
+            if len(given) > 1:
+                raise ConfigError(f"{' and '.join(given)} are both set: give one budget, the others follow from it")
+            if not 0 < self.tolerated_drop < float("inf"):
+                raise ConfigError(f"max_psnr_drop is {self.max_psnr_drop}: use a positive number of dB, 0.1 for one")
+            if self.stop < self.prune_at:
+                raise ConfigError(
+                    f"stop ({self.stop}) lies before prune_at ({self.prune_at}): auto has no time to search"
+                )
+        cap, target = self.max_primitives, self.target_primitives
+        if cap is not None and target is not None and target > cap:
+            raise ConfigError(f"target_primitives ({target}) is more than max_primitives ({cap}): swap them")

@@ -149,3 +149,24 @@ def test_half_precision_is_close(precision: str) -> None:
     assert out.dtype == torch.float32
     scale = (exact(*tensors) - tensors[0]).abs().mean()
     assert (out - exact(*tensors)).abs().mean() < 0.03 * scale
+
+
+def test_a_resized_head_is_one_of_that_size_with_the_same_parameters() -> None:
+    head, wanted = (
+        CompensationHead(HeadConfig(size="small")),
+        HeadConfig(size="tiny", num_features=5, pixel_unshuffle=1),
+    )
+    optimizer, held = torch.optim.Adam(head.parameters(), lr=0.01), list(head.parameters())
+    head.eval()
+    head.resize(wanted)
+    fresh = CompensationHead(wanted)
+    assert all(a is b for a, b in zip(held, head.parameters(), strict=True))
+    assert [p.shape for p in head.parameters()] == [p.shape for p in fresh.parameters()]
+    assert str(head.net) == str(fresh.eval().net), "layers say of themselves what they are"
+    assert not any(module.training for module in head.modules())
+    fresh.load_state_dict(head.state_dict())
+    pictures = [torch.rand(9, 11, channels) for channels in (3, 3 + 5, 1)]
+    assert torch.equal(head(*pictures), fresh(*pictures))
+    head.train()(*pictures).square().mean().backward()
+    optimizer.step()
+    assert not torch.equal(head(*pictures), fresh(*pictures))

@@ -146,6 +146,28 @@ def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
     assert run(policy, few, range(4))[0] == []
 
 
+@pytest.mark.parametrize("last", [60, 90])
+def test_continuous_ends_at_exactly_the_target(last: int) -> None:
+    config = PruningConfig(
+        mode="continuous", start=0, every=2, stop=3, target_primitives=80, max_primitives=120, num_neighbors=4
+    )
+    policy = make_policy(config)
+    made = field()
+    reports, state = run(policy, made, range(2))
+    assert [report.after for report in reports] == [80]
+    params, optimizers = field(last)  # what densification has made of it meanwhile
+    densification = {"grad2d": torch.zeros(last), "count": torch.zeros(last), "scene_scale": 1.0}
+    for step in (3, 4):
+        policy.step_post_backward(
+            params, optimizers, state, step, contribution=lambda: torch.ones(last), strategy_state=densification
+        )
+        assert {len(value) for value in params.values()} == {80}
+        assert all(optimizers[name].param_groups[0]["params"] == [params[name]] for name in optimizers)
+        rows = [len(value) for value in densification.values() if isinstance(value, Tensor)]
+        assert set(rows) <= {80}
+    assert state["peak"] == 100
+
+
 def test_a_resumed_continuous_run_goes_on_as_if_never_stopped() -> None:
     config = PruningConfig(mode="continuous", start=1, every=2, stop=7, keep_ratio=0.8, num_neighbors=4)
     whole, halves = field(), field()
@@ -299,3 +321,28 @@ def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> No
     with pytest.raises(ConfigError, match=next(iter(wrong))) as caught:
         make_policy(replace(PruningConfig(), **wrong))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "auto", "stop": 20000, "max_bytes": 1, "max_primitives": 1}, "max_bytes and max_primitives are both"),
+        ({"mode": "auto", "stop": 20000, "max_psnr_drop": 0.0}, "max_psnr_drop is 0.0"),
+        ({"mode": "auto", "stop": 14999}, "auto has no time to search"),
+        ({"mode": "auto", "stop": 20000, "rounds": 2}, "rounds is 2 but mode is auto"),
+        ({"mode": "auto", "stop": 20000, "target_primitives": 5}, "target_primitives is set but mode is auto"),
+        ({"max_bytes": 5}, "max_bytes is set but mode is one-shot: set mode to auto"),
+        ({"mode": "continuous", "max_psnr_drop": 0.1}, "max_psnr_drop is set but mode is continuous"),
+        ({"mode": "continuous", "max_primitives": 4, "target_primitives": 5}, "is more than max_primitives"),
+        ({"mode": "auto", "stop": 20000, "search_every": 0}, "search_every is 0"),
+    ],
+)
+def test_budgets_that_cannot_work_name_the_mend(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        PruningConfig(**options).validate()  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("budget", [{}, {"max_psnr_drop": 0.5}, {"max_bytes": 100}, {"max_primitives": 1}])
+def test_one_budget_is_enough(budget: dict[str, object]) -> None:
+    PruningConfig(mode="auto", stop=20000, **budget).validate()  # type: ignore[arg-type]
