@@ -32,7 +32,7 @@ from sundae_ns import checkpoint
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
-from sundae_ns.evaluation import Lpips, display, psnr, ssim
+from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
 from sundae_ns.rasterization import (
@@ -49,6 +49,7 @@ from sundae_ns.storage.transform import similarity
 
 NEAR_PLANE = 0.01
 SSIM_WINDOW = 11
+_Outputs = MutableMapping[str, Any]
 
 
 @dataclass
@@ -79,11 +80,11 @@ def _cut(image: Tensor, window: Window | None) -> Tensor:
     return image[window.top : window.top + window.height, window.left : window.left + window.width]
 
 
-def _names_full_memory(render: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
+def _names_full_memory(render: Callable[..., _Outputs]) -> Callable[..., _Outputs]:
     """Let a method of the model that runs out of the GPU's memory say how many primitives there were."""
 
     @wraps(render)
-    def wrapper(model: SundaeModel, *arguments: Any, **options: Any) -> dict[str, Any]:
+    def wrapper(model: SundaeModel, *arguments: Any, **options: Any) -> _Outputs:
         try:
             return render(model, *arguments, **options)
         except torch.cuda.OutOfMemoryError as error:
@@ -336,7 +337,12 @@ class SundaeModel(SplatfactoModel):
             camera: nerfstudio camera, camera-to-world with OpenGL axes.
             downscale: divide the resolution by this.
         """
-        pose = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
+        if self.training:
+            pose = self.camera_optimizer.apply_to_camera(camera)
+        else:
+            # Small sums on single numbers: on a GPU each would cost a launch, and each number read back a wait.
+            camera = camera.to("cpu")
+            pose = camera.camera_to_worlds
         pose = pose.reshape(-1, 3, 4)[0]
         rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
         top = torch.cat([rotation.T, -rotation.T @ pose[:, 3:]], dim=1)
@@ -424,8 +430,13 @@ class SundaeModel(SplatfactoModel):
         }
         return pictures, splat
 
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> _Outputs:  # type: ignore[override]
+        """Render a camera, or what of it lies in a box; unlike splatfacto's, this leaves the camera on its device."""
+        self.set_crop(obb_box)
+        return self.get_outputs(camera)
+
     @_names_full_memory
-    def get_outputs(self, camera: Cameras) -> dict[str, Any]:  # type: ignore[override]
+    def get_outputs(self, camera: Cameras) -> _Outputs:  # type: ignore[override]
         """Render a camera.
 
         Args:
@@ -433,8 +444,9 @@ class SundaeModel(SplatfactoModel):
 
         Returns:
             ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; outside training also ``features``
-            (principal components as colours) and ``response`` (spectral response of the primitives seen). In training,
-            pictures may be of a ``window`` alone, then given beside them.
+            (principal components as colours) and ``response`` (spectral response of the primitives seen), and those
+            beside the first two are made when they are asked for. In training, pictures may be of a ``window`` alone,
+            then given beside them.
         """
         view = self.view_of(camera, self._get_downscale_factor())
         background = self._get_background_color()
@@ -458,35 +470,48 @@ class SundaeModel(SplatfactoModel):
             return self.get_empty_outputs(view.width, view.height, background)
         params = self.gaussians if mask is None else {k: v[mask] for k, v in self.gaussians.items()}
         outputs, splat = self.render(params, view, background, compensate=self.compensate.value)
-        outputs["depth"] = display.fill_depth(outputs["depth"], splat.alpha)
-        outputs["features"] = self._feature_colors(outputs.pop("feature_image"), splat.alpha)
-        outputs["response"] = self._response_image(params, mask, view)
-        outputs["background"] = background.expand(view.height, view.width, 3)
-        return outputs
+        field, features = dict(self.gaussians), outputs.pop("feature_image")
+        later = {
+            "depth": partial(display.fill_depth, outputs["depth"], splat.alpha),
+            "features": partial(self._feature_colors, field, features, splat.alpha),
+            "response": partial(self._response_image, field, mask, self._response_key, view),
+        }
+        background = background.expand(view.height, view.width, 3)
+        return LazyOutputs({**outputs, **{k: Later(make) for k, make in later.items()}, "background": background})
 
-    def _feature_colors(self, features: Tensor, alpha: Tensor) -> Tensor:
-        if features.shape[-1] == 0:
+    @staticmethod
+    def _feature_colors(field: Mapping[str, Tensor], image: Tensor, alpha: Tensor) -> Tensor:
+        if image.shape[-1] == 0:
             return alpha.new_zeros(*alpha.shape[:2], 3)
-        return display.feature_colors(features, *display.principal_components(self.gauss_params[FEATURES]), alpha)
+        return display.feature_colors(image, *display.principal_components(field[FEATURES]), alpha)
 
-    def _response_image(self, params: Mapping[str, Tensor], mask: Tensor | None, view: View) -> Tensor:
-        shown = self._response_values()
-        if shown is None:
-            return params["means"].new_zeros(view.height, view.width, 1)
-        return self._splat(params, view, (shown if mask is None else shown[mask])[:, None]).colors
-
-    def _response_values(self) -> Tensor | None:
-        """Spectral response ``[N]`` for display, kept until the field is pruned again; None while the field still grows."""
+    @property
+    def _response_key(self) -> tuple[int, int] | None:
+        """Which state of the field a response belongs to; None while the field still grows, when it is not shown."""
         if self.attached and self._densifying:
             return None
-        key = (self.num_points, self.pruning_state["num_prunes"])
-        if self._response[0] != key:
+        return self.num_points, self.pruning_state["num_prunes"]
+
+    def _response_image(
+        self, field: Mapping[str, Tensor], mask: Tensor | None, key: tuple[int, int] | None, view: View
+    ) -> Tensor:
+        shown = None if key is None else self._response_values(field, key)
+        if shown is None:
+            return field["means"].new_zeros(view.height, view.width, 1)
+        if mask is not None:
+            field, shown = {name: value[mask] for name, value in field.items()}, shown[mask]
+        return self._splat(field, view, shown[:, None]).colors
+
+    def _response_values(self, field: Mapping[str, Tensor], key: tuple[int, int]) -> Tensor | None:
+        """Spectral response ``[N]`` for display, kept until the field is pruned again."""
+        of, values = self._response
+        if of != key:
             try:
-                values: Tensor | None = display.response_values(response(self.gaussians, self.config.pruning).magnitude)
+                values = display.response_values(response(field, self.config.pruning).magnitude)
             except DataError:  # too few primitives for a graph: nothing to show
                 values = None
             self._response = (key, values)
-        return self._response[1]
+        return values
 
     @staticmethod
     def get_empty_outputs(width: int, height: int, background: Tensor) -> dict[str, Any]:

@@ -158,6 +158,31 @@ def test_every_output_can_be_shown(mode: str, size: tuple[int, int]) -> None:
     assert (outputs["features"].std() > 0) == (mode != "off")
 
 
+def test_outputs_that_nobody_asks_for_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = perturb(build()).eval()
+    splatted: list[int] = []
+    splat = model._splat
+    monkeypatch.setattr(model, "_splat", lambda *args, **kwargs: splatted.append(1) or splat(*args, **kwargs))
+    outputs = model.get_outputs_for_camera(camera())
+    assert outputs["rgb"].shape == outputs["base_rgb"].shape
+    assert (len(splatted), model._response[0]) == (1, None)
+    assert outputs["response"].max() > 0
+    assert len(splatted) == 2
+
+
+def test_outputs_belong_to_the_field_that_was_rendered() -> None:
+    model = perturb(build()).eval()
+    before = {name: value.clone() for name, value in model.get_outputs_for_camera(camera()).items()}
+    outputs = model.get_outputs_for_camera(camera())
+    with torch.no_grad():  # a prune, while another thread still shows the picture
+        for name, value in model.gauss_params.items():
+            model.gauss_params[name] = torch.nn.Parameter(value[::2].clone())
+        model.pruning_state["num_prunes"] += 1
+    assert {name for name, value in outputs.items() if not torch.equal(value, before[name])} == set()
+    after = model.get_outputs_for_camera(camera())
+    assert not torch.equal(after["response"], before["response"])
+
+
 @torch.no_grad()
 def test_a_crop_without_primitives_has_the_same_keys() -> None:
     model = perturb(build()).eval()

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from sundae_ns.compensation.graphed import GraphedTraining
+from sundae_ns.compensation.graphed import GraphedInference, GraphedTraining
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import ConfigError
 
@@ -47,6 +47,8 @@ class HeadConfig:
     """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is meant for inference: it trains unscaled."""
     cuda_graph: bool = True
     """Replay the U-Net as one CUDA graph while training: the same numbers, without the time of launching each kernel."""
+    cuda_graph_inference: bool = False
+    """The same for pictures that are only looked at, once a size is shown for the third time in a row. Not measured yet."""
 
     def validate(self) -> None:
         """Check the values.
@@ -93,6 +95,7 @@ class CompensationHead(nn.Module):
         )
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._graphed = GraphedTraining(self.net, PRECISIONS[config.precision])
+        self._replayed = GraphedInference(self.net)
 
     def forward(self, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
         """Compensate one picture.
@@ -109,15 +112,22 @@ class CompensationHead(nn.Module):
         residual = self.config.mode == "residual"
         image = torch.cat([colors, alpha, features], dim=-1) if residual else features
         # [H, W, C] is the channels-last layout of [1, C, H, W]: no copy.
-        out = self._run(image.permute(2, 0, 1)[None])[0].permute(1, 2, 0).float()
-        return base + alpha * out if residual else out
+        out = self._run(image.permute(2, 0, 1)[None])[0].permute(1, 2, 0)
+        if out.dtype == torch.float16:
+            # Activations beyond its 65504 are infinite, and NaN in the next layer: no correction there.
+            out = out.nan_to_num(0.0, 0.0, 0.0)
+        return base + alpha * out.float() if residual else out.float()
 
     def _run(self, image: Tensor) -> Tensor:
         dtype = PRECISIONS[self.config.precision] if image.is_cuda else torch.float32
-        image = image.to(dtype)
-        if self.config.cuda_graph and image.is_cuda and image.requires_grad and self.training:
-            out = self._graphed(image)
-            if out is not None:
-                return out
+        out = None
+        if image.is_cuda and not torch.is_grad_enabled() and self.config.cuda_graph_inference:
+            out = self._replayed(image, dtype)
+            # In fp32 the caller's float() would hand out the graph's own memory, which the next picture overwrites.
+            out = out.clone() if out is not None and dtype == torch.float32 else out
+        elif self.config.cuda_graph and image.is_cuda and image.requires_grad and self.training:
+            out = self._graphed(image.to(dtype))
+        if out is not None:
+            return out
         with torch.autocast(image.device.type, dtype=dtype, enabled=dtype != torch.float32):
-            return self.net(image)
+            return self.net(image.to(dtype))

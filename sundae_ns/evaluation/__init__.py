@@ -2,6 +2,7 @@
 
 from sundae_ns.evaluation import display
 from sundae_ns.evaluation.flicker import Change, Frame, change
+from sundae_ns.evaluation.lazy import Later, LazyOutputs
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.evaluation.picture import ComparisonRow, comparison_sheet, save_comparison, side_by_side
@@ -14,6 +15,8 @@ __all__ = [
     "Change",
     "ComparisonRow",
     "Frame",
+    "Later",
+    "LazyOutputs",
     "Lpips",
     "Quality",
     "RunFigures",

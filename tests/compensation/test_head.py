@@ -88,6 +88,53 @@ def test_bad_options(options: dict[str, object]) -> None:
     assert "\n" not in str(error.value)
 
 
+WILD = {
+    "large": lambda t: 1e4 * t,
+    "large and negative": lambda t: -1e4 * t,
+    "zero": torch.zeros_like,
+    "one spike": lambda t: t.index_fill(1, torch.tensor([7], device=t.device), 1e4),
+}
+
+
+@pytest.mark.parametrize("kind", WILD)
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_wild_inputs_give_finite_pictures(mode: str, kind: str) -> None:
+    base, colors, features, alpha = inputs()
+    module = head(mode=mode)
+    perturb(module)
+    features = WILD[kind](features).requires_grad_()
+    out = module(base, WILD[kind](colors), features, alpha)
+    out.square().mean().backward()
+    assert torch.isfinite(out).all()
+    assert torch.isfinite(features.grad).all()
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_training_ten_times_too_fast_may_be_bad_but_not_broken(mode: str) -> None:
+    torch.manual_seed(0)
+    module = head(mode=mode, pixel_unshuffle=2)
+    optimizer = torch.optim.Adam(module.parameters(), lr=1e-2)  # the methods have 1e-3 at most
+    pictures = [inputs(16, 16) for _ in range(4)]
+    truths = [torch.rand(16, 16, 3) for _ in pictures]
+    for step in range(1000):
+        optimizer.zero_grad()
+        (module(*pictures[step % 4]) - truths[step % 4]).abs().mean().backward()
+        optimizer.step()
+    assert all(torch.isfinite(module(*picture)).all() for picture in pictures)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("kind", WILD)
+@pytest.mark.parametrize("precision", ["bf16", "fp16"])
+@torch.no_grad()
+def test_half_precision_of_wild_inputs_is_finite(precision: str, kind: str) -> None:
+    """What does not fit into the numbers of half precision is left uncompensated."""
+    base, colors, features, alpha = (t.cuda() for t in inputs())
+    module = head(precision=precision).cuda()
+    perturb(module)
+    assert torch.isfinite(module(base, WILD[kind](colors), WILD[kind](features), alpha)).all()
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
 def test_half_precision_is_close(precision: str) -> None:
@@ -121,3 +168,25 @@ def test_recorded_training_is_the_same(mode: str) -> None:
             results.append([out.detach(), features.grad, *(p.grad for p in module.parameters())])
         for a, b in zip(*results, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-2, atol=1e-5)  # bf16, whose atomics are not ordered
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("precision", ["fp32", "bf16", "fp16"])
+@torch.no_grad()
+def test_replayed_pictures_are_the_same(precision: str) -> None:
+    """At every size, in any order, and with weights that have changed since the recording."""
+    torch.manual_seed(0)
+    eager = head(precision=precision).cuda().eval()
+    replayed = head(precision=precision, cuda_graph_inference=True).cuda().eval()
+    sizes = [(33, 40)] * 5 + [(48, 64)] * 4 + [(33, 40), (16, 16)] + [(31, 30)] * 3 + [(20, 30)] * 3 + [(8, 8)] * 3
+    kept = []
+    for height, width in [*sizes, *sizes]:
+        perturb(eager)
+        replayed.load_state_dict(eager.state_dict())
+        tensors = [t.cuda() for t in inputs(height, width)]
+        found, expected = replayed(*tensors), eager(*tensors)
+        torch.testing.assert_close(found, expected)
+        kept.append((found, expected))
+    assert len(replayed._replayed._recorded) == 4
+    for found, expected in kept:  # nobody's picture was written over by a later one
+        torch.testing.assert_close(found, expected)
