@@ -126,10 +126,14 @@ class PackReport(NamedTuple):
         return sums
 
 
+def _array(values: Tensor) -> NDArray[np.float32]:
+    array: NDArray[np.float32] = values.detach().to("cpu", torch.float32).numpy()
+    return array
+
+
 def _matrix(values: Tensor) -> NDArray[np.float32]:
     """``[N, ...]`` as contiguous float32 ``[N, C]`` on the CPU."""
-    array = values.detach().to("cpu", torch.float32)
-    return np.ascontiguousarray(array.reshape(len(array), -1).numpy())
+    return np.ascontiguousarray(_array(values).reshape(len(values), -1))
 
 
 def _check(params: Mapping[str, Tensor]) -> None:
@@ -184,7 +188,7 @@ def _encode_uniform(
 
 def _encode_books(name: str, values: NDArray[np.float32], books: int) -> tuple[dict[str, Any], dict[str, Array]]:
     made = codebooks.fit(values, books)
-    arrays = {
+    arrays: dict[str, Array] = {
         "indices": made.indices,
         "entries": made.entries.reshape(books, -1),
         "steps": made.steps,
@@ -197,16 +201,19 @@ def _encode_books(name: str, values: NDArray[np.float32], books: int) -> tuple[d
 
 def _encode_transform(name: str, values: NDArray[np.float32], step: float) -> tuple[dict[str, Any], dict[str, Array]]:
     made = transform.forward(values, step)
-    arrays = {"codes": made.codes, "basis": made.basis.reshape(-1), "rows": made.rows, "exact": made.exact}
+    arrays: dict[str, Array] = {
+        "codes": made.codes,
+        "basis": made.basis.reshape(-1),
+        "rows": made.rows,
+        "exact": made.exact,
+    }
     about = {"codec": "transform", "step": step, "bound": transform.bound(made)}
     return about, {f"{name}/{part}": array for part, array in arrays.items()}
 
 
 def _encode_head(head: Mapping[str, Tensor], codec: HeadCodec) -> tuple[dict[str, Any], dict[str, Array]]:
     names = sorted(head)
-    values: dict[str, NDArray[np.float32]] = {
-        name: head[name].detach().to("cpu", torch.float32).numpy() for name in names
-    }
+    values = {name: _array(head[name]) for name in names}
     if not all(np.isfinite(value).all() for value in values.values()):
         raise PackError("the head has weights that are not finite; go back to an earlier checkpoint")
     tensors = [[name, list(values[name].shape)] for name in names]
@@ -295,7 +302,7 @@ def _join_crumbs(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
     padded = np.zeros(-(-len(values) // 4) * 4, np.uint8)
     padded[: len(values)] = values
     four = padded.reshape(-1, 4)
-    joined: NDArray[np.uint8] = four[:, 0] | four[:, 1] << 2 | four[:, 2] << 4 | four[:, 3] << 6
+    joined: NDArray[np.uint8] = np.bitwise_or.reduce(four << np.array([0, 2, 4, 6], np.uint8), axis=1)
     return joined
 
 
@@ -350,7 +357,7 @@ class _Reader:
         except OverflowError:
             array = np.array([np.inf])
         # Grids reach up to 2^16 steps, times a few in a transform; what is shown must still be a number in float32.
-        if not (np.abs(array) * 2**20 < np.finfo(np.float32).max).all():
+        if not (np.abs(array) < np.finfo(np.float32).max / 2**20).all():
             raise self.refuse(f"{key} has values that are no numbers of float32")
         return array
 
