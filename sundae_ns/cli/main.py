@@ -10,10 +10,13 @@ from typing import Annotated
 import tyro
 
 from sundae_ns.cli.bench import app as bench
+from sundae_ns.cli.packing import pack, unpack
 from sundae_ns.errors import SundaeError
 
 app = tyro.extras.SubcommandApp()
 app.command(bench, name="bench", help="Measure a part of SUNDAE on this machine.")
+app.command(pack)
+app.command(unpack)
 
 
 @app.command

@@ -29,7 +29,6 @@ def scene() -> Scene:
     cameras = {
         "poses": torch.eye(4)[None, :3],
         "intrinsics": torch.full((1, 4), 20.0).double(),
-        "distortion": torch.zeros(1, 6),
         "sizes": torch.full((1, 2), 32),
     }
     return Scene(field, head, cameras, {"model": {"sh_degree": 2}})

@@ -38,7 +38,6 @@ def cameras(n: int = 3) -> dict[str, Tensor]:
     return {
         "poses": torch.eye(4)[:3].repeat(n, 1, 1),
         "intrinsics": torch.tensor([[500.25, 501.5, 319.5, 239.5]]).double().repeat(n, 1),
-        "distortion": torch.zeros(n, 6),
         "sizes": torch.tensor([[640, 480]]).repeat(n, 1),
     }
 
