@@ -91,7 +91,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100) -> Scene:
             "trained_focal": list(model.trained_focal) if head and model.trained_focal else None,
         },
         "frame": _frame(path.parent / _FRAME_FILE),
-        "capture": _describe(manager.dataparser),
+        "capture": _describe(manager),
     }
     cameras = _cameras(manager, max_cameras) if max_cameras > 0 else None
     return Scene(field, head, cameras, meta)
@@ -169,7 +169,9 @@ def _manager(config: TrainerConfig) -> SundaeDatamanagerConfig:
     manager = copy.deepcopy(config.pipeline.datamanager)
     if not isinstance(manager, SundaeDatamanagerConfig):
         stock = cast(FullImageDatamanagerConfig, manager)
-        manager = SundaeDatamanagerConfig(data=stock.data, dataparser=stock.dataparser)
+        manager = SundaeDatamanagerConfig(
+            data=stock.data, dataparser=stock.dataparser, camera_res_scale_factor=stock.camera_res_scale_factor
+        )
     manager.data = manager.data or config.data
     return manager
 
@@ -184,8 +186,9 @@ def _cameras(manager: SundaeDatamanagerConfig, most: int) -> dict[str, Tensor]:
     }
 
 
-def _describe(parser: DataParserConfig) -> dict[str, Any] | None:
-    """Plain values of a parser, by which the same capture is read and split again; None for one of a rare kind."""
+def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
+    """Plain values by which the same capture is read, split and scaled again; None for one of a rare parser."""
+    parser = manager.dataparser
     kind = next((name for name, known in _PARSERS.items() if type(parser) is known), None)
     if kind is None:
         return None
@@ -197,7 +200,7 @@ def _describe(parser: DataParserConfig) -> dict[str, Any] | None:
         if isinstance(value, str) and isinstance(default, Path) and not _FOLDER.fullmatch(value):
             return None  # outside of the capture
         options[name] = value
-    return {"parser": kind, "options": options}
+    return {"parser": kind, "options": options, "scale": manager.camera_res_scale_factor}
 
 
 def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
@@ -250,7 +253,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
         manager.pictures = False
         config.data = folder / "cameras"
     else:
-        manager.dataparser = _parser(scene.meta.get("capture"))
+        manager.dataparser, manager.camera_res_scale_factor = _capture(scene.meta.get("capture"))
         config.data = data.resolve()
     manager.data = config.data
     try:
@@ -364,11 +367,15 @@ def _is_frame(stated: Any) -> bool:
     return isinstance(rows, list) and all(isinstance(row, list) and all(map(_is_number, row)) for row in rows)
 
 
-def _parser(stated: Any) -> DataParserConfig:
+def _capture(stated: Any) -> tuple[DataParserConfig, float]:
+    """Counterpart of :func:`_describe`: the parser, and the factor on the sides of its pictures."""
     kind = stated.get("parser") if isinstance(stated, dict) else None
     options = stated.get("options") if isinstance(stated, dict) else None
     if kind not in _PARSERS or not isinstance(options, dict):
         raise PackError("the packed scene does not say how its capture is read; unpack it without --data")
+    scale = stated.get("scale")
+    if not _is_number(scale) or not 0 < scale <= 1:
+        raise _refusal("pictures of a scale that cannot be")
     parser = _PARSERS[kind](load_3D_points=False)  # type: ignore[call-arg]
     known = _options(_PARSERS[kind])
     for name, value in options.items():
@@ -385,7 +392,7 @@ def _parser(stated: Any) -> DataParserConfig:
         if not fits:
             raise _refusal(f"an option {str(name)[:40]!r} of its capture that cannot be")
         setattr(parser, name, Path(value) if isinstance(default, Path) else value)
-    return parser
+    return parser, float(scale)
 
 
 def _transforms(scene: Scene) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from sundae_ns import checkpoint, packed_run
 from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, DataError, PackError, StorageError
 from sundae_ns.gaussians import from_points
 from sundae_ns.packed_run import scene_of_run, write_run
@@ -64,7 +65,7 @@ def meta() -> Json:
             "trained_focal": [40.0, 41.0],
         },
         "frame": {"transform": torch.eye(4)[:3].tolist(), "scale": 0.5},
-        "capture": {"parser": "colmap", "options": {"colmap_path": "sparse/0", "downscale_factor": 1}},
+        "capture": {"parser": "colmap", "options": {"colmap_path": "sparse/0"}, "scale": 1.0},
     }
 
 
@@ -208,17 +209,22 @@ def test_headers_that_lie_are_refused(tmp_path: Path, lie: str) -> None:
 )
 def test_a_capture_is_read_again_as_it_was(parser: Any) -> None:
     parser.load_3D_points = False
-    found = packed_run._parser(packed_run._describe(parser))
+    manager = SundaeDatamanagerConfig(dataparser=parser, camera_res_scale_factor=0.5)
+    found, scale = packed_run._capture(packed_run._describe(manager))
+    assert scale == 0.5
     assert type(found) is type(parser)
     assert vars(found) == vars(parser)
 
 
 def test_captures_that_are_not_described() -> None:
-    assert packed_run._describe(BlenderDataParserConfig()) is None
-    assert packed_run._describe(ColmapDataParserConfig(images_path=Path("/home/me/images"))) is None
+    for parser in (BlenderDataParserConfig(), ColmapDataParserConfig(images_path=Path("/home/me/images"))):
+        assert packed_run._describe(SundaeDatamanagerConfig(dataparser=parser)) is None
     for stated in (None, {}, {"parser": "blender-data", "options": {}}, {"parser": "colmap", "options": None}):
         with pytest.raises(PackError, match="without --data"):
-            packed_run._parser(stated)
+            packed_run._capture(stated)
+    for scale in (0, 2, "1", None, float("nan")):
+        with pytest.raises(PackError, match="a scale that cannot be"):
+            packed_run._capture({"parser": "colmap", "options": {}, "scale": scale})
 
 
 @pytest.mark.parametrize(
@@ -245,7 +251,7 @@ def test_captures_that_are_not_described() -> None:
 )
 def test_options_of_a_capture_that_cannot_be(name: str, value: Any) -> None:
     with pytest.raises(PackError, match="cannot be"):
-        packed_run._parser({"parser": "colmap", "options": {name: value}})
+        packed_run._capture({"parser": "colmap", "options": {name: value}, "scale": 1.0})
 
 
 # ------------------------------------------------------------------------------------------------------- runs to pack
