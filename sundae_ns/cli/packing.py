@@ -21,7 +21,7 @@ def pack(
     color_bits: int = 8,
     opacity_bits: int = 8,
     harmonics: Literal["transform", "codebooks"] = "transform",
-    harmonics_step: float = 0.03,
+    harmonics_step: float = 0.02,
     harmonics_books: int = 4,
     feature_bits: int = 6,
     feature_books: int = 0,

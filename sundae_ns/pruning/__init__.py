@@ -6,6 +6,7 @@ calls it at its steps and applies the mask with :func:`sundae_ns.gaussians.surge
 
 from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.decision import Decision, decide
+from sundae_ns.pruning.footprint import footprint
 from sundae_ns.pruning.policy import ContinuousPruning, NoPruning, OneShotPruning, PruningPolicy, make_policy
 from sundae_ns.pruning.report import PruneReport
 from sundae_ns.pruning.scores import Response, response, score
@@ -23,6 +24,7 @@ __all__ = [
     "Response",
     "attribute_signal",
     "decide",
+    "footprint",
     "kept_count",
     "make_policy",
     "position_signal",

@@ -30,7 +30,7 @@ class PackConfig:
     harmonics: HarmonicsCodec = "transform"
     """How the view-dependent colour is stored: transformed and rounded, or by residual codebooks, which take fewer bytes
     and lose more."""
-    harmonics_step: float = 0.03
+    harmonics_step: float = 0.02
     """Step that transformed coefficients are rounded to, in units of the spherical harmonics' coefficients."""
     harmonics_books: int = 4
     """Residual codebooks of the view-dependent colour: bytes a primitive, 1 to 32."""
