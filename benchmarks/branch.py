@@ -33,7 +33,7 @@ from sundae_ns.model import SundaeModel
 RESULTS = Path(__file__).parent / "results" / "branches.jsonl"
 FIELD = ("features_dc", "features_rest", "opacities", "scales", "quats", "features")
 
-EXPERIMENTS = "skip width flip rates cooldown picture_loss_on_base apart average weight_decay".split()
+EXPERIMENTS = "skip width flip rates cooldown picture_loss_on_base apart average weight_decay dropout".split()
 
 
 @dataclass
@@ -74,9 +74,22 @@ class FullResolutionSkip(nn.Module):
 def flipped(head_run: Any) -> Any:
     """The head sees mirrored pictures at random while it trains."""
 
-    def wrapped(self: CompensationHead, image: Tensor) -> Tensor:
+    def wrapped(self: CompensationHead, image: Tensor, dtype: torch.dtype) -> Tensor:
         sides = [side for side in (2, 3) if self.training and torch.rand(()) < 0.5]
-        return head_run(self, image.flip(sides)).flip(sides) if sides else head_run(self, image)
+        return head_run(self, image.flip(sides), dtype).flip(sides) if sides else head_run(self, image, dtype)
+
+    return wrapped
+
+
+def with_dropout(forward: Any, share: float) -> Any:
+    """Whole feature channels are hidden from the head at random while it trains."""
+
+    def wrapped(self: CompensationHead, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
+        if torch.is_grad_enabled():
+            kept = (torch.rand_like(splatted[0, 0]) >= share) / (1 - share)
+            kept[:3] = 1
+            splatted = splatted * kept
+        return forward(self, base, splatted, alpha)
 
     return wrapped
 
@@ -111,8 +124,9 @@ def apart(splat: Any) -> Any:
 def unmoved(forward: Any) -> Any:
     """The head adds to base colours without moving them."""
 
-    def wrapped(self: CompensationHead, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
-        return forward(self, base.detach(), colors.detach(), features, alpha.detach())
+    def wrapped(self: CompensationHead, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
+        splatted = torch.cat([splatted[..., :3].detach(), splatted[..., 3:]], dim=-1)
+        return forward(self, base.detach(), splatted, alpha.detach())
 
     return wrapped
 
@@ -166,6 +180,7 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--apart", action="store_true", help="the head's loss does not move the field")
     parser.add_argument("--average", type=float, help="decay of a moving average of all parameters, which is evaluated")
     parser.add_argument("--weight-decay", type=float, help="decoupled, of the head's weights, times its rate")
+    parser.add_argument("--dropout", type=float, help="share of feature channels hidden from the head at random")
     own, extra = sys.argv[1:], []
     if "--" in own:
         cut = own.index("--")
@@ -202,9 +217,11 @@ def main() -> None:
     if options.width is not None:
         SIZES["compact"] = (options.width, SIZES["compact"][1])
     if options.flip:
-        CompensationHead._run = flipped(CompensationHead._run)  # type: ignore[method-assign]
+        CompensationHead._layers = flipped(CompensationHead._layers)  # type: ignore[method-assign]
     if options.picture_loss_on_base:
         SundaeModel.get_loss_dict = with_picture_loss_on_base(SundaeModel.get_loss_dict)  # type: ignore[method-assign]
+    if options.dropout is not None:
+        CompensationHead.forward = with_dropout(CompensationHead.forward, options.dropout)  # type: ignore[method-assign]
     if options.apart:
         SundaeModel._splat = apart(SundaeModel._splat)  # type: ignore[method-assign]
         CompensationHead.forward = unmoved(CompensationHead.forward)  # type: ignore[method-assign]
@@ -215,7 +232,7 @@ def main() -> None:
             built(self, head)
             inputs = head.num_features + (4 if head.mode == "residual" else 0)
             self.net = FullResolutionSkip(self.net, inputs, options.skip)  # type: ignore[assignment]
-            self._graphed.net = self.net
+            self._can_fuse = False
 
         CompensationHead.__init__ = with_skip  # type: ignore[method-assign]
     run._set_random_seed(options.seed)

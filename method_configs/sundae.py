@@ -137,7 +137,15 @@ sundae_continuous = method(
 sundae_paper = method(
     "sundae-paper",
     "SUNDAE as literal as the paper's text allows: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",
-    pruning=PruningConfig(keep_ratio=0.1, selection="band", score="response", signal="positions", gamma=0.5),
+    pruning=PruningConfig(
+        keep_ratio=0.1,
+        selection="band",
+        score="response",
+        signal="positions",
+        edges="centres",
+        redistribution="none",
+        gamma=0.5,
+    ),
     head=HeadConfig(
         mode="features", size="regular", pixel_unshuffle=1, num_features=13, precision="fp32", max_train_pixels=0
     ),

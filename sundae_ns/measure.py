@@ -73,10 +73,8 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
             with compensation(model, on):
                 times.append(milliseconds(partial(show, camera)))
         if model.head is not None and model.head_active:
-            pictures, _ = model.render(model.gaussians, model.view_of(camera), background)
-            # The blended colours are not among the pictures; the base has their shape, and the time is the same.
-            base, features, alpha = (pictures[name] for name in ("base_rgb", "feature_image", "accumulation"))
-            heads.append(milliseconds(partial(model.head, base, base, features, alpha)))
+            pictures, splat = model.render(model.gaussians, model.view_of(camera), background)
+            heads.append(milliseconds(partial(model.head, pictures["base_rgb"], splat.colors, splat.alpha)))
     return FrameTimes(median(frames), median(splats), median(heads) if heads else 0.0)
 
 

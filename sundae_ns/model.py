@@ -34,7 +34,7 @@ from sundae_ns.datamanager import DATASET_FRAME, NO_PICTURES, SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
-from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
+from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, pixel_detail, response
 from sundae_ns.rasterization import (
     Backend,
     Rasterization,
@@ -61,8 +61,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """When to prune, how many primitives to keep, and which."""
     head: HeadConfig = field(default_factory=HeadConfig)
     """The compensation head."""
-    rasterizer: Literal["auto", "gsplat", "reference"] = "auto"
-    """auto takes gsplat where CUDA works, else the reference in plain PyTorch, which also runs on a CPU."""
+    rasterizer: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
+    """auto takes gsplat where CUDA works, and on a CPU the loops that numba compiles; reference is slow, in plain PyTorch."""
     base_loss_weight: float = 0.2
     """Weight of the loss on the picture without the head, which keeps exported .ply files valid."""
     warm_start: Path | None = None
@@ -265,7 +265,7 @@ class SundaeModel(SplatfactoModel):
     def _pruning_end(self) -> int:
         """Step of the schedule after which the field keeps its primitives."""
         pruning = self.config.pruning
-        return pruning.stop if pruning.mode == "continuous" else pruning.prune_at
+        return pruning.stop if pruning.mode == "continuous" else pruning.last_prune
 
     @property
     def head_active(self) -> bool:
@@ -414,7 +414,7 @@ class SundaeModel(SplatfactoModel):
             assert self.head is not None
             zoom, weight = (1.0, 1.0) if self.training else plan(view.focal, self.trained_focal)
             if zoom == 1.0:
-                rgb = self.head(base, blended, features, splat.alpha)
+                rgb = self.head(base, splat.colors, splat.alpha)
             elif weight > 0:
                 at_scale, _ = self.render(params, view.zoomed(zoom), background, depth=False)
                 correction = at_scale["rgb"] - at_scale["base_rgb"]
@@ -508,7 +508,7 @@ class SundaeModel(SplatfactoModel):
         if of != key:
             try:
                 values = display.response_values(response(field, self.config.pruning).magnitude)
-            except DataError:  # too few primitives for a graph: nothing to show
+            except DataError:  # one primitive has no neighbour: nothing to show
                 values = None
             self._response = (key, values)
         return values
@@ -598,8 +598,9 @@ class SundaeModel(SplatfactoModel):
                 attributes.trainer.save_checkpoint(step)
             raise
         self._refresh(optimizers)
-        if self.schedule_step >= self._pruning_end:
-            notify_pruned(optimizers.schedulers, step)
+        last = self.schedule_step >= self._pruning_end
+        if last or (self._prune_at is not None and self.pruning_state["num_prunes"] > 0):
+            notify_pruned(optimizers.schedulers, step, last=last)
         if report is None:
             return
         CONSOLE.log(report.summary())
@@ -643,12 +644,23 @@ class SundaeModel(SplatfactoModel):
 
     @torch.no_grad()
     def contribution(self, datamanager: SundaeDatamanager) -> Tensor:
-        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``."""
-        params = self.gaussians
+        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``.
+
+        Where the score asks for it, pixels count by the detail of the rendering, for as many cells as primitives seen in it
+        are going to be kept.
+        """
+        params, pruning = self.gaussians, self.config.pruning
+        share = pruning.share(self.num_points)
         total = torch.zeros(self.num_points, device=self.device)
+        # Not the one of training, which may be random: the choice is to be the same from run to run.
+        background = self.background_color.to(self.device)
         cameras = list(datamanager.training_cameras())
         for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
             view = self.view_of(camera)
+            pixels = None
+            if pruning.uses_detail:
+                pictures, splat = self.render(params, view, background, depth=False, compensate=False)
+                pixels = pixel_detail(pictures["base_rgb"], share * float((splat.radii > 0).sum()))
             total += blending_weights(
                 params["means"],
                 params["quats"],
@@ -658,6 +670,7 @@ class SundaeModel(SplatfactoModel):
                 view.K,
                 view.width,
                 view.height,
+                pixels=pixels,
                 backend=self.backend,
             )
         return total

@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1] / "sundae_ns"
 FLOORS = {
     "errors": 0,
+    "nvrtc": 0,
     "graphs": 0,
     "filters": 0,
     "gaussians": 1,
@@ -33,7 +34,7 @@ FLOORS = {
     "cli": 4,
 }
 # Rooms that may import a neighbour on their own floor.
-SAME_FLOOR = {"filters": {"graphs"}}
+SAME_FLOOR = {"graphs": {"nvrtc"}, "filters": {"graphs", "nvrtc"}}
 LISTER = """
 import importlib, json, pkgutil, sys
 room = sys.argv[1]

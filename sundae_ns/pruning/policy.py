@@ -19,11 +19,13 @@ from torch.optim import Optimizer
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, num_primitives
+from sundae_ns.gaussians.rewriting import rewrite
 from sundae_ns.gaussians.surgery import check_wiring, keep, keep_state
 from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.decision import decide
 from sundae_ns.pruning.report import PruneReport
 from sundae_ns.pruning.scores import Contribution
+from sundae_ns.pruning.selection import kept_count
 
 NEVER = -1
 """Value of ``state["pruned_at"]`` before the first prune."""
@@ -116,8 +118,10 @@ class PruningPolicy:
         if dropped:
             # Before the decision: the contribution is a render of the field, and one NaN spoils all of its pixels.
             apply(finite)
-        decision = decide(params, self._config_at(step), contribution, count=self._count())
+        decision = decide(params, self._config_at(step), contribution, count=self._count(state, before - dropped))
         apply(decision.mask)
+        if decision.values is not None:
+            rewrite(params, optimizers, decision.values)
         state["pruned_at"] = step
         state["num_prunes"] += 1
         return PruneReport(
@@ -136,8 +140,8 @@ class PruningPolicy:
         """Options of the prune at a step."""
         return self.config
 
-    def _count(self) -> int | None:
-        """Number of primitives to keep, or None for the keep ratio."""
+    def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
+        """Number of primitives to keep of ``n`` finite ones, or None for the keep ratio."""
         return None
 
 
@@ -150,11 +154,32 @@ class NoPruning(PruningPolicy):
 
 
 class OneShotPruning(PruningPolicy):
-    """Training, then one prune down to ``keep_ratio``, then fine-tuning: the paper's main strategy."""
+    """Training, then one prune down to ``keep_ratio``, then fine-tuning: the paper's main strategy.
+
+    With ``rounds`` the prune is taken in that many steps, each by the same factor, ``round_every`` steps of training apart.
+    The state holds how many primitives there were at first, so that the last round ends at the exact count.
+    """
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """Once, at ``prune_at``; or at once, if training went on from a later step without having pruned."""
-        return state["pruned_at"] == NEVER and step >= self.config.prune_at
+        """At ``prune_at``, or at once, if training went on from a later step without having pruned; then at the rounds."""
+        config, done = self.config, state["num_prunes"]
+        if state["pruned_at"] == NEVER:
+            return step >= config.prune_at
+        return done < config.rounds and step >= state["pruned_at"] + config.round_every
+
+    def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
+        config = self.config
+        if config.rounds == 1:
+            return None
+        first = state.setdefault("first", n)
+        done = state["num_prunes"] + 1
+        return kept_count(config.keep_ratio ** (done / config.rounds), first)
+
+    def _config_at(self, step: int) -> PruningConfig:
+        if self.config.rounds == 1:
+            return self.config
+        # Another draw in each round, and after a resume the same as without it.
+        return replace(self.config, seed=self.config.seed + step)
 
 
 class ContinuousPruning(PruningPolicy):
@@ -175,7 +200,7 @@ class ContinuousPruning(PruningPolicy):
         # Another draw each time, and after a resume the same as without it.
         return replace(self.config, seed=self.config.seed + step)
 
-    def _count(self) -> int | None:
+    def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
         return self.config.max_primitives
 
 
