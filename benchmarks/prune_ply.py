@@ -21,8 +21,10 @@ RULES: list[dict[str, Any]] = [
     {"score": "random"},
     {"score": "opacity", "selection": "top"},
     {"score": "response", "selection": "band", "signal": "positions"},
-    {"score": "contribution"},
-    {"score": "response-contribution"},
+    {"score": "contribution", "selection": "sampled"},
+    {"score": "response-contribution", "selection": "sampled"},
+    {"score": "contribution", "selection": "systematic"},
+    {"score": "response-contribution", "selection": "systematic"},
 ]
 
 

@@ -46,7 +46,7 @@ def prune(
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     keep: float = 0.1,
     score: Literal["response-contribution", "response", "contribution", "opacity", "random"] = "response-contribution",
-    selection: Literal["sampled", "band", "top"] = "sampled",
+    selection: Literal["systematic", "sampled", "band", "top"] = "systematic",
     signal: Literal["attributes", "positions"] = "attributes",
     gamma: float = 0.5,
     seed: int = 0,
@@ -60,8 +60,8 @@ def prune(
         out: the .ply to write; all properties and comments of the source are kept.
         keep: share of the primitives to keep, in (0, 1].
         score: importance of a primitive: high-pass response, contribution, their product, opacity, or random.
-        selection: sampled in proportion to the score, its highest and lowest band (the paper's, with score response and
-            signal positions), or the highest only.
+        selection: by chance in proportion to the score, evenly through space (systematic) or anywhere (sampled); its highest
+            and lowest band (the paper's, with score response and signal positions); or the highest only.
         signal: what the graph filters: position, colour, opacity and size, or positions alone.
         gamma: share that the band selection takes from the high end.
         seed: of random choices.
