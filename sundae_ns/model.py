@@ -30,7 +30,7 @@ from torch import Tensor
 from sundae_ns import checkpoint
 from sundae_ns.budget import Budget
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
-from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
+from sundae_ns.datamanager import DATASET_FRAME, NO_PICTURES, SundaeDatamanager
 from sundae_ns.densification import CappedStrategy, ChainStrategy, start_of_chain
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, peak_memory, psnr, ssim
@@ -748,6 +748,11 @@ class SundaeModel(SplatfactoModel):
     # --------------------------------------------------------------------------------------------- losses and metrics
 
     def _target(self, batch: dict[str, Any], outputs: dict[str, Any]) -> Tensor:
+        if NO_PICTURES in batch:
+            raise DataError(
+                "this run was unpacked without its capture: its cameras are there to look through, not to train or evaluate "
+                "on; give the capture to sundae unpack with --data"
+            )
         truth = _cut(self.get_gt_img(batch["image"]), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
 

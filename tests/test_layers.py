@@ -31,6 +31,7 @@ FLOORS = {
     "model": 3,
     "trainer": 3,
     "measure": 3,
+    "packed_run": 3,
     "method_configs": 4,
     "cli": 4,
 }

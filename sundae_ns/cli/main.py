@@ -10,10 +10,14 @@ from typing import Annotated, Literal
 import tyro
 
 from sundae_ns.cli.bench import app as bench
+from sundae_ns.cli.files import export, prune
+from sundae_ns.cli.packing import pack, unpack
 from sundae_ns.errors import SundaeError
 
 app = tyro.extras.SubcommandApp()
 app.command(bench, name="bench", help="Measure a part of SUNDAE on this machine.")
+for command in (pack, unpack, export, prune):
+    app.command(command)
 
 
 @app.command

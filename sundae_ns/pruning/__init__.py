@@ -9,6 +9,7 @@ from sundae_ns.pruning.coverage import band_shares, inclusion_probabilities, nei
 from sundae_ns.pruning.decision import Decision, decide
 from sundae_ns.pruning.detail import pixel_detail
 from sundae_ns.pruning.edges import field_graph
+from sundae_ns.pruning.footprint import footprint
 from sundae_ns.pruning.policy import ContinuousPruning, NoPruning, OneShotPruning, PruningPolicy, make_policy
 from sundae_ns.pruning.redistribution import grown, heirs, merged
 from sundae_ns.pruning.report import PruneReport
@@ -31,6 +32,7 @@ __all__ = [
     "color_signal",
     "decide",
     "field_graph",
+    "footprint",
     "grown",
     "heirs",
     "inclusion_probabilities",
