@@ -82,7 +82,7 @@ def with_table(text: str, rows: list[RunRow]) -> str:
 def scene_tables(rows: list[RunRow]) -> str:
     """All rows, a table for each scene."""
     heads = ["method", "variant", "keep", "primitives", "PSNR", "SSIM", "PSNR, head off", "MB"]
-    heads += ["ms a frame", "train s", "prune s", "commit", "GPU"]
+    heads += ["ms a frame", "train s", "prune s", "peak primitives", "peak MiB", "commit", "GPU"]
     parts = []
     for scene in dict.fromkeys(row.scene for row in rows):
         own = [row for row in rows if row.scene == scene]
@@ -92,6 +92,7 @@ def scene_tables(rows: list[RunRow]) -> str:
                 *(number(row.primitives, 0), number(row.psnr, 2), number(row.ssim, 4), number(row.psnr_base, 2)),
                 *(number(row.bytes_total / MB, 1), number(row.ms_frame, 2)),
                 *(number(row.train_s, 0), number(row.prune_s, 1)),
+                *(number(row.peak_primitives, 0), number(row.peak_vram_mib, 0)),
                 *(row.commit, row.gpu.replace("NVIDIA ", "")),
             ]
             for row in sorted(own, key=lambda row: (row.method, row.commit, row.variant))

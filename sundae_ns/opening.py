@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import torch
@@ -20,7 +21,9 @@ from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
+from sundae_ns.packed_run import write_run
 from sundae_ns.pruning import PruningConfig
+from sundae_ns.storage.packing import is_packed, read_scene
 
 
 @dataclass(frozen=True)
@@ -39,31 +42,67 @@ class Opened:
     method: str
     variant: str
     keep_ratio: float | None
-    seed: int
+    seed: int | None
+    """None where it is not known, as of a packed scene."""
     steps: int
     """Training steps that were done."""
     prune_s: float | None
     """Seconds that its prunes took; None where nothing is known of them."""
     curves: Path | None
     """Folder to look for tensorboard's event files in; None where there cannot be any."""
+    packed_bytes: int | None = None
+    """Size of the packed file that was opened; None of a run."""
 
 
 def open_scene(path: Path, *, data: Path | None = None) -> Opened:
     """Open a finished scene. This is the one place that knows the kinds; a new kind is one more branch here.
 
     Args:
-        path: folder of a run, or its ``config.yml``. The file is a program (see README): open your own.
-        data: where the capture is, if not where the run says.
+        path: folder of a run, or its ``config.yml``, which is a program (see README): open your own. Or a packed scene,
+            of which nothing is run.
+        data: where the capture is, if not where the run says. A packed scene does not say.
 
     Raises:
         CheckpointError: nothing there that can be opened.
         DataError: the capture is gone, or cannot be used.
+        PackError: the packed scene is damaged, or states what cannot be.
     """
+    if is_packed(path):
+        return open_packed(path, data=data)
     config = path / "config.yml" if path.is_dir() else path
     if config.name == "config.yml" and config.is_file():
         return open_run(config, data=data)
     reason = "is no run" if path.exists() else "does not exist"
-    raise CheckpointError(f"{path} {reason}; give the folder of a finished run, or its config.yml")
+    raise CheckpointError(f"{path} {reason}; give the folder of a finished run, its config.yml, or a packed scene")
+
+
+def open_packed(path: Path, *, data: Path | None) -> Opened:
+    """Open a file that ``sundae pack`` wrote, with the capture that it was trained on.
+
+    Raises:
+        DataError: it is not said where the capture is, or it cannot be used.
+        PackError: the file is damaged, or states what cannot be.
+    """
+    if data is None:
+        raise DataError(f"{path} is a packed scene, which does not say where its capture is; say it with --data")
+    scene = read_scene(path)
+    with TemporaryDirectory() as folder:
+        opened = open_run(write_run(scene, Path(folder), path.stem, data=data))
+    source = scene.meta.get("source")
+    source = source if isinstance(source, dict) else {}
+    step = source.get("step")
+    return replace(
+        opened,
+        source=path,
+        method=str(source.get("method") or opened.method),
+        variant=path.name,
+        keep_ratio=None,
+        seed=None,
+        steps=step + 1 if isinstance(step, int) else 0,
+        prune_s=None,
+        curves=None,
+        packed_bytes=path.stat().st_size,
+    )
 
 
 def open_run(path: Path, *, data: Path | None = None) -> Opened:

@@ -3,8 +3,10 @@
 from sundae_ns.evaluation import display
 from sundae_ns.evaluation.flicker import Change, Frame, change
 from sundae_ns.evaluation.flip import flip, flip_available
+from sundae_ns.evaluation.lazy import Later, LazyOutputs
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
 from sundae_ns.evaluation.measured import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality
+from sundae_ns.evaluation.memory import peak_memory
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.evaluation.picture import ComparisonRow, comparison_sheet, save_comparison, side_by_side
 from sundae_ns.evaluation.records import COLUMNS, RunRow, append_row, read_rows
@@ -19,6 +21,8 @@ __all__ = [
     "ComparisonRow",
     "Configuration",
     "Frame",
+    "Later",
+    "LazyOutputs",
     "Lpips",
     "Measured",
     "Quality",
@@ -36,6 +40,7 @@ __all__ = [
     "lpips_weights_path",
     "lpips_weights_url",
     "median_ms",
+    "peak_memory",
     "psnr",
     "read_rows",
     "report_tables",

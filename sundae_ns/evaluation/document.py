@@ -61,7 +61,8 @@ def document(
         "Each line is one way of rendering a field; its time and its errors are of the very same calls.",
         "Metrics are means over the test views: PSNR over all pixels and channels; SSIM of pytorch_msssim (11 x 11, valid",
         f"window); FLIP is {VARIANT}; LPIPS with the net that is named. ms: median over the views, device waited for.",
-        "MB are 1e6 bytes in fp32 of all that this way of rendering needs: without the head neither network nor features.",
+        "MB are 1e6 bytes in fp32 of all that this way of rendering needs: without the head neither network nor features;",
+        "of a packed scene, the whole file.",
         "",
     ]
     nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})

@@ -35,7 +35,7 @@ class Configuration:
     ms: float | None
     """Milliseconds a frame, device waited for: median over the test views; None if it was not timed."""
     bytes: int
-    """All that it needs on disk, in fp32: without the head neither network nor features."""
+    """All that it needs on disk, in fp32: without the head neither network nor features. Of a packed scene, the file."""
     views: tuple[ViewQuality, ...]
     """In the order of the test views."""
 
@@ -58,7 +58,8 @@ class Measured:
     method: str
     variant: str
     keep_ratio: float | None
-    seed: int
+    seed: int | None
+    """None where the file does not say."""
     steps: int
     primitives: int
     bytes_primitives: int
@@ -72,6 +73,7 @@ class Measured:
     lpips_net: str = ""
     train_s: float | None = None
     prune_s: float | None = None
+    peak_primitives: int | None = None
     peak_vram_mib: float | None = None
     gpu: str = ""
     """Device that rendered: its name; empty for a CPU."""
@@ -123,6 +125,7 @@ class Measured:
             ms_head=self.ms_head,
             train_s=self.train_s,
             prune_s=self.prune_s,
+            peak_primitives=self.peak_primitives,
             peak_vram_mib=self.peak_vram_mib,
             gpu=self.gpu,
             resolution=self.resolution,
