@@ -31,7 +31,6 @@ FLOORS = {
     "model": 3,
     "trainer": 3,
     "opening": 3,
-    "peers": 3,
     "measure": 3,
     "packed_run": 3,
     "method_configs": 4,

@@ -13,7 +13,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,7 @@ from sundae_ns.cli.bench.plan import Job
 from sundae_ns.errors import BackendError, CheckpointError, SundaeError
 from sundae_ns.evaluation import Lpips, lpips_weights_available
 from sundae_ns.measure import measure_scene
-from sundae_ns.model import SundaeModelConfig
 from sundae_ns.opening import open_scene
-from sundae_ns.peers import McmcModelConfig
 from sundae_ns.storage.atomic import write_text
 
 with contextlib.suppress(ImportError):  # Windows has none.
@@ -96,7 +94,7 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
         CheckpointError: the warm-up that it needs is not done.
     """
     cuda = torch.cuda.is_available()
-    if job.kind in ("stock", "mcmc") and not cuda:
+    if job.kind == "stock" and not cuda:
         raise BackendError(f"{job.arm} needs a CUDA device and gsplat's kernels; leave it out with --arms here")
     config, command = configure(job, out)
     # What an attempt that was stopped has left: its records would be taken for this one's.
@@ -111,6 +109,7 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
         if cuda:
             torch.cuda.reset_peak_memory_stats()
             torch.cuda.synchronize()
+        primitives = _Peak(trainer)
         started = time.perf_counter()
         trainer.train()
         if cuda:
@@ -123,12 +122,14 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
     _forget()
     opened = open_scene(folder)
     lpips = Lpips(download=False) if lpips_weights_available() else None
+    measured = measure_scene(opened, label=job.key, lpips=lpips, command=command)
     measured = replace(
-        measure_scene(opened, label=job.key, lpips=lpips, command=command),
+        measured,
         scene=job.scene,
         variant=job.arm,
         seed=job.seed,
         train_s=seconds,
+        peak_primitives=max(measured.peak_primitives or 0, primitives.peak),
         peak_vram_mib=peak,
     )
     if job.keep_ratio is not None:
@@ -146,25 +147,18 @@ def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
     arguments += ["--max-num-iterations", str(job.steps), *job.options]
     if job.kind == "branch":
         arguments += ["--pipeline.model.warm-start", str(_run_folder(out, job.needs) / "nerfstudio_models")]
+    if job.kind == "mcmc":
+        arguments += ["--pipeline.model.mcmc-cap", str(_cap(job, out))]
     arguments += job.parser
     config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)  # type: ignore[arg-type]
     assert isinstance(config, TrainerConfig)
     config.pipeline.datamanager.data = config.data
-    if job.kind == "mcmc":
-        config.pipeline.model = _mcmc(config.pipeline.model, _cap(job, out))
     config.output_dir = job_folder(out, job.key)
     config.experiment_name, config.timestamp = job.arm, "run"
     config.vis = "tensorboard"
     config.steps_per_save = config.steps_per_eval_batch = NEVER
     config.steps_per_eval_image = config.steps_per_eval_all_images = NEVER
     return config, "ns-train " + " ".join(job.scene if word == job.data else word for word in arguments)
-
-
-def _mcmc(model: Any, cap: int) -> McmcModelConfig:
-    """The same options for the peer's model."""
-    options = {field.name: getattr(model, field.name) for field in fields(SundaeModelConfig) if field.init}
-    options.pop("_target")
-    return McmcModelConfig(**options, cap=cap)
 
 
 def _cap(job: Job, out: Path) -> int:
@@ -181,6 +175,19 @@ def _run_folder(out: Path, key: str | None) -> Path:
         raise CheckpointError(f"the warm-up {key} is not done; run the whole plan")
     # Not what the result says: the folder of a comparison may have moved since.
     return job_folder(out, str(key)) / result["job"]["arm"] / result["job"]["method"] / "run"
+
+
+class _Peak:
+    """Most primitives before any step of a training. Fields of ours know of those within a step too."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.peak = 0
+        self._trainer, self._step = trainer, trainer.train_iteration
+        trainer.train_iteration = self  # type: ignore[method-assign,assignment]
+
+    def __call__(self, step: int) -> Any:
+        self.peak = max(self.peak, self._trainer.pipeline.model.num_points)
+        return self._step(step)
 
 
 class _Nothing(torch.nn.Module):

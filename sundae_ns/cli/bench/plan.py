@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,14 +12,18 @@ from sundae_ns.errors import ConfigError, DataError
 
 Kind = Literal["warm-up", "branch", "mcmc", "stock"]
 
+PLAIN = ("--pipeline.model.pruning.edges", "centres", "--pipeline.model.pruning.redistribution", "none")
+
 RULES: dict[str, tuple[str, ...]] = {
     "sundae": (),
     "band": (
         *("--pipeline.model.pruning.score", "response", "--pipeline.model.pruning.selection", "band"),
-        *("--pipeline.model.pruning.signal", "positions"),
+        *("--pipeline.model.pruning.signal", "positions", *PLAIN),
     ),
-    "contribution": ("--pipeline.model.pruning.score", "contribution", "--pipeline.model.pruning.selection", "top"),
-    "random": ("--pipeline.model.pruning.score", "random"),
+    "contribution": (
+        *("--pipeline.model.pruning.score", "contribution", "--pipeline.model.pruning.selection", "top", *PLAIN),
+    ),
+    "random": ("--pipeline.model.pruning.score", "random", "--pipeline.model.pruning.selection", "sampled", *PLAIN),
 }
 """Pruning rules by name, as options: ours; the paper's; the highest contribution, as LightGaussian prunes; the control."""
 
@@ -78,27 +81,6 @@ class Schedule:
             raise ConfigError(f"steps-scale is {factor}; give a positive factor, 0.01 for a trial")
         lengths = (self.warmup, self.finetune, self.stock, self.stock_short)
         return Schedule(self.method, *(max(round(length * factor), 1) for length in lengths))
-
-
-@dataclass(frozen=True)
-class Shard:
-    """Part ``index`` of ``count``, counted from 1."""
-
-    index: int = 1
-    count: int = 1
-
-    @staticmethod
-    def parse(text: str) -> Shard:
-        """From ``i/n``.
-
-        Raises:
-            ConfigError: it is not of that form, or there is no such part.
-        """
-        found = re.fullmatch(r"(\d+)/(\d+)", text)
-        index, count = (int(found[1]), int(found[2])) if found else (0, 0)
-        if not 1 <= index <= count:
-            raise ConfigError(f"shard is {text!r}; give i/n with i from 1 to n: 1/4, 2/4, 3/4 and 4/4 cut in four")
-        return Shard(index, count)
 
 
 def schedule_of(method: str, *, warmup: int | None, finetune: int | None, scale: float) -> Schedule:
@@ -235,8 +217,9 @@ def _branch_options(arm: str, ratio: float, seed: int, steps: int) -> tuple[str,
 
 def _mcmc_options(steps: int) -> tuple[str, ...]:
     return (
+        *("--pipeline.model.warmup", "mcmc"),
         *("--pipeline.model.pruning.mode", "off", "--pipeline.model.head.mode", "off"),
-        # gsplat's own share: 25,000 of 30,000.
+        # The share of its authors: 25,000 of 30,000.
         *("--pipeline.model.stop-split-at", str(max(steps * 5 // 6, 1))),
         *("--optimizers.means.scheduler.max-steps", str(steps)),
     )
@@ -261,12 +244,11 @@ def _check(arms: Sequence[str], keep_ratios: Sequence[float], seeds: Sequence[in
         )
 
 
-def jobs_of_shard(jobs: Sequence[Job], shard: Shard) -> list[Job]:
-    """The jobs of one part, with the warm-ups that they need; parts share nothing but those.
+def jobs_of_shard(jobs: Sequence[Job], index: int, parts: int) -> list[Job]:
+    """The jobs of part ``index``, counted from 0, with the warm-ups that they need; parts share nothing but those.
 
     Warm-ups are not dealt out: a part makes those that are not there yet, and finds the others finished.
     """
-    own = [job for job in jobs if job.kind != "warm-up"][shard.index - 1 :: shard.count]
-    needed = {job.needs for job in own}
-    keys = {job.key for job in own} | {key for key in needed if key is not None}
+    own = [job for job in jobs if job.kind != "warm-up"][index::parts]
+    keys = {job.key for job in own} | {job.needs for job in own}
     return [job for job in jobs if job.key in keys]

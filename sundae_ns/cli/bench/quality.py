@@ -12,9 +12,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
-from sundae_ns.cli.bench.plan import Job, Shard, jobs_of_shard, parser_of, plan_scene, schedule_of
+from sundae_ns.cli.bench.plan import Job, jobs_of_shard, parser_of, plan_scene, schedule_of
 from sundae_ns.cli.bench.recipes import plan_paper
 from sundae_ns.cli.bench.results import Result, paper_page, quality_page, read_results, write_results
+from sundae_ns.cli.bench.shards import parse_shard
 from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.evaluation.document import table
@@ -53,7 +54,7 @@ def run_quality(
         DataError: there is no such capture.
         StorageError: the folder cannot be written to.
     """
-    console, part = console or Console(), Shard.parse(shard)
+    console, part = console or Console(), parse_shard(shard)
     schedule = schedule_of(method, warmup=warmup_steps, finetune=finetune_steps, scale=steps_scale)
     data = scene.resolve()
     plan = plan_scene(
@@ -67,10 +68,10 @@ def run_quality(
         repeat_at=repeat_at,
     )
     if jobs:
-        show_jobs(jobs_of_shard(plan, part), out, console)
+        show_jobs(jobs_of_shard(plan, *part), out, console)
         return 0
     command = shlex.join(["sundae", "bench", "quality", str(scene), "-o", str(out)])
-    failed = run_jobs(jobs_of_shard(plan, part), out, runner or spawn, console)
+    failed = run_jobs(jobs_of_shard(plan, *part), out, runner or spawn, console)
     return _finish(out, failed, lambda results: quality_page(results, command), console)
 
 
@@ -96,16 +97,16 @@ def run_paper(
     Raises:
         ConfigError, DataError, StorageError: as in :func:`run_quality`.
     """
-    console, part = console or Console(), Shard.parse(shard)
+    console, part = console or Console(), parse_shard(shard)
     schedule = schedule_of(method, warmup=warmup_steps, finetune=finetune_steps, scale=steps_scale)
     plan, missing = plan_paper(root.resolve(), schedule, scenes=scenes, arms=arms, keep_ratios=keep_ratios, seed=seed)
     if missing:
         console.print(f"[yellow]Not there, and left out: {', '.join(missing)}", highlight=False)
     if jobs:
-        show_jobs(jobs_of_shard(plan, part), out, console)
+        show_jobs(jobs_of_shard(plan, *part), out, console)
         return 0
     command = shlex.join(["sundae", "bench", "paper", str(root), "-o", str(out)])
-    failed = run_jobs(jobs_of_shard(plan, part), out, runner or spawn, console)
+    failed = run_jobs(jobs_of_shard(plan, *part), out, runner or spawn, console)
     return _finish(out, failed, lambda results: paper_page(results, missing, command), console)
 
 
