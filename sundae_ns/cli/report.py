@@ -57,7 +57,9 @@ def run_report(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise storage_error(f"cannot make {out}", error) or error from error
-    command = shlex.join(["sundae", "report", *map(str, paths), "-o", str(out)])
+    words = ["sundae", "report", *map(str, paths), "-o", str(out), "--lpips-net", lpips_net]
+    words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
+    command = shlex.join(words)
     lpips = Lpips(lpips_net, download=False) if lpips_weights_available(lpips_net) else None
     runs: list[Measured] = []
     curves: dict[str, Curves] = {}

@@ -99,7 +99,7 @@ def plot_costs(path: Path, runs: Sequence[Measured], colors: Mapping[str, Any], 
         colors: from :func:`colors_of`.
         printed: the paper's rows of that scene.
     """
-    axes = (("ms", "ms a frame"), ("MB", "MB (fp32)"), ("primitives", "primitives"))
+    axes = (("ms", "ms a frame"), ("MB", "MB"), ("primitives", "primitives"))
     figure, panels = _figure(2, 3)
     shown = False
     for line, (metric, unit) in zip(panels, (("psnr", "PSNR, dB"), ("ssim", "SSIM")), strict=True):
@@ -221,7 +221,9 @@ def plot_curves(path: Path, curves: Mapping[str, Curves], colors: Mapping[str, A
     faint = len(curves) <= _FAINT_RUNS
     for label, run in curves.items():
         _noisy(loss, run.loss, colors[label], faint)
-        count.plot(run.primitives.steps, run.primitives.values, color=colors[label], linewidth=1.3)
+        # Steps, not slopes: a prune happens at once.
+        style = {"color": colors[label], "linewidth": 1.3, "drawstyle": "steps-post"}
+        count.plot(run.primitives.steps, run.primitives.values, **style)
         _noisy(psnr, run.psnr, colors[label], faint)
         if run.psnr_base.values != run.psnr.values:
             _noisy(psnr, run.psnr_base, colors[label], False, linestyle="--")

@@ -24,7 +24,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler, writer
 
-from sundae_ns.cli.bench.plan import Job
+from sundae_ns.cli.bench.plan import Job, done_file, job_folder
 from sundae_ns.errors import BackendError, CheckpointError, SundaeError
 from sundae_ns.evaluation import Lpips, lpips_weights_available
 from sundae_ns.measure import measure_scene
@@ -35,16 +35,6 @@ with contextlib.suppress(ImportError):  # Windows has none.
     import fcntl
 
 NEVER = 10**9
-
-
-def done_file(out: Path, key: str) -> Path:
-    """Where the result of a finished job lies: one line of JSON, so that files merge by concatenation."""
-    return out / "done" / f"{key}.json"
-
-
-def job_folder(out: Path, key: str) -> Path:
-    """Where a job keeps its description, its log and its run."""
-    return out / "jobs" / key
 
 
 def read_result(path: Path) -> dict[str, Any] | None:

@@ -252,3 +252,13 @@ def jobs_of_shard(jobs: Sequence[Job], index: int, parts: int) -> list[Job]:
     own = [job for job in jobs if job.kind != "warm-up"][index::parts]
     keys = {job.key for job in own} | {job.needs for job in own}
     return [job for job in jobs if job.key in keys]
+
+
+def done_file(out: Path, key: str) -> Path:
+    """Where the result of a finished job lies: one line of JSON, so that files merge by concatenation."""
+    return out / "done" / f"{key}.json"
+
+
+def job_folder(out: Path, key: str) -> Path:
+    """Where a job keeps its description, its log and its run."""
+    return out / "jobs" / key

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
-from sundae_ns.cli.bench.plan import Job, jobs_of_shard, parser_of, plan_scene, schedule_of
+from sundae_ns.cli.bench.plan import Job, done_file, job_folder, jobs_of_shard, parser_of, plan_scene, schedule_of
 from sundae_ns.cli.bench.recipes import plan_paper
 from sundae_ns.cli.bench.results import Result, paper_page, quality_page, read_results, write_results
 from sundae_ns.cli.bench.shards import parse_shard
@@ -70,7 +71,18 @@ def run_quality(
     if jobs:
         show_jobs(jobs_of_shard(plan, *part), out, console)
         return 0
-    command = shlex.join(["sundae", "bench", "quality", str(scene), "-o", str(out)])
+    command = _command(
+        ["sundae", "bench", "quality", str(scene), "-o", str(out)],
+        arms=arms,
+        keep_ratios=keep_ratios,
+        seeds=seeds,
+        repeat_at=repeat_at,
+        method=method,
+        warmup_steps=warmup_steps,
+        finetune_steps=finetune_steps,
+        steps_scale=steps_scale,
+        downscale=downscale,
+    )
     failed = run_jobs(jobs_of_shard(plan, *part), out, runner or spawn, console)
     return _finish(out, failed, lambda results: quality_page(results, command), console)
 
@@ -105,9 +117,28 @@ def run_paper(
     if jobs:
         show_jobs(jobs_of_shard(plan, *part), out, console)
         return 0
-    command = shlex.join(["sundae", "bench", "paper", str(root), "-o", str(out)])
+    command = _command(
+        ["sundae", "bench", "paper", str(root), "-o", str(out)],
+        scenes=scenes,
+        arms=arms,
+        keep_ratios=keep_ratios,
+        seed=seed,
+        method=method,
+        warmup_steps=warmup_steps,
+        finetune_steps=finetune_steps,
+        steps_scale=steps_scale,
+    )
     failed = run_jobs(jobs_of_shard(plan, *part), out, runner or spawn, console)
     return _finish(out, failed, lambda results: paper_page(results, missing, command), console)
+
+
+def _command(words: list[str], **options: object) -> str:
+    """The command that a page names: that of the whole, whichever part of it was done here."""
+    for name, value in options.items():
+        values = [value] if isinstance(value, str) or not isinstance(value, Sequence) else list(value)
+        if values and values != [None]:
+            words += [f"--{name.replace('_', '-')}", *map(str, values)]
+    return shlex.join(words)
 
 
 def show_jobs(jobs: Sequence[Job], out: Path, console: Console) -> None:
@@ -133,6 +164,9 @@ def run_jobs(jobs: Sequence[Job], out: Path, runner: Runner, console: Console) -
     for job in jobs:
         if job.key in done:
             _check_same(job, done[job.key], out)
+    # Results may have come without the runs that they are of, and a branch needs its warm-up itself.
+    needed = {job.needs for job in jobs if job.key not in done}
+    done = {key: result for key, result in done.items() if key not in needed or done_file(out, key).exists()}
     failed: dict[str, str] = {}
     columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
@@ -161,7 +195,8 @@ def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
         if percent is not None:
             on_percent(percent)
 
-    log = out / "jobs" / job.key / "log.txt"
+    # Another shard may wait for the same warm-up meanwhile.
+    log = job_folder(out, job.key) / f"log-{os.getpid()}.txt"
     try:
         run_logged([sys.executable, "-m", "sundae_ns.cli.bench.job", str(out), job.key], log, on_line)
     except SundaeError as error:
@@ -172,7 +207,7 @@ def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
 
 
 def _describe(job: Job, out: Path) -> None:
-    folder = out / "jobs" / job.key
+    folder = job_folder(out, job.key)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

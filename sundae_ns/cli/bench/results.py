@@ -73,6 +73,10 @@ def _group(results: Sequence[Result]) -> dict[tuple[str, str, float | None], lis
     return dict(sorted(groups.items(), key=lambda item: (item[0][0], item[0][2] or -1.0, order.get(item[0][1], 99))))
 
 
+def _percent(ratio: float | None) -> str:
+    return "" if ratio is None else f"{100 * ratio:g}%"
+
+
 def spread(values: Sequence[float | None], digits: int) -> str:
     """Mean and, of several, the standard deviation: ``29.03 ± 0.12``; a dash where one is missing."""
     mean = number(_mean(values), digits)
@@ -91,9 +95,10 @@ def quality_page(results: Sequence[Result], command: str) -> str:
     lines = ["# Comparison of quality", "", f"    {command}", ""]
     lines += [
         "Mean over the seeds, ± their standard deviation. Warm-ups are shared by all arms of a seed; keep is a share of their",
-        "primitives. Arms: ours (`sundae`), the paper's band rule on positions (`band`), the highest contribution, as",
-        "LightGaussian prunes (`contribution`), the control (`random`), each with the head and without one (`-no-head`);",
-        "gsplat's MCMC strategy with as many primitives as the arms keep (`mcmc`); stock splatfacto.",
+        "primitives, and their training comes before the arms' own. Arms: ours (`sundae`), the paper's band rule on positions",
+        "(`band`), the highest contribution, as LightGaussian prunes (`contribution`), the control (`random`), each with the",
+        "head and without one (`-no-head`); 3DGS-MCMC of warm-up and fine-tuning together, with as many primitives as the arms",
+        "keep (`mcmc`); stock splatfacto of nerfstudio. ms, MB and errors of a line are of the same way of rendering.",
     ]
     heads = ["arm", "rendered with", "keep", "seeds", "primitives", "PSNR, dB", "SSIM", "FLIP", "LPIPS", "MB"]
     heads += ["ms a frame", "training, s"]
@@ -106,7 +111,7 @@ def quality_page(results: Sequence[Result], command: str) -> str:
                 head = "no head" if len(ways[0]) == 1 else chosen[0]["name"]
                 rows.append(
                     [
-                        *(arm, head, "" if ratio is None else f"{ratio:.4g}", str(len(own))),
+                        *(arm, head, _percent(ratio), str(len(own))),
                         spread([r["measured"]["primitives"] for r in own], 0),
                         *(
                             spread([c["mean"][metric] for c in chosen], digits)
@@ -135,7 +140,7 @@ def paper_page(results: Sequence[Result], missing: Sequence[str], command: str) 
     ]
     for metric, digits in (("psnr", 2), ("ssim", 4)):
         name = {"psnr": "PSNR, dB", "ssim": "SSIM"}[metric]
-        heads = ["scene", *(f"{arm}" + ("" if ratio is None else f" {ratio:.0%}") for arm, ratio in arms)]
+        heads = ["scene", *(f"{arm} {_percent(ratio)}".rstrip() for arm, ratio in arms)]
         shares = [0.01, 0.1, 0.3, 0.5]
         heads += [f"*paper {share:.0%}*" for share in shares]
         rows = []
@@ -172,7 +177,7 @@ def _sizes(groups: Mapping[tuple[str, str, float | None], Sequence[Result]]) -> 
         with_head = full[0]["name"] != HEAD_OFF
         rows.append(
             [
-                *(scene, arm, "" if ratio is None else f"{ratio:.0%}"),
+                *(scene, arm, _percent(ratio)),
                 spread([r["measured"]["primitives"] for r in own], 0),
                 spread([way["bytes"] / MEGABYTE for way in full], 1),
                 *(spread([way["ms"] for way in full], 2), spread([way["mean"]["psnr"] for way in full], 2)),
