@@ -17,6 +17,8 @@ from sundae_ns.cli import main
 from sundae_ns.evaluation import COLUMNS, flip_available, read_rows
 from sundae_ns.measure import quality
 from sundae_ns.opening import open_scene
+from sundae_ns.packed_run import scene_of_run
+from sundae_ns.storage.packing import write_scene
 
 
 def sundae(*arguments: object) -> int:
@@ -150,3 +152,23 @@ def test_a_capture_that_moved(tiny: Any, stock: Path, tmp_path: Path, capsys: py
     (row,) = read_rows(tmp_path / "out" / "report.csv")
     assert row.ms_frame is row.ms_splat is None
     assert row.psnr is not None
+
+
+def test_a_packed_scene_counts_the_bytes_of_its_file(
+    report: Path, tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    packed = tmp_path / "tiny.sundae"
+    with torch.no_grad():
+        write_scene(packed, scene_of_run(tiny.folder))
+    assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0) == 2
+    assert "say it with --data" in one_line(capsys)
+    assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0, "--data", tiny.scene) == 0
+    (row,) = read_rows(tmp_path / "out" / "report.csv")
+    before = read_rows(report / "report.csv")[0]
+    assert row.bytes_total == packed.stat().st_size < before.bytes_total
+    assert (row.method, row.variant, row.steps) == ("sundae-tiny", "tiny.sundae", tiny.steps)
+    assert (row.primitives, row.seed, row.keep_ratio) == (before.primitives, None, None)
+    assert before.psnr is not None
+    assert before.psnr_base is not None
+    assert row.psnr == pytest.approx(before.psnr, abs=0.15)
+    assert row.psnr_base == pytest.approx(before.psnr_base, abs=0.15)
