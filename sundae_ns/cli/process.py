@@ -39,12 +39,17 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
             errors="replace",
         )
         assert process.stdout is not None
-        for line in process.stdout:
-            file.write(line)
-            last.append(line.rstrip())
-            if on_line is not None:
-                on_line(line)
-        code = process.wait()
+        try:
+            for line in process.stdout:
+                file.write(line)
+                last.append(line.rstrip())
+                if on_line is not None:
+                    on_line(line)
+            code = process.wait()
+        except BaseException:  # above all an interrupt, which should not leave it behind
+            process.terminate()
+            process.wait()
+            raise
     if code != 0:
         tail = "\n".join(last)
         raise SundaeError(

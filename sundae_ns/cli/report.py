@@ -90,7 +90,10 @@ def run_report(
                 curves[label] = found
                 measured = replace(measured, peak_vram_mib=max(found.memory.values, default=0.0) or None)
             elif opened.curves is not None:
-                notes.append(f"Curves of {label}: there are no event files of tensorboard in {opened.curves}.")
+                notes.append(
+                    f"Curves of {label}: there are no event files of tensorboard in {opened.curves}; "
+                    "--vis viewer+tensorboard writes them."
+                )
             runs.append(measured)
             progress.remove_task(task)
             progress.advance(everything)

@@ -25,6 +25,9 @@ from sundae_ns.storage.atomic import storage_error, write_text
 SAID = "sundae: "
 """How a line begins in which a job says why it ends."""
 
+STOPPED = 130
+"""Exit code after an interrupt, as shells have it."""
+
 OnPercent = Callable[[float], object]
 Runner = Callable[[Job, Path, OnPercent], None]
 """Does one job, and leaves its result in ``done/``."""
@@ -83,8 +86,8 @@ def run_quality(
         steps_scale=steps_scale,
         downscale=downscale,
     )
-    failed = run_jobs(jobs_of_shard(plan, *part), out, runner or spawn, console)
-    return _finish(out, failed, lambda results: quality_page(results, command), console)
+    own = jobs_of_shard(plan, *part)
+    return _carry_out(own, out, runner or spawn, lambda results: quality_page(results, command), console)
 
 
 def run_paper(
@@ -128,8 +131,8 @@ def run_paper(
         finetune_steps=finetune_steps,
         steps_scale=steps_scale,
     )
-    failed = run_jobs(jobs_of_shard(plan, *part), out, runner or spawn, console)
-    return _finish(out, failed, lambda results: paper_page(results, missing, command), console)
+    own = jobs_of_shard(plan, *part)
+    return _carry_out(own, out, runner or spawn, lambda results: paper_page(results, missing, command), console)
 
 
 def _command(words: list[str], **options: object) -> str:
@@ -230,7 +233,15 @@ def _check_same(job: Job, result: Result, out: Path) -> None:
         )
 
 
-def _finish(out: Path, failed: dict[str, str], page: Callable[[Sequence[Result]], str], console: Console) -> int:
+def _carry_out(
+    jobs: Sequence[Job], out: Path, runner: Runner, page: Callable[[Sequence[Result]], str], console: Console
+) -> int:
+    """Do the jobs and write the tables; the exit code."""
+    try:
+        failed = run_jobs(jobs, out, runner, console)
+    except KeyboardInterrupt:
+        console.print("stopped; the same command goes on from here", highlight=False)
+        return STOPPED
     results = read_results(out)
     if results:
         write_results(out, results, page(results))
