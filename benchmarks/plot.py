@@ -57,7 +57,7 @@ def main() -> None:
             panel.set_ylabel("test PSNR, dB")
             panel.set_title(f"{scene}, {own[0]['resolution']} px")
             panel.grid(alpha=0.3)
-        line[1].legend(fontsize=7)
+        line[0].legend(fontsize=7, loc="center right")
     FIGURE.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(FIGURE, dpi=110)
     print(f"wrote {FIGURE}")
