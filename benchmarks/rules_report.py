@@ -49,27 +49,42 @@ def tables(groups: Groups) -> None:
             print(f"| {rule} | " + " | ".join(cells) + " |")
 
 
-def bars(groups: Groups, path: Path) -> None:
-    panels = [(group, keep) for group, lines in groups.items() for keep in sorted({line["keep"] for line in lines})]
+def dots(groups: Groups, path: Path) -> None:
+    """One panel a capture, budget and length: PSNR of every rule, distance to random draws, a dot a seed."""
     columns = max(len({line["keep"] for line in lines}) for lines in groups.values())
+    most = [
+        max(len({x["rule"] for x in lines if x["keep"] == line["keep"]}) for line in lines) for lines in groups.values()
+    ]
+    heights = [0.9 + 0.19 * count for count in most]
     figure, axes = plt.subplots(
-        len(groups), columns, figsize=(4.6 * columns, 4.4 * len(groups)), layout="constrained", squeeze=False
+        len(groups),
+        columns,
+        figsize=(4.6 * columns, sum(heights)),
+        height_ratios=heights,
+        layout="constrained",
+        squeeze=False,
     )
-    for axis in axes.flat:
-        axis.set_visible(False)
-    for row, group in enumerate(groups):
-        for column, (_, keep) in enumerate(p for p in panels if p[0] == group):
-            axis, lines = axes[row][column], [line for line in groups[group] if line["keep"] == keep]
-            axis.set_visible(True)
+    for row, (group, everything) in enumerate(groups.items()):
+        keeps = sorted({line["keep"] for line in everything})
+        for axis in axes[row][len(keeps) :]:
+            axis.set_visible(False)
+        for axis, keep in zip(axes[row], keeps, strict=False):
+            lines = [line for line in everything if line["keep"] == keep]
             names = sorted({line["rule"] for line in lines}, key=lambda n: mean(_of(lines, n)))
+            start = mean(_of(lines, "random")) if "random" in names else None
+            if start is not None:
+                axis.axvline(start, color="0.8", linewidth=1)
             for place, name in enumerate(names):
                 values = _of(lines, name)
-                axis.barh(place, mean(values), color="0.75" if name in rules.CONTROLS else "tab:blue")
-                axis.plot(values, [place] * len(values), ".", color="black", markersize=4)
+                color = "0.5" if name in (*rules.CONTROLS, "mcmc") else "tab:blue"
+                if start is not None:
+                    axis.plot([start, mean(values)], [place] * 2, color=color, linewidth=2, alpha=0.5)
+                axis.plot(values, [place] * len(values), "o", color=color, markersize=5)
             axis.set_yticks(range(len(names)), names, fontsize=7)
-            axis.set_xlim(min(_of(lines, names[0])) - 0.5)
+            axis.set_ylim(-0.7, len(names) - 0.3)
             axis.set_title(f"{group[0]}, {keep:.0%}, {group[1]:,} steps", fontsize=9)
-            axis.set_xlabel("test PSNR, dB")
+            axis.set_xlabel("test PSNR, dB", fontsize=8)
+            axis.tick_params(axis="x", labelsize=7)
     _save(figure, path)
 
 
@@ -119,7 +134,7 @@ def main() -> None:
             groups[line["scene"], line["steps"]].append(line)
     tables(groups)
     if groups:
-        bars(
+        dots(
             {group: own for group, own in groups.items() if group[1]} or groups,
             options.figures / f"{options.results.stem}.png",
         )

@@ -3,12 +3,14 @@
     python benchmarks/tables.py [results/runs.csv]     # prints all rows, a table for each scene
     python benchmarks/tables.py --readme               # writes README's table anew, between its markers
 
-tests/test_readme.py checks that README's table is what this makes of runs.csv.
+tests/test_readme.py checks that README's table is what this makes of runs.csv and, for packed scenes, of pack.jsonl. Branches,
+whose frames nobody timed, are not printed: ``rules_report.py`` shows them.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from sundae_ns.evaluation.document import number, table
 
 ROOT = Path(__file__).parents[1]
 RUNS = ROOT / "benchmarks" / "results" / "runs.csv"
+PACKS = ROOT / "benchmarks" / "results" / "pack.jsonl"
 README = ROOT / "README.md"
 BEGIN = "<!-- made by: python benchmarks/tables.py --readme -->"
 END = "<!-- end of what is made -->"
@@ -34,16 +37,18 @@ class Shown:
     label: str
     timed: bool = True
     """Whether the run had the machine for itself, so that its times say something."""
+    packed: str = ""
+    """Name in pack.jsonl, where a line for the packed run is to follow."""
 
 
 SHOWN = (
     Shown("bonsai", "splatfacto", "default", "5e4bc58", "splatfacto"),
     Shown("bonsai", "sundae", "default", "5e4bc58", "sundae"),
     Shown("bonsai", "sundae", "no-head-branch", "5e4bc58", "the same field, no head", timed=False),
-    Shown("bonsai", "sundae", "band-positions", "2e7bd23", "the paper's band rule (H200, older head)", timed=False),
+    Shown("bonsai", "sundae", "band-positions", "2e7bd23", "the paper's band rule (H200, older head)"),
     Shown("fox", "splatfacto", "default", "5e4bc58", "splatfacto"),
-    Shown("fox", "sundae", "default", "5e4bc58", "sundae"),
-    Shown("fox", "sundae", "no-head-branch", "5e4bc58", "the same field, no head", timed=False),
+    Shown("fox", "sundae", "default", "ef71d9f", "sundae", packed="fox, 30,000 steps"),
+    Shown("fox", "sundae", "no-head-branch", "ef71d9f", "the same field, no head", timed=False),
 )
 
 
@@ -66,8 +71,19 @@ def readme_table(rows: list[RunRow]) -> str:
                 f"{number(row.train_s, 0)} s" if shown.timed else "",
             ]
         )
+        if shown.packed:
+            lines.append(packed_line(shown.packed))
     heads = ["scene", "method", "primitives", "PSNR", "SSIM", "PSNR, head off", "MB", "ms a frame", "training"]
     return "\n".join(table(heads, lines))
+
+
+def packed_line(run: str) -> list[str]:
+    """README's line of a run packed with the default options, whose last measurement counts."""
+    measured = [json.loads(line) for line in PACKS.read_text(encoding="utf-8").splitlines()]
+    *_, found = (line for line in measured if line["run"] == run and not line["set"])
+    quality = (number(found["psnr_packed"], 2), "", number(found["psnr_packed_base"], 2))
+    size = number(found["bytes"] / MB, 1)
+    return ["", "the same, packed", number(found["primitives"], 0), *quality, size, "", ""]
 
 
 def with_table(text: str, rows: list[RunRow]) -> str:
@@ -85,7 +101,7 @@ def scene_tables(rows: list[RunRow]) -> str:
     heads += ["ms a frame", "train s", "prune s", "peak primitives", "peak MiB", "commit", "GPU"]
     parts = []
     for scene in dict.fromkeys(row.scene for row in rows):
-        own = [row for row in rows if row.scene == scene]
+        own = [row for row in rows if row.scene == scene and row.ms_frame is not None]
         lines = [
             [
                 *(row.method, row.variant, "" if row.keep_ratio is None else f"{row.keep_ratio:.0%}"),

@@ -23,7 +23,7 @@ def pack(
     harmonics: Literal["transform", "codebooks"] = "transform",
     harmonics_step: float = 0.02,
     harmonics_books: int = 4,
-    feature_bits: int = 6,
+    feature_bits: int = 7,
     feature_books: int = 0,
     head: Literal["int8", "fp16"] = "int8",
     level: int = 19,

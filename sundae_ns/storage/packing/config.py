@@ -34,7 +34,7 @@ class PackConfig:
     """Step that transformed coefficients are rounded to, in units of the spherical harmonics' coefficients."""
     harmonics_books: int = 4
     """Residual codebooks of the view-dependent colour: bytes a primitive, 1 to 32."""
-    feature_bits: int = 6
+    feature_bits: int = 7
     """Bits of each feature, 4 to 16; the residual codebooks of feature-books replace them."""
     feature_books: int = 0
     """Residual codebooks of the feature vectors, up to 32; 0: each feature by itself, with feature-bits."""
