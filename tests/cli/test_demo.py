@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -39,3 +40,17 @@ def test_comparison_takes_the_pictures_apart(tmp_path: Path) -> None:
     with Image.open(tmp_path / "sheet.png") as sheet:
         colors = {color for _, color in sheet.convert("RGB").getcolors(1 << 20)}
     assert {(255, 255, 255), (200, 200, 200), (245, 245, 245), (50, 50, 50)} <= colors
+
+
+def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
+    pids = []
+
+    def interrupt(line: str) -> None:
+        pids.append(int(line))
+        raise KeyboardInterrupt
+
+    code = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
+    with pytest.raises(KeyboardInterrupt):
+        run_logged([sys.executable, "-c", code], tmp_path / "log.txt", interrupt)
+    with pytest.raises(ProcessLookupError):
+        os.kill(pids[0], 0)
