@@ -34,6 +34,7 @@ from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Lpips, display, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
+from sundae_ns.preview import Preview, in_viewer
 from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
 from sundae_ns.rasterization import (
     Backend,
@@ -190,6 +191,7 @@ class SundaeModel(SplatfactoModel):
             torch.tensor([0.1490, 0.1647, 0.2157]) if random_background else get_color(config.background_color)
         )
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
+        self.preview = Preview()
         self._backend: Backend | None = None
         self._response: tuple[Any, Tensor | None] = (None, None)
         self.attached = False
@@ -454,10 +456,14 @@ class SundaeModel(SplatfactoModel):
             return {**outputs, "background": background, "window": window}
 
         mask = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
+        kept = self.preview.mask(self)
+        if kept is not None:
+            mask = kept if mask is None else mask & kept
         if mask is not None and not mask.any():
             return self.get_empty_outputs(view.width, view.height, background)
         params = self.gaussians if mask is None else {k: v[mask] for k, v in self.gaussians.items()}
-        outputs, splat = self.render(params, view, background, compensate=self.compensate.value)
+        compensate = kept is None and (self.compensate.value or not in_viewer())
+        outputs, splat = self.render(params, view, background, compensate=compensate)
         outputs["depth"] = display.fill_depth(outputs["depth"], splat.alpha)
         outputs["features"] = self._feature_colors(outputs.pop("feature_image"), splat.alpha)
         outputs["response"] = self._response_image(params, mask, view)

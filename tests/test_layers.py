@@ -26,6 +26,7 @@ FLOORS = {
     "datamanager": 3,
     "checkpoint": 3,
     "model": 3,
+    "preview": 3,
     "trainer": 3,
     "measure": 3,
     "method_configs": 4,

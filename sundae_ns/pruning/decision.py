@@ -42,6 +42,7 @@ def decide(
     contribution: Contribution | None = None,
     *,
     count: int | None = None,
+    found: Response | None = None,
 ) -> Decision:
     """Decide which primitives of a field stay.
 
@@ -54,6 +55,7 @@ def decide(
         contribution: gives the blending weights over the training views, one per primitive of ``params`` ``[N]``;
             called only if the score needs it.
         count: keeps this many, or all if there are not so many, instead of the share.
+        found: response of the finite primitives, where it is known already; else it is computed if the score needs it.
 
     Raises:
         ConfigError: an option cannot work, or the score needs a contribution and there is none.
@@ -72,7 +74,7 @@ def decide(
         return Decision(finite, n_finite, n - n_finite, None, None, None, None)
 
     usable = params if n_finite == n else {name: value.detach()[finite] for name, value in params.items()}
-    found = response(usable, config) if config.uses_graph else None
+    found = (found or response(usable, config)) if config.uses_graph else None
     usable_contribution = None if contribution is None else lambda: _rows(contribution(), finite)
     selected = _select(score(usable, config, found, usable_contribution), config, count)
     mask = finite.clone()
