@@ -27,6 +27,7 @@ FLOORS = {
     "checkpoint": 3,
     "model": 3,
     "preview": 3,
+    "run_folder": 3,
     "trainer": 3,
     "measure": 3,
     "method_configs": 4,

@@ -5,6 +5,14 @@ from sundae_ns.evaluation.flicker import Change, Frame, change
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.evaluation.picture import ComparisonRow, comparison_sheet, save_comparison, side_by_side
+from sundae_ns.evaluation.points import (
+    Look,
+    draw_points,
+    look_along_axes,
+    look_through,
+    points_sheet,
+    response_histogram,
+)
 from sundae_ns.evaluation.records import COLUMNS, RunRow, append_row, read_rows
 from sundae_ns.evaluation.report import Quality, RunFigures, report_tables, report_text
 from sundae_ns.evaluation.timing import Timing, median_ms
@@ -14,6 +22,7 @@ __all__ = [
     "Change",
     "ComparisonRow",
     "Frame",
+    "Look",
     "Lpips",
     "Quality",
     "RunFigures",
@@ -23,14 +32,19 @@ __all__ = [
     "change",
     "comparison_sheet",
     "display",
+    "draw_points",
+    "look_along_axes",
+    "look_through",
     "lpips_weights_available",
     "lpips_weights_path",
     "lpips_weights_url",
     "median_ms",
+    "points_sheet",
     "psnr",
     "read_rows",
     "report_tables",
     "report_text",
+    "response_histogram",
     "save_comparison",
     "side_by_side",
     "ssim",
