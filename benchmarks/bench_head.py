@@ -2,19 +2,21 @@
 
     python benchmarks/bench_head.py
 
-Inference: fp16 weights and pictures, as a packed scene would hold them. Training: forward and backward in bf16 with fp32
-weights, as ``ns-train`` runs it.
+Inference: ``ms_HxW`` is the whole head in fp16 as the model runs it, from splatted fp32 pictures to the compensated one;
+``ms_layers_HxW`` the network alone, layer by layer, weights and picture in fp16. Training: forward and backward in bf16 with
+fp32 weights, as ``ns-train`` runs it, and layer by layer.
 """
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.compensation.graphed import GraphedTraining
 from sundae_ns.evaluation import median_ms
 
 RESULTS = Path(__file__).parent / "results" / "heads.jsonl"
@@ -58,18 +60,24 @@ def main() -> None:
             picture = torch.rand(1, height, width, channels, device="cuda").half().permute(0, 3, 1, 2)
             with torch.no_grad():
                 graph = recorded(half, picture)
-            line[f"ms_{height}x{width}"] = median_ms(graph.replay, device=picture.device).median_ms
-            net = CompensationHead(config).net.cuda()
-            training = GraphedTraining(net, torch.bfloat16)
-            sample = picture.bfloat16().requires_grad_()
+            line[f"ms_layers_{height}x{width}"] = median_ms(graph.replay, device=picture.device).median_ms
+            head = CompensationHead(replace(config, precision="fp16")).cuda().eval()
+            splat = torch.rand(height, width, 3 + config.num_features, device="cuda")
+            pictures = torch.rand_like(splat[..., :3]), splat, torch.rand_like(splat[..., :1])
+            with torch.no_grad():
+                whole = median_ms(partial(head, *pictures), device=picture.device, warmup=10)
+            line[f"ms_{height}x{width}"] = whole.median_ms
+            leaves = [picture.clone().requires_grad_() for picture in (splat, pictures[2])]
+            for fused in (True, False):
+                trained = CompensationHead(replace(config, fused=fused)).cuda()
 
-            def step(training: GraphedTraining = training, sample: torch.Tensor = sample) -> None:
-                out = training(sample)
-                assert out is not None
-                out.backward(torch.ones_like(out))
+                def step(trained: CompensationHead = trained) -> None:
+                    out = trained(pictures[0], *leaves)  # noqa: B023
+                    out.backward(torch.ones_like(out))
 
-            line[f"ms_train_{height}x{width}"] = median_ms(step, device=picture.device).median_ms
-            line["parameters"] = sum(p.numel() for p in net.parameters())
+                name = "train" if fused else "train_layers"
+                line[f"ms_{name}_{height}x{width}"] = median_ms(step, device=picture.device).median_ms
+            line["parameters"] = sum(p.numel() for p in head.parameters())
         print(json.dumps(line))
         with open(RESULTS, "a") as file:
             file.write(json.dumps(line) + "\n")

@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,12 @@ from torch.optim.lr_scheduler import LambdaLR
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.compensation.head import SIZES
 from sundae_ns.evaluation import psnr
+from sundae_ns.model import SundaeModel
 
 RESULTS = Path(__file__).parent / "results" / "branches.jsonl"
 FIELD = ("features_dc", "features_rest", "opacities", "scales", "quats", "features")
+
+EXPERIMENTS = "skip width flip rates cooldown picture_loss_on_base apart average weight_decay dropout".split()
 
 
 @dataclass
@@ -71,11 +74,91 @@ class FullResolutionSkip(nn.Module):
 def flipped(head_run: Any) -> Any:
     """The head sees mirrored pictures at random while it trains."""
 
-    def wrapped(self: CompensationHead, image: Tensor) -> Tensor:
+    def wrapped(self: CompensationHead, image: Tensor, dtype: torch.dtype) -> Tensor:
         sides = [side for side in (2, 3) if self.training and torch.rand(()) < 0.5]
-        return head_run(self, image.flip(sides)).flip(sides) if sides else head_run(self, image)
+        return head_run(self, image.flip(sides), dtype).flip(sides) if sides else head_run(self, image, dtype)
 
     return wrapped
+
+
+def with_dropout(forward: Any, share: float) -> Any:
+    """Whole feature channels are hidden from the head at random while it trains."""
+
+    def wrapped(self: CompensationHead, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
+        if torch.is_grad_enabled():
+            kept = (torch.rand_like(splatted[0, 0]) >= share) / (1 - share)
+            kept[:3] = 1
+            splatted = splatted * kept
+        return forward(self, base, splatted, alpha)
+
+    return wrapped
+
+
+def with_picture_loss_on_base(get_loss_dict: Any) -> Any:
+    """Base colours get the whole loss of a picture, instead of L1 alone."""
+
+    def wrapped(self: SundaeModel, outputs: Any, batch: Any, metrics: Any = None) -> dict[str, Tensor]:
+        losses = get_loss_dict(self, outputs, batch, metrics)
+        if "base_loss" in losses:
+            target = self._target(batch, outputs)
+            losses["base_loss"] = self.config.base_loss_weight * self._picture_loss(outputs["base_rgb"], target)
+        return losses
+
+    return wrapped
+
+
+def apart(splat: Any) -> Any:
+    """The head's loss moves features and head only: what it sees of the field has no gradients."""
+
+    def wrapped(self: SundaeModel, params: Any, view: Any, channels: Tensor, **options: Any) -> Any:
+        if not self.training or channels.shape[1] == 3:
+            return splat(self, params, view, channels, **options)
+        seen = splat(self, params, view, channels[:, :3], **options)
+        still = {name: value.detach() for name, value in params.items()}
+        features = splat(self, still, view, channels[:, 3:], render_depth=False)
+        return replace(seen, colors=torch.cat([seen.colors, features.colors], dim=-1))
+
+    return wrapped
+
+
+def unmoved(forward: Any) -> Any:
+    """The head adds to base colours without moving them."""
+
+    def wrapped(self: CompensationHead, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
+        splatted = torch.cat([splatted[..., :3].detach(), splatted[..., 3:]], dim=-1)
+        return forward(self, base.detach(), splatted, alpha.detach())
+
+    return wrapped
+
+
+class Averaged:
+    """Exponential moving average of all parameters, taken after each step."""
+
+    def __init__(self, model: SundaeModel, decay: float) -> None:
+        self.model, self.decay = model, decay
+        self.values = {name: value.detach().clone() for name, value in model.named_parameters()}
+
+    @torch.no_grad()
+    def update(self, step: int) -> None:
+        decay = min(self.decay, (1 + step) / (10 + step))
+        for name, value in self.model.named_parameters():
+            self.values[name].lerp_(value, 1 - decay)
+
+    @torch.no_grad()
+    def take(self) -> None:
+        for name, value in self.model.named_parameters():
+            value.copy_(self.values[name])
+
+
+def after_each_step(trainer: Any, fn: Any) -> None:
+    train_iteration = trainer.train_iteration
+
+    def wrapped(step: int) -> Any:
+        result = train_iteration(step)
+        fn(step)
+        return result
+
+    trainer.train_iteration = wrapped
 
 
 def parse() -> tuple[argparse.Namespace, list[str]]:
@@ -93,6 +176,11 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--flip", action="store_true", help="mirror pictures at random for the head")
     parser.add_argument("--rates", type=float, default=1.0, help="factor on the field's learning rates")
     parser.add_argument("--cooldown", type=float, help="share of the branch over which the field's rates fall")
+    parser.add_argument("--picture-loss-on-base", action="store_true", help="SSIM too in the loss of base colours")
+    parser.add_argument("--apart", action="store_true", help="the head's loss does not move the field")
+    parser.add_argument("--average", type=float, help="decay of a moving average of all parameters, which is evaluated")
+    parser.add_argument("--weight-decay", type=float, help="decoupled, of the head's weights, times its rate")
+    parser.add_argument("--dropout", type=float, help="share of feature channels hidden from the head at random")
     own, extra = sys.argv[1:], []
     if "--" in own:
         cut = own.index("--")
@@ -129,7 +217,14 @@ def main() -> None:
     if options.width is not None:
         SIZES["compact"] = (options.width, SIZES["compact"][1])
     if options.flip:
-        CompensationHead._run = flipped(CompensationHead._run)  # type: ignore[method-assign]
+        CompensationHead._layers = flipped(CompensationHead._layers)  # type: ignore[method-assign]
+    if options.picture_loss_on_base:
+        SundaeModel.get_loss_dict = with_picture_loss_on_base(SundaeModel.get_loss_dict)  # type: ignore[method-assign]
+    if options.dropout is not None:
+        CompensationHead.forward = with_dropout(CompensationHead.forward, options.dropout)  # type: ignore[method-assign]
+    if options.apart:
+        SundaeModel._splat = apart(SundaeModel._splat)  # type: ignore[method-assign]
+        CompensationHead.forward = unmoved(CompensationHead.forward)  # type: ignore[method-assign]
     if options.skip is not None:
         built = CompensationHead.__init__
 
@@ -137,14 +232,28 @@ def main() -> None:
             built(self, head)
             inputs = head.num_features + (4 if head.mode == "residual" else 0)
             self.net = FullResolutionSkip(self.net, inputs, options.skip)  # type: ignore[assignment]
-            self._graphed.net = self.net
+            self._can_fuse = False
 
         CompensationHead.__init__ = with_skip  # type: ignore[method-assign]
     run._set_random_seed(options.seed)
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     trainer.save_checkpoint = lambda step: None
+    averaged = None if options.average is None else Averaged(trainer.pipeline.model, options.average)
+    if averaged is not None:
+        after_each_step(trainer, averaged.update)
+    if options.weight_decay is not None:
+        optimizer = trainer.optimizers.optimizers["compensation"]
+
+        @torch.no_grad()
+        def decay(step: int) -> None:
+            for group in optimizer.param_groups:
+                torch._foreach_mul_(group["params"], 1 - group["lr"] * options.weight_decay)
+
+        after_each_step(trainer, decay)
     trainer.train()
+    if averaged is not None:
+        averaged.take()
     trainer.pipeline.eval()
     line = {
         "name": options.name,
@@ -157,7 +266,7 @@ def main() -> None:
         "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
         "commit": run.commit(),
         "command": command.replace(str(options.field), "PRUNED"),
-        "experiments": {key: getattr(options, key) for key in ("skip", "width", "flip", "rates", "cooldown")},
+        "experiments": {key: getattr(options, key) for key in EXPERIMENTS},
     }
     options.results.parent.mkdir(parents=True, exist_ok=True)
     with open(options.results, "a") as file:

@@ -18,7 +18,7 @@ AXES = (("bytes_total", 1e6, "MB, primitives and head in fp32"), ("ms_frame", 1.
 
 def main() -> None:
     with open(RUNS, newline="") as file:
-        rows = list(csv.DictReader(file))
+        rows = [row for row in csv.DictReader(file) if row["ms_frame"]]
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, panels = plt.subplots(len(scenes), 2, figsize=(11, 4.2 * len(scenes)), layout="constrained")
     labels = sorted({(row["method"], row["variant"]) for row in rows})
@@ -33,7 +33,10 @@ def main() -> None:
                     runs = [
                         row
                         for row in own
-                        if (row["method"], row["variant"]) == label and (row["gpu"] == newest) == here
+                        if (row["method"], row["variant"]) == label
+                        and (row["gpu"] == newest) == here
+                        # Branches ran side by side: their times say nothing.
+                        and not (column == "ms_frame" and row["variant"].endswith("-branch"))
                     ]
                     if not runs:
                         continue
@@ -46,11 +49,15 @@ def main() -> None:
                         s=50 if here else 30,
                         label=" ".join([*label, runs[0]["gpu"].split()[1]]),
                     )
+                    if here and label == ("sundae", "default"):
+                        for row in runs:
+                            place = float(row[column]) / unit, float(row["psnr"])
+                            panel.annotate(row["commit"], place, (7, -3), textcoords="offset points", fontsize=7)
             panel.set_xlabel(title)
             panel.set_ylabel("test PSNR, dB")
             panel.set_title(f"{scene}, {own[0]['resolution']} px")
             panel.grid(alpha=0.3)
-        line[1].legend(fontsize=7)
+        line[0].legend(fontsize=7, loc="center right")
     FIGURE.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(FIGURE, dpi=110)
     print(f"wrote {FIGURE}")

@@ -84,6 +84,19 @@ def configure(options: argparse.Namespace, extra: list[str]) -> tuple[TrainerCon
     return config, "ns-train " + " ".join(shown)
 
 
+class CountPrimitives:
+    """Most primitives after any step of a training."""
+
+    def __init__(self, trainer: Any) -> None:
+        self.peak = 0
+        self._trainer, self._step = trainer, trainer.train_iteration
+        trainer.train_iteration = self
+
+    def __call__(self, step: int) -> Any:
+        self.peak = max(self.peak, self._trainer.pipeline.model.num_points)
+        return self._step(step)
+
+
 @torch.no_grad()
 def evaluate(pipeline: Any) -> dict[str, float]:
     """Mean PSNR and SSIM over all test views, of the picture and of its base colours."""
@@ -126,6 +139,7 @@ def main() -> None:
     if options.save:
         wanted.add(config.max_num_iterations - 1)
     trainer.save_checkpoint = lambda step: save(step) if step in wanted else None
+    counts = CountPrimitives(trainer)
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
         torch.cuda.synchronize()
@@ -145,7 +159,14 @@ def main() -> None:
     if isinstance(model, SundaeModel):
         times, bytes_ = frame_times(model, views), sizes(model)
         ms_frame, ms_splat, ms_head = times.frame, times.splat, times.head
-        keep_ratio = 1.0 if model.config.pruning.mode == "off" else model.config.pruning.keep_ratio
+        counts.peak = max(counts.peak, model.pruning_state["peak"])
+        budget = trainer.base_dir / "budget.json"
+        if budget.exists():
+            found = json.loads(budget.read_text())
+            keep_ratio = found["primitives"] / found["before"]
+            print("budget:", json.dumps(found))
+        elif model.config.pruning.mode != "off":
+            keep_ratio = model.config.pruning.keep_ratio
         reports = trainer.base_dir / "prune.json"
         if reports.exists():
             report = json.loads(reports.read_text())
@@ -177,6 +198,7 @@ def main() -> None:
         ms_head=ms_head,
         train_s=train_s,
         prune_s=prune_s,
+        peak_primitives=counts.peak,
         peak_vram_mib=peak,
         gpu=torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
         resolution=f"{int(cameras.width[0])}x{int(cameras.height[0])}",

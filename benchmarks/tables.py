@@ -1,4 +1,7 @@
-"""Print the measured runs as Markdown tables: python benchmarks/tables.py [results/runs.csv]."""
+"""Print the measured runs as Markdown tables: python benchmarks/tables.py [results/runs.csv].
+
+Branches, whose frames nobody timed, are left out: ``rules_report.py`` shows them.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +22,15 @@ COLUMNS = (
     ("ms a frame", "ms_frame", "{:.2f}"),
     ("train s", "train_s", "{:.0f}"),
     ("prune s", "prune_s", "{:.1f}"),
+    ("peak primitives", "peak_primitives", "{:,.0f}"),
+    ("peak MiB", "peak_vram_mib", "{:,.0f}"),
     ("commit", "commit", "{}"),
 )
 
 
 def cell(row: dict[str, str], column: str, form: str) -> str:
     value = row[column]
-    if form == "{}":
+    if form == "{}" or not value:
         return value
     number = float(value) / (1e6 if column == "bytes_total" else 1)
     return form.format(number)
@@ -34,7 +39,7 @@ def cell(row: dict[str, str], column: str, form: str) -> str:
 def main() -> None:
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else RUNS
     with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
+        rows = [row for row in csv.DictReader(file) if row["ms_frame"]]
     for scene in dict.fromkeys(row["scene"] for row in rows):
         own = [row for row in rows if row["scene"] == scene]
         print(f"\n**{scene}**, {own[0]['resolution']} px, every 8th image for test\n")

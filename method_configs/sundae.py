@@ -70,6 +70,7 @@ def method(
     steps: int = 30000,
     means_restart: float | None = 1.6e-4,
     trainer: dict[str, Any] | None = None,
+    datamanager: dict[str, Any] | None = None,
     **model: Any,
 ) -> MethodSpecification:
     """One method.
@@ -82,6 +83,7 @@ def method(
         steps: length of the run.
         means_restart: see :func:`optimizers`.
         trainer: more options of the trainer.
+        datamanager: more options of the datamanager.
         model: more options of the model.
     """
     config = SundaeTrainerConfig(
@@ -95,7 +97,9 @@ def method(
         machine=MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu"),
         pipeline=VanillaPipelineConfig(
             datamanager=SundaeDatamanagerConfig(
-                dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
+                dataparser=NerfstudioDataParserConfig(load_3D_points=True),
+                cache_images_type="uint8",
+                **(datamanager or {}),
             ),
             model=SundaeModelConfig(
                 pruning=pruning,
@@ -130,14 +134,29 @@ sundae_100 = _keep(100)
 
 sundae_continuous = method(
     "sundae-continuous",
-    "SUNDAE with continuous pruning while densifying: a lower peak of memory, a loosely held final count.",
+    "SUNDAE with continuous pruning while densifying: a lower peak of memory; cap and final count exact, where given.",
     pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
+)
+
+sundae_auto = method(
+    "sundae-auto",
+    "SUNDAE that finds its own budget: as few primitives, bands and network as lose 0.1 dB, or as many as bytes allow.",
+    pruning=PruningConfig(mode="auto", stop=26000),
+    datamanager={"holdout_every": 8},
 )
 
 sundae_paper = method(
     "sundae-paper",
     "SUNDAE as literal as the paper's text allows: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",
-    pruning=PruningConfig(keep_ratio=0.1, selection="band", score="response", signal="positions", gamma=0.5),
+    pruning=PruningConfig(
+        keep_ratio=0.1,
+        selection="band",
+        score="response",
+        signal="positions",
+        edges="centres",
+        redistribution="none",
+        gamma=0.5,
+    ),
     head=HeadConfig(
         mode="features", size="regular", pixel_unshuffle=1, num_features=13, precision="fp32", max_train_pixels=0
     ),

@@ -25,6 +25,9 @@ from sundae_ns.storage.point_cloud import read_point_cloud
 DATASET_FRAME = "sundae_dataset_frame"
 """Key of the training set's metadata: (transform ``[3, 4]``, scale) from the capture's own coordinates to the model's."""
 
+NO_PICTURES = "sundae_no_pictures"
+"""Key of a dataset's metadata and of a batch: there is a camera alone, and grey stands for its picture."""
+
 
 class LightNerfstudioParser(Nerfstudio):
     """The ``nerfstudio-data`` parser, reading sparse clouds without open3d, which needs system libraries of a desktop."""
@@ -66,7 +69,7 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
 
 
 class CheckedDataset(InputDataset):
-    """nerfstudio's pictures; one that cannot be decoded is named."""
+    """nerfstudio's pictures; one that cannot be decoded is named, and grey stands for those that a capture does not have."""
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """Picture, and mask if there is one.
@@ -74,6 +77,11 @@ class CheckedDataset(InputDataset):
         Raises:
             DataError: a file of this view is damaged.
         """
+        if self.metadata.get(NO_PICTURES):
+            camera = self.cameras[image_idx]
+            grey = torch.tensor(128, dtype=torch.uint8) if image_type == "uint8" else torch.tensor(0.5)
+            image = grey.expand(int(camera.height.item()), int(camera.width.item()), 3)
+            return {"image_idx": image_idx, "image": image, NO_PICTURES: True}
         try:
             return super().get_data(image_idx, image_type)
         except Exception as error:  # decoders raise many kinds; each means the same to the user
@@ -87,6 +95,8 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: SundaeDatamanager)
     holdout_every: int = 0
     """Hold back every n-th training view from training, for choosing budgets without touching test views. 0: none."""
+    pictures: bool = True
+    """False for cameras without pictures, as sundae unpack writes them: they can be looked through, and nothing else."""
 
 
 class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
@@ -121,7 +131,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             config.dataparser,
             data,
             ("train", "val" if test_mode == "val" else "test"),
-            pictures=test_mode != "inference",
+            pictures=config.pictures and test_mode != "inference",
         )
         try:
             super().__init__(config, device, test_mode, **kwargs)
@@ -143,7 +153,16 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         if len(outputs.image_filenames) == 0:
             raise DataError(f"no training images in {self.config.dataparser.data}; check the path and the split")
         outputs.metadata[DATASET_FRAME] = (outputs.dataparser_transform, float(outputs.dataparser_scale))
-        return super().create_train_dataset()
+        return self._marked(super().create_train_dataset())
+
+    def create_eval_dataset(self) -> CheckedDataset:
+        """The test set."""
+        return self._marked(super().create_eval_dataset())
+
+    def _marked(self, dataset: CheckedDataset) -> CheckedDataset:
+        if not self.config.pictures:
+            dataset.metadata[NO_PICTURES] = True
+        return dataset
 
     @property
     def holdout_indices(self) -> list[int]:
@@ -191,6 +210,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, torch.Tensor]]:
         dataset = self.train_dataset if split == "train" else self.eval_dataset
+        if not self.config.pictures:
+            # The viewer asks for all of them before it shows anything.
+            return super()._load_images(split, "gpu")
         self._check_pictures(dataset)
         if split == "train" and self.eval_dataset:
             # A test view that cannot be read should be known now, not at the prune.

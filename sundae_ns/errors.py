@@ -33,6 +33,10 @@ class StorageError(SundaeError, OSError):
     """A file cannot be written: no room, or no right to."""
 
 
+class PackError(SundaeError, ValueError):
+    """A packed scene is damaged, of another version, or a field cannot be packed."""
+
+
 class MemoryExhaustedError(SundaeError, RuntimeError):
     """The device has not enough memory for the field or the picture."""
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
@@ -14,9 +16,10 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
+from sundae_ns.compensation import resize
 from sundae_ns.datamanager import SundaeDatamanager
-from sundae_ns.errors import CheckpointError
-from sundae_ns.evaluation import median_ms
+from sundae_ns.errors import BackendError, CheckpointError, ConfigError
+from sundae_ns.evaluation import median_ms, psnr, ssim
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
 
@@ -26,11 +29,22 @@ class FrameTimes:
     """Milliseconds a frame, device waited for, median over the given cameras."""
 
     frame: float
-    """The whole picture: harmonics, splatting of colours, features and depth, and the head."""
+    """The whole picture, as nerfstudio's commands ask for it: camera, harmonics, splatting of colours, features and depth,
+    and the head."""
     splat: float
     """The same without the head, and so without features."""
     head: float
     """The head alone; 0 without one."""
+
+
+@contextmanager
+def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
+    """Show pictures of ``model`` with the head, or without, as the viewer's check box does."""
+    before, model.compensate.value = model.compensate.value, on
+    try:
+        yield
+    finally:
+        model.compensate.value = before
 
 
 @torch.no_grad()
@@ -48,16 +62,19 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
     def milliseconds(fn: Callable[[], object]) -> float:
         return median_ms(fn, device=model.device, warmup=warmup, repeats=repeats).median_ms
 
-    frames, splats, heads = [], [], []
+    def show(camera: Cameras) -> Tensor:
+        return model.get_outputs_for_camera(camera)["rgb"]
+
+    frames: list[float] = []
+    splats: list[float] = []
+    heads: list[float] = []
     for camera in cameras:
-        render = partial(model.render, model.gaussians, model.view_of(camera), background)
-        frames.append(milliseconds(render))
-        splats.append(milliseconds(partial(render, compensate=False)))
+        for on, times in ((True, frames), (False, splats)):
+            with compensation(model, on):
+                times.append(milliseconds(partial(show, camera)))
         if model.head is not None and model.head_active:
-            pictures, _ = render()
-            # The blended colours are not among the pictures; the base has their shape, and the time is the same.
-            base, features, alpha = (pictures[name] for name in ("base_rgb", "feature_image", "accumulation"))
-            heads.append(milliseconds(partial(model.head, base, base, features, alpha)))
+            pictures, splat = model.render(model.gaussians, model.view_of(camera), background)
+            heads.append(milliseconds(partial(model.head, pictures["base_rgb"], splat.colors, splat.alpha)))
     return FrameTimes(median(frames), median(splats), median(heads) if heads else 0.0)
 
 
@@ -95,3 +112,83 @@ def load_run(config: Path) -> LoadedRun:
         image = model.get_gt_img(batch["image"])
         truths.append(model.composite_with_background(image, model._get_background_color()))
     return LoadedRun(model, cameras, truths)
+
+
+@dataclass(frozen=True)
+class FrameFigures:
+    """Speed of a configuration beside its own error; means over the test views."""
+
+    width: int
+    height: int
+    """Size of the first picture, pixels."""
+    precision: str
+    """Arithmetic of the head."""
+    views: int
+    ms_frame: float
+    ms_splat: float
+    ms_head: float
+    psnr: float
+    ssim: float
+    psnr_base: float
+    ssim_base: float
+
+
+@torch.no_grad()
+def frame_figures(
+    run: LoadedRun, *, factor: float = 1.0, precision: str | None = None, warmup: int = 3, repeats: int = 5
+) -> FrameFigures:
+    """Time the frames of a run at a size and a precision, and compare these very frames with the truth resized alike.
+
+    Args:
+        run: a finished run.
+        factor: on the pictures' sides.
+        precision: of the head, one of ``PRECISIONS``; by default the run's own, and fp32 on a CPU.
+        warmup, repeats: as for :func:`frame_times`.
+
+    Raises:
+        ConfigError: the factor is not above zero.
+        BackendError: half precision is asked for on a CPU.
+    """
+    model = run.model
+    if not factor > 0:
+        raise ConfigError(f"pictures {factor} times their size have no pixels; give a factor above 0")
+    on_cpu = model.device.type == "cpu"
+    precision = precision or ("fp32" if on_cpu or model.head is None else model.head.config.precision)
+    if on_cpu and precision != "fp32":
+        raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
+    cameras = [copy.deepcopy(camera) for camera in run.cameras]
+    for camera in cameras:
+        camera.rescale_output_resolution(factor, scale_rounding_mode="ceil")
+    with _precision(model, precision):
+        times = frame_times(model, cameras, warmup=warmup, repeats=repeats)
+        errors = dict.fromkeys(("psnr", "ssim", "psnr_base", "ssim_base"), 0.0)
+        for camera, truth in zip(cameras, run.truths, strict=True):
+            outputs = model.get_outputs_for_camera(camera)
+            height, width = outputs["rgb"].shape[:2]
+            target = truth if truth.shape[:2] == (height, width) else resize(truth, height, width)
+            for suffix, picture in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
+                errors["psnr" + suffix] += float(psnr(picture, target)) / len(cameras)
+                errors["ssim" + suffix] += float(ssim(picture, target)) / len(cameras)
+    return FrameFigures(
+        width=int(cameras[0].width),
+        height=int(cameras[0].height),
+        precision=precision,
+        views=len(cameras),
+        ms_frame=times.frame,
+        ms_splat=times.splat,
+        ms_head=times.head,
+        **errors,
+    )
+
+
+@contextmanager
+def _precision(model: SundaeModel, precision: str) -> Iterator[None]:
+    if model.head is None:
+        yield
+        return
+    before = model.head.config
+    model.head.config = replace(before, precision=precision)  # type: ignore[arg-type]
+    try:
+        yield
+    finally:
+        model.head.config = before

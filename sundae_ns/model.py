@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
 
 import torch
-from gsplat.strategy import DefaultStrategy
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
@@ -29,13 +28,15 @@ from rich.progress import track
 from torch import Tensor
 
 from sundae_ns import checkpoint
+from sundae_ns.budget import Budget
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
-from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager
+from sundae_ns.datamanager import DATASET_FRAME, NO_PICTURES, SundaeDatamanager
+from sundae_ns.densification import CappedStrategy, ChainStrategy, start_of_chain
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
-from sundae_ns.evaluation import Lpips, display, psnr, ssim
+from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, peak_memory, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.preview import Preview, in_viewer
-from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, response
+from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, pixel_detail, response, select_random
 from sundae_ns.rasterization import (
     Backend,
     Rasterization,
@@ -50,6 +51,9 @@ from sundae_ns.storage.transform import similarity
 
 NEAR_PLANE = 0.01
 SSIM_WINDOW = 11
+MCMC_REGULARISER = 0.01
+"""Weights of opacities and sizes in the loss while the field grows by MCMC (lambda_o and lambda_Sigma of the paper)."""
+_Outputs = MutableMapping[str, Any]
 
 
 @dataclass
@@ -61,14 +65,18 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """When to prune, how many primitives to keep, and which."""
     head: HeadConfig = field(default_factory=HeadConfig)
     """The compensation head."""
-    rasterizer: Literal["auto", "gsplat", "reference"] = "auto"
-    """auto takes gsplat where CUDA works, else the reference in plain PyTorch, which also runs on a CPU."""
+    rasterizer: Literal["auto", "gsplat", "cpu", "reference"] = "auto"
+    """auto takes gsplat where CUDA works, and on a CPU the loops that numba compiles; reference is slow, in plain PyTorch."""
     base_loss_weight: float = 0.2
     """Weight of the loss on the picture without the head, which keeps exported .ply files valid."""
     warm_start: Path | None = None
     """Start from a finished field instead of warming up: a splatfacto or sundae .ckpt (or the folder), or a 3DGS .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
     """Coordinates of the warm start: nerfstudio's model, or the capture's own (COLMAP). auto goes by the kind of file."""
+    warmup: Literal["densify", "mcmc"] = "densify"
+    """How the field grows: by gradients (3DGS), or as a Markov chain with an exact cap (3DGS-MCMC)."""
+    mcmc_cap: int = 1_000_000
+    """Most primitives of a warm-up by mcmc, at any step."""
     evaluate_prune: bool = True
     """Evaluate all test views right before and right after the prune, and record both."""
 
@@ -80,11 +88,11 @@ def _cut(image: Tensor, window: Window | None) -> Tensor:
     return image[window.top : window.top + window.height, window.left : window.left + window.width]
 
 
-def _names_full_memory(render: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
+def _names_full_memory(render: Callable[..., _Outputs]) -> Callable[..., _Outputs]:
     """Let a method of the model that runs out of the GPU's memory say how many primitives there were."""
 
     @wraps(render)
-    def wrapper(model: SundaeModel, *arguments: Any, **options: Any) -> dict[str, Any]:
+    def wrapper(model: SundaeModel, *arguments: Any, **options: Any) -> _Outputs:
         try:
             return render(model, *arguments, **options)
         except torch.cuda.OutOfMemoryError as error:
@@ -144,6 +152,8 @@ class SundaeModel(SplatfactoModel):
         config.pruning.validate()
         if config.head.mode != "off":
             config.head.validate()
+        if config.mcmc_cap < 1:
+            raise ConfigError(f"mcmc-cap is {config.mcmc_cap}; give the most primitives that the field may have")
         if config.base_loss_weight < 0:
             raise ConfigError(f"base-loss-weight is {config.base_loss_weight}; give 0 or more")
         if config.warm_start is not None and config.pruning.mode == "continuous":
@@ -162,24 +172,9 @@ class SundaeModel(SplatfactoModel):
         )
 
         self.policy = make_policy(config.pruning)
+        self.budget = Budget(config.pruning, config.head) if config.pruning.mode == "auto" else None
         self.pruning_state: dict[str, Any] = self.policy.initialize_state()
-        self.strategy = DefaultStrategy(
-            prune_opa=config.cull_alpha_thresh,
-            grow_grad2d=config.densify_grad_thresh,
-            grow_scale3d=config.densify_size_thresh,
-            grow_scale2d=config.split_screen_size,
-            prune_scale3d=config.cull_scale_thresh,
-            prune_scale2d=config.cull_screen_size,
-            refine_scale2d_stop_iter=config.stop_screen_size_at,
-            refine_start_iter=config.warmup_length,
-            # Densification after a one-shot prune would undo it.
-            refine_stop_iter=min(config.stop_split_at, self._prune_at or config.stop_split_at),
-            reset_every=config.reset_alpha_every * config.refine_every,
-            refine_every=config.refine_every,
-            pause_refine_after_reset=self.num_train_data + config.refine_every,
-            absgrad=config.use_absgrad,
-            verbose=False,
-        )
+        self.strategy = self._strategy()
         self.strategy_state: dict[str, Any] = self.strategy.initialize_state(scene_scale=1.0)
 
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
@@ -223,7 +218,13 @@ class SundaeModel(SplatfactoModel):
                     "points. Results are better with one (COLMAP, or ply_file_path in transforms.json)."
                 )
             xyz, rgb = random_points(config.num_random, config.random_scale)
-        return from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=self.num_features)
+        cap = getattr(self._strategy(), "cap", None)
+        if cap is not None and len(xyz) > cap:
+            CONSOLE.print(f"[yellow]Warning: {len(xyz):,} points are more than the cap; starting from {cap:,} of them")
+            chosen = select_random(len(xyz), cap, config.pruning.seed, xyz.device)
+            xyz, rgb = xyz[chosen], rgb[chosen]
+        params = from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=self.num_features)
+        return start_of_chain(params) if config.warmup == "mcmc" else params
 
     def _warm_field(self, source: Path) -> dict[str, Tensor]:
         config = self.config
@@ -247,6 +248,37 @@ class SundaeModel(SplatfactoModel):
         CONSOLE.log(f"warm start: {len(params['means'])} primitives from {source}")
         return params
 
+    def _strategy(self) -> CappedStrategy | ChainStrategy:
+        """How the field grows, until the prune that would be undone by it."""
+        config, pruning = self.config, self.config.pruning
+        continuous = pruning.mode == "continuous"
+        stop = min(config.stop_split_at, pruning.stop if continuous else self._prune_at or config.stop_split_at)
+        cap = pruning.max_primitives if continuous else None
+        if config.warmup == "mcmc":
+            return ChainStrategy(
+                cap=min(config.mcmc_cap, cap or config.mcmc_cap),
+                refine_start_iter=config.warmup_length,
+                refine_stop_iter=stop,
+                refine_every=config.refine_every,
+            )
+        return CappedStrategy(
+            cap=cap,
+            prune_opa=config.cull_alpha_thresh,
+            grow_grad2d=config.densify_grad_thresh,
+            grow_scale3d=config.densify_size_thresh,
+            grow_scale2d=config.split_screen_size,
+            prune_scale3d=config.cull_scale_thresh,
+            prune_scale2d=config.cull_screen_size,
+            refine_scale2d_stop_iter=config.stop_screen_size_at,
+            refine_start_iter=config.warmup_length,
+            refine_stop_iter=stop,
+            reset_every=config.reset_alpha_every * config.refine_every,
+            refine_every=config.refine_every,
+            pause_refine_after_reset=self.num_train_data + config.refine_every,
+            absgrad=config.use_absgrad,
+            verbose=False,
+        )
+
     @property
     def gaussians(self) -> MutableMapping[str, torch.nn.Parameter]:
         """The parameters of the field; a ``ParameterDict`` is a mapping in all but its declared type."""
@@ -254,8 +286,8 @@ class SundaeModel(SplatfactoModel):
 
     @property
     def _prune_at(self) -> int | None:
-        """Step of the one-shot prune; None with another mode."""
-        return self.config.pruning.prune_at if self.config.pruning.mode == "one-shot" else None
+        """Step of the prune that follows densification; None where there is none."""
+        return self.config.pruning.prune_at if self.config.pruning.mode in ("one-shot", "auto") else None
 
     @property
     def schedule_step(self) -> int:
@@ -266,11 +298,13 @@ class SundaeModel(SplatfactoModel):
     def _pruning_end(self) -> int:
         """Step of the schedule after which the field keeps its primitives."""
         pruning = self.config.pruning
-        return pruning.stop if pruning.mode == "continuous" else pruning.prune_at
+        return pruning.stop if pruning.mode == "continuous" else pruning.last_prune
 
     @property
     def head_active(self) -> bool:
-        """Whether the head takes part: it starts when pruning has ended, unless told otherwise."""
+        """Whether the head takes part: it starts when pruning has ended, unless told otherwise, or when auto lets it."""
+        if self.budget is not None:
+            return self.head is not None and self.budget.search.head
         start = self.config.head.start_at
         return self.head is not None and self.schedule_step > (self._pruning_end if start is None else start)
 
@@ -300,15 +334,18 @@ class SundaeModel(SplatfactoModel):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Step, states of densification and pruning, and the head's scale: what goes on needs beside the tensors."""
-        return checkpoint.extra_state(
+        state = checkpoint.extra_state(
             self.step, self.num_features, self.strategy_state, self.pruning_state, self.trained_focal
         )
+        return state if self.budget is None else {**state, "budget": self.budget.state()}
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`get_extra_state`; tensors move to the device of the field."""
         self.step = int(state["step"])
         focal = state.get("trained_focal")  # older checkpoints do not know it
         self.trained_focal = None if focal is None else (float(focal[0]), float(focal[1]))
+        if self.budget is not None:
+            self.budget.load_state(state.get("budget"))
         for own, theirs in ((self.strategy_state, state["strategy"]), (self.pruning_state, state["pruning"])):
             own.clear()
             own.update({k: v.to(self.means.device) if isinstance(v, Tensor) else v for k, v in theirs.items()})
@@ -321,10 +358,15 @@ class SundaeModel(SplatfactoModel):
         Raises:
             CheckpointError: it is another method's checkpoint, or one of another feature width or head.
         """
-        checkpoint.check_model_state(state_dict, self.state_dict(), self.num_features)
+        expected: Mapping[str, Any] = self.state_dict()
+        if self.budget is not None:
+            expected = self.budget.shapes(state_dict.get(checkpoint.EXTRA_STATE), expected)
+        checkpoint.check_model_state(state_dict, expected, self.num_features)
         n = state_dict["gauss_params.means"].shape[0]
-        for value in self.gauss_params.values():
-            value.data = value.data.new_zeros(n, *value.shape[1:])
+        for name, value in self.gauss_params.items():
+            value.data = value.data.new_zeros(n, *expected[f"gauss_params.{name}"].shape[1:])
+        if self.budget is not None:
+            self.head = self.budget.prepare_head(state_dict[checkpoint.EXTRA_STATE], self.head)
         self._warm_start_error = None
         # Past SplatfactoModel's own loader on purpose: it replaces parameters and resets the step.
         return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
@@ -338,7 +380,12 @@ class SundaeModel(SplatfactoModel):
             camera: nerfstudio camera, camera-to-world with OpenGL axes.
             downscale: divide the resolution by this.
         """
-        pose = self.camera_optimizer.apply_to_camera(camera) if self.training else camera.camera_to_worlds
+        if self.training:
+            pose = self.camera_optimizer.apply_to_camera(camera)
+        else:
+            # Small sums on single numbers: on a GPU each would cost a launch, and each number read back a wait.
+            camera = camera.to("cpu")
+            pose = camera.camera_to_worlds
         pose = pose.reshape(-1, 3, 4)[0]
         rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
         top = torch.cat([rotation.T, -rotation.T @ pose[:, 3:]], dim=1)
@@ -370,7 +417,7 @@ class SundaeModel(SplatfactoModel):
         """Colours ``[N, 3]`` of the primitives as this view sees them."""
         if self.config.sh_degree == 0:
             return params["features_dc"].sigmoid()
-        degree = self.config.sh_degree
+        degree = round((params["features_rest"].shape[1] + 1) ** 0.5) - 1
         if self.config.warm_start is None:
             degree = min(self.step // self.config.sh_degree_interval, degree)
         center = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
@@ -401,7 +448,7 @@ class SundaeModel(SplatfactoModel):
         compensate = compensate and self.head_active
         colors = self._colors(params, view)
         channels = torch.cat([colors, params[FEATURES]], dim=1) if compensate else colors
-        absgrad = self.training and self.config.use_absgrad and self._densifying
+        absgrad = self.training and self.config.use_absgrad and self._densifying and self.config.warmup == "densify"
         splat = self._splat(params, view, channels, render_depth=depth, absgrad=absgrad)
         blended, features = splat.colors[..., :3], splat.colors[..., 3:]
         base = (blended + (1 - splat.alpha) * background).clamp(0.0, 1.0)
@@ -410,7 +457,7 @@ class SundaeModel(SplatfactoModel):
             assert self.head is not None
             zoom, weight = (1.0, 1.0) if self.training else plan(view.focal, self.trained_focal)
             if zoom == 1.0:
-                rgb = self.head(base, blended, features, splat.alpha)
+                rgb = self.head(base, splat.colors, splat.alpha)
             elif weight > 0:
                 at_scale, _ = self.render(params, view.zoomed(zoom), background, depth=False)
                 correction = at_scale["rgb"] - at_scale["base_rgb"]
@@ -426,8 +473,13 @@ class SundaeModel(SplatfactoModel):
         }
         return pictures, splat
 
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> _Outputs:  # type: ignore[override]
+        """Render a camera, or what of it lies in a box; unlike splatfacto's, this leaves the camera on its device."""
+        self.set_crop(obb_box)
+        return self.get_outputs(camera)
+
     @_names_full_memory
-    def get_outputs(self, camera: Cameras) -> dict[str, Any]:  # type: ignore[override]
+    def get_outputs(self, camera: Cameras) -> _Outputs:  # type: ignore[override]
         """Render a camera.
 
         Args:
@@ -435,8 +487,9 @@ class SundaeModel(SplatfactoModel):
 
         Returns:
             ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; outside training also ``features``
-            (principal components as colours) and ``response`` (spectral response of the primitives seen). In training,
-            pictures may be of a ``window`` alone, then given beside them.
+            (principal components as colours) and ``response`` (spectral response of the primitives seen), and those
+            beside the first two are made when they are asked for. In training, pictures may be of a ``window`` alone,
+            then given beside them.
         """
         view = self.view_of(camera, self._get_downscale_factor())
         background = self._get_background_color()
@@ -456,43 +509,59 @@ class SundaeModel(SplatfactoModel):
             return {**outputs, "background": background, "window": window}
 
         mask = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
-        kept = self.preview.mask(self)
-        if kept is not None:
-            mask = kept if mask is None else mask & kept
+        preview = self.preview.decision(self)
+        if preview is not None:
+            mask = preview.mask if mask is None else mask & preview.mask
         if mask is not None and not mask.any():
             return self.get_empty_outputs(view.width, view.height, background)
         params = self.gaussians if mask is None else {k: v[mask] for k, v in self.gaussians.items()}
-        compensate = kept is None and (self.compensate.value or not in_viewer())
+        if preview is not None and mask is not None and preview.values is not None:
+            rows = mask[preview.mask]
+            params = {**params, **{k: v[rows] for k, v in preview.values.items()}}
+        compensate = preview is None and (self.compensate.value or not in_viewer())
         outputs, splat = self.render(params, view, background, compensate=compensate)
-        outputs["depth"] = display.fill_depth(outputs["depth"], splat.alpha)
-        outputs["features"] = self._feature_colors(outputs.pop("feature_image"), splat.alpha)
-        outputs["response"] = self._response_image(params, mask, view)
-        outputs["background"] = background.expand(view.height, view.width, 3)
-        return outputs
+        field, features = dict(self.gaussians), outputs.pop("feature_image")
+        later = {
+            "depth": partial(display.fill_depth, outputs["depth"], splat.alpha),
+            "features": partial(self._feature_colors, field, features, splat.alpha),
+            "response": partial(self._response_image, field, mask, self._response_key, view),
+        }
+        background = background.expand(view.height, view.width, 3)
+        return LazyOutputs({**outputs, **{k: Later(make) for k, make in later.items()}, "background": background})
 
-    def _feature_colors(self, features: Tensor, alpha: Tensor) -> Tensor:
-        if features.shape[-1] == 0:
+    @staticmethod
+    def _feature_colors(field: Mapping[str, Tensor], image: Tensor, alpha: Tensor) -> Tensor:
+        if image.shape[-1] == 0:
             return alpha.new_zeros(*alpha.shape[:2], 3)
-        return display.feature_colors(features, *display.principal_components(self.gauss_params[FEATURES]), alpha)
+        return display.feature_colors(image, *display.principal_components(field[FEATURES]), alpha)
 
-    def _response_image(self, params: Mapping[str, Tensor], mask: Tensor | None, view: View) -> Tensor:
-        shown = self._response_values()
-        if shown is None:
-            return params["means"].new_zeros(view.height, view.width, 1)
-        return self._splat(params, view, (shown if mask is None else shown[mask])[:, None]).colors
-
-    def _response_values(self) -> Tensor | None:
-        """Spectral response ``[N]`` for display, kept until the field is pruned again; None while the field still grows."""
+    @property
+    def _response_key(self) -> tuple[int, int] | None:
+        """Which state of the field a response belongs to; None while the field still grows, when it is not shown."""
         if self.attached and self._densifying:
             return None
-        key = (self.num_points, self.pruning_state["num_prunes"])
-        if self._response[0] != key:
+        return self.num_points, self.pruning_state["num_prunes"]
+
+    def _response_image(
+        self, field: Mapping[str, Tensor], mask: Tensor | None, key: tuple[int, int] | None, view: View
+    ) -> Tensor:
+        shown = None if key is None else self._response_values(field, key)
+        if shown is None:
+            return field["means"].new_zeros(view.height, view.width, 1)
+        if mask is not None:
+            field, shown = {name: value[mask] for name, value in field.items()}, shown[mask]
+        return self._splat(field, view, shown[:, None]).colors
+
+    def _response_values(self, field: Mapping[str, Tensor], key: tuple[int, int]) -> Tensor | None:
+        """Spectral response ``[N]`` for display, kept until the field is pruned again."""
+        of, values = self._response
+        if of != key:
             try:
-                values: Tensor | None = display.response_values(response(self.gaussians, self.config.pruning).magnitude)
-            except DataError:  # too few primitives for a graph: nothing to show
+                values = display.response_values(response(field, self.config.pruning).magnitude)
+            except DataError:  # one primitive has no neighbour: nothing to show
                 values = None
             self._response = (key, values)
-        return self._response[1]
+        return values
 
     @staticmethod
     def get_empty_outputs(width: int, height: int, background: Tensor) -> dict[str, Any]:
@@ -539,10 +608,16 @@ class SundaeModel(SplatfactoModel):
         backend = self.backend  # an unusable rasteriser should be known before the first step
         CONSOLE.log(f"rasteriser: {backend.name} on {self.device}")
         self.attached = True
+        if self.budget is not None:
+            self.budget.check(cast(Any, training_callback_attributes.pipeline).datamanager)
         callbacks = super().get_training_callbacks(training_callback_attributes)
-        prune = partial(self._prune_if_due, training_callback_attributes)
-        prune.__name__ = "prune_if_due"  # type: ignore[attr-defined]
-        callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], prune))
+        for location, act in (
+            (TrainingCallbackLocation.AFTER_TRAIN, self._finish),
+            (TrainingCallbackLocation.AFTER_TRAIN_ITERATION, self._prune_if_due),
+        ):
+            callback = partial(act, training_callback_attributes)
+            callback.__name__ = act.__name__.lstrip("_")  # type: ignore[attr-defined]
+            callbacks.append(TrainingCallback([location], callback))
         return callbacks
 
     def step_post_backward(self, step: int) -> None:
@@ -561,6 +636,9 @@ class SundaeModel(SplatfactoModel):
         optimizers, pipeline = attributes.optimizers, attributes.pipeline
         assert optimizers is not None
         assert pipeline is not None
+        # Between growing and culling there were more than now.
+        peaks = (self.pruning_state["peak"], self.strategy_state.get("peak", 0))
+        self.pruning_state["peak"] = max(peaks)
         due = self.policy.due(self.pruning_state, self.schedule_step, self.num_points)
         evaluate = due and self.config.evaluate_prune and self._prune_at is not None
         before = self._evaluate(pipeline, "warm-up", step) if evaluate else {}
@@ -573,14 +651,18 @@ class SundaeModel(SplatfactoModel):
                 strategy_state=self.strategy_state,
                 contribution=partial(self.contribution, cast(SundaeDatamanager, pipeline.datamanager)),
             )
+            if self.budget is not None:
+                self.budget.after_step(self, attributes)
         except SundaeError:
             # The warm-up should not be lost to an option that can be mended: resuming prunes at the first step.
             if attributes.trainer is not None:
                 attributes.trainer.save_checkpoint(step)
             raise
         self._refresh(optimizers)
-        if self.schedule_step >= self._pruning_end:
-            notify_pruned(optimizers.schedulers, step)
+        last = self.schedule_step >= self._pruning_end
+        pruned = last or (self._prune_at is not None and self.pruning_state["num_prunes"] > 0)
+        if self.budget is None and pruned:
+            notify_pruned(optimizers.schedulers, step, last=last)
         if report is None:
             return
         CONSOLE.log(report.summary())
@@ -588,6 +670,15 @@ class SundaeModel(SplatfactoModel):
             CONSOLE.print(f"[yellow]Warning: dropped {report.dropped_nonfinite} primitives that were not finite")
         after = self._evaluate(pipeline, "pruned", step) if evaluate else {}
         self._record(attributes, report, before, after, step)
+
+    def _finish(self, attributes: TrainingCallbackAttributes, step: int) -> None:
+        """Say what training took at its peak, and whether a budget was met."""
+        primitives, memory = self.pruning_state["peak"], peak_memory(self.device) / 1e6
+        CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {self.device.type} memory")
+        writer.put_dict(name="Peak", scalar_dict={"primitives": primitives, "memory_mb": memory}, step=step)
+        if self.budget is not None:
+            self.budget.finish(self, attributes)
+        writer.write_out_storage()
 
     def _refresh(self, optimizers: Optimizers) -> None:
         """Surgery makes new parameters; nerfstudio's own list of them would go stale."""
@@ -623,29 +714,58 @@ class SundaeModel(SplatfactoModel):
         write_text(path, json.dumps(reports, indent=2))
 
     @torch.no_grad()
-    def contribution(self, datamanager: SundaeDatamanager) -> Tensor:
-        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``."""
-        params = self.gaussians
+    def contribution(self, datamanager: SundaeDatamanager, pruning: PruningConfig | None = None) -> Tensor:
+        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``.
+
+        Where the score asks for it, pixels count by the detail of the rendering, for as many cells as primitives seen in it
+        are going to be kept.
+
+        Args:
+            datamanager: has the training views.
+            pruning: options of the prune, if they are not those of the model.
+        """
+        pruning = pruning or self.config.pruning
+        share = pruning.share(self.num_points) if pruning.uses_detail else None
         total = torch.zeros(self.num_points, device=self.device)
         cameras = list(datamanager.training_cameras())
         for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
-            view = self.view_of(camera)
-            total += blending_weights(
-                params["means"],
-                params["quats"],
-                params["scales"].exp(),
-                params["opacities"].sigmoid().squeeze(-1),
-                view.viewmat,
-                view.K,
-                view.width,
-                view.height,
-                backend=self.backend,
-            )
+            total += self.weights_of(self.view_of(camera), share)
         return total
+
+    def weights_of(self, view: View, keep_ratio: float | None = None) -> Tensor:
+        """Blending weight of each primitive, summed over the pixels of one view ``[N]``.
+
+        Args:
+            view: the camera.
+            keep_ratio: share of the primitives that will stay; given, pixels count by the detail that so many can show.
+        """
+        params, pixels = self.gaussians, None
+        if keep_ratio is not None:
+            # Not the background of training, which may be random: the choice is to be the same from run to run.
+            background = self.background_color.to(self.device)
+            pictures, splat = self.render(params, view, background, depth=False, compensate=False)
+            pixels = pixel_detail(pictures["base_rgb"], keep_ratio * float((splat.radii > 0).sum()))
+        return blending_weights(
+            params["means"],
+            params["quats"],
+            params["scales"].exp(),
+            params["opacities"].sigmoid().squeeze(-1),
+            view.viewmat,
+            view.K,
+            view.width,
+            view.height,
+            pixels=pixels,
+            backend=self.backend,
+        )
 
     # --------------------------------------------------------------------------------------------- losses and metrics
 
     def _target(self, batch: dict[str, Any], outputs: dict[str, Any]) -> Tensor:
+        if NO_PICTURES in batch:
+            raise DataError(
+                "this run was unpacked without its capture: its cameras are there to look through, not to train or evaluate "
+                "on; give the capture to sundae unpack with --data"
+            )
         truth = _cut(self.get_gt_img(batch["image"]), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
 
@@ -683,6 +803,10 @@ class SundaeModel(SplatfactoModel):
             losses["base_loss"] = self.config.base_loss_weight * (base - target).abs().mean()
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
+            if self.config.warmup == "mcmc" and self._densifying:
+                # What nothing needs becomes transparent and small, and can be moved (equation 10 of 3DGS-MCMC).
+                losses["opacity_loss"] = MCMC_REGULARISER * self.gauss_params["opacities"].sigmoid().mean()
+                losses["scale_loss"] = MCMC_REGULARISER * self.gauss_params["scales"].exp().mean()
         return losses
 
     def get_image_metrics_and_images(

@@ -1,8 +1,8 @@
 """What a prune would keep, shown in the viewer before it happens. Floor 3: nerfstudio's viewer elements, no maths.
 
-A slider and a menu in the viewer; the field, and pictures of training and evaluation, are never touched. The head is left
-out of previews: it was trained on the primitives that are there, and on a part of them it would paint what no one has
-trained it to. A real prune is followed by training it again; base colours are what a prune leaves at once.
+A slider and a menu in the viewer; the field, and pictures of training and evaluation, are never touched. What is shown is
+what the prune itself leaves, by the same decision: under a rule that merges, with what the dropped hand on. The head is left
+out: it was trained on the primitives that are there, and on a part of them it would paint what no one has trained it to.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.gaussians import finite_mask
-from sundae_ns.pruning import PruningConfig, Response, decide, response
+from sundae_ns.graphs import NeighborGraph
+from sundae_ns.pruning import Decision, PruningConfig, band_rule, decide, field_graph, single_prune
+from sundae_ns.pruning.scores import on_graph_device
 
 if TYPE_CHECKING:
     from sundae_ns.model import SundaeModel
@@ -43,18 +45,20 @@ def in_viewer() -> bool:
 
 
 def rule_config(config: PruningConfig, rule: Rule, keep_ratio: float) -> PruningConfig:
-    """Options of a prune by ``rule`` that keeps ``keep_ratio``; graph, signal, gamma and seed are those of ``config``.
+    """Options of one prune by ``rule`` that keeps ``keep_ratio``; what the rule leaves open is as in ``config``.
 
     ``band: both`` is the paper's rule, with ``config``'s gamma; ``band: high`` and ``band: low`` are its two ends alone.
+    These, opacity and random leave the values of what stays alone.
     """
     bands = {"band: high": 1.0, "band: low": 0.0, "band: both": config.gamma}
     if rule in bands:
-        return replace(config, keep_ratio=keep_ratio, score="response", selection="band", gamma=bands[rule])
+        return band_rule(replace(config, signal="positions"), keep_ratio, bands[rule])
+    config = single_prune(config, keep_ratio)
     if rule == "opacity":
-        return replace(config, keep_ratio=keep_ratio, score="opacity", selection="top")
+        return replace(config, score="opacity", selection="top", redistribution="none")
     if rule == "random":
-        return replace(config, keep_ratio=keep_ratio, score="random")
-    return replace(config, keep_ratio=keep_ratio)
+        return replace(config, score="random", selection="sampled", redistribution="none")
+    return config
 
 
 class _Version:
@@ -96,51 +100,58 @@ class Preview(torch.nn.Module):
             hint="Show only what a prune to this share would keep; 1 shows everything",
         )
         rules = list(get_args(Rule))
-        self.rule = ViewerDropdown("Rule", rules[0], rules, hint="Which primitives a prune would keep; the head is off")
+        self.rule = ViewerDropdown(
+            "Rule", rules[0], rules, hint="Which primitives a prune would keep; shown without the head"
+        )
         self.control = ViewerControl()
         """Through it nerfstudio hands over the viewer, and so the training views."""
         self._lock = threading.Lock()
         self._seen: _Version | None = None
-        self._response: Response | None = None
-        self._contribution: Tensor | None = None
-        self._mask: Tensor | None = None
-        self._mask_of: tuple[str, float] | None = None
+        self._graphs: dict[str, NeighborGraph] = {}
+        self._contribution: tuple[float | None, Tensor] | None = None
+        self._found: tuple[tuple[str, float], Decision | None] | None = None
 
-    def mask(self, model: SundaeModel) -> Tensor | None:
-        """Which primitives to show, bool ``[N]``; None for all of them.
+    def decision(self, model: SundaeModel) -> Decision | None:
+        """What to show; None for all of the field as it is.
 
-        None outside of the viewer, with the slider at 1, and where the rule cannot be applied, which is said once. What
-        the field's graph and views say is computed once a field. The caller holds nerfstudio's lock on the field, as
-        its viewer does, so that training in another thread waits.
+        None outside of the viewer, with the slider at 1, and where the rule cannot be applied, which is said once. Graphs
+        are built once a field; the pass over the training views is repeated where the rule weighs pixels by the share
+        that is kept. The caller holds nerfstudio's lock on the field, as its viewer does, so that training in another
+        thread waits.
         """
         keep_ratio = round(float(self.keep_ratio.value), 6)
         if keep_ratio >= 1 or not in_viewer():
             return None
-        rule = self.rule.value
+        asked = (self.rule.value, keep_ratio)
         with self._lock:
             if self._seen is None or not self._seen.is_of(model):
-                self._seen, self._response, self._contribution, self._mask_of = _Version(model), None, None, None
-            if self._mask_of != (rule, keep_ratio):
+                self._seen, self._graphs, self._contribution, self._found = _Version(model), {}, None, None
+            if self._found is None or self._found[0] != asked:
+                found: Decision | None = None
                 try:
-                    self._mask = self._decide(model, rule_config(model.config.pruning, rule, keep_ratio))
-                except SundaeError as error:
+                    found = self._decide(model, rule_config(model.config.pruning, *asked))
+                except (SundaeError, torch.cuda.OutOfMemoryError) as error:
                     # In the viewer's thread an error would end all drawing.
-                    CONSOLE.log(f"[yellow]No preview of {rule}: {error}")
-                    self._mask = None
-                self._mask_of = (rule, keep_ratio)
-            return self._mask
+                    reason = " ".join(str(error).split())[:200]
+                    CONSOLE.log(f"[yellow]No preview of {asked[0]}: {reason}")
+                self._found = (asked, found)
+            return self._found[1]
 
-    def _decide(self, model: SundaeModel, config: PruningConfig) -> Tensor:
+    def _decide(self, model: SundaeModel, config: PruningConfig) -> Decision:
         params = model.gaussians
-        if config.uses_graph and self._response is None:
+        if config.uses_graph and config.edges not in self._graphs:
             finite = finite_mask(params)
-            self._response = response({name: value.detach()[finite] for name, value in params.items()}, config)
-        return decide(params, config, lambda: self._contribution_of(model), found=self._response).mask
+            usable = {name: value.detach()[finite] for name, value in params.items()}
+            self._graphs[config.edges] = field_graph(on_graph_device(usable, config), config)
+        return decide(
+            params, config, lambda: self._contribution_of(model, config), graph=self._graphs.get(config.edges)
+        )
 
-    def _contribution_of(self, model: SundaeModel) -> Tensor:
-        if self._contribution is None:
+    def _contribution_of(self, model: SundaeModel, config: PruningConfig) -> Tensor:
+        share = config.keep_ratio if config.uses_detail else None
+        if self._contribution is None or self._contribution[0] != share:
             viewer: Any = getattr(self.control, "viewer", None)
             if viewer is None:
                 raise ConfigError("there are no training views here; open the run with ns-viewer, or take another rule")
-            self._contribution = model.contribution(viewer.pipeline.datamanager)
-        return self._contribution
+            self._contribution = (share, model.contribution(viewer.pipeline.datamanager, config))
+        return self._contribution[1]

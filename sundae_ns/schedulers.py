@@ -81,9 +81,14 @@ class PruneAwareDecay(Scheduler):
         return LambdaLR(optimizer, lr_lambda=decay)
 
 
-def notify_pruned(schedulers: dict[str, LRScheduler], step: int) -> None:
-    """Tell every :class:`Decay` among ``schedulers`` that the field was pruned at ``step``; the first prune counts."""
+def notify_pruned(schedulers: dict[str, LRScheduler], step: int, *, last: bool = True) -> None:
+    """Tell every :class:`Decay` among ``schedulers`` that the field was pruned at ``step``; the first prune counts.
+
+    Where pruning goes on (``last`` is False), those that hold their rate until it ends are not told yet.
+    """
     for scheduler in schedulers.values():
         for multiplier in getattr(scheduler, "lr_lambdas", []):
-            if isinstance(multiplier, Decay) and multiplier.pruned_at is None:
+            if not isinstance(multiplier, Decay) or multiplier.pruned_at is not None:
+                continue
+            if last or not multiplier.hold_until_prune:
                 multiplier.pruned_at = step

@@ -10,7 +10,7 @@ import pytest
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.data.scene_box import OrientedBox, SceneBox
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
@@ -19,11 +19,12 @@ from nerfstudio.viewer.viewer_elements import ViewerElement
 from torch import Tensor
 
 import sundae_ns.preview
+import sundae_ns.pruning.decision
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.optimizers import FusedAdamConfig
-from sundae_ns.preview import Rule
-from sundae_ns.pruning import PruningConfig, decide, response
+from sundae_ns.preview import Rule, rule_config
+from sundae_ns.pruning import PruningConfig, make_policy, response
 
 N = 90
 RULES: tuple[Rule, ...] = get_args(Rule)
@@ -46,13 +47,13 @@ class Views:
         yield from (camera(-0.5), camera(0.5))
 
 
-def build(n: int = N) -> tuple[SundaeModel, Views]:
+def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
     """A model whose head takes part, as a viewer has set it up."""
     generator = torch.Generator().manual_seed(1)
     xyz = torch.randn(n, 3, generator=generator) * 0.5
     rgb = torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
     config = SundaeModelConfig(
-        pruning=PruningConfig(prune_at=3, keep_ratio=0.5),
+        pruning=PruningConfig(**{"prune_at": 3, "keep_ratio": 0.5, **pruning}),
         head=HeadConfig(size="tiny", num_features=5, pixel_unshuffle=1),
         camera_optimizer=CameraOptimizerConfig(mode="off"),
         sh_degree=1,
@@ -89,7 +90,8 @@ def as_the_viewer(call: Callable[[], Any]) -> Any:
 
 def shown(model: SundaeModel, rule: Rule, keep_ratio: float) -> Tensor | None:
     model.preview.rule.value, model.preview.keep_ratio.value = rule, keep_ratio
-    return as_the_viewer(lambda: model.preview.mask(model))
+    decision = as_the_viewer(lambda: model.preview.decision(model))
+    return None if decision is None else decision.mask
 
 
 def picture(model: SundaeModel) -> dict[str, Tensor]:
@@ -122,25 +124,77 @@ def test_exactly_the_share_is_shown(rule: Rule, keep_ratio: float) -> None:
     assert torch.equal(mask, again)
 
 
-def test_what_is_shown_is_what_a_prune_keeps() -> None:
-    model, views = build()
-    mask = shown(model, "as configured", 0.2)
-    config = PruningConfig(keep_ratio=0.2)
-    expected = decide(model.gaussians, config, lambda: model.contribution(views)).mask  # type: ignore[arg-type]
-    assert mask is not None
-    assert torch.equal(mask, expected)
-    known = response(model.gaussians, model.config.pruning).magnitude
-    high, low, both = (shown(model, rule, 0.2) for rule in ("band: high", "band: low", "band: both"))
+PRUNES: list[dict[str, Any]] = [
+    {},
+    {"score": "contribution", "redistribution": "grow"},
+    {"score": "response-contribution", "selection": "shared"},
+    {"score": "coherence-contribution", "selection": "sampled", "redistribution": "none", "seed": 3},
+    {"score": "response", "selection": "band", "signal": "positions", "edges": "centres", "redistribution": "none"},
+]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("options", PRUNES, ids=lambda options: options.get("score", "default"))
+def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None:
+    model, views = build(**options)
+    model.preview.keep_ratio.value = 0.2
+    decision = as_the_viewer(lambda: model.preview.decision(model))
+    seen = as_the_viewer(lambda: picture(model))
+    model.config.pruning.keep_ratio = 0.2
+    before = {name: value.clone() for name, value in model.gaussians.items()}
+    optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
+    report = make_policy(model.config.pruning).step_post_backward(
+        model.gaussians,
+        optimizers,
+        {"pruned_at": -1, "num_prunes": 0, "peak": N},
+        model.config.pruning.prune_at,
+        contribution=lambda: model.contribution(views),  # type: ignore[arg-type]
+    )
+    assert report is not None
+    assert report.after == int(decision.mask.sum()) == 18
+    values = {name: value[decision.mask] for name, value in before.items()} | dict(decision.values or {})
+    assert {name for name, value in model.gaussians.items() if not torch.equal(value, values[name])} == set()
+    # A merge and growth show in the picture too.
+    left, _ = model.render(model.gaussians, model.view_of(camera()), seen["background"][0, 0], compensate=False)
+    assert torch.equal(seen["rgb"], left["rgb"])
+
+
+def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
+    model, _ = build()
+    known = response(model.gaussians, rule_config(model.config.pruning, "band: both", 0.2)).magnitude
+    masks = {rule: shown(model, rule, 0.2) for rule in RULES}
+    high, low, both, top = (masks[rule] for rule in ("band: high", "band: low", "band: both", "opacity"))
     assert high is not None
     assert low is not None
     assert both is not None
+    assert top is not None
     assert known[high].min() >= known[~high].max()
     assert known[low].max() <= known[~low].min()
     assert torch.equal(both, (both & high) | (both & low))
+    assert int((both & high).sum()) == int((both & low).sum()) == 9
     opaque = model.opacities[:, 0]
-    top = shown(model, "opacity", 0.2)
-    assert top is not None
     assert opaque[top].min() >= opaque[~top].max()
+    # The share of the slider counts, whatever budget the run had.
+    for options in ({"mode": "auto", "max_bytes": 900}, {"mode": "continuous", "target_primitives": 7, "start": 20000}):
+        busy, _ = build(**{"stop": 20000, **options})
+        mask = shown(busy, "as configured", 0.2)
+        assert mask is not None
+        assert torch.equal(mask, masks["as configured"])  # type: ignore[arg-type]
+
+
+@torch.no_grad()
+def test_a_crop_box_cuts_the_preview_too() -> None:
+    model, _ = build()
+    model.preview.keep_ratio.value = 0.5
+    decision = as_the_viewer(lambda: model.preview.decision(model))
+    half = OrientedBox(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]), torch.tensor([2.0, 9.0, 9.0]))
+    seen = as_the_viewer(lambda: model.get_outputs_for_camera(camera(), half))
+    rows = half.within(model.means).squeeze(-1)[decision.mask]
+    assert 0 < int(rows.sum()) < len(rows)
+    params = {name: value[decision.mask][rows] for name, value in model.gaussians.items()}
+    params |= {name: value[rows] for name, value in decision.values.items()}
+    expected, _ = model.render(params, model.view_of(camera()), seen["background"][0, 0], compensate=False)
+    assert torch.equal(seen["rgb"], expected["rgb"])
 
 
 @torch.no_grad()
@@ -159,16 +213,12 @@ def test_off_every_picture_is_as_before(rule: Rule) -> None:
 
 
 @torch.no_grad()
-def test_on_it_shows_the_kept_ones_in_base_colours_and_touches_nothing() -> None:
+def test_on_it_shows_base_colours_and_touches_nothing() -> None:
     model, _ = build()
     before = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, Tensor)}
     versions = [value._version for value in model.parameters()]
-    mask = shown(model, "as configured", 0.3)
-    assert mask is not None
+    model.preview.keep_ratio.value = 0.3
     found = as_the_viewer(lambda: picture(model))
-    part = {name: value[mask] for name, value in model.gaussians.items()}
-    expected, _ = model.render(part, model.view_of(camera()), found["background"][0, 0], compensate=False)
-    assert torch.equal(found["rgb"], expected["rgb"])
     assert torch.equal(found["rgb"], found["base_rgb"])
     assert found["response"].max() > 0
     after = model.state_dict()
@@ -194,15 +244,16 @@ def test_training_and_evaluation_do_not_see_it() -> None:
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Sizes of the fields whose graph was built for the preview."""
+    """Sizes of the fields whose graph was built, by the preview or by a decision."""
     seen: list[int] = []
-    original = sundae_ns.preview.response
+    original = sundae_ns.preview.field_graph
 
     def counted(params: Any, config: PruningConfig) -> Any:
         seen.append(len(params["means"]))
         return original(params, config)
 
-    monkeypatch.setattr(sundae_ns.preview, "response", counted)
+    monkeypatch.setattr(sundae_ns.preview, "field_graph", counted)
+    monkeypatch.setattr(sundae_ns.pruning.decision, "field_graph", counted)
     return seen
 
 
@@ -211,7 +262,12 @@ def test_graph_and_views_are_used_once_a_field(calls: list[int]) -> None:
     for rule in RULES:
         for keep_ratio in (0.1, 0.2, 0.3):
             shown(model, rule, keep_ratio)
-    assert calls == [N]
+    # One graph with the configured edges and one with the paper's; the detail that counts depends on the share.
+    assert calls == [N, N]
+    assert views.asked == 3
+    model, views = build(score="contribution")
+    for keep_ratio in (0.1, 0.2, 0.3):
+        shown(model, "as configured", keep_ratio)
     assert views.asked == 1
 
 
@@ -261,12 +317,12 @@ def test_a_prune_in_training_is_seen_and_a_step_is_not(calls: list[int]) -> None
     after = model.num_points
     assert after == 45
     assert kept == [18, 18, 18, 9, 9]
-    assert calls == [N, after]
+    assert calls == [N, N, after]  # the second one by the prune itself
 
 
 @torch.no_grad()
 def test_a_rule_that_cannot_be_applied_shows_everything_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
-    few, _ = build(10)  # fewer than neighbours in the graph
+    few, _ = build(1)  # a graph needs two
     before = picture(few)
     few.preview.rule.value, few.preview.keep_ratio.value = "band: high", 0.5
     for _ in range(2):

@@ -18,7 +18,8 @@ from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.evaluation import Look, look_along_axes, look_through, points_sheet, response_histogram
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.gaussians.parameters import sh_to_rgb
-from sundae_ns.pruning import PruningConfig, Response, decide, response
+from sundae_ns.graphs import NeighborGraph
+from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, response
 from sundae_ns.run_folder import find_config, read_config, training_cameras
 from sundae_ns.storage import replacing, write_point_cloud, write_text
 from sundae_ns.storage.atomic import storage_error
@@ -46,7 +47,7 @@ def base_colors(params: Mapping[str, Tensor], *, logits: bool) -> Tensor:
 
 
 def band_masks(
-    params: Mapping[str, Tensor], config: PruningConfig, found: Response, keep_ratio: float
+    params: Mapping[str, Tensor], config: PruningConfig, graph: NeighborGraph, keep_ratio: float
 ) -> dict[str, Tensor]:
     """Which primitives each rule keeps, bool ``[N]`` by the names of ``RULES``.
 
@@ -55,13 +56,12 @@ def band_masks(
 
     Args:
         params: the field, all finite.
-        config: graph, signal and gamma.
-        found: response of the field.
+        config: signal and gamma.
+        graph: of the field, on which the response is taken.
         keep_ratio: share that each rule keeps.
     """
     shares = {"high": 1.0, "low": 0.0, "combined": config.gamma}
-    options = replace(config, keep_ratio=keep_ratio, score="response", selection="band")
-    return {name: decide(params, replace(options, gamma=shares[name]), found=found).mask for name in RULES}
+    return {name: decide(params, band_rule(config, keep_ratio, shares[name]), graph=graph).mask for name in RULES}
 
 
 def band_figures(magnitude: Tensor, masks: Mapping[str, Tensor], keep_ratio: float) -> dict[str, Any]:
@@ -109,7 +109,7 @@ def _views(points: Tensor, source: Path, view: int | None) -> tuple[list[Look], 
     except SundaeError as error:
         if view is not None:
             raise ConfigError(f"there is no training view {view}: {error}") from error
-        return look_along_axes(points), f"three orthogonal views, since {error}"
+        return look_along_axes(points), f"three orthogonal views, since {str(error).partition(';')[0]}"
     if view is not None and not 0 <= view < len(cameras):
         raise ConfigError(f"there is no training view {view}: the run has {len(cameras)}, from 0 on")
 
@@ -177,7 +177,9 @@ def run_bands(
             raise DataError(f"none of the {len(finite)} primitives in {run} is finite; give another field")
         colors = base_colors(params, logits=run.suffix != ".ply")
         next_is("Graph and response")
-        found = response(params, config)
+        config = band_rule(config, ratios[0], config.gamma)
+        graph = field_graph(params, config)
+        found = response(params, config, graph)
         next_is("Cameras")
         looks, looked = _views(params["means"], source, view)
         next_is("Rules")
@@ -197,7 +199,7 @@ def run_bands(
 
         cloud("all.ply")
         for keep_ratio in ratios:
-            masks = band_masks(params, config, found, keep_ratio)
+            masks = band_masks(params, config, graph, keep_ratio)
             figures.append(band_figures(found.magnitude, masks, keep_ratio))
             thresholds[f"{keep_ratio:g}"] = (figures[-1]["low_to"], figures[-1]["high_from"])
             for name, mask in masks.items():

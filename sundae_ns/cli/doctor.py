@@ -97,13 +97,20 @@ def kernels(compile_kernels: bool) -> Finding:
 
 def rasterizer(kernels_finding: Finding) -> Finding:
     """Which rasteriser ``auto`` takes."""
+    from sundae_ns.rasterization import numba_problem
+
     if torch.cuda.is_available():
         if kernels_finding.ok:
             return Finding("rasteriser", True, "auto takes gsplat")
         if kernels_finding.detail == "not built yet":
             return Finding("rasteriser", True, "auto takes gsplat, after it has built its kernels")
-    detail = "auto takes reference, in plain PyTorch: right for small scenes, slow for captures"
-    return Finding("rasteriser", True, detail)
+    elif problem := numba_problem():
+        cause, mend = problem.rsplit("; ", 1)
+        detail = f"auto takes reference, in plain PyTorch: several times as slow as cpu, since {cause}"
+        return Finding("rasteriser", False, detail, mend, needed=False)
+    else:
+        return Finding("rasteriser", True, "auto takes cpu, compiled by numba: for small scenes; a capture needs CUDA")
+    return Finding("rasteriser", True, "auto takes reference, in plain PyTorch: slow; mend gsplat's kernels")
 
 
 def lpips() -> Finding:

@@ -10,10 +10,14 @@ from typing import Annotated, Literal
 import tyro
 
 from sundae_ns.cli.bench import app as bench
+from sundae_ns.cli.files import export, prune
+from sundae_ns.cli.packing import pack, unpack
 from sundae_ns.errors import SundaeError
 
 app = tyro.extras.SubcommandApp()
 app.command(bench, name="bench", help="Measure a part of SUNDAE on this machine.")
+for command in (pack, unpack, export, prune):
+    app.command(command)
 
 
 @app.command
@@ -37,6 +41,8 @@ def scene(
     width: int = 128,
     height: int = 128,
     points: int = 2000,
+    kind: Literal["still-life", "wall"] = "still-life",
+    sensor_noise: float = 0.0,
 ) -> int:
     """Write the embedded scene: a small ray-traced capture in nerfstudio format, with a sparse point cloud.
 
@@ -48,6 +54,8 @@ def scene(
         width: pixels.
         height: pixels.
         points: size of the sparse point cloud.
+        kind: the still life, or one flat painted wall, which needs next to nothing.
+        sensor_noise: standard deviation of the noise of each pixel, in [0, 1].
     """
     from rich.progress import Progress
 
@@ -63,6 +71,8 @@ def scene(
             width=width,
             height=height,
             points=points,
+            kind=kind,
+            sensor_noise=sensor_noise,
             progress=lambda done, total: progress.update(task, completed=done, total=total),
         )
     print(f"wrote {train_views} training and {test_views} test views to {out}")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from sundae_ns.compensation.graphed import GraphedTraining
+from sundae_ns.compensation.fused import FusedInference
+from sundae_ns.compensation.fused_training import FusedTraining
 from sundae_ns.compensation.unet import UNet
-from sundae_ns.errors import ConfigError
+from sundae_ns.errors import BackendError, ConfigError
 
 SIZES: dict[str, tuple[int, int | None]] = {
     "tiny": (8, None),
@@ -20,6 +22,8 @@ SIZES: dict[str, tuple[int, int | None]] = {
     "large": (128, None),
 }
 """Channels of the finest level, and the most that a coarser one may have. The last three are the paper's."""
+
+_log = logging.getLogger(__name__)
 
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
 
@@ -40,13 +44,14 @@ class HeadConfig:
     """Length F of the feature vector of each primitive. 1, 5, 13 and 29 splat without padding."""
     start_at: int | None = None
     """Training step at which the head starts; by default it starts with the prune."""
-    max_train_pixels: int = 2**20
+    max_train_pixels: int = 2**22
     """Train on a random window of at most this many pixels where pictures are larger, once the head takes part; 0 for
     whole pictures."""
     precision: Literal["fp32", "bf16", "fp16"] = "bf16"
     """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is meant for inference: it trains unscaled."""
-    cuda_graph: bool = True
-    """Replay the U-Net as one CUDA graph while training: the same numbers, without the time of launching each kernel."""
+    fused: bool = True
+    """On CUDA, in bf16 and fp16: run through our own kernels between the convolutions, and as one CUDA graph for each picture
+    size, both while training and for pictures that are only looked at. Otherwise layer by layer."""
 
     def validate(self) -> None:
         """Check the values.
@@ -76,6 +81,9 @@ class CompensationHead(nn.Module):
 
     def __init__(self, config: HeadConfig) -> None:
         super().__init__()
+        self._build(config)
+
+    def _build(self, config: HeadConfig) -> None:
         config.validate()
         if config.mode == "off":
             raise ConfigError("head.mode is off: there is no compensation head to build; ask for residual or features")
@@ -92,32 +100,62 @@ class CompensationHead(nn.Module):
             zero_init=config.mode == "residual",
         )
         self.net.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._graphed = GraphedTraining(self.net, PRECISIONS[config.precision])
+        self._accelerate()
 
-    def forward(self, base: Tensor, colors: Tensor, features: Tensor, alpha: Tensor) -> Tensor:
+    def _accelerate(self) -> None:
+        residual = self.config.mode == "residual"
+        self._inference, self._training = FusedInference(self.net, residual), FusedTraining(self.net, residual)
+        self._can_fuse = self.config.fused
+
+    @torch.no_grad()
+    def resize(self, config: HeadConfig) -> None:
+        """Become the head of another size or feature width, with fresh weights.
+
+        The parameters stay the same objects, which an optimizer may hold; a state that it has of them is stale.
+        """
+        held = list(self.parameters())
+        self._build(config)
+        places = [(module, name) for module in self.net.modules() for name in module._parameters]
+        for own, (module, name) in zip(held, places, strict=True):
+            own.data, own.grad = getattr(module, name).data.to(own), None
+            setattr(module, name, own)
+        self.net.train(self.training)
+        self._accelerate()
+
+    def forward(self, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
         """Compensate one picture.
 
         Args:
             base: ``[H, W, 3]`` spherical-harmonics picture over its background, in [0, 1].
-            colors: ``[H, W, 3]`` the same without background, so that the head does not depend on it.
-            features: ``[H, W, F]`` splatted features.
+            splatted: ``[H, W, 3 + F]`` the same colours without background, so that the head does not depend on it, and the
+                features.
             alpha: ``[H, W, 1]`` accumulation.
 
         Returns:
             ``[H, W, 3]`` float32, not clamped. Where nothing was splatted the residual head returns ``base``.
         """
+        dtype = PRECISIONS[self.config.precision] if base.is_cuda else torch.float32
+        if self._can_fuse and dtype != torch.float32:
+            try:
+                return self._fused(base, splatted, alpha, dtype)
+            except BackendError as error:
+                _log.warning("the head runs layer by layer, not with the kernels for %s: %s", base.device, error)
+                self._can_fuse = False
         residual = self.config.mode == "residual"
-        image = torch.cat([colors, alpha, features], dim=-1) if residual else features
+        image = torch.cat([splatted[..., :3], alpha, splatted[..., 3:]], dim=-1) if residual else splatted[..., 3:]
         # [H, W, C] is the channels-last layout of [1, C, H, W]: no copy.
-        out = self._run(image.permute(2, 0, 1)[None])[0].permute(1, 2, 0).float()
-        return base + alpha * out if residual else out
+        out = self._layers(image.permute(2, 0, 1)[None], dtype)[0].permute(1, 2, 0)
+        if out.dtype == torch.float16:
+            # Activations beyond its 65504 are infinite, and NaN in the next layer: no correction there.
+            out = out.nan_to_num(0.0, 0.0, 0.0)
+        return base + alpha * out.float() if residual else out.float()
 
-    def _run(self, image: Tensor) -> Tensor:
-        dtype = PRECISIONS[self.config.precision] if image.is_cuda else torch.float32
-        image = image.to(dtype)
-        if self.config.cuda_graph and image.is_cuda and image.requires_grad and self.training:
-            out = self._graphed(image)
-            if out is not None:
-                return out
+    def _fused(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
+        if not torch.is_grad_enabled():
+            return self._inference(base, splatted, alpha, dtype)
+        out = self._training(splatted, alpha, dtype)
+        return base + out if self.config.mode == "residual" else out
+
+    def _layers(self, image: Tensor, dtype: torch.dtype) -> Tensor:
         with torch.autocast(image.device.type, dtype=dtype, enabled=dtype != torch.float32):
-            return self.net(image)
+            return self.net(image.to(dtype))

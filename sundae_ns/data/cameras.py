@@ -67,6 +67,31 @@ def orbit(
     return cameras
 
 
+def facing(
+    count: int, *, width: int, height: int, rng: np.random.Generator, field_of_view: float = 50.0
+) -> list[Camera]:
+    """``count`` cameras before the plane y = 0, which all look at it, from up to 40 degrees to the side.
+
+    Places follow the golden-ratio sequence across and up, so that any few in a row cover the whole range.
+
+    Args:
+        count: number of cameras.
+        width: pixels.
+        height: pixels.
+        rng: source of the small jitter.
+        field_of_view: degrees, across the shorter side.
+    """
+    golden = (5**0.5 - 1) / 2
+    focal = 0.5 * min(width, height) / np.tan(np.radians(field_of_view) / 2)
+    cameras = []
+    for i in range(count):
+        across, up = 2 * ((i + 0.5) / count) - 1, 2 * ((i * golden) % 1.0) - 1
+        eye = np.array([2.6 * across, -3.2 + rng.uniform(-0.3, 0.3), 1.4 * up])
+        target = np.array([0.3 * across, 0.0, 0.2 * up]) + rng.uniform(-0.1, 0.1, 3) * [1, 0, 1]
+        cameras.append(Camera(look_at(eye, target), float(focal), width, height))
+    return cameras
+
+
 def pixel_rays(camera: Camera, columns: Array, rows: Array) -> tuple[Array, Array]:
     """Rays through image points.
 

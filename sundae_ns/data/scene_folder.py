@@ -5,16 +5,20 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 from PIL import Image
 
-from sundae_ns.data.cameras import Camera, orbit
+from sundae_ns.data.cameras import Camera, facing, orbit
 from sundae_ns.data.points import sparse_points
 from sundae_ns.data.shapes import Array
 from sundae_ns.data.still_life import still_life
 from sundae_ns.data.tracer import render
+from sundae_ns.data.wall import wall
 from sundae_ns.errors import ConfigError, DataError
+
+Kind = Literal["still-life", "wall"]
 
 TRANSFORMS = "transforms.json"
 POINT_CLOUD = "sparse_pc.ply"
@@ -98,9 +102,11 @@ def write_scene(
     point_noise: float = 0.002,
     outliers: float = 0.01,
     samples: int = 2,
+    kind: Kind = "still-life",
+    sensor_noise: float = 0.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Render the embedded still life and write it as a nerfstudio data set.
+    """Render the embedded still life, or a plain wall, and write it as a nerfstudio data set.
 
     Writes ``transforms.json`` (with its own train/test split), ``images/*.png`` and ``sparse_pc.ply``. The same
     arguments give the same bytes on the same machine. ``transforms.json`` comes last: a folder that an interrupted run
@@ -117,13 +123,16 @@ def write_scene(
         point_noise: standard deviation of a point's error, as a fraction of its distance from the camera.
         outliers: fraction of wrong points.
         samples: each pixel is the mean of ``samples`` x ``samples`` rays.
+        kind: the still life, or one flat painted wall, which needs few primitives.
+        sensor_noise: standard deviation of the noise of each pixel and colour, in [0, 1]; a phone's camera in a room has
+            about 0.015.
         progress: called with (views done, views in all) after each view.
 
     Returns:
         ``out``, the value for ``--data``.
 
     Raises:
-        ConfigError: a count or size is too small.
+        ConfigError: a count or size is too small, or the kind is unknown.
         DataError: ``out`` is a file, or holds files that are not ours.
     """
     for name, value, least in (
@@ -136,9 +145,12 @@ def write_scene(
         ("samples", samples, 1),
         ("point_noise", point_noise, 0),
         ("outliers", outliers, 0),
+        ("sensor_noise", sensor_noise, 0),
     ):
         if not value >= least:
             raise ConfigError(f"{name} is {value}; it must be {least} or more.")
+    if kind not in get_args(Kind):
+        raise ConfigError(f"kind is {kind!r}; use one of {', '.join(get_args(Kind))}.")
     if not outliers <= 1:
         raise ConfigError(f"outliers is {outliers}, a fraction of the points; it must be 1 or less.")
     if test_views > train_views:
@@ -150,11 +162,14 @@ def write_scene(
     names = [f"images/frame_{i + 1:05d}.png" for i in range(total)]
     _claim(out, [*names, POINT_CLOUD, TRANSFORMS])
 
-    scene = still_life(seed)
-    cameras = orbit(total, width=width, height=height, rng=np.random.default_rng([seed, 2]))
+    scene, cameras_of = (still_life(seed), orbit) if kind == "still-life" else (wall(seed), facing)
+    cameras = cameras_of(total, width=width, height=height, rng=np.random.default_rng([seed, 2]))
+    grain = np.random.default_rng([seed, 5])
     pictures = []
     for i, (camera, name) in enumerate(zip(cameras, names, strict=True)):
         picture = render(scene, camera, samples=samples)
+        if sensor_noise:
+            picture = np.clip(picture + grain.normal(scale=sensor_noise, size=picture.shape), 0, 1)
         Image.fromarray(np.round(picture * 255).astype(np.uint8)).save(out / name)
         pictures.append(picture)
         if progress is not None:

@@ -2,7 +2,9 @@
 
 from sundae_ns.evaluation import display
 from sundae_ns.evaluation.flicker import Change, Frame, change
+from sundae_ns.evaluation.lazy import Later, LazyOutputs
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
+from sundae_ns.evaluation.memory import peak_memory
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.evaluation.picture import ComparisonRow, comparison_sheet, save_comparison, side_by_side
 from sundae_ns.evaluation.points import (
@@ -22,6 +24,8 @@ __all__ = [
     "Change",
     "ComparisonRow",
     "Frame",
+    "Later",
+    "LazyOutputs",
     "Look",
     "Lpips",
     "Quality",
@@ -39,6 +43,7 @@ __all__ = [
     "lpips_weights_path",
     "lpips_weights_url",
     "median_ms",
+    "peak_memory",
     "points_sheet",
     "psnr",
     "read_rows",

@@ -58,10 +58,11 @@ def look_through(points: Tensor, viewmat: Tensor, K: Tensor, width: int, height:
 def look_along_axes(points: Tensor, side: int = 600) -> list[Look]:
     """Three orthogonal views of points ``[N, 3]``: from above (along z), from the front (y) and from the side (x).
 
-    Their common scale shows all but the outermost hundredth of the points at each end; floaters would shrink the rest.
+    Their common scale shows the middle 70% of the points along each axis and half as much again around them: a far
+    background, as captures that were walked around have, would shrink the rest to a dot.
     """
-    low, high = (torch.quantile(_few(points.double()), share, dim=0) for share in (0.01, 0.99))
-    middle, extent = (low + high) / 2, float((high - low).max()) * 1.05
+    low, high = (torch.quantile(_few(points.double()), share, dim=0) for share in (0.15, 0.85))
+    middle, extent = (low + high) / 2, float((high - low).max()) * 1.5
     scale = side / extent if extent > 0 else 1.0
     looks = []
     for name, right, up, along, sign in (
@@ -70,7 +71,7 @@ def look_along_axes(points: Tensor, side: int = 600) -> list[Look]:
         ("from the side", 1, 2, 0, -1.0),
     ):
         moved = (points.double() - middle) * scale
-        tall = float(high[up] - low[up]) * 1.05 * scale
+        tall = float(high[up] - low[up]) * 1.5 * scale
         height = round(min(max(tall, side / 4), side))
         pixels = torch.stack([side / 2 + moved[:, right], height / 2 - moved[:, up]], dim=1)
         depth = sign * moved[:, along]
@@ -163,7 +164,7 @@ def response_histogram(
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
+    figure = Figure(figsize=(9.5, 4.5), dpi=120, layout="constrained")
     panel = figure.subplots()
     values = magnitude[torch.isfinite(magnitude) & (magnitude > 0)].double().log10().numpy()
     if len(values):
@@ -177,14 +178,14 @@ def response_histogram(
                 panel.axvline(place, color=color, linestyle=style, linewidth=1.4, label=label)
     zeros, unknown = int((magnitude == 0).sum()), int((~torch.isfinite(magnitude)).sum())
     panel.set_title(
-        f"{len(magnitude):,} primitives; {unknown:,} without a response, {zeros:,} with none at all", fontsize=11
+        f"{len(magnitude):,} primitives; not shown: {unknown:,} without neighbours, {zeros:,} of no response",
+        fontsize=11,
     )
     panel.set_xlabel("squared norm of the high-pass response")
     panel.set_ylabel("primitives")
     if thresholds:
-        panel.legend(
-            title="high-pass keeps right of the line,\nlow-pass left of the dotted one", fontsize=9, title_fontsize=9
-        )
+        title = "share kept; high-pass right\nof the line, low-pass left\nof the dotted one"
+        figure.legend(loc="outside right upper", title=title, fontsize=9, title_fontsize=9)
     return _picture(figure)
 
 

@@ -45,7 +45,10 @@ class RunRow:
     ms_head: float | None
     train_s: float | None
     prune_s: float | None
+    peak_primitives: int | None
+    """Most primitives at any time during training, between growing and culling too."""
     peak_vram_mib: float | None
+    """Most memory that torch held on the GPU during training."""
     gpu: str
     resolution: str
     """Width x height of the pictures, pixels: ``1237x822``."""
@@ -76,6 +79,8 @@ def _parse(name: str, text: str) -> Any:
         return text
     if kind is int:
         return int(text)
+    if kind == (int | None):
+        return int(text) if text else None
     return float(text) if text else None
 
 

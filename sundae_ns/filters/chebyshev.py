@@ -130,6 +130,30 @@ def cheby_filter(
     return filtered.to(signal.dtype).reshape(signal.shape)
 
 
+def cheby_moments(L: sp.csr_matrix, probes: Tensor, *, order: int, lmax: float) -> Tensor:
+    """Moments of a graph's spectrum, ``tr T_j(2 L / lmax - I) / N`` for j up to ``order``, by random probes (Hutchinson).
+
+    With the coefficients of a kernel they give the mean of its gains over all frequencies: ``c @ moments``.
+
+    Args:
+        L: Laplacian ``[N, N]``.
+        probes: independent values of unit variance, any device ``[N, D]``.
+        order: highest moment, at least 0.
+        lmax: end of the spectrum, positive.
+
+    Returns:
+        Moments relative to that of order 0, float64, on the CPU ``[order + 1]``.
+    """
+    values = _check_signal(L, probes)
+    shifted = _operator((2 / lmax * L - sp.identity(L.shape[0])).tocsr(), probes.device)
+    previous, current = values, _product(shifted, values)
+    moments = [(values * values).sum(), (values * current).sum()]
+    while len(moments) <= order:
+        previous, current = current, _product(shifted, current).mul_(2).sub_(previous)
+        moments.append((values * current).sum())
+    return (torch.stack(moments[: order + 1]) / moments[0]).cpu()
+
+
 def exact_filter(L: sp.csr_matrix, signal: Tensor, kernel: Kernel) -> Tensor:
     """Filter a signal by eigendecomposition, ``U kernel(lambda) U^T x``: the oracle, for small graphs.
 

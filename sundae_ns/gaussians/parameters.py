@@ -53,5 +53,5 @@ def finite_mask(params: Mapping[str, Tensor]) -> Tensor:
     n = num_primitives(params)
     mask = torch.ones(n, dtype=torch.bool, device=params["means"].device)
     for value in params.values():
-        mask &= torch.isfinite(value.detach().reshape(n, -1)).all(dim=1)
+        mask &= torch.isfinite(value.detach().flatten(1)).all(dim=1)
     return mask

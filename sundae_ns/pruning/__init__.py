@@ -4,13 +4,18 @@
 calls it at its steps and applies the mask with :func:`sundae_ns.gaussians.surgery.keep`.
 """
 
-from sundae_ns.pruning.config import PruningConfig
+from sundae_ns.pruning.config import PruningConfig, band_rule, single_prune
+from sundae_ns.pruning.coverage import band_shares, inclusion_probabilities, neighbor_order, select_systematic
 from sundae_ns.pruning.decision import Decision, decide
+from sundae_ns.pruning.detail import pixel_detail
+from sundae_ns.pruning.edges import field_graph
+from sundae_ns.pruning.footprint import footprint
 from sundae_ns.pruning.policy import ContinuousPruning, NoPruning, OneShotPruning, PruningPolicy, make_policy
+from sundae_ns.pruning.redistribution import grown, heirs, merged
 from sundae_ns.pruning.report import PruneReport
-from sundae_ns.pruning.scores import Response, response, score
+from sundae_ns.pruning.scores import Response, coherence, response, score
 from sundae_ns.pruning.selection import kept_count, select_band, select_random, select_sampled, select_top
-from sundae_ns.pruning.signals import attribute_signal, position_signal
+from sundae_ns.pruning.signals import attribute_signal, color_signal, position_signal
 
 __all__ = [
     "ContinuousPruning",
@@ -22,14 +27,28 @@ __all__ = [
     "PruningPolicy",
     "Response",
     "attribute_signal",
+    "band_rule",
+    "band_shares",
+    "coherence",
+    "color_signal",
     "decide",
+    "field_graph",
+    "footprint",
+    "grown",
+    "heirs",
+    "inclusion_probabilities",
     "kept_count",
     "make_policy",
+    "merged",
+    "neighbor_order",
+    "pixel_detail",
     "position_signal",
     "response",
     "score",
     "select_band",
     "select_random",
     "select_sampled",
+    "select_systematic",
     "select_top",
+    "single_prune",
 ]

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from sundae_ns.errors import ConfigError
 
-Mode = Literal["one-shot", "continuous", "off"]
-ScoreName = Literal["response-contribution", "response", "contribution", "opacity", "random"]
-SelectionName = Literal["sampled", "band", "top"]
-SignalName = Literal["attributes", "positions"]
+Mode = Literal["one-shot", "continuous", "auto", "off"]
+ScoreName = Literal[
+    "response-contribution",
+    "coherence-contribution",
+    "detail-contribution",
+    "response",
+    "coherence",
+    "contribution",
+    "opacity",
+    "random",
+]
+SelectionName = Literal["sampled", "systematic", "shared", "band", "top"]
+SignalName = Literal["attributes", "colors", "positions"]
+EdgesName = Literal["centres", "appearance"]
+RedistributionName = Literal["none", "merge", "grow"]
 RuleName = Literal["robust", "literal"]
 DeviceName = Literal["cpu", "field"]
 
@@ -19,27 +30,43 @@ DeviceName = Literal["cpu", "field"]
 class PruningConfig:
     """When to prune, how much, and by which score.
 
-    The defaults are what ``sundae`` uses: sampling in proportion to response times contribution. The paper's rule is
-    ``selection="band", score="response", signal="positions"``.
+    The defaults are what ``sundae`` uses: one draw in each stretch of space, in proportion to the contribution to pixels
+    with detail, and what is dropped is merged into what stays. The paper's rule is ``selection="band", score="response",
+    signal="positions", edges="centres", redistribution="none"``.
     """
 
     mode: Mode = "one-shot"
-    """Prune once (the paper's main strategy), periodically while densifying (lower peak memory), or never."""
+    """Prune once (the paper's main strategy), periodically while densifying (lower peak memory), down to what the scene
+    needs (by max-psnr-drop, max-bytes or max-primitives), or never."""
     keep_ratio: float = 0.1
     """Share of the primitives to keep at each prune, in (0, 1]; the kept count is exactly round(keep_ratio * N)."""
-    selection: SelectionName = "sampled"
-    """How a score becomes a choice: sampled in proportion to it, its highest and lowest band, or the highest only."""
-    score: ScoreName = "response-contribution"
-    """Importance of a primitive: high-pass response, blending weight over the training views, their product, opacity,
-    or uniformly random (which leaves nothing for the selection to choose)."""
+    selection: SelectionName = "systematic"
+    """How scores become a choice: one draw in each stretch of space (systematic), independent draws (sampled), a systematic
+    draw with a share for every band of the response (shared), the highest (top), or both ends as in the paper (band)."""
+    score: ScoreName = "detail-contribution"
+    """What a primitive is worth: its blending weight over the training views (contribution), or the same with pixels weighted
+    by the detail in them that the budget cannot show (detail-contribution); its high-pass response, or its energy in the
+    low band that the budget spans (coherence), by themselves or times contribution; opacity; or all alike (random)."""
     signal: SignalName = "attributes"
-    """Graph signal that is filtered: position, colour, opacity and size together, or the paper's positions alone."""
+    """What the response is taken of, for the scores that have one: position, colour, opacity and size together, colour, or
+    the paper's positions alone."""
+    edges: EdgesName = "appearance"
+    """What makes neighbours near in the graph: overlap and likeness of colour beside distance (appearance), or distance alone
+    as in the paper (centres)."""
+    redistribution: RedistributionName = "merge"
+    """What becomes of the dropped: each is merged into the kept primitive that is nearest along the graph (merge), those that
+    stay grow into the gaps instead (grow), or nothing as in the paper (none). A merge needs a pass over the training
+    views."""
+    rounds: int = 1
+    """Prunes of the one-shot mode, each by the same factor, down to the keep ratio; training goes on in between."""
+    round_every: int = 500
+    """Steps from one round to the next."""
     gamma: float = 0.5
     """Share of the kept primitives that the band selection takes from the high end, in [0, 1]; the rest is low end."""
     num_neighbors: int = 16
-    """Most neighbours of a primitive in the graph."""
-    graph_device: DeviceName = "cpu"
-    """Where the graph is built and filtered: the CPU, or the device of the field, which for CUDA is our own kernel."""
+    """Most neighbours of a primitive in the graph; in a field of fewer primitives, all others."""
+    graph_device: DeviceName = "field"
+    """Where the graph is built and filtered: on the device of the field, which for CUDA is our own kernel, or on the CPU."""
     bandwidth: RuleName = "robust"
     """How the reach and the width of edges are found; the paper's literal rule gives an empty graph on most fields."""
     tau: float | None = None
@@ -53,21 +80,63 @@ class PruningConfig:
     start: int = 2000
     """First step at which continuous pruning may happen."""
     stop: int = 15000
-    """Last step at which continuous pruning may happen."""
+    """Last step at which continuous pruning may happen, or at which auto may look for a smaller field."""
     every: int = 2000
     """Steps from one continuous prune to the next."""
     max_primitives: int | None = None
-    """Cap for continuous pruning: prune down to this count where there are more, instead of by the keep ratio."""
+    """Continuous: never more than this many at any step, densification included. Auto: keep at most this many."""
+    target_primitives: int | None = None
+    """Continuous: each prune goes down to exactly this count where there are more, instead of by the keep ratio; the last one
+    comes after densification, and where that has left fewer, the field is filled up."""
+    max_psnr_drop: float | None = None
+    """Auto: keep as few as lose at most this many dB against the warm-up field on held-back training views, after
+    fine-tuning. 0.1 if no other budget is given."""
+    max_bytes: int | None = None
+    """Auto: keep as many as are stored in at most this many bytes, everything needed to show the scene counted."""
+    search_every: int = 250
+    """Auto: steps from one look at the held-back views to the next."""
+    patience: int = 4
+    """Auto: looks after which a cut that has not recovered is taken back."""
+
+    @property
+    def tolerated_drop(self) -> float:
+        """What auto may lose on held-back views, dB: for the count, or for the harmonics alone if that is given."""
+        return 0.1 if self.max_psnr_drop is None else self.max_psnr_drop
 
     @property
     def uses_contribution(self) -> bool:
-        """Whether the score needs the blending weights over the training views."""
-        return self.score in ("contribution", "response-contribution")
+        """Whether the blending weights over the training views are needed, by the score or by the merge."""
+        return self.score.endswith("contribution") or self.redistribution == "merge"
 
     @property
     def uses_graph(self) -> bool:
-        """Whether the score needs the neighbour graph."""
-        return self.score in ("response", "response-contribution")
+        """Whether the neighbour graph is needed, by the score, the selection or the merge."""
+        return self.uses_response or self.uses_coherence or self.redistribution == "merge"
+
+    @property
+    def uses_response(self) -> bool:
+        """Whether the high-pass response is needed, by the score or for its bands."""
+        return self.score.startswith("response") or self.selection == "shared"
+
+    @property
+    def uses_coherence(self) -> bool:
+        """Whether the score needs the local coherence."""
+        return self.score.startswith("coherence")
+
+    @property
+    def uses_detail(self) -> bool:
+        """Whether the score weighs the pixels of the contribution by the detail of the renderings."""
+        return self.score == "detail-contribution"
+
+    def share(self, n: int) -> float:
+        """Share of ``n`` primitives that a prune keeps: the keep ratio, or what the target or the cap leaves."""
+        goal = self.max_primitives if self.target_primitives is None else self.target_primitives
+        return self.keep_ratio if goal is None else min(1.0, goal / n)
+
+    @property
+    def last_prune(self) -> int:
+        """Step of the one-shot mode's last round."""
+        return self.prune_at + (self.rounds - 1) * self.round_every
 
     def validate(self) -> None:
         """Check every option.
@@ -80,6 +149,8 @@ class PruningConfig:
             ("selection", SelectionName),
             ("score", ScoreName),
             ("signal", SignalName),
+            ("edges", EdgesName),
+            ("redistribution", RedistributionName),
             ("bandwidth", RuleName),
             ("graph_device", DeviceName),
         ):
@@ -90,17 +161,76 @@ class PruningConfig:
             raise ConfigError(f"keep_ratio is {self.keep_ratio}: use a share in (0, 1], 0.1 to keep a tenth")
         if not 0 <= self.gamma <= 1:
             raise ConfigError(f"gamma is {self.gamma}: use a share in [0, 1]")
-        for name, least in (("num_neighbors", 1), ("every", 1), ("prune_at", 0), ("start", 0), ("max_primitives", 1)):
+        at_least = {"num_neighbors": 1, "every": 1, "prune_at": 0, "start": 0, "rounds": 1, "round_every": 1}
+        budgets = {"max_primitives": 1, "target_primitives": 1, "max_bytes": 1, "search_every": 1, "patience": 1}
+        for name, least in {**at_least, **budgets}.items():
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ConfigError(f"{name} is {value}: use at least {least}")
-        if self.stop < self.start:
+        if self.mode != "auto" and self.stop < self.start:
             raise ConfigError(f"stop ({self.stop}) lies before start ({self.start}): swap them, or set mode to off")
+        if self.rounds > 1 and self.mode in ("continuous", "auto"):
+            raise ConfigError(f"rounds is {self.rounds} but mode is {self.mode}: set mode to one-shot, or drop rounds")
         for name in ("tau", "sigma"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ConfigError(f"{name} is {value}: use a positive number, or leave it out for the bandwidth rule")
-        if self.max_primitives is not None and self.mode != "continuous":
-            raise ConfigError(
-                f"max_primitives is set but mode is {self.mode}: set mode to continuous, or drop max_primitives"
-            )
+        self._validate_budgets()
+
+    def _validate_budgets(self) -> None:
+        homes = {
+            "max_primitives": ("continuous", "auto"),
+            "target_primitives": ("continuous",),
+            "max_psnr_drop": ("auto",),
+            "max_bytes": ("auto",),
+        }
+        for name, modes in homes.items():
+            if getattr(self, name) is not None and self.mode not in modes:
+                raise ConfigError(
+                    f"{name} is set but mode is {self.mode}: set mode to {' or '.join(modes)}, or drop {name}"
+                )
+        if self.mode == "auto":
+            given = [
+                name for name in ("max_psnr_drop", "max_bytes", "max_primitives") if getattr(self, name) is not None
+            ]
+            if len(given) > 1:
+                raise ConfigError(f"{' and '.join(given)} are both set: give one budget, the others follow from it")
+            if not 0 < self.tolerated_drop < float("inf"):
+                raise ConfigError(f"max_psnr_drop is {self.max_psnr_drop}: use a positive number of dB, 0.1 for one")
+            if self.stop < self.prune_at:
+                raise ConfigError(
+                    f"stop ({self.stop}) lies before prune_at ({self.prune_at}): auto has no time to search"
+                )
+        cap, target = self.max_primitives, self.target_primitives
+        if cap is not None and target is not None and target > cap:
+            raise ConfigError(f"target_primitives ({target}) is more than max_primitives ({cap}): swap them")
+
+
+def single_prune(config: PruningConfig, keep_ratio: float) -> PruningConfig:
+    """The same choice as one prune to a share: without the mode's schedule, and without its budgets."""
+    return replace(
+        config,
+        mode="one-shot",
+        keep_ratio=keep_ratio,
+        rounds=1,
+        start=0,
+        max_primitives=None,
+        target_primitives=None,
+        max_psnr_drop=None,
+        max_bytes=None,
+    )
+
+
+def band_rule(config: PruningConfig, keep_ratio: float, gamma: float) -> PruningConfig:
+    """The paper's kind of prune to a share: both ends of the response, on a graph of centres, and nothing is merged.
+
+    Of the high end it takes ``gamma``; signal, neighbours and bandwidth are those of ``config``.
+    """
+    return replace(
+        single_prune(config, keep_ratio),
+        score="response",
+        selection="band",
+        gamma=gamma,
+        edges="centres",
+        redistribution="none",
+    )

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import DataError
+from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.parameters import finite_mask, num_primitives
+from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning.config import PruningConfig
-from sundae_ns.pruning.scores import Contribution, Response, response, score
+from sundae_ns.pruning.coverage import band_shares, neighbor_order, select_systematic
+from sundae_ns.pruning.edges import field_graph
+from sundae_ns.pruning.redistribution import grown, merged
+from sundae_ns.pruning.scores import Contribution, Response, coherence, on_graph_device, response, score
 from sundae_ns.pruning.selection import kept_count, select_band, select_random, select_sampled, select_top
 
 
@@ -33,6 +38,8 @@ class Decision:
     """Width of the graph's weights, scene units; None if no graph was needed."""
     isolated: int | None
     """How many primitives have no neighbour within the threshold; None if no graph was needed."""
+    values: Mapping[str, Tensor] | None = None
+    """What the parameters of those that stay become, in order ``[kept, ...]``; None where they stay as they are."""
 
 
 @torch.no_grad()
@@ -42,12 +49,13 @@ def decide(
     contribution: Contribution | None = None,
     *,
     count: int | None = None,
-    found: Response | None = None,
+    graph: NeighborGraph | None = None,
 ) -> Decision:
     """Decide which primitives of a field stay.
 
     Primitives with a NaN or infinite parameter go first; of the N that are left, exactly ``round(keep_ratio * N)``
-    stay. Where that is all of them, nothing is scored.
+    stay. Where that is all of them, nothing is scored, so that one primitive always stays. A field of no more primitives
+    than ``num_neighbors`` is pruned like any other: each is a neighbour of all others within reach.
 
     Args:
         params: the field.
@@ -55,11 +63,11 @@ def decide(
         contribution: gives the blending weights over the training views, one per primitive of ``params`` ``[N]``;
             called only if the score needs it.
         count: keeps this many, or all if there are not so many, instead of the share.
-        found: response of the finite primitives, where it is known already; else it is computed if the score needs it.
+        graph: :func:`field_graph` of the finite primitives by the same options, where it is at hand.
 
     Raises:
         ConfigError: an option cannot work, or the score needs a contribution and there is none.
-        DataError: no primitive is finite, or the field has not more primitives than the graph has neighbours.
+        DataError: no primitive is finite, or the contribution has not one value a primitive.
     """
     config.validate()
     n = num_primitives(params)
@@ -74,23 +82,54 @@ def decide(
         return Decision(finite, n_finite, n - n_finite, None, None, None, None)
 
     usable = params if n_finite == n else {name: value.detach()[finite] for name, value in params.items()}
-    found = (found or response(usable, config)) if config.uses_graph else None
-    usable_contribution = None if contribution is None else lambda: _rows(contribution(), finite)
-    selected = _select(score(usable, config, found, usable_contribution), config, count)
+    weights = _once(contribution, finite)
+    if not config.uses_graph:
+        graph = None
+    elif graph is None:
+        graph = field_graph(on_graph_device(usable, config), config)
+    found = response(usable, config, graph) if config.uses_response else None
+    coherent = coherence(graph, count, config, finite.device) if graph is not None and config.uses_coherence else None
+    values = score(usable, config, found, weights, coherent)
+    selected = _select(values, config, count, found, usable["means"])
     mask = finite.clone()
-    mask[finite] = selected
+    mask[finite] = selected.to(mask.device)
     return Decision(
         mask=mask,
         kept=count,
         dropped_nonfinite=n - n_finite,
         magnitude=None if found is None else _spread(found, finite),
-        tau=None if found is None else found.tau,
-        sigma=None if found is None else found.sigma,
-        isolated=None if found is None else found.isolated,
+        tau=None if graph is None else graph.tau,
+        sigma=None if graph is None else graph.sigma,
+        isolated=None if graph is None else int(graph.isolated.sum()),
+        values=_redistributed(usable, config, graph, selected, weights),
     )
 
 
-def _select(values: Tensor, config: PruningConfig, count: int) -> Tensor:
+def _redistributed(
+    params: Mapping[str, Tensor],
+    config: PruningConfig,
+    graph: NeighborGraph | None,
+    mask: Tensor,
+    weights: Contribution | None,
+) -> dict[str, Tensor] | None:
+    if config.redistribution == "none":
+        return None
+    if config.redistribution == "grow":
+        return grown(params, mask)
+    assert graph is not None
+    if weights is None:
+        raise ConfigError("a merge needs a pass over the training views and there are none: set redistribution to grow")
+    return merged(params, graph, mask, weights())
+
+
+def _select(values: Tensor, config: PruningConfig, count: int, found: Response | None, points: Tensor) -> Tensor:
+    if config.selection in ("systematic", "shared"):
+        order = neighbor_order(points)
+        if config.selection == "shared":
+            assert found is not None
+            values, band = band_shares(values, found.magnitude.sqrt())
+            order = order[torch.sort(band[order], stable=True).indices]
+        return select_systematic(values, count, order, config.seed)
     if config.score == "random":
         return select_random(len(values), count, config.seed, values.device)
     if config.selection == "band":
@@ -98,6 +137,11 @@ def _select(values: Tensor, config: PruningConfig, count: int) -> Tensor:
     if config.selection == "top":
         return select_top(values, count)
     return select_sampled(values, count, config.seed)
+
+
+def _once(contribution: Contribution | None, finite: Tensor) -> Contribution | None:
+    """The contribution of the finite primitives, asked for once however often it is needed."""
+    return None if contribution is None else functools.cache(lambda: _rows(contribution(), finite))
 
 
 def _rows(contribution: Tensor, finite: Tensor) -> Tensor:

@@ -19,14 +19,19 @@ from torch.optim import Optimizer
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, num_primitives
+from sundae_ns.gaussians.relocation import grow
+from sundae_ns.gaussians.rewriting import rewrite
 from sundae_ns.gaussians.surgery import check_wiring, keep, keep_state
 from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.decision import decide
 from sundae_ns.pruning.report import PruneReport
 from sundae_ns.pruning.scores import Contribution
+from sundae_ns.pruning.selection import kept_count
 
 NEVER = -1
 """Value of ``state["pruned_at"]`` before the first prune."""
+LEAST_OPACITY = 0.005
+"""Of primitives that share one's looks; 3DGS-MCMC takes those below it for dead."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +121,10 @@ class PruningPolicy:
         if dropped:
             # Before the decision: the contribution is a render of the field, and one NaN spoils all of its pixels.
             apply(finite)
-        decision = decide(params, self._config_at(step), contribution, count=self._count())
+        decision = decide(params, self._config_at(step), contribution, count=self._count(state, before - dropped))
         apply(decision.mask)
+        if decision.values is not None:
+            rewrite(params, optimizers, decision.values)
         state["pruned_at"] = step
         state["num_prunes"] += 1
         return PruneReport(
@@ -136,8 +143,8 @@ class PruningPolicy:
         """Options of the prune at a step."""
         return self.config
 
-    def _count(self) -> int | None:
-        """Number of primitives to keep, or None for the keep ratio."""
+    def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
+        """Number of primitives to keep of ``n`` finite ones, or None for the keep ratio."""
         return None
 
 
@@ -150,33 +157,92 @@ class NoPruning(PruningPolicy):
 
 
 class OneShotPruning(PruningPolicy):
-    """Training, then one prune down to ``keep_ratio``, then fine-tuning: the paper's main strategy."""
+    """Training, then one prune down to ``keep_ratio``, then fine-tuning: the paper's main strategy.
 
-    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """Once, at ``prune_at``; or at once, if training went on from a later step without having pruned."""
-        return state["pruned_at"] == NEVER and step >= self.config.prune_at
-
-
-class ContinuousPruning(PruningPolicy):
-    """Periodic pruning while densification goes on: a lower peak, a loosely held final count.
-
-    The alternative strategy of the paper (section "Continuous Pruning as a Strategy"). With ``max_primitives`` it
-    prunes down to that cap where there are more; without, by ``keep_ratio`` each time.
+    With ``rounds`` the prune is taken in that many steps, each by the same factor, ``round_every`` steps of training apart.
+    The state holds how many primitives there were at first, so that the last round ends at the exact count.
     """
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """At ``start`` and each ``every`` steps from there until ``stop``, if the count is above the cap."""
+        """At ``prune_at``, or at once, if training went on from a later step without having pruned; then at the rounds."""
+        config, done = self.config, state["num_prunes"]
+        if state["pruned_at"] == NEVER:
+            return step >= config.prune_at
+        return done < config.rounds and step >= state["pruned_at"] + config.round_every
+
+    def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
         config = self.config
+        if config.rounds == 1:
+            return None
+        first = state.setdefault("first", n)
+        done = state["num_prunes"] + 1
+        return kept_count(config.keep_ratio ** (done / config.rounds), first)
+
+    def _config_at(self, step: int) -> PruningConfig:
+        if self.config.rounds == 1:
+            return self.config
+        # Another draw in each round, and after a resume the same as without it.
+        return replace(self.config, seed=self.config.seed + step)
+
+
+class ContinuousPruning(PruningPolicy):
+    """Periodic pruning while densification goes on: a lower peak of memory.
+
+    The alternative strategy of the paper (section "Continuous Pruning as a Strategy"), whose final count is loosely held:
+    each prune goes by ``keep_ratio``. With ``target_primitives`` each goes down to exactly that count, the last one when
+    densification has ended, which makes it the final count. ``max_primitives`` caps every step in between: densification
+    has to be bounded by it (:class:`sundae_ns.densification.CappedStrategy`), so that no prune has to.
+    """
+
+    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
+        """At ``start`` and each ``every`` steps from there until ``stop``; with a count to go down to also at ``stop``."""
+        config, goal = self.config, self._goal
         scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
-        above = config.max_primitives is None or n > config.max_primitives
-        return scheduled and above and step > state["pruned_at"]
+        last = goal is not None and step >= config.stop
+        above = goal is None or n > goal
+        return (scheduled or last) and above and step > state["pruned_at"]
 
     def _config_at(self, step: int) -> PruningConfig:
         # Another draw each time, and after a resume the same as without it.
         return replace(self.config, seed=self.config.seed + step)
 
-    def _count(self) -> int | None:
-        return self.config.max_primitives
+    @torch.no_grad()
+    def step_post_backward(
+        self,
+        params: MutableMapping[str, Parameter],
+        optimizers: Mapping[str, Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Mapping[str, Any] | None = None,
+        *,
+        contribution: Contribution | None = None,
+        strategy_state: MutableMapping[str, Any] | None = None,
+    ) -> PruneReport | None:
+        """Prune if it is due; where densification has ended with too few for ``target_primitives``, add those that lack.
+
+        They are added on top of others, whose looks they share, so that no picture changes. What densification counted per
+        primitive is forgotten then: it has ended.
+        """
+        report = super().step_post_backward(
+            params, optimizers, state, step, info, contribution=contribution, strategy_state=strategy_state
+        )
+        n = num_primitives(params)
+        lacking = (self.config.target_primitives or 0) - n
+        if step >= self.config.stop and lacking > 0:
+            grow(params, optimizers, lacking, LEAST_OPACITY)
+            if strategy_state is not None:
+                stale = [k for k, v in strategy_state.items() if isinstance(v, Tensor) and v.shape[:1] == (n,)]
+                strategy_state.update(dict.fromkeys(stale))
+            state["peak"] = max(state["peak"], n + lacking)
+        return report
+
+    @property
+    def _goal(self) -> int | None:
+        config = self.config
+        return config.max_primitives if config.target_primitives is None else config.target_primitives
+
+    def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
+        return self._goal
 
 
 def make_policy(config: PruningConfig) -> PruningPolicy:
@@ -186,7 +252,8 @@ def make_policy(config: PruningConfig) -> PruningPolicy:
         ConfigError: an option cannot work.
     """
     config.validate()
-    policies = {"off": NoPruning, "one-shot": OneShotPruning, "continuous": ContinuousPruning}
+    # Under auto a search cuts (pruning.search), and the policy counts.
+    policies = {"off": NoPruning, "auto": NoPruning, "one-shot": OneShotPruning, "continuous": ContinuousPruning}
     return policies[config.mode](config)
 
 

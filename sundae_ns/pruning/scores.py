@@ -9,11 +9,14 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.filters import high_pass, response_magnitude
+from sundae_ns.filters import high_pass, local_coherence, response_magnitude
 from sundae_ns.gaussians.parameters import num_primitives
-from sundae_ns.graphs import build_graph
+from sundae_ns.graphs import NeighborGraph, laplacian
 from sundae_ns.pruning.config import PruningConfig
-from sundae_ns.pruning.signals import attribute_signal, position_signal
+from sundae_ns.pruning.edges import field_graph
+from sundae_ns.pruning.signals import attribute_signal, color_signal, position_signal
+
+SIGNALS = {"attributes": attribute_signal, "colors": color_signal, "positions": position_signal}
 
 Contribution = Callable[[], Tensor]
 """Gives the summed blending weight of each primitive over the training views ``[N]``; expensive, so called on need."""
@@ -33,35 +36,50 @@ class Response:
     """How many primitives have no neighbour within the threshold."""
 
 
+def on_graph_device(params: Mapping[str, Tensor], config: PruningConfig) -> Mapping[str, Tensor]:
+    """What graphs and signals of a field are made from, on the device that the configuration names for it."""
+    if config.graph_device == "field":
+        return params
+    return {name: params[name].detach().cpu() for name in ("means", "features_dc", "opacities", "scales", "quats")}
+
+
 @torch.no_grad()
-def response(params: Mapping[str, Tensor], config: PruningConfig) -> Response:
+def response(params: Mapping[str, Tensor], config: PruningConfig, graph: NeighborGraph | None = None) -> Response:
     """Magnitude of the high-pass response of the configured signal.
 
     Args:
         params: the field, all finite, N primitives.
         config: graph and signal are taken from it.
+        graph: the field's graph, where it is at hand.
 
     Raises:
-        DataError: there are not more primitives than neighbours, or positions are not finite.
+        DataError: there is only one primitive, or positions are not finite.
     """
     device = params["means"].device
-    if config.graph_device == "cpu":
-        params = {name: params[name].cpu() for name in ("means", "features_dc", "opacities", "scales")}
-    graph = build_graph(
-        params["means"],
-        num_neighbors=config.num_neighbors,
-        rule=config.bandwidth,
-        tau=config.tau,
-        sigma=config.sigma,
-    )
-    signal = position_signal(params) if config.signal == "positions" else attribute_signal(params)
+    params = on_graph_device(params, config)
+    graph = field_graph(params, config) if graph is None else graph
+    signal = SIGNALS[config.signal](params)
     magnitude = response_magnitude(high_pass(graph, signal, isolated="nan")).to(device)
     return Response(magnitude, graph.tau, graph.sigma, int(graph.isolated.sum()))
 
 
 @torch.no_grad()
+def coherence(graph: NeighborGraph, count: int, config: PruningConfig, device: torch.device) -> Tensor:
+    """Local coherence of a graph in the band of ``count`` frequencies, float64 ``[N]``, computed on the device.
+
+    The Laplacian is the combinatorial one: where primitives crowd, edges are many and the frequencies high, and so a crowd
+    gets no more samples than it has band. See :func:`sundae_ns.filters.local_coherence`.
+    """
+    return local_coherence(laplacian(graph), count, seed=config.seed, device=device)
+
+
+@torch.no_grad()
 def score(
-    params: Mapping[str, Tensor], config: PruningConfig, found: Response | None, contribution: Contribution | None
+    params: Mapping[str, Tensor],
+    config: PruningConfig,
+    found: Response | None,
+    contribution: Contribution | None,
+    coherent: Tensor | None = None,
 ) -> Tensor:
     """Score of the configured name, float64 ``[N]``.
 
@@ -78,6 +96,7 @@ def score(
         config: names the score.
         found: result of :func:`response` on the same field; needed by the scores with a response.
         contribution: gives the blending weights; needed by the scores with a contribution, else not called.
+        coherent: result of :func:`coherence`; needed by the scores with a coherence.
 
     Raises:
         ConfigError: the score needs a response or a contribution and there is none.
@@ -88,10 +107,14 @@ def score(
         return torch.sigmoid(params["opacities"].detach().double()).reshape(n)
     if config.score == "random":
         return torch.ones(n, dtype=torch.float64, device=params["means"].device)
-    if config.score == "contribution":
+    if config.score in ("contribution", "detail-contribution"):
         return _weights(contribution, n, config)
     if config.score == "response":
         return _norm(found)
+    if config.uses_coherence:
+        if coherent is None:
+            raise ConfigError("this score needs a coherence: compute it first with coherence(graph, count, ...)")
+        return coherent if config.score == "coherence" else _weights(contribution, n, config) * coherent
     return _weights(contribution, n, config) * _filled_with_median(_norm(found))
 
 

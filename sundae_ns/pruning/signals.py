@@ -15,6 +15,11 @@ def position_signal(params: Mapping[str, Tensor]) -> Tensor:
     return params["means"].detach()
 
 
+def color_signal(params: Mapping[str, Tensor]) -> Tensor:
+    """View-independent colours ``[N, 3]``."""
+    return sh_to_rgb(params["features_dc"].detach())
+
+
 def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
     """Position, colour, opacity and log size, each without unit and of like spread ``[N, 10]``.
 

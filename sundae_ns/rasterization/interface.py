@@ -31,7 +31,7 @@ def rasterize(
 ) -> Rasterization:
     """Splat N Gaussian primitives into one pinhole view (EWA splatting, front-to-back blending; Kerbl et al. 2023).
 
-    Differentiable with respect to the primitives; not to ``K``, and to ``viewmat`` only under the reference.
+    Differentiable with respect to the primitives; not to ``K``, and to ``viewmat`` not under gsplat.
 
     Args:
         means: Centres in world units. ``[N, 3]``
@@ -125,16 +125,25 @@ def blending_weights(
     near_plane: float = 0.01,
     far_plane: float = 1e10,
     antialiased: bool = False,
+    pixels: Tensor | None = None,
     backend: Backend,
 ) -> Tensor:
     """Contribution of each primitive to one view: its alpha times transmittance, summed over the pixels.
 
     Blending is linear in the colours, so this is exactly the gradient of the summed image with respect to a one-channel
-    colour; no backend needs code for it. Arguments are those of :func:`rasterize`.
+    colour; no backend needs code for it. Arguments are those of :func:`rasterize`, and:
+
+    Args:
+        pixels: What each pixel counts; 1 where it is not given. ``[H, W]``
 
     Returns:
         ``[N]``, in pixels, detached; 0 for primitives that are invisible.
+
+    Raises:
+        DataError: As there, or ``pixels`` has another size than the image.
     """
+    if pixels is not None:
+        _check_shape("pixels", pixels, (height, width))
     with torch.enable_grad():
         ones = torch.ones_like(means[:, :1], requires_grad=True)
         image = rasterize(
@@ -152,7 +161,7 @@ def blending_weights(
             antialiased=antialiased,
             backend=backend,
         ).colors
-        (weights,) = torch.autograd.grad(image.sum(), ones)
+        (weights,) = torch.autograd.grad(image.sum() if pixels is None else (image[..., 0] * pixels).sum(), ones)
     return weights[:, 0]
 
 

@@ -16,8 +16,8 @@ from torch.nn.functional import normalize
 BLUR = 0.3
 """Variance in square pixels added to each footprint."""
 
-_FOV_MARGIN = 0.3
-_MAX_RADIUS = 1e9  # keeps footprints of any size inside int32
+FOV_MARGIN = 0.3
+MAX_RADIUS = 1e9  # keeps footprints of any size inside int32
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def project(
 
 
 def _limit_slope(slope: Tensor, focal: Tensor, centre: Tensor, size: int) -> Tensor:
-    margin = _FOV_MARGIN * 0.5 * size / focal
+    margin = FOV_MARGIN * 0.5 * size / focal
     return torch.clamp(slope, min=-centre / focal - margin, max=(size - centre) / focal + margin)
 
 
@@ -98,7 +98,7 @@ def _screen_radii(means2d: Tensor, covars2d: Tensor, width: int, height: int) ->
     """Three standard deviations of the longer axis, rounded up; 0 where that square misses the image."""
     xx, xy, yy = covars2d.unbind(-1)
     spread = (0.25 * (xx - yy).square() + xy * xy).clamp(min=0.01).sqrt()
-    radii = torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt()).clamp(max=_MAX_RADIUS)
+    radii = torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt()).clamp(max=MAX_RADIUS)
     size = means2d.new_tensor([width, height])
     inside = (means2d + radii[:, None] > 0) & (means2d - radii[:, None] < size)
     return radii * inside.all(dim=-1)

@@ -51,17 +51,31 @@ class ReferenceBackend:
         means2d = projection.means2d[None]
         lists = build_tile_lists(projection, opacities, width, height)
         image, alpha = composite(means2d, projection.conics, opacities, colors, lists, width, height, absgrad)
-        return Rasterization(
-            colors=image[..., :channels],
-            depth=image[..., channels:] / alpha.clamp(min=_SMALLEST_ALPHA) if render_depth else None,
-            alpha=alpha,
-            radii=projection.radii,
-            info=_strategy_info(means2d, projection.radii, width, height),
-        )
+        return assemble(image, alpha, means2d, projection.radii, channels)
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""
         return evaluate_harmonics(degree, directions, coeffs)
+
+
+def assemble(image: Tensor, alpha: Tensor, means2d: Tensor, radii: Tensor, channels: int) -> Rasterization:
+    """The result of a view from its blended image ``[H, W, C]`` or, with depth behind the channels, ``[H, W, C + 1]``.
+
+    Args:
+        image: Channels, then perhaps depth. ``[H, W, C]`` or ``[H, W, C + 1]``
+        alpha: Accumulated opacity. ``[H, W, 1]``
+        means2d: Centres in pixels. ``[1, N, 2]``
+        radii: int32 ``[N]``
+        channels: C.
+    """
+    height, width, depth = image.shape
+    return Rasterization(
+        colors=image[..., :channels],
+        depth=image[..., channels:] / alpha.clamp(min=_SMALLEST_ALPHA) if depth > channels else None,
+        alpha=alpha,
+        radii=radii,
+        info=_strategy_info(means2d, radii, width, height),
+    )
 
 
 def _strategy_info(means2d: Tensor, radii: Tensor, width: int, height: int) -> dict[str, Any]:

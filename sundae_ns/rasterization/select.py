@@ -1,4 +1,5 @@
-"""Which backend runs where. Nothing of gsplat is imported, and no kernel built, before a CUDA device is asked for."""
+"""Which backend runs where. Nothing of gsplat is imported, and no kernel built, before a CUDA device is asked for; nor numba
+before a CPU is."""
 
 from __future__ import annotations
 
@@ -12,32 +13,84 @@ from sundae_ns.rasterization.gsplat_backend import GsplatBackend
 from sundae_ns.rasterization.reference import ReferenceBackend
 from sundae_ns.rasterization.types import Backend
 
-BackendName = Literal["auto", "gsplat", "reference"]
+BackendName = Literal["auto", "gsplat", "cpu", "reference"]
 
 
 def select_backend(name: BackendName, device: torch.device | str) -> Backend:
     """Choose the rasteriser for tensors on ``device``.
 
-    ``auto`` takes gsplat on a CUDA device where its kernels run, else the reference. The check is made once per
-    process; where gsplat has no prebuilt kernels, it builds them during that check.
+    ``auto`` takes gsplat on a CUDA device where its kernels run, and cpu on a CPU where numba imports, else the reference.
+    Each check is made once per process; where gsplat has no prebuilt kernels, it builds them during that check.
 
     Raises:
-        BackendError: ``gsplat`` was asked for and cannot run on ``device``.
+        BackendError: ``gsplat`` or ``cpu`` was asked for and cannot run on ``device``.
         ConfigError: The name is unknown.
     """
-    if name not in ("auto", "gsplat", "reference"):
-        raise ConfigError(f"unknown rasterizer {name!r}; use auto, gsplat or reference")
+    device = torch.device(device)
+    if name == "auto":
+        if _gsplat_problem_on(device) is None:
+            return GsplatBackend()
+        return ReferenceBackend() if _cpu_problem_on(device) else _cpu_backend()
     if name == "reference":
         return ReferenceBackend()
-    problem = _problem_on(torch.device(device))
-    if problem is None:
+    if name == "gsplat":
+        if problem := _gsplat_problem_on(device):
+            raise BackendError(f"gsplat cannot rasterize: {problem}; or use the backend 'reference'")
         return GsplatBackend()
-    if name == "auto":
-        return ReferenceBackend()
-    raise BackendError(f"gsplat cannot rasterize: {problem}; or use the backend 'reference'")
+    if name == "cpu":
+        if problem := _cpu_problem_on(device):
+            raise BackendError(f"the cpu backend cannot rasterize: {problem}; or use the backend 'reference'")
+        return _cpu_backend()
+    raise ConfigError(f"unknown rasterizer {name!r}; use auto, gsplat, cpu or reference")
 
 
-def _problem_on(device: torch.device) -> str | None:
+def _cpu_problem_on(device: torch.device) -> str | None:
+    if device.type != "cpu":
+        return f"the tensors are on the device '{device}'; move them to 'cpu'"
+    return numba_problem()
+
+
+@lru_cache(maxsize=1)
+def numba_problem() -> str | None:
+    """Render one pixel with compiled loops; the cause and mend if that fails, else None.
+
+    It takes half a second, or some seconds where the loops were never compiled before.
+    """
+    try:
+        ones = torch.ones(1, 4)
+        _cpu_backend().rasterize(
+            ones[:, :3],
+            ones,
+            ones[:, :3],
+            ones[:, 0],
+            ones[:, :1],
+            torch.eye(4),
+            torch.eye(3),
+            1,
+            1,
+            near_plane=0.01,
+            far_plane=1e10,
+            antialiased=False,
+            absgrad=False,
+            render_depth=False,
+        )
+    except ImportError as error:
+        return f"numba does not import ({_first_line(error)}); pip install numba"
+    except (
+        Exception
+    ) as error:  # numba refuses versions of Python and numpy, processors and settings with errors of many kinds
+        mend = "pip install --force-reinstall numba, and unset NUMBA_DISABLE_JIT"
+        return f"numba does not compile ({_first_line(error)}); {mend}"
+    return None
+
+
+def _cpu_backend() -> Backend:
+    from sundae_ns.rasterization.cpu import CpuBackend
+
+    return CpuBackend()
+
+
+def _gsplat_problem_on(device: torch.device) -> str | None:
     if not torch.cuda.is_available():
         return "CUDA is not available; use a machine with an NVIDIA GPU and a CUDA build of torch"
     if device.type != "cuda":

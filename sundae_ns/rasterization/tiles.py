@@ -21,8 +21,8 @@ TILE = 8
 MIN_ALPHA = 1.0 / 255.0
 """Fainter contributions to a pixel are skipped."""
 
-_BIN = 16  # side of gsplat's tiles
-_ROUNDING = 1e-3  # slack on exponents, so that rounding here never drops what the blending would still count
+BIN = 16  # side of gsplat's tiles
+ROUNDING = 1e-3  # slack on exponents, so that rounding here never drops what the blending would still count
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ def build_tile_lists(projection: Projection, opacities: Tensor, width: int, heig
     visible = ((projection.radii > 0) & (opacities >= MIN_ALPHA)).nonzero()[:, 0]
     ids = visible[projection.depths[visible].argsort(stable=True)]
     centres, covars = projection.means2d[ids], projection.covars2d[ids]
-    reach = torch.log(opacities[ids] / MIN_ALPHA) + _ROUNDING  # largest exponent that still counts
+    reach = torch.log(opacities[ids] / MIN_ALPHA) + ROUNDING  # largest exponent that still counts
 
     half = (2 * reach[:, None] * covars[:, [0, 2]]).sqrt()
     radii = projection.radii[ids, None].to(centres.dtype)
-    per_bin = _BIN // TILE
-    low = torch.maximum(((centres - radii) / _BIN).floor() * per_bin, ((centres - half) / TILE).floor())
-    high = torch.minimum(((centres + radii) / _BIN).ceil() * per_bin, ((centres + half) / TILE).ceil())
+    per_bin = BIN // TILE
+    low = torch.maximum(((centres - radii) / BIN).floor() * per_bin, ((centres - half) / TILE).floor())
+    high = torch.minimum(((centres + radii) / BIN).ceil() * per_bin, ((centres + half) / TILE).ceil())
     grid = centres.new_tensor([columns, rows])
     low, high = low.clamp(min=0).minimum(grid), high.clamp(min=0).minimum(grid)
     spans = (high - low).clamp(min=0).long()

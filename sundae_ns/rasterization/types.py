@@ -38,7 +38,7 @@ class Backend(Protocol):
 
     @property
     def name(self) -> str:
-        """``"gsplat"`` or ``"reference"``."""
+        """``"gsplat"``, ``"cpu"`` or ``"reference"``."""
 
     def rasterize(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 
@@ -20,6 +20,24 @@ def bytes_of(params: Mapping[str, Tensor]) -> int:
 def bytes_of_module(module: nn.Module) -> int:
     """Bytes of a module's parameters and buffers, each in its own dtype; a tensor that is shared counts once."""
     return sum(tensor.numel() * tensor.element_size() for tensor in chain(module.parameters(), module.buffers()))
+
+
+def rows_within(params: Mapping[str, Tensor], limit: int, count_bytes: Callable[[Mapping[str, Tensor]], int]) -> int:
+    """Most primitives of a field, from the first on, that are stored in at most ``limit`` bytes; 0 if not one is.
+
+    Args:
+        params: the field, each parameter ``[N, ...]``.
+        limit: bytes.
+        count_bytes: bytes of a field; must not fall where primitives are added.
+    """
+    low, high = 0, len(params["means"])
+    while low < high:
+        middle = (low + high + 1) // 2
+        if count_bytes({name: value[:middle] for name, value in params.items()}) <= limit:
+            low = middle
+        else:
+            high = middle - 1
+    return low
 
 
 def megabytes(count: int) -> str:

@@ -193,3 +193,26 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     by_channel = stack_columns(vertex, _rest_columns(rest)).reshape(vertex.count, 3, rest // 3)
     params["features_rest"] = by_channel.transpose(1, 2).contiguous()
     return {name: params[name] for name in SPLAT_NAMES}
+
+
+def keep_vertices(source: Path, out: Path, mask: Tensor) -> None:
+    """Copy a .ply with some of its vertices; properties, comments and other elements stay as they are.
+
+    Args:
+        source: any .ply.
+        out: the file to write, whole or not at all; may be ``source``.
+        mask: which vertices stay, bool ``[N]``.
+
+    Raises:
+        DataError: the file cannot be read, or has another number of vertices.
+        StorageError: the disk is full, or may not be written to.
+    """
+    data = load_ply(source)
+    vertex = data["vertex"]
+    if vertex.count != len(mask):
+        raise DataError(f"{source} has {vertex.count} vertices, {len(mask)} were expected; it was changed meanwhile.")
+    kept = PlyElement.describe(np.asarray(vertex.data[mask.cpu().numpy()]), "vertex", comments=vertex.comments)
+    elements = [kept if element.name == "vertex" else element for element in data.elements]
+    copy = PlyData(elements, text=data.text, byte_order=data.byte_order, comments=data.comments, obj_info=data.obj_info)
+    with replacing(Path(out)) as partial:
+        copy.write(str(partial))

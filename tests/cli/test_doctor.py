@@ -44,13 +44,24 @@ def _kernels(monkeypatch: pytest.MonkeyPatch, problem: str | None) -> None:
     monkeypatch.setattr("sundae_ns.rasterization.select_backend", select)
 
 
-def test_without_cuda_auto_takes_the_reference(no_cuda: None) -> None:
+def test_without_cuda_auto_takes_the_compiled_loops(no_cuda: None) -> None:
     found = finding("CUDA")
     assert not found.ok
     assert not found.needed
     assert found.mend
-    assert "auto takes reference" in finding("rasteriser").detail
+    assert "auto takes cpu" in finding("rasteriser").detail
     assert not finding("gsplat kernels", compile_kernels=True).ok
+
+
+def test_without_numba_auto_takes_the_reference(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = "numba does not import (x; y); pip install numba"
+    monkeypatch.setattr("sundae_ns.rasterization.numba_problem", lambda: problem)
+    found = finding("rasteriser")
+    assert not found.ok
+    assert not found.needed
+    assert "auto takes reference" in found.detail
+    assert "numba does not import (x; y)" in found.detail
+    assert found.mend == "pip install numba"
 
 
 def test_with_running_kernels_auto_takes_gsplat(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -144,7 +155,7 @@ def report(**options: Any) -> tuple[int, str]:
 def test_a_machine_without_a_gpu_is_fine(no_cuda: None) -> None:
     code, text = report()
     assert code == 0
-    assert "auto takes reference" in text
+    assert "auto takes cpu" in text
     for one in doctor.examine():
         assert one.name in text
         assert one.ok or f"{one.name}: {one.mend}" in text

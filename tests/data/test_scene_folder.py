@@ -194,3 +194,32 @@ def test_impossible_options(tmp_path, wrong):
     with pytest.raises(ConfigError):
         write_scene(tmp_path / "scene", **wrong)
     assert not (tmp_path / "scene").exists()
+
+
+def test_a_wall_fills_every_picture_and_is_smooth(tmp_path):
+    wall = write_scene(tmp_path / "wall", kind="wall", **SIZE)
+    still = write_scene(tmp_path / "still", **SIZE)
+
+    def detail(folder):
+        pictures = [_picture(path) for path in sorted((folder / "images").glob("*.png"))]
+        return np.mean([np.abs(np.diff(picture, axis=1)).mean() for picture in pictures])
+
+    assert detail(wall) < detail(still) / 5
+    xyz, _ = _points(wall)
+    assert np.median(np.abs(xyz[:, 1])) < 0.02
+    for path in (wall / "images").glob("*.png"):
+        assert 0.25 < _picture(path).min()
+        assert _picture(path).std(axis=(0, 1)).max() > 0.01, "no texture"
+    with pytest.raises(ConfigError, match="kind is 'attic'; use one of still-life, wall"):
+        write_scene(tmp_path / "attic", kind="attic", **SIZE)
+
+
+def test_sensor_noise_is_that_of_each_pixel(tmp_path):
+    clean, noisy = (
+        write_scene(tmp_path / str(noise), kind="wall", sensor_noise=noise, **SIZE) for noise in (0.0, 0.03)
+    )
+    names = [f"images/frame_{i:05d}.png" for i in (1, 2)]
+    errors = np.stack([_picture(noisy / name) - _picture(clean / name) for name in names])
+    assert 0.029 < errors.std() < 0.031
+    assert np.abs(errors.mean()) < 0.001
+    assert np.abs(np.corrcoef(errors[0].ravel(), errors[1].ravel())[0, 1]) < 0.03

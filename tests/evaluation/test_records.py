@@ -8,8 +8,8 @@ from sundae_ns.evaluation import COLUMNS, RunRow, append_row, read_rows
 
 HEADER = (
     "scene,method,variant,keep_ratio,seed,steps,primitives,psnr,ssim,psnr_base,ssim_base,lpips,lpips_net,"
-    "bytes_primitives,bytes_head,bytes_total,ms_frame,ms_splat,ms_head,train_s,prune_s,peak_vram_mib,gpu,resolution,"
-    "commit,command"
+    "bytes_primitives,bytes_head,bytes_total,ms_frame,ms_splat,ms_head,train_s,prune_s,peak_primitives,"
+    "peak_vram_mib,gpu,resolution,commit,command"
 )
 ROW = RunRow(
     scene="bonsai",
@@ -33,6 +33,7 @@ ROW = RunRow(
     ms_head=1.5,
     train_s=600.0,
     prune_s=1.25,
+    peak_primitives=1_300_000,
     peak_vram_mib=2345.5,
     gpu="NVIDIA H100",
     resolution="1237x822",

@@ -12,8 +12,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from sundae_ns import nvrtc
 from sundae_ns.errors import BackendError
-from sundae_ns.graphs import knn, nvrtc, radius_neighbors
+from sundae_ns.graphs import knn, radius_neighbors
 from sundae_ns.graphs.traversal import KERNEL, MAX_NEIGHBORS, OPTIONS, SOURCE, Launch, definitions, search_tree
 from sundae_ns.graphs.tree import LEAF, build_tree
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-from sundae_ns.errors import CheckpointError
-from sundae_ns.measure import frame_times, load_run, sizes
+from sundae_ns.cli import main
+from sundae_ns.errors import BackendError, CheckpointError, ConfigError
+from sundae_ns.evaluation import psnr
+from sundae_ns.measure import compensation, frame_figures, frame_times, load_run, sizes
 
 
 def test_figures_of_a_run(tiny: Any) -> None:
@@ -23,6 +27,64 @@ def test_figures_of_a_run(tiny: Any) -> None:
     # Before the head's start there is no head to time.
     model.config.head.start_at = 10**9
     assert frame_times(model, cameras[:1], warmup=0, repeats=1).head == 0
+
+
+def test_frames_are_judged_as_they_are_timed(tiny: Any) -> None:
+    run = load_run(tiny.config)
+    run = run._replace(cameras=run.cameras[:2], truths=run.truths[:2])
+    whole = frame_figures(run, warmup=0, repeats=1)
+    assert (whole.width, whole.height) == run.truths[0].shape[1::-1]
+    assert (whole.precision, whole.views) == ("fp32", 2)
+    assert min(whole.ms_frame, whole.ms_splat, whole.ms_head) > 0
+    with torch.no_grad():
+        shown = [run.model.get_outputs_for_camera(camera) for camera in run.cameras]
+    for name, found in (("rgb", whole.psnr), ("base_rgb", whole.psnr_base)):
+        expected = [float(psnr(picture[name], truth)) for picture, truth in zip(shown, run.truths, strict=True)]
+        assert found == pytest.approx(sum(expected) / 2, abs=1e-4)
+    half = frame_figures(run, factor=0.5, warmup=0, repeats=1)
+    assert (half.width, half.height) == (-(-whole.width // 2), -(-whole.height // 2))
+    # The cameras of the run are as they were.
+    assert int(run.cameras[0].width) == whole.width
+
+
+def test_switching_the_head_off_for_a_while(tiny: Any) -> None:
+    model = load_run(tiny.config).model
+    with compensation(model, on=False):
+        assert not model.compensate.value
+    assert model.compensate.value
+
+    with pytest.raises(ZeroDivisionError), compensation(model, on=False):
+        raise ZeroDivisionError
+    assert model.compensate.value
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "match"),
+    [
+        ({"precision": "fp16"}, BackendError, "a CPU runs the head in fp32"),
+        ({"factor": 0.0}, ConfigError, "no pixels"),
+        ({"factor": float("nan")}, ConfigError, "no pixels"),
+    ],
+)
+def test_frames_that_cannot_be_measured(tiny: Any, options: dict[str, Any], error: type, match: str) -> None:
+    with pytest.raises(error, match=match):
+        frame_figures(load_run(tiny.config), **options)
+
+
+def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--load-config", str(tiny.config), "--views", "1", "--repeats", "1", "--factors", "1", "0.25"]
+    with pytest.raises(SystemExit) as caught:
+        main(["bench", "frame", *arguments, "--json"])
+    assert caught.value.code == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["factor"] for line in lines] == [1, 0.25]
+    assert {line["device"] for line in lines} == {"cpu"}
+    # A quarter is where the head has faded out.
+    assert lines[0]["psnr"] != lines[0]["psnr_base"]
+    assert lines[1]["psnr"] == lines[1]["psnr_base"]
+    with pytest.raises(SystemExit):
+        main(["bench", "frame", *arguments])
+    assert "PSNR off" in capsys.readouterr().out
 
 
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ METHODS = {
     "sundae-50": 0.5,
     "sundae-80": 0.8,
     "sundae-100": 1.0,
+    "sundae-auto": None,
     "sundae-continuous": None,
     "sundae-paper": 0.1,
     "sundae-tiny": None,

@@ -13,7 +13,9 @@ from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians.parameters import rgb_to_sh
 from sundae_ns.pruning import PruningConfig, attribute_signal, decide, position_signal, response, score
 
-PAPER = PruningConfig(selection="band", score="response", signal="positions")
+PLAIN = PruningConfig(selection="sampled", score="response-contribution", edges="centres", redistribution="none")
+"""A score and independent draws, none of what the default rule adds."""
+PAPER = replace(PLAIN, selection="band", score="response", signal="positions")
 
 
 def field(n: int = 60, seed: int = 0) -> dict[str, Tensor]:
@@ -39,7 +41,7 @@ def ones(n: int = 60) -> Tensor:
 def test_every_score_and_selection_keeps_the_exact_count(name: Any, selection: Any, keep_ratio: float) -> None:
     params = field()
     before = {key: value.clone() for key, value in params.items()}
-    config = PruningConfig(score=name, selection=selection, keep_ratio=keep_ratio)
+    config = replace(PLAIN, score=name, selection=selection, keep_ratio=keep_ratio)
     decision = decide(params, config, ones)
     assert int(decision.mask.sum()) == decision.kept == max(1, round(keep_ratio * 60))
     assert torch.equal(decide(params, config, ones).mask, decision.mask)
@@ -66,14 +68,14 @@ def test_isolated_floaters_are_judged_by_contribution_or_not_kept() -> None:
         assert not decide(params, replace(PAPER, keep_ratio=0.5, gamma=gamma)).mask[[3, 40]].any()
     contribution = torch.ones(60)
     contribution[3], contribution[40] = 1e6, 0.0
-    mask = decide(params, PruningConfig(keep_ratio=0.5), lambda: contribution).mask
+    mask = decide(params, replace(PLAIN, keep_ratio=0.5), lambda: contribution).mask
     assert mask[3]
     assert not mask[40]
 
 
 def test_contribution_alone_decides_on_a_graph_without_edges() -> None:
     contribution = torch.arange(60).float()
-    config = PruningConfig(selection="top", keep_ratio=0.1, tau=1e-12)
+    config = replace(PLAIN, selection="top", keep_ratio=0.1, tau=1e-12)
     decision = decide(field(), config, lambda: contribution)
     assert decision.isolated == 60
     assert decision.mask.nonzero().squeeze(1).tolist() == list(range(54, 60))
@@ -88,7 +90,7 @@ def test_attribute_response_finds_the_colour_edge() -> None:
     params["features_dc"] = rgb_to_sh(torch.where(left, 0.2, 0.8)[:, None].expand(-1, 3)).clone()
     params["scales"] = torch.zeros(n, 3)
     params["opacities"] = torch.zeros(n, 1)
-    magnitude = response(params, PruningConfig(num_neighbors=8)).magnitude
+    magnitude = response(params, replace(PLAIN, num_neighbors=8)).magnitude
     edge = (params["means"][:, 0] - 9.5).abs() < 1
     assert magnitude[edge].min() > 10 * magnitude[~edge].max()
 
@@ -123,7 +125,7 @@ def test_broken_primitives_go_first_and_do_not_count(value: float) -> None:
     params["means"][8] = value
     contribution = torch.ones(60)
     contribution[7] = torch.nan
-    decision = decide(params, PruningConfig(keep_ratio=0.5), lambda: contribution)
+    decision = decide(params, replace(PLAIN, keep_ratio=0.5), lambda: contribution)
     assert decision.dropped_nonfinite == 2
     assert int(decision.mask.sum()) == decision.kept == 29
     assert not decision.mask[[7, 8]].any()
@@ -138,12 +140,12 @@ def test_contribution_is_only_asked_for_when_it_matters() -> None:
         raise AssertionError
 
     for name in ("response", "opacity", "random"):
-        decide(field(), PruningConfig(score=name), never)
+        decide(field(), replace(PLAIN, score=name), never)
     decide(field(), PruningConfig(keep_ratio=1.0), never)
 
 
 def test_count_replaces_the_share() -> None:
-    config = PruningConfig(score="opacity", selection="top")
+    config = replace(PLAIN, score="opacity", selection="top")
     decision = decide(field(), config, count=17)
     opacities = field()["opacities"].squeeze(1)
     assert torch.equal(decision.mask, opacities >= opacities.sort(descending=True).values[16])
@@ -152,7 +154,7 @@ def test_count_replaces_the_share() -> None:
 
 def test_what_cannot_work_says_why_in_one_line() -> None:
     cases: list[tuple[type[Exception], str, Any]] = [
-        (DataError, "12 primitives cannot have 16 neighbours", lambda: decide(field(12), PAPER)),
+        (DataError, "1 primitives cannot have 1 neighbours", lambda: response(field(1), PAPER)),
         (DataError, "none of 60", lambda: decide({k: v * torch.nan for k, v in field().items()}, PAPER)),
         (ConfigError, "training views", lambda: decide(field(), PruningConfig())),
         (DataError, r"shape \[59\] for 60", lambda: decide(field(), PruningConfig(), lambda: ones(59))),

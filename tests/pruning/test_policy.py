@@ -146,6 +146,28 @@ def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
     assert run(policy, few, range(4))[0] == []
 
 
+@pytest.mark.parametrize("last", [60, 90])
+def test_continuous_ends_at_exactly_the_target(last: int) -> None:
+    config = PruningConfig(
+        mode="continuous", start=0, every=2, stop=3, target_primitives=80, max_primitives=120, num_neighbors=4
+    )
+    policy = make_policy(config)
+    made = field()
+    reports, state = run(policy, made, range(2))
+    assert [report.after for report in reports] == [80]
+    params, optimizers = field(last)  # what densification has made of it meanwhile
+    densification = {"grad2d": torch.zeros(last), "count": torch.zeros(last), "scene_scale": 1.0}
+    for step in (3, 4):
+        policy.step_post_backward(
+            params, optimizers, state, step, contribution=lambda: torch.ones(last), strategy_state=densification
+        )
+        assert {len(value) for value in params.values()} == {80}
+        assert all(optimizers[name].param_groups[0]["params"] == [params[name]] for name in optimizers)
+        rows = [len(value) for value in densification.values() if isinstance(value, Tensor)]
+        assert set(rows) <= {80}
+    assert state["peak"] == 100
+
+
 def test_a_resumed_continuous_run_goes_on_as_if_never_stopped() -> None:
     config = PruningConfig(mode="continuous", start=1, every=2, stop=7, keep_ratio=0.8, num_neighbors=4)
     whole, halves = field(), field()
@@ -156,7 +178,10 @@ def test_a_resumed_continuous_run_goes_on_as_if_never_stopped() -> None:
 
 
 def test_continuous_draws_anew_each_time() -> None:
-    policy = make_policy(PruningConfig(mode="continuous", start=0, every=1, score="random", keep_ratio=0.5))
+    config = PruningConfig(
+        mode="continuous", start=0, every=1, keep_ratio=0.5, score="random", selection="sampled", redistribution="none"
+    )
+    policy = make_policy(config)
     kept = []
     for step in (3, 3, 4):
         made = field()
@@ -192,7 +217,7 @@ def test_the_state_of_densification_is_sliced_along() -> None:
     made = field()
     made[0]["means"].data[0] = torch.nan
     strategy_state = {"grad2d": torch.arange(100), "scene_scale": 2.0}
-    config = PruningConfig(prune_at=0, score="opacity", selection="top", keep_ratio=0.1)
+    config = PruningConfig(prune_at=0, score="opacity", selection="top", redistribution="none", keep_ratio=0.1)
     opacities = made[0]["opacities"].detach().squeeze(1).clone()
     policy = make_policy(config)
     policy.step_post_backward(*made, policy.initialize_state(), 0, strategy_state=strategy_state)
@@ -218,8 +243,8 @@ def test_a_failed_prune_leaves_field_and_state() -> None:
     made = field(10)
     policy = make_policy(PruningConfig(prune_at=0))
     state = policy.initialize_state()
-    with pytest.raises(DataError, match="10 primitives cannot have 16 neighbours"):
-        policy.step_post_backward(*made, state, 0, contribution=lambda: torch.ones(10))
+    with pytest.raises(DataError, match=r"contribution has shape \[9\] for 10 primitives"):
+        policy.step_post_backward(*made, state, 0, contribution=lambda: torch.ones(9))
     assert len(made[0]["means"]) == 10
     assert state["pruned_at"] == -1
 
@@ -240,7 +265,9 @@ def test_report_is_one_line_of_plain_numbers() -> None:
     assert "\n" not in summary
     assert summary.startswith("step 0: kept 10 of 100 primitives in ")
     assert f"sigma {report.sigma:.3g}, tau {report.tau:.3g}, {report.isolated:,} isolated" in summary
-    (unscored,), _ = run(make_policy(PruningConfig(prune_at=0, score="opacity")), field(), range(1))
+    (unscored,), _ = run(
+        make_policy(PruningConfig(prune_at=0, score="opacity", redistribution="none")), field(), range(1)
+    )
     assert "sigma" not in unscored.summary()
 
 
@@ -294,3 +321,28 @@ def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> No
     with pytest.raises(ConfigError, match=next(iter(wrong))) as caught:
         make_policy(replace(PruningConfig(), **wrong))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "auto", "stop": 20000, "max_bytes": 1, "max_primitives": 1}, "max_bytes and max_primitives are both"),
+        ({"mode": "auto", "stop": 20000, "max_psnr_drop": 0.0}, "max_psnr_drop is 0.0"),
+        ({"mode": "auto", "stop": 14999}, "auto has no time to search"),
+        ({"mode": "auto", "stop": 20000, "rounds": 2}, "rounds is 2 but mode is auto"),
+        ({"mode": "auto", "stop": 20000, "target_primitives": 5}, "target_primitives is set but mode is auto"),
+        ({"max_bytes": 5}, "max_bytes is set but mode is one-shot: set mode to auto"),
+        ({"mode": "continuous", "max_psnr_drop": 0.1}, "max_psnr_drop is set but mode is continuous"),
+        ({"mode": "continuous", "max_primitives": 4, "target_primitives": 5}, "is more than max_primitives"),
+        ({"mode": "auto", "stop": 20000, "search_every": 0}, "search_every is 0"),
+    ],
+)
+def test_budgets_that_cannot_work_name_the_mend(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        PruningConfig(**options).validate()  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("budget", [{}, {"max_psnr_drop": 0.5}, {"max_bytes": 100}, {"max_primitives": 1}])
+def test_one_budget_is_enough(budget: dict[str, object]) -> None:
+    PruningConfig(mode="auto", stop=20000, **budget).validate()  # type: ignore[arg-type]

@@ -30,8 +30,32 @@ def _arguments(n: int = 3) -> dict:
 
 
 @pytest.mark.parametrize("device", ["cpu", torch.device("cpu")])
-def test_auto_takes_the_reference_on_a_cpu(device: torch.device | str) -> None:
-    assert select_backend("auto", device).name == "reference"
+def test_auto_takes_the_compiled_loops_on_a_cpu(device: torch.device | str) -> None:
+    assert select_backend("auto", device).name == "cpu"
+
+
+def test_without_numba_auto_takes_the_reference() -> None:
+    """In a fresh interpreter that cannot import numba; asked for by name, the backend says why not."""
+    code = """
+import sys
+sys.modules["numba"] = None
+from sundae_ns.errors import BackendError
+from sundae_ns.rasterization import select_backend
+assert select_backend("auto", "cpu").name == "reference"
+try:
+    select_backend("cpu", "cpu")
+except BackendError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    (line,) = done.stdout.splitlines()
+    assert line.startswith("the cpu backend cannot rasterize: numba does not import (")
+    assert line.endswith("; pip install numba; or use the backend 'reference'")
+
+
+def test_cpu_backend_off_the_cpu_is_refused() -> None:
+    with pytest.raises(BackendError, match=r"on the device 'meta'; move them to 'cpu'; or use the backend 'reference'"):
+        select_backend("cpu", "meta")
 
 
 def test_gsplat_without_a_gpu_is_one_line_with_cause_and_mend(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -46,7 +70,7 @@ def test_gsplat_on_cpu_tensors_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     with pytest.raises(BackendError, match="on the device 'cpu'"):
         select_backend("gsplat", "cpu")
-    assert select_backend("auto", "cpu").name == "reference"
+    assert select_backend("auto", "cpu").name == "cpu"
 
 
 def test_kernels_that_fail_are_reported_and_auto_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,14 +82,15 @@ def test_kernels_that_fail_are_reported_and_auto_goes_on(monkeypatch: pytest.Mon
 
 
 def test_unknown_backend() -> None:
-    with pytest.raises(ConfigError, match="auto, gsplat or reference"):
+    with pytest.raises(ConfigError, match="auto, gsplat, cpu or reference"):
         select_backend("vulkan", "cpu")  # type: ignore[arg-type]
 
 
-def test_selecting_on_a_cpu_imports_nothing_of_gsplat() -> None:
+@pytest.mark.parametrize(("chosen", "missing"), [("'auto', 'cpu'", "gsplat"), ("'reference', 'cpu'", "numba")])
+def test_selecting_imports_nothing_of_what_is_not_taken(chosen: str, missing: str) -> None:
     code = (
-        "import sys; from sundae_ns.rasterization import select_backend; select_backend('auto', 'cpu'); "
-        "sys.exit(any(name.split('.')[0] == 'gsplat' for name in sys.modules))"
+        f"import sys; from sundae_ns.rasterization import select_backend; select_backend({chosen}); "
+        f"sys.exit(any(name.split('.')[0] == '{missing}' for name in sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
@@ -105,3 +130,15 @@ def test_blending_weights_work_without_grad() -> None:
         weights = blending_weights(**arguments)
     assert weights.shape == (3,)
     assert not weights.requires_grad
+
+
+def test_blending_weights_count_pixels_by_their_weight() -> None:
+    arguments = {**_arguments(), "scales": torch.full((3, 3), 0.3), "opacities": torch.full((3,), 0.5), "height": 5}
+    arguments.pop("colors")
+    left = torch.zeros(5, 4)
+    left[:, :2] = 2.5
+    total, of_left, of_right = (blending_weights(**arguments, pixels=p) for p in (None, left, 2.5 - left))
+    torch.testing.assert_close(of_left + of_right, 2.5 * total)
+    assert not torch.equal(of_left, of_right)
+    with pytest.raises(DataError, match="pixels has shape"):
+        blending_weights(**arguments, pixels=left[1:])

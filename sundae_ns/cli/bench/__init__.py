@@ -50,4 +50,74 @@ def graph(
     )
 
 
+@app.command
+def frame(
+    load_config: Path,
+    factors: tuple[float, ...] = (1.0,),
+    precisions: tuple[Literal["fp32", "bf16", "fp16"], ...] = (),
+    views: int | None = None,
+    repeats: int = 5,
+    json: bool = False,
+) -> int:
+    """Time the frames of a finished run: splat, head and whole, each beside the error of the frames that were timed.
+
+    Args:
+        load_config: the run's config.yml.
+        factors: sizes to show, as factors on the pictures' sides; the truth is resized alike.
+        precisions: arithmetic of the head; by default all three on CUDA, and fp32 on a CPU, which knows no other.
+        views: measure on the first so many test views; by default on all.
+        repeats: timed runs of each view, of which the median counts.
+        json: print one line of JSON for each size and precision, instead of a table.
+    """
+    from sundae_ns.cli.bench.frame import run_frame
+
+    return run_frame(load_config, factors=factors, precisions=precisions, views=views, repeats=repeats, json=json)
+
+
+@app.command
+def rasterizer(
+    counts: tuple[int, ...] = (100, 1000, 10_000, 100_000, 1_000_000),
+    rasterizers: tuple[Literal["auto", "gsplat", "cpu", "reference"], ...] = (),
+    dtypes: tuple[Literal["float32", "float64"], ...] = ("float32", "float64"),
+    size: tuple[int, int] = (640, 480),
+    channels: int = 16,
+    pixels: float = 2.0,
+    repeats: int = 20,
+    seed: int = 0,
+    shard: str = "1/1",
+    output: Path | None = None,
+    json: bool = False,
+) -> int:
+    """Time the rasterisers on random views, each row with its errors against the reference in float64.
+
+    Args:
+        counts: numbers of primitives.
+        rasterizers: what to measure; by default everything that runs here. gsplat runs on CUDA, cpu on a CPU.
+        dtypes: precisions; gsplat knows float32 only.
+        size: width and height of the picture.
+        channels: values that are blended beside alpha.
+        pixels: standard deviation of a primitive on the screen.
+        repeats: timed runs, of which the median counts; fewer where they take longer than 20 s together.
+        seed: of the views.
+        shard: i/n measures the i-th of n parts; what they write is merged by concatenation.
+        output: append a line of JSON for every row to this file, and leave out what is in it already.
+        json: print one line of JSON for every row that was measured, instead of a table.
+    """
+    from sundae_ns.cli.bench.rasterizer import run_rasterizer
+
+    return run_rasterizer(
+        counts=counts,
+        rasterizers=rasterizers,
+        dtypes=dtypes,
+        size=size,
+        channels=channels,
+        pixels=pixels,
+        repeats=repeats,
+        seed=seed,
+        shard=shard,
+        output=output,
+        json=json,
+    )
+
+
 __all__ = ["app"]

@@ -1,0 +1,143 @@
+"""Packed scenes: bytes, bits a primitive, quality and seconds; one JSON line.
+
+    python benchmarks/bench_pack.py                              # 1,000,000 random primitives, which pack worst
+    python benchmarks/bench_pack.py --run RUN --views 6          # a finished run, at the size that it was trained at
+    python benchmarks/bench_pack.py --run RUN --set harmonics=codebooks feature_bits=5
+
+Random primitives have no structure that an entropy coder could use; they measure time. Of a run, the test views are rendered
+before and after: ``psnr`` and ``psnr_packed`` are against the photographs, each with the head and without (``_base``), and
+``psnr_between`` is of the packed model's pictures against the unpacked one's: where it is B, a model of PSNR P keeps about
+P - 10 log10(1 + 10^((P - B) / 10)) dB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from rich.progress import track
+from torch import Tensor
+
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.evaluation import psnr
+from sundae_ns.measure import load_run
+from sundae_ns.packed_run import scene_of_run, write_run
+from sundae_ns.storage.packing import PackConfig, PackReport, Scene, read_scene, write_scene
+
+
+def random_scene(n: int) -> Scene:
+    g = torch.Generator().manual_seed(0)
+    features = 13
+    field = {
+        "means": torch.randn(n, 3, generator=g),
+        "scales": 0.8 * torch.randn(n, 3, generator=g) - 5,
+        "quats": torch.randn(n, 4, generator=g),
+        "features_dc": 0.5 * torch.randn(n, 3, generator=g),
+        "features_rest": 0.05 * torch.randn(n, 15, 3, generator=g),
+        "opacities": 2 * torch.randn(n, 1, generator=g),
+        "features": torch.randn(n, features, generator=g),
+    }
+    torch.manual_seed(0)
+    return Scene(field, dict(CompensationHead(HeadConfig(num_features=features)).state_dict()))
+
+
+def config_of(settings: list[str]) -> PackConfig:
+    kinds = {field.name: type(field.default) for field in fields(PackConfig)}
+    values: dict[str, Any] = {}
+    for setting in settings:
+        name, _, value = setting.partition("=")
+        values[name] = kinds[name](value)
+    return PackConfig(**values)
+
+
+def seconds(action: Callable[[], Any]) -> tuple[float, float]:
+    """Seconds on the clock, and of all cores together."""
+    start, busy = time.perf_counter(), time.process_time()
+    action()
+    return time.perf_counter() - start, time.process_time() - busy
+
+
+def sizes(report: PackReport) -> dict[str, Any]:
+    return {
+        "primitives": report.primitives,
+        "bytes": report.bytes,
+        "bits": {name: round(bits, 2) for name, bits in report.bits.items()},
+        "bytes_a_primitive_without_head": round(
+            (report.bytes - report.bits.get("head", 0.0) * report.primitives / 8) / report.primitives, 2
+        ),
+    }
+
+
+@torch.no_grad()
+def quality(run: Path, file: Path, folder: Path, views: int) -> dict[str, Any]:
+    before = load_run(run / "config.yml")
+    after = load_run(write_run(read_scene(file), folder, "packed")).model
+    chosen = torch.linspace(0, len(before.cameras) - 1, min(views, len(before.cameras))).round().long().tolist()
+    names = ("psnr", "psnr_packed", "psnr_between")
+    sums = {name + suffix: 0.0 for name in names for suffix in ("", "_base")}
+    for i in track(chosen, description="Rendering", transient=True):
+        camera, truth = before.cameras[i], before.truths[i]
+        pictures: list[dict[str, Tensor]] = [model.get_outputs_for_camera(camera) for model in (before.model, after)]
+        for suffix, output in (("", "rgb"), ("_base", "base_rgb")):
+            old, new = (picture[output].clamp(0, 1) for picture in pictures)
+            # Errors of all views together: PSNR is their logarithm.
+            for name, (a, b) in zip(names, ((old, truth), (new, truth), (new, old)), strict=True):
+                value = float(psnr(a, b))
+                sums[name + suffix] += (10 ** (-value / 10) if name == "psnr_between" else value) / len(chosen)
+    for name in ("psnr_between", "psnr_between_base"):
+        sums[name] = -10 * torch.tensor(sums[name]).log10().item()
+    camera = before.cameras[0]
+    return {
+        "views": len(chosen),
+        "width": int(camera.width),
+        "height": int(camera.height),
+        "rasterizer": before.model.backend.name,
+        **{name: round(value, 3) for name, value in sums.items()},
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--primitives", type=int, default=1_000_000)
+    parser.add_argument("--run", type=Path)
+    parser.add_argument("--views", type=int, default=6)
+    parser.add_argument("--set", nargs="*", default=[], metavar="OPTION=VALUE", help="fields of PackConfig")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+
+    torch.set_num_threads(options.threads)
+    config = config_of(options.set)
+    scene = random_scene(options.primitives) if options.run is None else scene_of_run(options.run)
+    with tempfile.TemporaryDirectory() as name:
+        file = Path(name) / "scene.sundae"
+        start = time.perf_counter()
+        report = write_scene(file, scene, config)
+        packing = time.perf_counter() - start
+        times = [seconds(lambda: read_scene(file)) for _ in range(options.repeats)]
+        result = {
+            "run": None if options.run is None else options.run.resolve().parents[1].name,
+            "set": options.set,
+            "threads": options.threads,
+            **sizes(report),
+            "s_pack": round(packing, 2),
+            "s_unpack": round(median(clock for clock, _ in times), 3),
+            "s_unpack_best": round(min(times)[0], 3),
+            "s_unpack_worst": round(max(times)[0], 3),
+            "core_s_unpack": round(median(busy for _, busy in times), 3),
+        }
+        if options.run is not None:
+            result |= quality(options.run, file, Path(name), options.views)
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()

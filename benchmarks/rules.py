@@ -1,0 +1,350 @@
+"""Compare selection rules: one warm-up a capture, then a branch for each rule, keep ratio and seed; one line each.
+
+    python benchmarks/rules.py --scene bonsai --data DIR                          # 1,500 steps of fine-tuning a branch
+    python benchmarks/rules.py --scene bonsai --data DIR --steps 15000 --rules random contribution systematic
+    python benchmarks/rules.py --scene bonsai --data DIR --sweep gamma
+    CUDA_VISIBLE_DEVICES=0 python benchmarks/rules.py --scene bonsai --data DIR --shard 0/2 &
+    CUDA_VISIBLE_DEVICES=1 python benchmarks/rules.py --scene bonsai --data DIR --shard 1/2 &
+
+The warm-up is trained once and kept under ``--out``; of several processes the first makes it and the others wait. Branches
+that have a line already are passed over, so a run that was stopped goes on where it was. All branches train without a head,
+see the same views in the same order for the same seed, and let their rates decay over their own length. ``--list`` shows
+the branches that would run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import fcntl
+import json
+import shlex
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import run
+import torch
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import Progress
+
+from sundae_ns import checkpoint
+from sundae_ns.evaluation import RunRow, append_row
+from sundae_ns.measure import sizes
+from sundae_ns.model import SundaeModel
+from sundae_ns.pruning import field_graph, make_policy
+from sundae_ns.pruning.scores import on_graph_device
+from sundae_ns.schedulers import Decay
+
+RESULTS = Path(__file__).parent / "results" / "rules.jsonl"
+COLMAP = "colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8"
+
+PLAIN = {"selection": "sampled", "edges": "centres", "redistribution": "none"}
+"""What rules differ from."""
+PAPER = {"selection": "band", "score": "response", "signal": "positions"}
+SYSTEMATIC = {"score": "contribution", "selection": "systematic"}
+RESPONSE = {"score": "response-contribution", "selection": "systematic"}
+DETAIL = {"score": "detail-contribution", "selection": "systematic"}
+MERGE = {"redistribution": "merge", "edges": "appearance"}
+CONTROLS: dict[str, dict[str, Any]] = {
+    "random": {"score": "random"},
+    "opacity-top": {"score": "opacity", "selection": "top"},
+    "contribution-top": {"score": "contribution", "selection": "top"},
+    "contribution": {"score": "contribution"},
+}
+"""Rules without a spectrum, by the name of their rows: what others have to beat."""
+RULES: dict[str, dict[str, Any]] = {
+    **CONTROLS,
+    "paper": PAPER,
+    "response-contribution": {"score": "response-contribution"},
+    "color-response": {"score": "response-contribution", "signal": "colors"},
+    "coherence": {"score": "coherence-contribution", "selection": "systematic"},
+    "coherence-appearance": {"score": "coherence-contribution", "selection": "systematic", "edges": "appearance"},
+    "detail": {"score": "detail-contribution"},
+    "systematic": SYSTEMATIC,
+    "response-systematic": RESPONSE,
+    "response-shared": {"score": "response-contribution", "selection": "shared"},
+    "detail-systematic": DETAIL,
+    "random-merge": {"score": "random", **MERGE},
+    "systematic-merge": {**SYSTEMATIC, **MERGE},
+    "response-merge": {**RESPONSE, **MERGE},
+    "detail-merge": {**DETAIL, **MERGE},
+    "detail-merge-centres": {**DETAIL, "redistribution": "merge"},
+    "detail-grow": {**DETAIL, "redistribution": "grow"},
+    "detail-rounds": {**DETAIL, "rounds": 3},
+    "detail-merge-rounds": {**DETAIL, **MERGE, "rounds": 3},
+}
+"""All rules, by the name of their rows, with the options of pruning that make them."""
+
+
+class Branch(NamedTuple):
+    """One prune and what is trained after it."""
+
+    rule: str
+    keep: float
+    seed: int
+    options: dict[str, Any]
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", required=True)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--method", default="sundae")
+    parser.add_argument("--warmup", type=int, help="steps before the prune, in place of the method's own")
+    parser.add_argument("--steps", type=int, default=1500, help="steps of a branch after its prune; 0: none")
+    parser.add_argument("--keep", type=float, nargs="+", help="default: 0.01 0.1 0.3; 0.01 for a sweep")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--rules", nargs="+", default=list(RULES), choices=list(RULES))
+    parser.add_argument("--sweep", choices=list(SWEEPS), help="this in place of the rules")
+    parser.add_argument("--shard", default="0/1", help="i/n: every n-th branch, from the i-th on")
+    parser.add_argument("--parser", default=COLMAP, help="dataparser with its options, as ns-train takes them")
+    parser.add_argument("--extra", default="", help="more options of ns-train, for the warm-up and all branches")
+    parser.add_argument("--out", type=Path, default=Path("outputs/rules"))
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--rows", type=Path, default=run.RESULTS, help="CSV file of rows; - for none")
+    parser.add_argument("--list", action="store_true", help="print the branches and stop")
+    return parser.parse_args()
+
+
+def _gamma() -> dict[str, dict[str, Any]]:
+    return {f"paper gamma {g / 10:g}": {**PAPER, "gamma": g / 10} for g in range(11)}
+
+
+def _tau() -> dict[str, dict[str, Any]]:
+    # Factors on the distance that edges reach by the robust rule; tau is its square.
+    factors = (0.25, 0.5, 1.0, 2.0, 4.0)
+    return {f"{name} reach x{f:g}": {**RULES[name], REACH: f} for name in SWEPT for f in factors}
+
+
+def _neighbors() -> dict[str, dict[str, Any]]:
+    return {f"{name} k {k}": {**RULES[name], "num_neighbors": k} for name in SWEPT for k in (4, 8, 16, 32, 64)}
+
+
+SWEEPS = {"gamma": _gamma, "tau": _tau, "k": _neighbors}
+SWEPT = ("paper", "response-contribution", "detail-merge")
+REACH = "reach"
+"""Not an option of pruning: becomes tau and sigma when the field is known."""
+
+
+def branches(options: argparse.Namespace) -> list[Branch]:
+    rules = SWEEPS[options.sweep]() if options.sweep else {name: RULES[name] for name in options.rules}
+    keeps = options.keep or ([0.01] if options.sweep else [0.01, 0.1, 0.3])
+    return [Branch(n, k, s, o) for s in options.seeds for k in keeps for n, o in rules.items()]
+
+
+class Bench:
+    """A trainer that goes back to the end of its warm-up before each branch."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options = options
+        arguments = [options.method, "--data", str(options.data), "--pipeline.model.head.mode", "off"]
+        if options.warmup is not None:
+            arguments += ["--pipeline.model.pruning.prune-at", str(options.warmup)]
+        arguments += shlex.split(options.extra)
+        config = tyro.cli(AnnotatedBaseConfigUnion, args=[*arguments, *shlex.split(options.parser)])
+        self.command = " ".join(["ns-train", options.method, "--data", options.scene, *arguments[3:], options.parser])
+        config.pipeline.datamanager.data = config.data
+        config.output_dir = options.out
+        config.experiment_name = f"{options.scene}-{options.shard.replace('/', '-of-')}"
+        config.set_timestamp()
+        config.vis = "tensorboard"
+        config.pipeline.model.evaluate_prune = False
+        run._set_random_seed(config.machine.seed)
+        self.trainer = config.setup(local_rank=0, world_size=1)
+        self.trainer.setup()
+        self.model: SundaeModel = self.trainer.pipeline.model
+        self.pruning = config.pipeline.model.pruning
+        self.step = self.pruning.prune_at
+        self.weights: dict[tuple[bool, float], torch.Tensor] = {}
+        self._measured = self.model.contribution
+        self.start = self._warm_up(options.out / f"{options.scene}-{options.method}-{self.step}.ckpt")
+
+    def _warm_up(self, path: Path) -> dict[str, Any]:
+        """The state right before the prune: from the file, or trained into it."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path.with_suffix(".lock"), "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not path.exists():
+                self.model.policy = make_policy(replace(self.pruning, mode="off"))
+                started = time.perf_counter()
+                self._train(range(self.step + 1), "Warm-up")
+                state = {
+                    "step": self.step,
+                    "pipeline": self.trainer.pipeline.state_dict(),
+                    "optimizers": {k: v.state_dict() for k, v in self.trainer.optimizers.optimizers.items()},
+                    "schedulers": {k: v.state_dict() for k, v in self.trainer.optimizers.schedulers.items()},
+                    "scalers": self.trainer.grad_scaler.state_dict(),
+                }
+                checkpoint.save(state, path)
+                CONSOLE.log(f"warm-up: {self.model.num_points} primitives in {time.perf_counter() - started:.0f} s")
+        return checkpoint.load(path)
+
+    def _train(self, steps: range, what: str) -> None:
+        with Progress(console=CONSOLE, transient=True) as progress:
+            for step in progress.track(steps, description=what):
+                self.trainer.pipeline.train()
+                for location in (TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, None):
+                    if location is None:
+                        self.trainer.train_iteration(step)
+                        location = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+                    for callback in self.trainer.callbacks:
+                        callback.run_callback_at_location(step, location)
+
+    def _rewind(self, seed: int, steps: int) -> None:
+        self.trainer._restore(copy.deepcopy(self.start))
+        self.model.pruning_state.update(self.model.policy.initialize_state())
+        for scheduler in self.trainer.optimizers.schedulers.values():
+            for decay in scheduler.lr_lambdas:
+                assert isinstance(decay, Decay)
+                decay.max_steps, decay.pruned_at = self.step + steps, None
+        data = self.trainer.pipeline.datamanager
+        data.config.train_cameras_sampling_seed = 42 + seed
+        data._order = (-1, [])
+        run._set_random_seed(42 + seed)
+
+    def _contribution(self, data: Any) -> torch.Tensor:
+        """What a pass over the training views gives, kept for the field as it was when the warm-up ended."""
+        if self.model.pruning_state["num_prunes"]:
+            return self._measured(data)
+        pruning = self.model.config.pruning
+        key = (pruning.uses_detail, pruning.keep_ratio if pruning.uses_detail else 1.0)
+        if key not in self.weights:
+            self.weights[key] = self._measured(data)
+        return self.weights[key]
+
+    def branch(self, branch: Branch) -> dict[str, Any]:
+        """Prune, evaluate, train, evaluate."""
+        options = self.options
+        self._rewind(branch.seed, options.steps)
+        choice = dict(branch.options)
+        if REACH in choice:
+            graph = field_graph(on_graph_device(self.model.gaussians, self.pruning), self.pruning)
+            choice |= {"sigma": graph.sigma, "tau": graph.tau * choice.pop(REACH) ** 2}
+        if choice.get("rounds", 1) > 1:
+            # A tenth of the branch apart: all branches are trained for the same time in all.
+            choice.setdefault("round_every", max(options.steps // 10, 1))
+        config = replace(self.pruning, keep_ratio=branch.keep, seed=branch.seed, **{**PLAIN, **choice})
+        self.model.config.pruning, self.model.policy = config, make_policy(config)
+        self.model.contribution = self._contribution  # type: ignore[method-assign]
+        before = self.model.num_points
+        started = time.perf_counter()
+        for callback in self.trainer.callbacks:
+            if getattr(callback.func, "__name__", "") == "prune_if_due":
+                callback.run_callback(self.step)
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        prune_s = time.perf_counter() - started
+        self.trainer.pipeline.eval()
+        pruned = run.evaluate(self.trainer.pipeline)
+        started = time.perf_counter()
+        self._train(range(self.step + 1, self.step + 1 + options.steps), f"{branch.rule}, {branch.keep:g}")
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        train_s = time.perf_counter() - started
+        self.trainer.pipeline.eval()
+        tuned = run.evaluate(self.trainer.pipeline) if options.steps else pruned
+        return {
+            **key_of(options, branch, self.step),
+            "options": choice,
+            "before": before,
+            "primitives": self.model.num_points,
+            "psnr_pruned": pruned["psnr"],
+            "ssim_pruned": pruned["ssim"],
+            "psnr": tuned["psnr"],
+            "ssim": tuned["ssim"],
+            "prune_s": prune_s,
+            "train_s": train_s,
+            "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
+            "commit": run.commit(),
+            "command": self.command,
+        }
+
+    def row(self, line: dict[str, Any]) -> RunRow:
+        bytes_, camera = sizes(self.model), self.trainer.pipeline.datamanager.eval_dataset.cameras[0]
+        flags = [f"--pipeline.model.pruning.{k.replace('_', '-')} {v}" for k, v in (PLAIN | line["options"]).items()]
+        return RunRow(
+            scene=line["scene"],
+            method=line["method"],
+            variant=line["rule"],
+            keep_ratio=line["keep"],
+            seed=line["seed"],
+            steps=line["warmup"] + line["steps"],
+            primitives=line["primitives"],
+            psnr=line["psnr"],
+            ssim=line["ssim"],
+            psnr_base=line["psnr"],
+            ssim_base=line["ssim"],
+            lpips=None,
+            lpips_net="",
+            bytes_primitives=bytes_.primitives,
+            bytes_head=0,
+            bytes_total=bytes_.total,
+            ms_frame=None,
+            ms_splat=None,
+            ms_head=None,
+            train_s=line["train_s"],
+            prune_s=line["prune_s"],
+            peak_primitives=None,
+            peak_vram_mib=None,
+            gpu=line["gpu"],
+            resolution=f"{int(camera.width)}x{int(camera.height)}",
+            commit=line["commit"],
+            command=" ".join([line["command"], f"--pipeline.model.pruning.keep-ratio {line['keep']}", *flags]),
+        )
+
+
+def key_of(options: argparse.Namespace, branch: Branch, warmup: int) -> dict[str, Any]:
+    """What tells branches apart."""
+    return {
+        "scene": options.scene,
+        "method": options.method,
+        "warmup": warmup,
+        "steps": options.steps,
+        "rule": branch.rule,
+        "keep": branch.keep,
+        "seed": branch.seed,
+    }
+
+
+def is_finished(path: Path, key: dict[str, Any]) -> bool:
+    return any(all(line[name] == value for name, value in key.items()) for line in finished(path))
+
+
+def finished(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def append(path: Path, line: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.write(json.dumps(line) + "\n")
+
+
+def main() -> None:
+    options = parse()
+    number, of = (int(part) for part in options.shard.split("/"))
+    mine = branches(options)[number::of]
+    if options.list:
+        for branch in mine:
+            print(json.dumps(branch._asdict()))
+        return
+    bench = Bench(options)
+    for branch in mine:
+        key = key_of(options, branch, bench.step)
+        if is_finished(options.results, key):
+            continue
+        line = bench.branch(branch)
+        append(options.results, line)
+        if str(options.rows) != "-":
+            append_row(options.rows, bench.row(line))
+        CONSOLE.print(f"{branch.rule}, {branch.keep:g}: {line['psnr_pruned']:.2f} then {line['psnr']:.2f} dB")
+
+
+if __name__ == "__main__":
+    main()

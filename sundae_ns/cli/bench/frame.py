@@ -1,0 +1,60 @@
+"""``sundae bench frame``: milliseconds of splat, head and whole frame, each beside the error of what was timed."""
+
+from __future__ import annotations
+
+import json as jsonlib
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from sundae_ns.errors import ConfigError
+from sundae_ns.measure import FrameFigures, frame_figures, load_run
+
+
+def run_frame(
+    load_config: Path,
+    *,
+    factors: Sequence[float],
+    precisions: Sequence[str],
+    views: int | None,
+    repeats: int,
+    json: bool,
+) -> int:
+    """Measure and print; options are those of the command."""
+    if repeats < 1 or (views is not None and views < 1):
+        raise ConfigError(f"{repeats} timed runs of {views} views measure nothing: use at least 1 of each")
+    with redirect_stdout(sys.stderr):  # what nerfstudio says while it loads is no figure
+        run = load_run(load_config)
+    run = run._replace(cameras=run.cameras[:views], truths=run.truths[:views])
+    device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
+    every = ("fp32", "bf16", "fp16") if device != "cpu" and run.model.head is not None else (None,)
+    wanted: Sequence[str | None] = precisions or every
+    jobs = [(factor, precision) for factor in factors for precision in wanted]
+    found: list[FrameFigures] = []
+    for factor, precision in track(jobs, description="Frames", transient=True, console=Console(stderr=True)):
+        found.append(frame_figures(run, factor=factor, precision=precision, repeats=repeats))
+        if json:
+            line = {"config": str(load_config), "device": device, "primitives": run.model.num_points}
+            rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(found[-1]).items()}
+            print(jsonlib.dumps({**line, "factor": factor, "repeats": repeats, **rounded}), flush=True)
+    if not json:
+        Console().print(_table(found, f"{run.model.num_points:,} primitives, {device}, {len(run.cameras)} test views"))
+    return 0
+
+
+def _table(figures: Sequence[FrameFigures], title: str) -> Table:
+    table = Table(title=title, caption="frame, splat and head in ms; off: without the head")
+    for column in ("size", "head in", "frame", "splat", "head", "PSNR", "SSIM", "PSNR off", "SSIM off"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for f in figures:
+        times = (f"{value:.2f}" for value in (f.ms_frame, f.ms_splat, f.ms_head))
+        errors = (f"{f.psnr:.2f}", f"{f.ssim:.4f}", f"{f.psnr_base:.2f}", f"{f.ssim_base:.4f}")
+        table.add_row(f"{f.width}x{f.height}", f.precision, *times, *errors)
+    return table

@@ -1,0 +1,295 @@
+"""``sundae bench rasterizer``: milliseconds of the rasterisers, each beside the error of the very view that was timed."""
+
+from __future__ import annotations
+
+import json as jsonlib
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import Tensor
+
+from sundae_ns.errors import BackendError, ConfigError, DataError
+from sundae_ns.rasterization import Backend, BackendName, rasterize, select_backend
+
+DTYPES = {"float32": torch.float32, "float64": torch.float64}
+DEPTHS = (2.0, 4.0)
+"""Between these the primitives lie, in world units; it takes two to have an order."""
+WORTH_IT = 20.0
+"""Seconds after which no further repeat is begun."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is measured: the fields that tell one row from another."""
+
+    rasterizer: str
+    device: str
+    dtype: str
+    primitives: int
+    width: int
+    height: int
+    channels: int
+    pixels: float
+    seed: int
+    threads: int
+
+
+Drawn = dict[str, Tensor]
+
+
+def run_rasterizer(
+    *,
+    counts: Sequence[int],
+    rasterizers: Sequence[BackendName],
+    dtypes: Sequence[str],
+    size: tuple[int, int],
+    channels: int,
+    pixels: float,
+    repeats: int,
+    seed: int,
+    shard: str,
+    output: Path | None,
+    json: bool,
+) -> int:
+    """Measure and print; options are those of the command."""
+    if not counts or min(counts) < 1 or min(size) < 1 or channels < 1 or repeats < 1 or not pixels > 0:
+        raise ConfigError("nothing to measure: primitives, size, channels, pixels and repeats must be at least 1")
+    index, parts = parse_shard(shard)
+    threads = torch.get_num_threads()
+    cases = [
+        Case(name, device, dtype, count, *size, channels, pixels, seed, threads)
+        for count in counts
+        for name, device in _backends(rasterizers)
+        for dtype in dtypes
+        if not (name == "gsplat" and dtype == "float64")  # its kernels know no other precision
+    ][index::parts]
+    rows = {case: row for row in _read(output) if (case := _case_of(row)) in cases}
+    if done := len(rows):
+        print(f"{output} has {done} of {len(cases)} rows already", file=sys.stderr)
+    todo = [case for case in cases if case not in rows]
+    oracle = _Oracle()
+    for case in track(todo, description="Rasterisers", transient=True, console=Console(stderr=True), disable=not todo):
+        rows[case] = {"benchmark": "rasterizer", **asdict(case), **measure(case, oracle(case), repeats)}
+        if output is not None:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            with output.open("a") as lines:
+                lines.write(jsonlib.dumps(rows[case]) + "\n")
+        if json:
+            print(jsonlib.dumps(rows[case]), flush=True)
+    if not json:
+        title = f"{size[0]}x{size[1]}, {channels} channels, primitives of {pixels:g} px, {threads} threads"
+        Console().print(_table([rows[case] for case in cases], title))
+    return 0
+
+
+def parse_shard(shard: str) -> tuple[int, int]:
+    """``"2/5"``, the second of five parts, as the index from 0 and the number of parts.
+
+    Raises:
+        ConfigError: it is not of that form.
+    """
+    part, _, parts = shard.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
+        raise ConfigError(f"{shard!r} is no part of a whole: use i/n with i from 1 to n")
+    return int(part) - 1, int(parts)
+
+
+def draw_view(case: Case) -> tuple[Drawn, Drawn]:
+    """Primitives after activation, and the camera; float64 on the CPU, rounded to float32, so that errors are arithmetic's.
+
+    Centres are spread evenly over picture and depth. Standard deviations are, on the screen, between half of and one and a
+    half times the pixels asked for. Opacities are even between 0 and 1.
+    """
+    generator = torch.Generator().manual_seed(case.seed)
+
+    def even(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    n, focal = case.primitives, 1.2 * max(case.width, case.height)
+    depth = DEPTHS[0] + (DEPTHS[1] - DEPTHS[0]) * even(n, 1)
+    screen = (even(n, 2) - 0.5) * torch.tensor([case.width, case.height])
+    scene = {
+        "means": torch.cat([screen * depth / focal, depth], dim=1),
+        "quats": torch.randn(n, 4, generator=generator, dtype=torch.float64),
+        "scales": case.pixels * depth / focal * (0.5 + even(n, 3)),
+        "opacities": even(n),
+        "colors": even(n, case.channels),
+    }
+    K = torch.tensor([[focal, 0, case.width / 2], [0, focal, case.height / 2], [0, 0, 1]], dtype=torch.float64)
+    camera = {"viewmat": torch.eye(4, dtype=torch.float64), "K": K}
+    return tuple({key: value.float().double() for key, value in part.items()} for part in (scene, camera))  # type: ignore[return-value]
+
+
+def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
+    """Times in milliseconds, medians after one run that is not timed; errors against the oracle.
+
+    ``cpu_ms`` is what all threads together computed: where it is less than the other on one thread, the machine was shared.
+
+    Args:
+        case: what to measure.
+        exact: from :func:`render` by the reference in float64.
+        repeats: timed runs, fewer where they take longer than ``WORTH_IT`` seconds together.
+    """
+    backend = select_backend(_name(case.rasterizer), case.device)
+    pull = _pull(case).to(case.device, DTYPES[case.dtype])
+    scene, camera = (
+        {key: value.to(case.device, DTYPES[case.dtype]) for key, value in part.items()} for part in draw_view(case)
+    )
+    found = render(case, scene, camera, pull, backend)
+    errors = {key: (found[key].cpu().double() - exact[key]) for key in exact}
+    gradients = {
+        key: float(errors[key].norm()) / max(float(exact[key].norm()), 1e-30) for key in errors if key in scene
+    }
+    picture = errors["picture"].abs()
+    del found, errors
+
+    def forward() -> None:
+        with torch.no_grad():
+            _picture(case, scene, camera, backend)
+
+    forward_ms, forward_cpu_ms, _ = _median_ms(forward, repeats, case.device)
+    both = _median_ms(lambda: render(case, scene, camera, pull, backend), repeats, case.device)
+    return {
+        "forward_ms": _rounded(forward_ms),
+        "forward_backward_ms": _rounded(both[0]),
+        "forward_cpu_ms": _rounded(forward_cpu_ms),
+        "forward_backward_cpu_ms": _rounded(both[1]),
+        "repeats": both[2],
+        "max_error": _rounded(float(picture.max())),
+        "mean_error": _rounded(float(picture.mean())),
+        "gradient_error": _rounded(max(gradients.values())),
+        **{f"gradient_error_{key}": _rounded(value) for key, value in gradients.items()},
+        "device_name": torch.cuda.get_device_name() if case.device == "cuda" else f"CPU, {case.threads} threads",
+        "torch": torch.__version__,
+    }
+
+
+def render(case: Case, scene: Drawn, camera: Drawn, pull: Tensor, backend: Backend) -> Drawn:
+    """The picture with alpha behind the channels ``[H, W, C + 1]``, and the gradients of its product with ``pull``."""
+    leaves = {key: value.detach().requires_grad_() for key, value in scene.items()}
+    picture = _picture(case, leaves, camera, backend)
+    gradients = torch.autograd.grad(picture, list(leaves.values()), pull)
+    return {"picture": picture.detach(), **dict(zip(leaves, gradients))}
+
+
+class _Oracle:
+    """The reference in float64 on the CPU, kept for the rows of the same view."""
+
+    def __init__(self) -> None:
+        self._view: tuple[object, ...] | None = None
+        self._exact: Drawn = {}
+
+    def __call__(self, case: Case) -> Drawn:
+        view = (case.primitives, case.width, case.height, case.channels, case.pixels, case.seed)
+        if view != self._view:
+            self._exact = render(case, *draw_view(case), _pull(case), select_backend("reference", "cpu"))
+            self._view = view
+        return self._exact
+
+
+def _picture(case: Case, scene: Drawn, camera: Drawn, backend: Backend) -> Tensor:
+    view = rasterize(
+        scene["means"],
+        scene["quats"],
+        scene["scales"],
+        scene["opacities"],
+        scene["colors"],
+        camera["viewmat"],
+        camera["K"],
+        case.width,
+        case.height,
+        backend=backend,
+    )
+    return torch.cat([view.colors, view.alpha], dim=-1)
+
+
+def _pull(case: Case) -> Tensor:
+    """What the loss pulls at each value of the picture: fixed random numbers, of float32."""
+    generator = torch.Generator().manual_seed(case.seed + 1)
+    return torch.randn(case.height, case.width, case.channels + 1, generator=generator).double()
+
+
+def _backends(names: Sequence[BackendName]) -> Iterator[tuple[str, str]]:
+    """Rasterisers and their devices: those that were named, or by default all that run here."""
+    if names:
+        for name in names:
+            device = "cuda" if name == "gsplat" else "cpu"
+            yield select_backend(name, device).name, device
+        return
+    for default, device in (("gsplat", "cuda"), ("reference", "cuda"), ("cpu", "cpu"), ("reference", "cpu")):
+        if device == "cuda" and not torch.cuda.is_available():
+            continue
+        try:
+            select_backend(_name(default), device)
+        except BackendError as error:
+            print(f"without {default}: {error}", file=sys.stderr)
+            continue
+        yield default, device
+
+
+def _name(name: str) -> BackendName:
+    return name  # type: ignore[return-value]
+
+
+def _median_ms(function: Callable[[], object], repeats: int, device: str) -> tuple[float, float, int]:
+    """Milliseconds by the clock, milliseconds of the processor, and the number of runs."""
+    function()
+    times: list[float] = []
+    busy: list[float] = []
+    while len(times) < repeats and sum(times) < WORTH_IT:
+        started, computed = _now(device), time.process_time()
+        function()
+        times.append(_now(device) - started)
+        busy.append(time.process_time() - computed)
+    return 1e3 * statistics.median(times), 1e3 * statistics.median(busy), len(times)
+
+
+def _now(device: str) -> float:
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def _read(output: Path | None) -> Iterator[dict[str, Any]]:
+    if output is None or not output.exists():
+        return
+    for number, line in enumerate(output.read_text().splitlines(), 1):
+        try:
+            row = jsonlib.loads(line)
+        except ValueError as error:
+            raise DataError(f"{output}, line {number} is no JSON: remove the line, and it is measured again") from error
+        if isinstance(row, dict):
+            yield row
+
+
+def _case_of(row: dict[str, Any]) -> Case | None:
+    try:
+        return Case(**{field.name: row[field.name] for field in fields(Case)})
+    except KeyError:
+        return None
+
+
+def _table(rows: Sequence[dict[str, Any]], title: str) -> Table:
+    caption = "milliseconds; largest and mean error of the picture, worst relative error of a gradient"
+    table = Table(title=title, caption=caption, box=None, pad_edge=False)
+    for column in ("N", "rasterizer", "in", "forward", "both ways", "max", "mean", "gradient"):
+        table.add_column(column, justify="right", no_wrap=True)
+    for row in rows:
+        name = row["rasterizer"] if row["device"] == "cpu" else f"{row['rasterizer']} ({row['device']})"
+        times = (f"{row[key]:.2f}" for key in ("forward_ms", "forward_backward_ms"))
+        errors = (f"{row[key]:.1e}" for key in ("max_error", "mean_error", "gradient_error"))
+        table.add_row(f"{row['primitives']:,}", name, row["dtype"], *times, *errors)
+    return table
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")

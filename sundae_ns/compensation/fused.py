@@ -1,0 +1,293 @@
+"""The head with all that lies between its convolutions in a few kernels: for pictures that are only looked at.
+
+cuDNN convolves; :mod:`sundae_ns.compensation.kernels` does the rest. The whole is recorded as one CUDA graph for each
+picture size that stays. Gradients are the business of :mod:`sundae_ns.compensation.fused_training`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import NamedTuple, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
+from sundae_ns.compensation.unet import UNet
+
+MAX_SIZES = 4
+"""Recordings kept at a time: each holds its own activations."""
+
+RECORD_AT = 3
+"""A size is recorded when it is shown for this time in a row: a viewer that is being resized never shows one twice."""
+
+
+class Weights:
+    """What the convolutions read: a network's weights in the dtype of the arithmetic, channels last.
+
+    Args:
+        net: the network.
+        dtype: of the arithmetic.
+    """
+
+    def __init__(self, net: UNet, dtype: torch.dtype) -> None:
+        first, *others = (conv.weight.detach() for conv in convolutions(net))
+        channels = padded_channels(first.shape[1] // net.pixel_unshuffle**2, net.pixel_unshuffle)
+        shape = (len(first), channels * net.pixel_unshuffle**2, *first.shape[2:])
+        self._source = [first, *others]
+        # As many channels as a folded picture has.
+        padded = first.new_zeros(shape, dtype=dtype).contiguous(memory_format=torch.channels_last)
+        self.cast = [padded, *(torch.empty_like(w, dtype=dtype, memory_format=torch.channels_last) for w in others)]
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Take over what the network has learnt since."""
+        first, *others = self._source
+        self.cast[0][:, : first.shape[1]].copy_(first)
+        torch._foreach_copy_(self.cast[1:], others)
+
+
+@dataclass
+class Tape:
+    """What gradients need of a pass: the pictures that were convolved, and those results that nothing has activated yet."""
+
+    inputs: list[Tensor] = field(default_factory=list)
+    """Of all 3 x 3 convolutions, in order; every second one holds the activations of the convolution before."""
+    coarse: list[Tensor] = field(default_factory=list)
+    """What the upsamplings read, from the coarsest level on."""
+    last: Tensor | None = None
+    """What the last kernel reads."""
+
+
+def padded_channels(channels: int, fold: int) -> int:
+    """Channels of an unfolded pixel, the empty ones included, such that the folded picture has whole packs."""
+    per_pack = PACK // math.gcd(PACK, fold**2)
+    return -(-channels // per_pack) * per_pack
+
+
+def fold(splatted: Tensor, alpha: Tensor, size: int, residual: bool, folded: Tensor, launches: Launches) -> None:
+    """Put what was splatted into the network's input, blocks of ``size`` pixels a side folded into channels.
+
+    Args:
+        splatted: colours and features, float32; pixels may be apart, rows may not ``[H, W, 3 + F]``.
+        alpha: accumulation, likewise ``[H, W, 1]``.
+        size: of the blocks, pixels.
+        residual: whether the network sees colours and accumulation beside the features.
+        folded: where to, ``[1, C, h, w]`` channels last.
+        launches: the kernels.
+    """
+    height, width = splatted.shape[:2]
+    rows, columns = folded.shape[-2:]
+    padded = folded.shape[1] // size**2
+    launches["fold"](
+        rows * columns * padded,
+        [
+            *(splatted, pixel_stride(splatted), alpha, pixel_stride(alpha)),
+            *(4 if residual else 0, splatted.shape[2] - 3, padded),
+            *(height, width, rows, columns, folded),
+        ],
+    )
+
+
+def network(net: UNet, weights: Weights, folded: Tensor, launches: Launches) -> Tape:
+    """The network from its folded input to what the last kernel makes the picture from.
+
+    Args:
+        net: gives the biases.
+        weights: of the network.
+        folded: ``[1, C, h, w]`` channels last.
+        launches: the kernels.
+
+    Returns:
+        The tape; ``last`` is the result of the last 3 x 3 convolution, without bias and activation,
+        ``[1, width, h, w]`` channels last.
+    """
+    levels = len(net.encoder)
+    tape = Tape()
+    convs = iter(zip(weights.cast, convolutions(net), strict=True))
+
+    def convolved(x: Tensor) -> tuple[Tensor, Tensor]:
+        weight, conv = next(convs)
+        tape.inputs.append(x)
+        return F.conv2d(x, weight, padding=1).contiguous(memory_format=torch.channels_last), bias_of(conv)
+
+    def double(x: Tensor) -> tuple[Tensor, Tensor]:
+        raw, bias = convolved(x)
+        _, channels, rows, columns = raw.shape
+        launches["activate"](raw.numel() // PACK, [raw, bias, channels, rows * columns])
+        return convolved(raw)
+
+    x, rooms = folded, []
+    raw, bias = double(x)
+    for level in range(1, levels):
+        _, channels, rows, columns = raw.shape
+        # The skip connection needs no copy: it is written where the decoder finds it.
+        coarser = cast("nn.Conv2d", cast("nn.Sequential", net.encoder[level])[0]).out_channels
+        room = picture_like(raw, channels + coarser, rows, columns)
+        x = picture_like(raw, channels, rows // 2, columns // 2)
+        launches["pool"](x.numel() // PACK, [raw, bias, channels, rows, columns, room, room.shape[1], x])
+        rooms.append(room)
+        raw, bias = double(x)
+    for room in reversed(rooms):
+        _, channels, rows, columns = raw.shape
+        tape.coarse.append(raw)
+        threads = 4 * raw.numel() // PACK
+        launches["upsample"](threads, [raw, bias, channels, rows, columns, room, room.shape[1]])
+        raw, bias = double(room)
+    tape.last = raw
+    return tape
+
+
+def unfold(net: UNet, raw: Tensor, base: Tensor, alpha: Tensor, launches: Launches) -> Tensor:
+    """The picture from the result of the last 3 x 3 convolution.
+
+    Args:
+        net: gives the last layers.
+        raw: ``[1, width, h, w]`` channels last.
+        base: picture to be corrected, float32; where the network makes pictures by itself, anything of its size
+            ``[H, W, 3]``.
+        alpha: accumulation, float32 ``[H, W, 1]``.
+        launches: the kernels.
+
+    Returns:
+        ``[H, W, 3]`` float32.
+    """
+    height, width = base.shape[:2]
+    rows, columns = raw.shape[-2:]
+    base = base.contiguous()
+    out = torch.empty_like(base)
+    launches["unfold"](
+        rows * columns,
+        [
+            *(raw, *last_layers(net), rows, columns),
+            *(base, alpha, pixel_stride(alpha)),
+            *(height, width, out),
+        ],
+    )
+    return out
+
+
+def folded_room(net: UNet, height: int, width: int, like: Tensor, dtype: torch.dtype) -> Tensor:
+    """An uninitialised input of the network for a picture of a size ``[1, C, h, w]`` channels last."""
+    size = net.pixel_unshuffle
+    stride = 2 ** (len(net.encoder) - 1)
+    rows, columns = (-(-side // (size * stride)) * stride for side in (height, width))
+    channels = padded_channels(convolutions(net)[0].in_channels // size**2, size) * size**2
+    return picture_like(like, channels, rows, columns, dtype)
+
+
+def convolutions(net: UNet) -> list[nn.Conv2d]:
+    """The 3 x 3 convolutions, in the order in which they run."""
+    blocks = [cast("nn.Sequential", block) for block in (*net.encoder, *net.decoder)]
+    return [layer for block in blocks for layer in block if isinstance(layer, nn.Conv2d)]
+
+
+def last_layers(net: UNet) -> tuple[Tensor, Tensor, Tensor]:
+    """Bias of the last 3 x 3 convolution, weights ``[C, width]`` and bias of the 1 x 1 convolution after it."""
+    weight = net.out.weight.detach().reshape(len(net.out.weight), -1).contiguous()
+    return bias_of(convolutions(net)[-1]), weight, bias_of(net.out)
+
+
+def bias_of(conv: nn.Conv2d) -> Tensor:
+    """The bias, which all convolutions of the network have."""
+    assert conv.bias is not None
+    return conv.bias.detach()
+
+
+def picture_like(like: Tensor, channels: int, rows: int, columns: int, dtype: torch.dtype | None = None) -> Tensor:
+    """An uninitialised picture ``[1, channels, rows, columns]`` channels last."""
+    shape = (1, channels, rows, columns)
+    dtype = like.dtype if dtype is None else dtype
+    return torch.empty(shape, dtype=dtype, device=like.device, memory_format=torch.channels_last)
+
+
+def pixel_stride(picture: Tensor) -> int:
+    """Values from one pixel of ``[H, W, C]`` to the next; rows follow each other without gaps, as in a slice of channels."""
+    row, pixel, channel = picture.stride()
+    assert row == pixel * picture.shape[1] or picture.shape[0] == 1
+    assert channel == 1 or picture.shape[2] == 1
+    return pixel
+
+
+class _Recording(NamedTuple):
+    graph: torch.cuda.CUDAGraph
+    folded: Tensor
+    """Where the graph reads."""
+    raw: Tensor
+    """Where it writes."""
+
+
+class FusedInference:
+    """Compensated pictures of a network without gradients, with its newest weights.
+
+    A plain object that refers to the network, so that recordings and weights stay out of checkpoints.
+
+    Args:
+        net: the network; its parameters must stay the same tensors while they stay on their device.
+        residual: whether its output corrects a picture, or is one.
+    """
+
+    def __init__(self, net: UNet, residual: bool) -> None:
+        self.net = net
+        self.residual = residual
+        self._recorded: OrderedDict[tuple[object, ...], _Recording] = OrderedDict()
+        self._last: tuple[object, ...] | None = None
+        self._in_a_row = 0
+
+    def __call__(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
+        """One picture.
+
+        Args:
+            base: float32, on CUDA ``[H, W, 3]``.
+            splatted: likewise; pixels may be apart, rows may not ``[H, W, 3 + F]``.
+            alpha: likewise ``[H, W, 1]``.
+            dtype: arithmetic, float16 or bfloat16.
+
+        Returns:
+            ``[H, W, 3]`` float32, see :meth:`sundae_ns.compensation.CompensationHead.forward`.
+
+        Raises:
+            BackendError: the kernels cannot be compiled or loaded here.
+        """
+        net = self.net
+        launches = compiled(base.device, dtype, definitions(net, self.residual))
+        height, width = base.shape[:2]
+        key = (height, width, dtype, net.out.weight.data_ptr())
+        self._in_a_row = self._in_a_row + 1 if key == self._last else 1
+        self._last = key
+        if key not in self._recorded and self._in_a_row >= RECORD_AT:
+            if len(self._recorded) >= MAX_SIZES:
+                self._recorded.popitem(last=False)
+            self._recorded[key] = self._record(folded_room(net, height, width, base, dtype).zero_(), launches)
+        recording = self._recorded.get(key)
+        folded = folded_room(net, height, width, base, dtype) if recording is None else recording.folded
+        fold(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
+        if recording is None:
+            raw = self._run(folded, launches)
+        else:
+            self._recorded.move_to_end(key)
+            recording.graph.replay()
+            raw = recording.raw
+        return unfold(net, raw, base, alpha, launches)
+
+    def _run(self, folded: Tensor, launches: Launches) -> Tensor:
+        # Casting half a million weights takes no time, and shows what was learnt since the last picture.
+        raw = network(self.net, Weights(self.net, folded.dtype), folded, launches).last
+        assert raw is not None
+        return raw
+
+    def _record(self, folded: Tensor, launches: Launches) -> _Recording:
+        # What runs first on a stream of its own allocates and chooses kernels, neither of which can be recorded.
+        side = torch.cuda.Stream(folded.device)
+        side.wait_stream(torch.cuda.current_stream(folded.device))
+        with torch.cuda.stream(side):
+            self._run(folded, launches)
+        torch.cuda.current_stream(folded.device).wait_stream(side)
+        graph = torch.cuda.CUDAGraph()
+        # A training loop beside a viewer may allocate meanwhile; only this thread's work belongs to the recording.
+        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            raw = self._run(folded, launches)
+        return _Recording(graph, folded, raw)

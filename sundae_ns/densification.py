@@ -1,0 +1,126 @@
+"""How a field grows during the warm-up: gsplat's densification under a cap, or Markov chain Monte Carlo with one.
+
+Both have the verbs of gsplat's strategies, and their running state holds ``peak``, the most primitives right after
+growing, before anything is culled.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, MutableMapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gsplat.strategy import DefaultStrategy
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
+
+from sundae_ns.gaussians.relocation import grow, jitter, relocate
+
+
+def limit_growth(state: MutableMapping[str, Any], room: int, threshold: float, radius: float | None) -> None:
+    """Let at most ``room`` primitives grow: those with the highest gradients keep their statistics, others lose theirs.
+
+    Args:
+        state: of gsplat's strategy, with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used.
+        room: how many may be duplicated or split; each adds one.
+        threshold: mean gradient above which a primitive grows.
+        radius: share of the picture above which it is split, None where it is not looked at.
+    """
+    gradients = state["grad2d"] / state["count"].clamp_min(1)
+    growing = gradients > threshold
+    if radius is not None and state.get("radii") is not None:
+        growing |= state["radii"] > radius
+    candidates = growing.nonzero().squeeze(1)
+    if len(candidates) <= room:
+        return
+    order = gradients[candidates].argsort(descending=True, stable=True)
+    left_out = candidates[order[max(room, 0) :]]
+    state["grad2d"][left_out] = 0
+    if radius is not None and state.get("radii") is not None:
+        state["radii"][left_out] = state["radii"][left_out].clamp_max(radius)
+
+
+@dataclass
+class CappedStrategy(DefaultStrategy):
+    """gsplat's densification, with an exact cap: where more would grow, those with the highest gradients do."""
+
+    cap: int | None = None
+    """Most primitives at any time; None for no cap."""
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """gsplat's state, and the peak."""
+        return {**super().initialize_state(scene_scale), "peak": 0}
+
+    @torch.no_grad()
+    def _grow_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> tuple[int, int]:
+        if self.cap is not None:
+            radius = self.grow_scale2d if step < self.refine_scale2d_stop_iter else None
+            limit_growth(state, self.cap - len(params["means"]), self.grow_grad2d, radius)
+        grown = super()._grow_gs(params, optimizers, state, step)
+        state["peak"] = max(state.get("peak", 0), len(params["means"]))
+        return grown
+
+
+def start_of_chain(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The field that the chain starts from: opacities of one half, and a tenth of the width, as in its paper.
+
+    Args:
+        params: the field from points ``[N, ...]``; it is not changed.
+    """
+    scales = params["scales"] + math.log(0.1)
+    return {**params, "opacities": torch.zeros_like(params["opacities"]), "scales": scales}
+
+
+@dataclass
+class ChainStrategy:
+    """3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al., 2024), in plain PyTorch, on any device.
+
+    Transparent primitives are moved onto visible ones, a twentieth is added at a time until the cap is reached, and
+    centres are moved by noise. Numbers are the paper's.
+    """
+
+    cap: int
+    """Most primitives at any time."""
+    refine_start_iter: int = 500
+    """First step after which primitives are moved and added."""
+    refine_stop_iter: int = 25000
+    """Step from which on nothing is done any more."""
+    refine_every: int = 100
+    """Steps from one round to the next."""
+    min_opacity: float = 0.005
+    """Primitives below this are moved."""
+    growth: float = 0.05
+    """Share that is added in a round."""
+    noise: float = 5e5
+    """Noise of the centres, in units of their learning rate."""
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """The peak; nothing else is remembered from step to step."""
+        return {"peak": 0}
+
+    def step_pre_backward(self, *_: Any, **__: Any) -> None:
+        """Nothing: no gradient is looked at."""
+
+    @torch.no_grad()
+    def step_post_backward(
+        self,
+        params: MutableMapping[str, Parameter],
+        optimizers: Mapping[str, Optimizer],
+        state: MutableMapping[str, Any],
+        step: int,
+        info: Mapping[str, Any] | None = None,
+        packed: bool = False,
+    ) -> None:
+        """Move, add, and shake; call it after the optimizer's step."""
+        if step >= self.refine_stop_iter:
+            return
+        if step > self.refine_start_iter and step % self.refine_every == 0:
+            dead: Tensor = params["opacities"].detach().sigmoid().flatten() <= self.min_opacity
+            relocate(params, optimizers, dead, self.min_opacity)
+            n = len(params["means"])
+            grow(params, optimizers, min(self.cap, int((1 + self.growth) * n)) - n, self.min_opacity)
+            state["peak"] = max(state.get("peak", 0), len(params["means"]))
+        jitter(params, self.noise * optimizers["means"].param_groups[0]["lr"])

@@ -1,0 +1,65 @@
+"""The graph of a field: which primitives are neighbours, and how alike they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from sundae_ns.gaussians.covariance import covariances, overlap
+from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.graphs import NeighborGraph, build_graph
+from sundae_ns.pruning.config import PruningConfig
+
+LEAST_WIDTH = 0.25
+"""Width that flat primitives are given where their overlap is measured, as a share of the graph's sigma."""
+
+MOST_UNLIKE = 8.0
+"""Differences of colour count up to this many times the typical one: weights fall to e^-32 and stay positive, or one
+primitive of a wild colour would have no neighbour, and no heir, in the middle of others."""
+
+
+@torch.no_grad()
+def field_graph(params: Mapping[str, Tensor], config: PruningConfig) -> NeighborGraph:
+    """Neighbour graph of a field, with the configured weights.
+
+    ``centres`` is the paper's: weights fall with distance. ``appearance`` multiplies them by how far two primitives overlap
+    (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean square difference over
+    all edges: what lies on either side of an edge of the picture hardly counts as neighbours, as in a bilateral filter.
+
+    A field of no more primitives than neighbours has the graph of all pairs within reach.
+
+    Args:
+        params: the field, all finite, N primitives; the graph is built where the tensors are.
+        config: neighbours, width, reach and kind of edges are taken from it.
+
+    Raises:
+        DataError: there is only one primitive, or positions are not finite.
+    """
+    means = params["means"].detach()
+    graph = build_graph(
+        means,
+        num_neighbors=min(config.num_neighbors, max(len(means) - 1, 1)),
+        rule=config.bandwidth,
+        tau=config.tau,
+        sigma=config.sigma,
+    )
+    if config.edges == "centres":
+        return graph
+    weights = graph.weights * _color_affinity(sh_to_rgb(params["features_dc"].detach()), graph)
+    covariance = covariances(params["scales"].detach().double().exp(), params["quats"].detach().double())
+    weights *= overlap(means, covariance, graph.indices, least_width=LEAST_WIDTH * graph.sigma)
+    return replace(graph, weights=weights, dw=weights.sum(dim=1))
+
+
+def _color_affinity(colors: Tensor, graph: NeighborGraph) -> Tensor:
+    squares = torch.empty_like(graph.weights)
+    for column, neighbor in enumerate(graph.indices.unbind(dim=1)):
+        squares[:, column] = (colors - colors[neighbor]).square().sum(dim=1)
+    present = graph.weights > 0
+    typical = (squares * present).sum(dtype=torch.float64) / present.sum().clamp_min(1)
+    if not typical > 0:
+        return torch.ones_like(squares)
+    return (squares / typical.to(squares.dtype)).clamp_max_(MOST_UNLIKE**2).mul_(-0.5).exp_()

@@ -1,0 +1,232 @@
+"""How few primitives a scene needs: cut, let training recover, look at held-back views, go on or step back.
+
+Right after a cut a field is far worse than after some training, and how much worse says little about where it ends. So a
+cut is judged by what training makes of it: it is accepted as soon as the held-back views reach the target again, and
+taken back if they have not after ``patience`` looks, or cannot any more at the rate of the last look (recovery slows
+down, so that this rate is the best to be hoped for). Steps behind an accepted cut are the fine-tuning itself; only those
+behind a cut that is taken back are lost.
+
+How deep to cut follows from the cut before: what it cost once recovered, per halving, against the margin that there is.
+Where the margin is too small for a cut worth its while, training goes on until it has grown.
+
+This module holds the decisions, as plain numbers; :mod:`sundae_ns.budget` acts on them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal
+
+from sundae_ns.compensation.head import SIZES
+from sundae_ns.errors import CheckpointError
+
+DEEPEST, SHALLOWEST = 1.0, 0.15
+"""Halvings of the deepest cut (a half goes), and of the least that is worth a cut (a tenth goes)."""
+
+_KINDS: dict[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "bool": (bool,)}
+
+Phase = Literal["before", "bands", "field", "head", "done"]
+Verdict = Literal["accepted", "waiting", "rejected", "resting"]
+
+
+@dataclass
+class Point:
+    """One look at the held-back views."""
+
+    step: int
+    """Step of training."""
+    phase: str
+    """``field``: base colours alone; ``head``: with the head; ``final``: at the end of the run."""
+    primitives: int
+    bytes: int
+    """What would be stored, head included where it takes part."""
+    psnr: float
+    """Mean PSNR over the held-back views, dB."""
+    verdict: str
+    since_cut: int
+    """Steps of training since the cut."""
+
+
+@dataclass
+class Search:
+    """State of the search; plain numbers and strings, so that a checkpoint can carry it."""
+
+    phase: Phase = "before"
+    reference: float = math.nan
+    """PSNR of the warm-up field on the held-back views, dB."""
+    target: float = math.nan
+    """PSNR that has to be kept, dB."""
+    began: int = 0
+    """Step of the schedule at which the search began."""
+    trying: bool = False
+    """Whether a cut waits for its verdict."""
+    looks: int = 0
+    """Looks since the last cut, or since the last verdict."""
+    last_psnr: float = math.nan
+    margin: float = math.nan
+    """What the field was above the target before the last cut, dB."""
+    slope: float = 0.0
+    """What a halving cost after recovery, dB, by the last verdict."""
+    rejected: int = 0
+    """Cuts taken back in this phase."""
+    failed: int = 0
+    """Primitives of the last cut taken back in this phase; 0 before."""
+    cuts: int = 0
+    """Cuts accepted in this phase."""
+    accepted: int = 0
+    """Primitives of the field that training would go back to."""
+    tried: int = 0
+    """Primitives after the last cut."""
+    cut_at: int = 0
+    """Step of the schedule of the last cut."""
+    head: bool = False
+    """Whether the head takes part."""
+    head_at: int = 0
+    """Step of the schedule at which it joined."""
+    head_size: str = ""
+    """Size that was chosen for it; empty before."""
+    num_features: int = -1
+    """Length of the feature vectors that was chosen; -1 before."""
+    head_dropped: bool = False
+    """Whether it was decided that this scene needs no head."""
+    degree: int = -1
+    """Degree of the harmonics of the field at hand; -1 before the search."""
+    before: int = 0
+    """Primitives of the warm-up field."""
+    steps_lost: int = 0
+    """Steps of training behind what was taken back."""
+    seconds: float = 0.0
+    """Time that looking, scoring and cutting took, training not counted."""
+    views: int = 0
+    """Held-back views."""
+    zeroed: int = 0
+    """Primitives whose bands above 0 were found to carry nothing, and were set to 0."""
+    degrees: dict[str, float] = field(default_factory=dict)
+    """PSNR by degree of the harmonics, dB, each after the same training of the warm-up field."""
+    curve: list[Point] = field(default_factory=list)
+
+    @property
+    def searching(self) -> bool:
+        """Whether something is being tried."""
+        return self.phase in ("bands", "field", "head")
+
+    def begin(self, phase: Literal["field", "head"], accepted: int) -> None:
+        """Start to cut a field that meets the target; what a halving costs is remembered from an earlier phase."""
+        self.phase, self.accepted, self.trying = phase, accepted, False
+        self.rejected, self.failed, self.cuts, self.looks = 0, 0, 0, 0
+
+    def next_degree(self, top: int, tolerated: float) -> int | None:
+        """The degree to try next, None when the lowest that does is known: bisection, all bands first.
+
+        Args:
+            top: degree of the warm-up field.
+            tolerated: what may be lost against all bands, dB.
+        """
+        if str(top) not in self.degrees:
+            return top
+        best, worst = self.lowest_degree(top, tolerated), -1
+        for name, value in self.degrees.items():
+            if value < self.degrees[str(top)] - tolerated:
+                worst = max(worst, int(name))
+        return None if best - worst <= 1 else (best + worst) // 2
+
+    def lowest_degree(self, top: int, tolerated: float) -> int:
+        """The lowest degree among those tried that loses no more than is tolerated."""
+        return min(int(name) for name, value in self.degrees.items() if value >= self.degrees[str(top)] - tolerated)
+
+    def next_count(self, psnr: float, least: int) -> int | None:
+        """Primitives after the next cut; None if the margin is too small for one, or there is nothing left to cut.
+
+        Args:
+            psnr: of the field that would be cut, dB.
+            least: fewest primitives.
+        """
+        margin = psnr - self.target
+        if margin < 0:
+            return None
+        halvings = DEEPEST if margin >= self.slope * DEEPEST else margin / self.slope
+        if self.failed:
+            # Half the way to what has failed; no nearer to it, and beyond it, in the least steps: training may have gained.
+            halvings = min(halvings, max(0.5 * math.log2(self.accepted / self.failed), SHALLOWEST))
+        count = max(int(self.accepted * 0.5**halvings), least)
+        return count if halvings >= SHALLOWEST and count < self.accepted else None
+
+    def cut(self, psnr: float, count: int, step: int) -> None:
+        """A field was cut to ``count`` primitives after this step of the schedule."""
+        self.margin, self.tried, self.cut_at, self.trying, self.looks = psnr - self.target, count, step, True, 0
+
+    def judge(self, psnr: float, step: int, patience: int) -> Verdict:
+        """Judge the last cut, if it waits for it, by a look at the held-back views.
+
+        Args:
+            psnr: mean over the views, dB.
+            step: of the schedule.
+            patience: looks that a cut may take to recover.
+        """
+        self.looks += 1
+        # The first look has nothing to compare with: what a cut costs is not what training gains.
+        gain = psnr - self.last_psnr if self.looks > 1 else math.inf
+        self.last_psnr = psnr
+        if not self.trying:
+            return "resting"
+        left, margin = patience - self.looks, psnr - self.target
+        if margin < 0 and left > 0 and margin + gain * left >= 0:
+            return "waiting"
+        self.trying, self.looks = False, 0
+        # Training gains meanwhile, and a lucky cut does not make the next one cheap.
+        self.slope = max((self.margin - margin) / math.log2(self.accepted / self.tried), self.slope / 2)
+        if margin >= 0:
+            self.accepted, self.cuts = self.tried, self.cuts + 1
+            return "accepted"
+        self.rejected, self.failed = self.rejected + 1, self.tried
+        self.steps_lost += step - self.cut_at
+        return "rejected"
+
+    def state(self) -> dict[str, Any]:
+        """Plain numbers for a checkpoint."""
+        return asdict(self)
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Search:
+        """Counterpart of :meth:`state`.
+
+        Raises:
+            CheckpointError: it is not what :meth:`state` gives.
+        """
+        try:
+            if set(state) != {f.name for f in fields(cls)}:
+                raise ValueError("other entries")
+            search = cls(**{**state, "curve": [Point(**point) for point in state["curve"]]})
+            if search.phase not in ("before", "bands", "field", "head", "done") or not -1 <= search.degree <= 4:
+                raise ValueError("unknown phase or degree")
+            if search.head_size not in ("", *SIZES) or not -1 <= search.num_features <= 1024:
+                raise ValueError("unknown head")
+            for f in fields(cls):
+                kinds = _KINDS.get(str(f.type))
+                if kinds is not None and not isinstance(getattr(search, f.name), kinds):
+                    raise ValueError(f"{f.name} is no {f.type}")
+        except (TypeError, ValueError, KeyError, AttributeError) as error:
+            raise CheckpointError(
+                f"the checkpoint does not say where its search for a budget stood ({error}); give another"
+            ) from error
+        return search
+
+
+def curve_text(points: Sequence[Point], target: float, width: int = 40) -> str:
+    """The curve as lines of text, one a look, the fewest primitives last; bars are dB above the worst look."""
+    if not points:
+        return ""
+    low = min([point.psnr for point in points] + [target])
+    span = max([point.psnr for point in points] + [target]) - low or 1.0
+    mark = round((target - low) / span * (width - 1))
+    lines = []
+    for point in sorted(points, key=lambda point: (-point.primitives, point.step)):
+        bar = list("#" * round((point.psnr - low) / span * (width - 1)) + " " * width)[:width]
+        bar[mark] = "|"
+        lines.append(
+            f"{point.primitives:>10,}  {''.join(bar)} {point.psnr:7.3f} dB  {point.psnr - target:+.3f} to the target  "
+            f"step {point.step}, {point.since_cut} after the cut, {point.phase}, {point.verdict}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,16 @@
+"""Packed scenes: a field, its head and its cameras in one small file that can be checked and cannot be run."""
+
+from sundae_ns.storage.packing.config import PackConfig
+from sundae_ns.storage.packing.container import VERSION, read_header
+from sundae_ns.storage.packing.scene import CAMERAS, PackReport, Scene, read_scene, write_scene
+
+__all__ = [
+    "CAMERAS",
+    "VERSION",
+    "PackConfig",
+    "PackReport",
+    "Scene",
+    "read_header",
+    "read_scene",
+    "write_scene",
+]

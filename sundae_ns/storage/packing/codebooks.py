@@ -1,0 +1,111 @@
+"""Residual codebooks: a vector as a sum of entries, one of each of a few small books found by k-means.
+
+Book 1 is fitted to the vectors, each further book to what the ones before it leave (Juang and Gray, 1982). A row is then as
+many bytes as there are books.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+MOST_ENTRIES = 256
+"""Entries of a book: what one byte can name."""
+ROWS_AN_ENTRY = 16
+"""Fields with fewer rows for each entry get smaller books, which would else take more bytes than they save."""
+EXACT = 0.001
+"""Share of rows, those that the books fit worst, that are stored as they are; it bounds the error of all others."""
+_SAMPLE = 1 << 16
+_ROUNDS = 8
+_CHUNK = 1 << 14
+
+
+class Codebooks(NamedTuple):
+    """Vectors ``[N, D]`` by books; no element of a row is off by more than ``bound``."""
+
+    indices: NDArray[np.uint8]
+    """Entry of each book for each row ``[S, N]``."""
+    entries: NDArray[np.int8]
+    """Entries of the books, in steps ``[S, K, D]``."""
+    steps: NDArray[np.float32]
+    """Size of a step, one a book ``[S]``."""
+    rows: NDArray[np.uint32]
+    """Rows that are stored exactly, rising ``[E]``."""
+    exact: NDArray[np.float32]
+    """These rows ``[E, D]``."""
+    bound: float
+
+
+def fit(vectors: NDArray[np.float32], books: int, *, seed: int = 0) -> Codebooks:
+    """Find books, and the entries of each row.
+
+    Args:
+        vectors: ``[N, D]``, finite, N and D at least 1.
+        books: how many, at least 1.
+        seed: of the sample and the first centres.
+    """
+    n, width = vectors.shape
+    entries = min(MOST_ENTRIES, max(1, n // ROWS_AN_ENTRY))
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.from_numpy(np.ascontiguousarray(vectors)).double()
+    rest = target.clone()
+    kept = torch.zeros(books, entries, width, dtype=torch.int8)
+    steps = torch.zeros(books)
+    indices = torch.zeros(books, n, dtype=torch.uint8)
+    for book in range(books):
+        centres = _kmeans(rest, entries, generator)
+        step = (centres.abs().max() / 127).float()
+        steps[book] = step
+        if step > 0:
+            kept[book] = (centres / step.double()).round().clamp(-127, 127).to(torch.int8)
+        # What is left is taken from the entries as they are stored, so that the next book mends their rounding too.
+        stored = kept[book].float() * step
+        nearest = _nearest(rest, stored.double())
+        indices[book] = nearest.to(torch.uint8)
+        rest -= stored.double()[nearest]
+    made = Codebooks(
+        indices.numpy(), kept.numpy(), steps.numpy(), np.zeros(0, np.uint32), np.zeros((0, width), np.float32), 0.0
+    )
+    error = np.abs(vectors.astype(np.float64) - restore(made)).max(axis=1)
+    count = int(n * EXACT)
+    worst = np.sort(np.argpartition(error, n - count)[n - count :]) if count else np.zeros(0, np.int64)
+    others = np.delete(error, worst)
+    return made._replace(
+        rows=worst.astype(np.uint32), exact=vectors[worst], bound=float(others.max()) if len(others) else 0.0
+    )
+
+
+def restore(packed: Codebooks) -> NDArray[np.float32]:
+    """Counterpart of :func:`fit`: ``[N, D]``."""
+    books, entries, width = packed.entries.shape
+    table = torch.from_numpy(packed.entries.astype(np.float32) * packed.steps[:, None, None]).reshape(-1, width)
+    names = packed.indices.T.astype(np.int32)
+    names += np.arange(0, books * entries, entries, dtype=np.int32)
+    # The sum of a few rows of a table: torch does it in one pass, on several threads.
+    out: NDArray[np.float32] = F.embedding_bag(torch.from_numpy(names), table, mode="sum").numpy()
+    out[packed.rows] = packed.exact
+    return out
+
+
+def _kmeans(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Centres ``[count, D]`` by Lloyd's rounds on a sample of the rows."""
+    sample = rows[torch.randperm(len(rows), generator=generator)[:_SAMPLE]]
+    centres = sample[:count].clone()
+    for _ in range(_ROUNDS):
+        nearest = _nearest(sample, centres)
+        number = torch.bincount(nearest, minlength=count)[:, None]
+        sums = torch.zeros_like(centres).index_add_(0, nearest, sample)
+        centres = torch.where(number > 0, sums / number.clamp_min(1), centres)
+    return centres
+
+
+def _nearest(rows: Tensor, centres: Tensor) -> Tensor:
+    """Index ``[N]`` of the nearest centre of each row."""
+    # |x - c|^2 less |x|^2, in float32: a wrong pick between two like entries costs nothing.
+    flat, half = centres.float(), (centres * centres).sum(dim=1).float() / 2
+    return torch.cat([(chunk.float() @ flat.T - half).argmax(dim=1) for chunk in rows.split(_CHUNK)])

@@ -1,0 +1,307 @@
+"""One file of named arrays behind a JSON header: every byte under a checksum, nothing in it can be run.
+
+    offset  bytes
+    0       8      magic, ``89 53 55 4E 44 41 45 0A`` (``\\x89SUNDAE\\n``)
+    8       4      version of the format, unsigned, little-endian
+    12      4      length H of the header, unsigned, little-endian, at most 4 MiB
+    16      32     SHA-256 of the header
+    48      H      header: a JSON object in UTF-8; its key ``sections`` lists the sections in their order
+    48 + H  ...    the sections, one behind the other, to the end of the file
+
+A section is one array, little-endian. Its bytes are cut into planes of equal length: one for each index of its first
+dimension where it has more than one, and of each of those one for each byte of a number, the lowest first. Each plane is one
+zstandard frame that states its size, or, where that would not be shorter, the plane itself. The header has for every section
+``name``, ``dtype`` (numpy's, as ``<u2``), ``shape``, ``parts`` (length of each plane in the file) and ``sha256`` of these
+bytes.
+
+Sizes are checked before anything is allocated: all sections together may unpack to ``SPARE`` bytes and ``MAX_RATIO`` bytes for
+each byte of the file. A writer of something that unpacks to more adds a section ``padding``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import struct
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from sundae_ns.errors import PackError
+from sundae_ns.storage.atomic import replacing
+
+MAGIC = b"\x89SUNDAE\n"
+VERSION = 1
+SPARE, MAX_RATIO = 8 << 20, 32
+MAX_HEADER = 4 << 20
+PADDING = "padding"
+_PREAMBLE = struct.Struct("<8sII32s")
+_DTYPES = ("|u1", "<u2", "<u4", "<u8", "|i1", "<i2", "<f2", "<f4", "<f8")
+_THREADS = 2
+
+Array = NDArray[Any]
+
+
+class Section(NamedTuple):
+    """Where an array lies in the file."""
+
+    name: str
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    parts: tuple[int, ...]
+    sha256: str
+    offset: int
+
+    @property
+    def length(self) -> int:
+        """Bytes in the file."""
+        return sum(self.parts)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the array."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    @property
+    def planes(self) -> int:
+        """Parts that the array is cut into."""
+        return _rows(self.shape) * self.dtype.itemsize
+
+
+class Header(NamedTuple):
+    """What a file says of itself."""
+
+    meta: dict[str, Any]
+    """The JSON object, ``sections`` included."""
+    sections: dict[str, Section]
+    size: int
+    """Bytes of the file."""
+
+
+def _rows(shape: tuple[int, ...]) -> int:
+    return shape[0] if len(shape) > 1 else 1
+
+
+def _cut(array: Array) -> list[bytes]:
+    """The planes of an array."""
+    if array.size == 0:
+        return []
+    flat = np.ascontiguousarray(array).reshape(_rows(array.shape), -1)
+    planes = flat.view(np.uint8).reshape(flat.shape[0], flat.shape[1], array.dtype.itemsize)
+    return [plane.tobytes() for plane in planes.transpose(0, 2, 1).reshape(-1, flat.shape[1])]
+
+
+def _join(planes: list[bytes], section: Section) -> Array:
+    """Counterpart of :func:`_cut`."""
+    if not planes:
+        return np.zeros(section.shape, section.dtype)
+    rows, size = _rows(section.shape), section.dtype.itemsize
+    if len(planes) == 1:
+        return np.frombuffer(planes[0], section.dtype).reshape(section.shape)
+    table = np.empty((rows, math.prod(section.shape) // rows, size), np.uint8)
+    for i, plane in enumerate(planes):
+        table[i // size, :, i % size] = np.frombuffer(plane, np.uint8)
+    return table.reshape(-1).view(section.dtype).reshape(section.shape)
+
+
+def _squeeze(plane: bytes, level: int) -> bytes:
+    frame = zstandard.ZstdCompressor(level=level, write_checksum=False).compress(plane)
+    return frame if len(frame) < len(plane) else plane
+
+
+def _expand(part: memoryview, size: int) -> bytes:
+    """A plane of ``size`` bytes; the frame's own idea of its size is never trusted."""
+    if len(part) == size:
+        return bytes(part)
+    try:
+        if zstandard.frame_content_size(part) != size:
+            raise PackError("a section does not unpack to the size that the header states")
+        return zstandard.ZstdDecompressor().decompress(part, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise PackError("a section cannot be decompressed") from error
+
+
+def write(
+    path: Path, meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0, level: int = 19
+) -> int:
+    """Write a file, whole or not at all.
+
+    Args:
+        path: the file; its folder must exist.
+        meta: for the header: plain values of JSON; must not have ``sections``.
+        arrays: arrays of the dtypes in ``_DTYPES``.
+        unpacked: bytes that a reader makes of the arrays, if more than they have themselves.
+        level: of zstandard, 1 to 22.
+
+    Returns:
+        Bytes of the file.
+
+    Raises:
+        StorageError: no room or no right to write.
+    """
+    named = {name: np.asarray(array) for name, array in arrays.items()}
+
+    def encode(array: Array) -> list[bytes]:
+        little = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        return [_squeeze(plane, level) for plane in _cut(little)]
+
+    with ThreadPoolExecutor(_THREADS) as pool:
+        parts = dict(zip(named, pool.map(encode, named.values()), strict=True))
+    sections = [_entry(name, named[name], parts[name]) for name in named]
+    body = sum(len(part) for planes in parts.values() for part in planes)
+    most = max(unpacked, sum(array.nbytes for array in named.values()))
+    lacking = (most - SPARE) // MAX_RATIO + 1 - body
+    if lacking > 0:
+        padding = np.zeros(lacking, np.uint8)
+        parts[PADDING] = [padding.tobytes()]
+        sections.append(_entry(PADDING, padding, parts[PADDING]))
+    header = json.dumps({**meta, "sections": sections}, allow_nan=False, separators=(",", ":")).encode()
+    if len(header) > MAX_HEADER:
+        raise PackError(
+            f"the header would take {len(header):,} bytes, at most {MAX_HEADER:,} can be read; give fewer cameras"
+        )
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(_PREAMBLE.pack(MAGIC, VERSION, len(header), hashlib.sha256(header).digest()))
+        file.write(header)
+        for planes in parts.values():
+            for part in planes:
+                file.write(part)
+    return path.stat().st_size
+
+
+def _entry(name: str, array: Array, parts: list[bytes]) -> dict[str, Any]:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
+    return {
+        "name": name,
+        "dtype": array.dtype.newbyteorder("<").str,
+        "shape": list(array.shape),
+        "parts": [len(part) for part in parts],
+        "sha256": digest.hexdigest(),
+    }
+
+
+def read_header(path: Path) -> Header:
+    """Read and check the header, without the sections.
+
+    Raises:
+        PackError: no packed scene, of another version, cut short, altered, or stating sizes that cannot be.
+    """
+    try:
+        with path.open("rb") as file:
+            size = path.stat().st_size
+            preamble = file.read(_PREAMBLE.size)
+            if preamble[: len(MAGIC)] != MAGIC:
+                raise PackError(f"{path} is no packed scene; give a file that sundae pack wrote")
+            if len(preamble) < _PREAMBLE.size:
+                raise _damaged(path, "it ends in its first bytes")
+            _, version, length, digest = _PREAMBLE.unpack(preamble)
+            if version != VERSION:
+                raise PackError(f"{path} has version {version} of the format, this program reads {VERSION}; update it")
+            if length > min(MAX_HEADER, size - _PREAMBLE.size):
+                raise _damaged(path, "it ends in its header")
+            text = file.read(length)
+    except OSError as error:
+        raise PackError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+    if hashlib.sha256(text).digest() != digest:
+        raise _damaged(path, "the checksum of its header is wrong")
+    try:
+        meta = json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise _damaged(path, "its header is no JSON") from error
+    return Header(meta, _sections(path, meta, _PREAMBLE.size + length, size), size)
+
+
+def _damaged(path: Path, reason: str) -> PackError:
+    return PackError(f"{path} is not a whole packed scene ({reason}); get it again, or pack it again")
+
+
+def _no_constant(name: str) -> None:
+    raise ValueError(f"{name} is no number")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 28
+
+
+def _sections(path: Path, meta: Any, offset: int, size: int) -> dict[str, Section]:
+    entries = meta.get("sections") if isinstance(meta, dict) else None
+    if not isinstance(entries, list):
+        raise _damaged(path, "its header lists no sections")
+    found: dict[str, Section] = {}
+    total = 0
+    for entry in entries:
+        section = _section(entry, offset)
+        if section is None or section.name in found:
+            raise _damaged(path, "its header describes a section that cannot be")
+        found[section.name] = section
+        offset += section.length
+        total += section.size
+    if offset != size:
+        raise _damaged(path, f"its header states {offset:,} bytes, it has {size:,}")
+    check_ratio(path, total, size)
+    return found
+
+
+def check_ratio(path: Path, unpacked: int, size: int) -> None:
+    """Refuse what would unpack to far more than the file has.
+
+    Raises:
+        PackError: ``unpacked`` bytes are more than a file of ``size`` bytes may become.
+    """
+    if unpacked > SPARE + MAX_RATIO * size:
+        raise _damaged(path, f"{size:,} bytes would unpack to {unpacked:,}")
+
+
+def _section(entry: Any, offset: int) -> Section | None:
+    """A section of the header, or None if it cannot be."""
+    if not isinstance(entry, dict) or not all(
+        isinstance(entry.get(key), kind)
+        for key, kind in (("name", str), ("dtype", str), ("shape", list), ("parts", list), ("sha256", str))
+    ):
+        return None
+    shape, parts = entry["shape"], entry["parts"]
+    if entry["dtype"] not in _DTYPES or not 1 <= len(shape) <= 3 or not all(map(_is_count, [*shape, *parts])):
+        return None
+    made = Section(entry["name"], np.dtype(entry["dtype"]), tuple(shape), tuple(parts), entry["sha256"], offset)
+    empty = made.size == 0
+    if len(parts) != (0 if empty else made.planes):
+        return None
+    return None if not empty and any(part > made.size // made.planes for part in parts) else made
+
+
+def read_sections(path: Path, header: Header) -> dict[str, Array]:
+    """All sections but padding.
+
+    Raises:
+        PackError: a section is altered or cut short.
+    """
+    wanted = [section for section in header.sections.values() if section.name != PADDING]
+    try:
+        content = memoryview(path.read_bytes())
+    except OSError as error:
+        raise PackError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+    for section in header.sections.values():
+        stored = content[section.offset : section.offset + section.length]
+        if hashlib.sha256(stored).hexdigest() != section.sha256:
+            raise _damaged(path, f"the checksum of {section.name} is wrong")
+
+    def decode(section: Section) -> Array:
+        planes, start = [], section.offset
+        for part in section.parts:
+            planes.append(_expand(content[start : start + part], section.size // section.planes))
+            start += part
+        return _join(planes, section)
+
+    try:
+        with ThreadPoolExecutor(_THREADS) as pool:
+            return dict(zip([section.name for section in wanted], pool.map(decode, wanted), strict=True))
+    except PackError as error:
+        raise _damaged(path, str(error)) from error

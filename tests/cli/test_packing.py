@@ -1,0 +1,63 @@
+"""Options of ``sundae pack``, and refusals in one line."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import torch
+
+from sundae_ns.cli import main
+from sundae_ns.cli.packing import pack
+from sundae_ns.gaussians import from_points
+from sundae_ns.storage.packing import PackConfig, Scene, write_scene
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as caught:
+        main([str(argument) for argument in arguments])
+    assert isinstance(caught.value.code, int)
+    return caught.value.code
+
+
+def test_options_are_those_of_the_configuration() -> None:
+    """They are written out a second time so that ``sundae --help`` need not import torch."""
+    options = inspect.signature(pack).parameters
+    for field in fields(PackConfig):
+        assert options[field.name].default == field.default, field.name
+    assert set(options) == {"run", "out", "max_cameras"} | {field.name for field in fields(PackConfig)}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["pack", "nothing", "-o", "a.sundae"], "nothing cannot be read"),
+        (["pack", "nothing", "-o", "a.sundae", "--scale-bits", "2"], "scale-bits is 2; give 4 to 16"),
+        (["pack", "nothing", "-o", "no/a.sundae"], "no is no folder"),
+        (["unpack", "nothing"], "nothing cannot be read"),
+        (["unpack", "cut.sundae"], "not a whole packed scene"),
+        (["unpack", "harmed.sundae"], "the checksum of"),
+        (["unpack", "bare.sundae"], "states no model"),
+    ],
+)
+def test_refusals_are_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    says: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    points = torch.rand(20, 3)
+    write_scene(Path("bare.sundae"), Scene(from_points(points, points, sh_degree=0, num_features=0)))
+    content = Path("bare.sundae").read_bytes()
+    Path("cut.sundae").write_bytes(content[:-5])
+    Path("harmed.sundae").write_bytes(content[:-5] + bytes([content[-5] ^ 64]) + content[-4:])
+    before = sorted(tmp_path.iterdir())
+    assert run(*arguments) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("sundae: ")
+    assert says in line
+    assert sorted(tmp_path.iterdir()) == before

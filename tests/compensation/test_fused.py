@@ -1,0 +1,292 @@
+"""The fused kernels: their very lines, compiled for the CPU, against the network layer by layer; and on a GPU."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import shutil
+import subprocess
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from sundae_ns import nvrtc
+from sundae_ns.compensation import CompensationHead, HeadConfig, fused, kernels
+from sundae_ns.compensation.fused_training import FusedTraining
+from sundae_ns.errors import BackendError, SundaeError
+
+# What a GPU's compiler knows by itself, pictures of floats, and a loop over the threads. A block has one thread here, so
+# that what the threads of a block share is filled before it is read.
+SHIM = """
+#define __device__
+#define __global__
+#define __forceinline__ inline
+#define __shared__ static
+#define __align__(n) __attribute__((aligned(n)))
+#define __syncthreads()
+typedef float T;
+inline float load(T v) { return v; }
+inline T store(float v) { return v; }
+struct Index { unsigned x; };
+static Index blockIdx, blockDim = {1}, threadIdx;
+%s
+extern "C" void at(unsigned block) { blockIdx.x = block; }
+"""
+
+Compile = Callable[[CompensationHead], kernels.Launches]
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Compile:
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("no g++ here to compile the kernels for the CPU")
+    folder = tmp_path_factory.mktemp("kernels")
+    (folder / "kernels.cpp").write_text(SHIM % kernels.SOURCE)
+
+    def compile_for(head: CompensationHead) -> kernels.Launches:
+        options = kernels.definitions(head.net, head.config.mode == "residual")
+        library = folder / f"{abs(hash(options))}.so"
+        if not library.exists():
+            flags = ["-O1", "-w", "-shared", "-fPIC", *options]
+            subprocess.run([compiler, *flags, "-o", library, folder / "kernels.cpp"], check=True)
+        loaded = ctypes.CDLL(str(library))
+
+        def launch_of(name: str) -> kernels.Launch:
+            def launch(threads: int, arguments: list[Tensor | int | float]) -> None:
+                values = [
+                    ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_int(a) for a in arguments
+                ]
+                # More threads than asked for, as whole blocks have.
+                for block in range(threads + 3):
+                    loaded.at(block)
+                    getattr(loaded, name)(*values)
+
+            return launch
+
+        return {name: launch_of(name) for name in kernels.FORWARD + kernels.BACKWARD}
+
+    return compile_for
+
+
+def make(**options: object) -> CompensationHead:
+    torch.manual_seed(0)
+    head = CompensationHead(HeadConfig(**{"size": "tiny", "num_features": 5, **options}))  # type: ignore[arg-type]
+    for parameter in head.parameters():
+        nn.init.normal_(parameter, std=0.3 if parameter.ndim == 1 else (parameter[0].numel()) ** -0.5)
+    return head
+
+
+def splatted(height: int, width: int, num_features: int, *, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Base, colours with features, and accumulation; depth lies beside them, as a rasteriser leaves it."""
+    generator = torch.Generator().manual_seed(seed)
+    everything = torch.rand(height, width, 4 + num_features, generator=generator)
+    alpha = torch.rand(height, width, 1, generator=generator)
+    base = torch.rand(height, width, 3, generator=generator)
+    return base, everything[..., :-1], alpha
+
+
+@torch.no_grad()
+def by_kernels(head: CompensationHead, pictures: tuple[Tensor, Tensor, Tensor], compiled: Compile) -> Tensor:
+    base, seen, alpha = pictures
+    launches = compiled(head)
+    folded = fused.folded_room(head.net, *base.shape[:2], base, torch.float32).fill_(torch.nan)
+    fused.fold(seen, alpha, head.config.pixel_unshuffle, head.config.mode == "residual", folded, launches)
+    last = fused.network(head.net, fused.Weights(head.net, torch.float32), folded, launches).last
+    assert last is not None
+    return fused.unfold(head.net, last, base, alpha, launches)
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+@pytest.mark.parametrize("pixel_unshuffle", [1, 2, 3, 4])
+@torch.no_grad()
+def test_the_same_picture(compiled: Compile, mode: str, pixel_unshuffle: int) -> None:
+    head = make(mode=mode, pixel_unshuffle=pixel_unshuffle)
+    pictures = splatted(37, 50, 5)
+    torch.testing.assert_close(by_kernels(head, pictures, compiled), head(*pictures), rtol=1e-4, atol=1e-5)
+
+
+@settings(max_examples=15, deadline=None)
+@given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
+@torch.no_grad()
+def test_at_any_size(compiled: Compile, height: int, width: int, num_features: int, seed: int) -> None:
+    head = make(num_features=num_features)
+    pictures = splatted(height, width, num_features, seed=seed)
+    torch.testing.assert_close(by_kernels(head, pictures, compiled), head(*pictures), rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_compact_levels_and_wide_ones(compiled: Compile) -> None:
+    for size in ("compact", "small"):
+        head = make(size=size, num_features=13)
+        pictures = splatted(20, 33, 13)
+        torch.testing.assert_close(by_kernels(head, pictures, compiled), head(*pictures), rtol=1e-4, atol=1e-5)
+
+
+@torch.no_grad()
+def test_overflow_corrects_nothing(compiled: Compile) -> None:
+    head = make()
+    base, seen, alpha = splatted(16, 16, 5)
+    seen[3, 4] = torch.inf
+    out = by_kernels(head, (base, seen, alpha), compiled)
+    assert torch.isfinite(out).all()
+    assert torch.equal(out[3, 4], base[3, 4])
+
+
+Gradients = list[Tensor]
+
+
+def of_layers(head: CompensationHead, pictures: tuple[Tensor, Tensor, Tensor], to_out: Tensor) -> Gradients:
+    """The picture, and gradients of splatted, accumulation and parameters by autograd."""
+    base, *leaves = pictures[0], *(picture.clone().requires_grad_() for picture in pictures[1:])
+    head.zero_grad()
+    out = head(base, *leaves)
+    (out * to_out).sum().backward()
+    grads = [leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for leaf in leaves]
+    return [out.detach(), *grads, *(p.grad.clone() for p in head.parameters() if p.grad is not None)]
+
+
+def of_kernels(
+    head: CompensationHead, pictures: tuple[Tensor, Tensor, Tensor], to_out: Tensor, training: FusedTraining
+) -> Gradients:
+    """The same by the kernels."""
+    base, *leaves = pictures[0], *(picture.clone().requires_grad_() for picture in pictures[1:])
+    head.zero_grad()
+    out = training(*leaves, torch.float32)
+    out = base + out if head.config.mode == "residual" else out
+    (out * to_out).sum().backward()
+    return [out.detach(), *(leaf.grad for leaf in leaves), *(p.grad.clone() for p in head.parameters())]
+
+
+def assert_same(found: Gradients, expected: Gradients) -> None:
+    assert len(found) == len(expected)
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-5 * max(1.0, float(b.abs().max())))
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+@pytest.mark.parametrize("pixel_unshuffle", [1, 2, 4])
+def test_the_same_gradients(compiled: Compile, mode: str, pixel_unshuffle: int) -> None:
+    head = make(mode=mode, pixel_unshuffle=pixel_unshuffle)
+    training = FusedTraining(head.net, mode == "residual", compiled(head))
+    for size in ((37, 50), (16, 16)):
+        pictures, to_out = splatted(*size, 5), torch.randn(*size, 3)
+        assert_same(of_kernels(head, pictures, to_out, training), of_layers(head, pictures, to_out))
+
+
+@settings(max_examples=10, deadline=None)
+@given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
+def test_the_same_gradients_at_any_size(
+    compiled: Compile, height: int, width: int, num_features: int, seed: int
+) -> None:
+    head = make(num_features=num_features)
+    pictures, to_out = splatted(height, width, num_features, seed=seed), torch.randn(height, width, 3)
+    training = FusedTraining(head.net, True, compiled(head))
+    assert_same(of_kernels(head, pictures, to_out, training), of_layers(head, pictures, to_out))
+
+
+def test_gradients_of_an_earlier_picture_are_refused(compiled: Compile) -> None:
+    head = make()
+    training = FusedTraining(head.net, True, compiled(head))
+    pictures = [splatted(16, 16, 5, seed=seed) for seed in range(2)]
+    outs = [training(p[1].clone().requires_grad_(), p[2], torch.float32) for p in pictures]
+    with pytest.raises(SundaeError, match=r"before that$"):
+        outs[0].sum().backward()
+    outs[1].sum().backward()
+
+
+def test_kernels_compile_for_gpus_that_have_the_types() -> None:
+    try:
+        nvrtc._library("nvrtc")
+    except BackendError as error:
+        pytest.skip(f"no NVRTC here: {error}")
+    for architecture, dtype, head in (
+        ("sm_75", torch.float16, make(pixel_unshuffle=4)),
+        ("sm_80", torch.bfloat16, make(size="large", mode="features")),
+        ("sm_90", torch.float16, make()),
+    ):
+        options = kernels.definitions(head.net, head.config.mode == "residual")
+        code = nvrtc.compile_cubin(kernels.program(dtype), architecture, options)
+        assert all(name.encode() in code for name in kernels.FORWARD + kernels.BACKWARD)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("precision", "tolerance"), [("bf16", 0.02), ("fp16", 0.003)])
+@pytest.mark.parametrize("mode", ["residual", "features"])
+@torch.no_grad()
+def test_on_a_gpu_at_every_size_and_with_weights_that_change(precision: str, tolerance: float, mode: str) -> None:
+    exact = make(mode=mode, size="compact", num_features=13, precision="fp32").cuda().eval()
+    quick = make(mode=mode, size="compact", num_features=13, precision=precision).cuda().eval()
+    sizes = [(33, 40)] * 5 + [(48, 64)] * 4 + [(33, 40), (16, 16)] + [(31, 30)] * 3 + [(20, 30)] * 3 + [(8, 8)] * 3
+    kept = []
+    for seed, (height, width) in enumerate([*sizes, *sizes]):
+        for parameter in exact.parameters():
+            parameter += 0.01 * torch.randn_like(parameter)
+        quick.load_state_dict(exact.state_dict())
+        pictures = tuple(picture.cuda() for picture in splatted(height, width, 13, seed=seed))
+        found, expected = quick(*pictures), exact(*pictures)
+        scale = float((expected - pictures[0]).abs().max())
+        assert float((found - expected).abs().max()) < tolerance * scale
+        kept.append((found, found.clone()))
+    assert quick._can_fuse
+    assert len(quick._inference._recorded) == fused.MAX_SIZES
+    for found, copy in kept:  # nobody's picture was written over by a later one
+        assert torch.equal(found, copy)
+
+
+@pytest.mark.gpu
+@torch.no_grad()
+def test_recorded_and_unrecorded_pictures_are_equal() -> None:
+    head = make(size="compact", num_features=13).cuda().eval()
+    pictures = tuple(picture.cuda() for picture in splatted(64, 80, 13))
+    shown = [head(*pictures) for _ in range(5)]
+    assert len(head._inference._recorded) == 1
+    for picture in shown[1:]:
+        assert torch.equal(picture, shown[0])
+
+
+@pytest.mark.gpu
+@torch.no_grad()
+def test_without_kernels_the_layers_run(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def refuse(*_: object) -> kernels.Launches:
+        raise BackendError("no compiler: install one")
+
+    head = make().cuda().eval()
+    pictures = tuple(picture.cuda() for picture in splatted(16, 16, 5))
+    expected = head(*pictures)
+    monkeypatch.setattr(fused, "compiled", refuse)
+    with caplog.at_level(logging.WARNING):
+        found, again = head(*pictures), head(*pictures)
+    assert caplog.text.count("layer by layer") == 1
+    torch.testing.assert_close(found, expected, rtol=0.05, atol=0.05)
+    torch.testing.assert_close(again, found)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_training_on_a_gpu_is_that_of_the_layers(mode: str) -> None:
+    """Values and gradients, at more sizes than are recorded, and after a step that changed the weights."""
+    exact = make(mode=mode, size="compact", num_features=13, precision="fp32").cuda()
+    layers = make(mode=mode, size="compact", num_features=13, fused=False).cuda()
+    quick = make(mode=mode, size="compact", num_features=13).cuda()
+    sizes = [(33, 40), (48, 64), (33, 40), (31, 30), (16, 16), (24, 56), (16, 16), (8, 8)]
+    for seed, (height, width) in enumerate(sizes):
+        with torch.no_grad():
+            for parameter in exact.parameters():
+                parameter += 0.01 * torch.randn_like(parameter)
+        for head in (layers, quick):
+            head.load_state_dict(exact.state_dict())
+        pictures = tuple(picture.cuda() for picture in splatted(height, width, 13, seed=seed))
+        to_out = torch.randn(height, width, 3, device="cuda")
+        results = (of_layers(head, pictures, to_out) for head in (quick, layers, exact))
+        for found, by_layers, expected in zip(*results, strict=True):
+            # bf16 rounds on both sides, at different places; where it turns an activation's sign, small pictures differ by
+            # several percent.
+            error, allowed = (float((result - expected).norm()) for result in (found, by_layers))
+            assert error <= 4 * allowed + 1e-2 * float(expected.norm())
+        assert quick._can_fuse
+    assert len(quick._training._recorded) == fused.MAX_SIZES

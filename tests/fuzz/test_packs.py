@@ -1,0 +1,198 @@
+"""Bad packed scenes: harmed, harmed behind right checksums, bombs, and headers that lie."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import zstandard
+
+from sundae_ns.errors import PackError
+from sundae_ns.gaussians import from_points
+from sundae_ns.storage.packing import PackConfig, Scene, read_scene, write_scene
+
+Json = dict[str, Any]
+
+
+def scene() -> Scene:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(50, 3, generator=generator)
+    field = from_points(points, points, sh_degree=2, num_features=3, generator=generator)
+    field["features_rest"] = torch.randn(50, 8, 3, generator=generator)
+    head = {"net.weight": torch.randn(3, 4, 1, 1, generator=generator), "net.bias": torch.randn(3, generator=generator)}
+    cameras = {
+        "poses": torch.eye(4)[None, :3],
+        "intrinsics": torch.full((1, 4), 20.0).double(),
+        "sizes": torch.full((1, 2), 32),
+    }
+    return Scene(field, head, cameras, {"model": {"sh_degree": 2}})
+
+
+def packed(folder: Path, config: PackConfig) -> bytes:
+    write_scene(folder / "a.sundae", scene(), config)
+    return (folder / "a.sundae").read_bytes()
+
+
+@pytest.fixture(scope="module", params=["transform", "codebooks"])
+def good(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    books = 0 if request.param == "transform" else 2
+    return packed(tmp_path_factory.mktemp("packs"), PackConfig(harmonics=request.param, feature_books=books))
+
+
+def parts(content: bytes) -> tuple[Json, bytes]:
+    (length,) = struct.unpack("<I", content[12:16])
+    return json.loads(content[48 : 48 + length]), content[48 + length :]
+
+
+def sealed(meta: bytes, body: bytes) -> bytes:
+    """A file of any header and body, with the header's checksum right."""
+    return b"\x89SUNDAE\n" + struct.pack("<II", 1, len(meta)) + hashlib.sha256(meta).digest() + meta + body
+
+
+def resealed(meta: Json, body: bytes) -> bytes:
+    """The file with all checksums right again."""
+    offset = 0
+    for section in meta["sections"]:
+        length = sum(section["parts"])
+        section["sha256"] = hashlib.sha256(body[offset : offset + length]).hexdigest()
+        offset += length
+    return sealed(json.dumps(meta).encode(), body)
+
+
+def judged(verdict: Any, path: Path, content: bytes) -> Any:
+    path.write_bytes(content)
+    return verdict(lambda: finite(read_scene(path)), len(content))
+
+
+def finite(found: Scene) -> None:
+    assert all(torch.isfinite(value).all() for value in found.field.values())
+    assert len({len(value) for value in found.field.values()}) == 1
+
+
+def test_the_good_one_is_good(good: bytes, verdict: Any, tmp_path: Path) -> None:
+    assert judged(verdict, tmp_path / "a.sundae", good) is None
+    assert judged(verdict, tmp_path / "a.sundae", resealed(*parts(good))) is None
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_harmed(good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
+    content = harmed(good, seed)
+    error = judged(verdict, tmp_path / "a.sundae", content)
+    assert isinstance(error, PackError) or content == good
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_harmed_behind_right_checksums(good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
+    meta, body = parts(good)
+    changed = harmed(body, seed)[: len(body)]
+    judged(verdict, tmp_path / "a.sundae", resealed(meta, changed + bytes(len(body) - len(changed))))
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_harmed_header_behind_right_checksums(
+    good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int
+) -> None:
+    meta, body = parts(good)
+    judged(verdict, tmp_path / "a.sundae", sealed(harmed(json.dumps(meta).encode(), seed), body))
+
+
+def section(meta: Json, name: str) -> Json:
+    return next(entry for entry in meta["sections"] if entry["name"] == name)
+
+
+def change(path: str, value: Any) -> Callable[[Json], None]:
+    """Set one value of the header; ``path`` names keys, and after a colon a section."""
+
+    def apply(meta: Json) -> None:
+        *keys, last = path.split(".")
+        place: Any = section(meta, keys.pop(0)[1:]) if path.startswith(":") else meta
+        for key in keys:
+            place = place[key]
+        place[int(last) if isinstance(place, list) else last] = value
+
+    return apply
+
+
+LIES: dict[str, Callable[[Json], None]] = {
+    "a billion primitives": change("primitives", 10**9),
+    "no primitives": change("primitives", 0),
+    "half a primitive": change("primitives", 0.5),
+    "true primitives": change("primitives", True),
+    "no attributes": change("attributes", 3),
+    "an attribute of another kind": change("attributes.scales.codec", "pickle"),
+    "more bits than numbers have": change("attributes.scales.bits", 200),
+    "an infinite step": change("attributes.opacities.step", [1e308]),
+    "a huge whole number": change("attributes.opacities.low", [10**4000]),
+    "a word for a number": change("attributes.opacities.low", ["nan"]),
+    "a blocks of nothing": change("attributes.means.block", 0),
+    "a huge shape": change(":opacities/codes.shape", [1, 2**27]),
+    "a shape beyond numbers": change(":opacities/codes.shape", [2**27, 2**27, 2**27]),
+    "a negative length": change(":opacities/codes.parts.0", -5),
+    "a huge length": change(":opacities/codes.parts.0", 2**50),
+    "no parts": change(":opacities/codes.parts", []),
+    "a dtype of objects": change(":opacities/codes.dtype", "|O"),
+    "a dtype of another width": change(":opacities/codes.dtype", "<f8"),
+    "a name twice": change(":opacities/codes.name", "scales/codes"),
+    "sections that are none": change("sections", [1, None, []]),
+    "no sections": change("sections", {}),
+    "a head of another shape": change("attributes.head.tensors", [["a", [3, 5, 1, 1]], ["b", [3]]]),
+    "a head without shape": change("attributes.head.tensors", "all"),
+    "a huge head": change("attributes.head.tensors", [["a", [2**27, 2**27]]]),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_headers_that_lie_are_refused(lie: str, verdict: Any, tmp_path: Path) -> None:
+    meta, body = parts(packed(tmp_path, PackConfig()))
+    LIES[lie](meta)
+    text = json.dumps(meta).encode()
+    assert isinstance(judged(verdict, tmp_path / "a.sundae", sealed(text, body)), PackError)
+
+
+ODD: dict[str, bytes] = {
+    "empty": b"",
+    "magic alone": b"\x89SUNDAE\n",
+    "a checkpoint": b"PK\x03\x04" + bytes(200),
+    "no JSON": sealed(b"{", b""),
+    "deep JSON": sealed(b"[" * 100_000, b""),
+    "a list": sealed(b"[]", b""),
+    "not a number": sealed(b'{"sections": [], "primitives": NaN}', b""),
+    "no text": sealed(b"\xff\xfe", b""),
+    "a long header": b"\x89SUNDAE\n" + struct.pack("<II", 1, 2**32 - 1) + bytes(132),
+}
+
+
+@pytest.mark.parametrize("kind", ODD)
+def test_what_is_no_scene_is_refused(kind: str, verdict: Any, tmp_path: Path) -> None:
+    assert isinstance(judged(verdict, tmp_path / "ünï cöde.sundae", ODD[kind]), PackError)
+
+
+@pytest.mark.parametrize("stated", ["as it is", "small"])
+def test_bombs_are_refused_before_they_unpack(stated: str, verdict: Any, tmp_path: Path) -> None:
+    size = 1 << 27
+    frame = zstandard.ZstdCompressor(level=1).compress(bytes(size))
+    shape = [size if stated == "as it is" else 1 << 20]
+    meta = {"primitives": 1, "attributes": {}, "sections": [{"name": "a", "dtype": "|u1", "shape": shape}]}
+    meta["sections"][0] |= {"parts": [len(frame)], "sha256": hashlib.sha256(frame).hexdigest()}  # type: ignore[index]
+    content = sealed(json.dumps(meta).encode(), frame)
+    error = judged(verdict, tmp_path / "a.sundae", content)
+    assert isinstance(error, PackError)
+
+
+def test_a_few_constant_planes_cannot_fill_the_memory(verdict: Any, tmp_path: Path) -> None:
+    """Every section within its limit, and the field that they describe beyond it."""
+    n = 200_000
+    field = {k: v[:1].expand(n, *v.shape[1:]) for k, v in scene().field.items()}
+    write_scene(tmp_path / "a.sundae", Scene(field))
+    meta, body = parts((tmp_path / "a.sundae").read_bytes())
+    padding = meta["sections"].pop()
+    assert padding["name"] == "padding"
+    body = body[: len(body) - sum(padding["parts"])]
+    error = judged(verdict, tmp_path / "a.sundae", resealed(meta, body))
+    assert "would unpack to" in str(error)

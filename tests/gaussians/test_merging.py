@@ -1,0 +1,215 @@
+"""Covariances, overlap, merging, and rewriting a field in training."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+
+from sundae_ns.errors import DataError
+from sundae_ns.gaussians.covariance import covariances, mean_shadow, overlap, quaternions, rotations
+from sundae_ns.gaussians.merging import merge
+from sundae_ns.gaussians.rewriting import rewrite
+
+
+def field(n: int = 12, seed: int = 0) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "features_rest": (3, 3)}
+    shapes |= {"opacities": (1,), "features": (5,)}
+    return {name: torch.randn(n, *s, generator=generator, dtype=torch.float64) for name, s in shapes.items()}
+
+
+def covariance_of(params: dict[str, Tensor]) -> Tensor:
+    return covariances(params["scales"].exp(), params["quats"])
+
+
+def test_a_group_becomes_one_with_the_moments_of_the_mixture() -> None:
+    params, w = field(), torch.rand(12, dtype=torch.float64)
+    heir = torch.tensor([0, 0, 0, 0, 4, 4, 6, 7, 7, 7, 0, -1])
+    found = merge(params, heir, w)
+    assert {name: value.shape for name, value in found.items()} == {k: (4, *v.shape[1:]) for k, v in params.items()}
+    for place, owner in enumerate([0, 4, 6, 7]):
+        group = heir == owner
+        share = w[group] / w[group].sum()
+        mean = share @ params["means"][group]
+        offset = params["means"][group] - mean
+        S = (share[:, None, None] * (covariance_of(params)[group] + offset[:, :, None] * offset[:, None, :])).sum(dim=0)
+        torch.testing.assert_close(found["means"][place], mean)
+        torch.testing.assert_close(covariance_of(found)[place], S)
+        for name in ("features_dc", "features_rest", "features"):
+            expected = torch.einsum("n,n...->...", share, params[name][group])
+            torch.testing.assert_close(found[name][place], expected)
+    # 6 is alone.
+    assert all(torch.equal(found[name][2], params[name][6]) for name in params)
+
+
+def test_clones_behind_each_other_multiply_what_they_let_through() -> None:
+    params = {name: value.expand(3, *value.shape[1:]).clone() for name, value in field(1).items()}
+    params["opacities"][:] = math.log(0.3 / 0.7)
+    found = merge(params, torch.zeros(3, dtype=torch.long), torch.ones(3))
+    assert float(found["opacities"].sigmoid()) == pytest.approx(1 - 0.7**3)
+    torch.testing.assert_close(covariance_of(found), covariance_of(params)[:1])
+
+
+def test_a_wall_of_small_ones_stays_as_dark() -> None:
+    # Optical depth times shadow is what leaves a picture darker, seen from afar.
+    params = field(100)
+    params["means"] = torch.cartesian_prod(*[torch.arange(10.0).double()] * 2, torch.zeros(1).double())
+    params["scales"][:] = torch.tensor([0.4, 0.4, 1e-3]).double().log()
+    params["quats"][:] = torch.tensor([1.0, 0, 0, 0]).double()
+    params["opacities"][:] = -2.0
+    found = merge(params, torch.zeros(100, dtype=torch.long), torch.ones(100))
+
+    def darkness(p: dict[str, Tensor]) -> float:
+        return float((-torch.log1p(-p["opacities"].sigmoid().squeeze(1)) * mean_shadow(p["scales"].exp())).sum())
+
+    assert darkness(found) == pytest.approx(darkness(params))
+    assert float(found["scales"].exp().min()) == pytest.approx(1e-3)
+
+
+def test_merging_commutes_with_rotation_scale_and_shift() -> None:
+    params, heir, w = field(), torch.tensor([0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, -1]), torch.rand(12)
+    turn = torch.randn(1, 4, dtype=torch.float64)
+    R = rotations(turn)[0]
+    moved = {**params, "means": 8 * params["means"] @ R.T + 100, "scales": params["scales"] + math.log(8)}
+    moved["quats"] = quaternions(R @ rotations(params["quats"]))
+    before, after = merge(params, heir, w), merge(moved, heir, w)
+    torch.testing.assert_close(after["means"], 8 * before["means"] @ R.T + 100)
+    torch.testing.assert_close(covariance_of(after), 64 * R @ covariance_of(before) @ R.T)
+    torch.testing.assert_close(after["opacities"], before["opacities"])
+
+
+def test_without_weight_nothing_changes_and_weights_have_no_unit() -> None:
+    params, heir = field(), torch.tensor([0] * 6 + [6] * 6)
+    for w in (torch.zeros(12), torch.full((12,), torch.nan)):
+        found = merge(params, heir, w)
+        assert all(torch.equal(found[name], params[name][[0, 6]]) for name in params)
+    w = torch.rand(12, dtype=torch.float64)
+    small, plain = merge(params, heir, w * 1e-200), merge(params, heir, w)
+    assert all(torch.allclose(small[name], plain[name]) for name in params)
+
+
+def test_extremes_stay_finite() -> None:
+    params = {name: value.float() for name, value in field().items()}
+    params["scales"][0] = torch.tensor([1e-8, 1e3, 1.0]).log()
+    params["quats"][1] = 0
+    params["opacities"][:4] = torch.tensor([30.0, -30.0, 200.0, -200.0])[:, None]
+    params["means"][5] = 1e18
+    found = merge(params, torch.zeros(12, dtype=torch.long), torch.ones(12))
+    assert all(value.isfinite().all() for value in found.values())
+    assert found["opacities"].dtype == torch.float32
+    assert float(found["opacities"].sigmoid().max()) <= 0.99 + 1e-6
+
+
+def test_what_overflows_or_vanishes_stays_as_it_is() -> None:
+    params = field()
+    params["scales"][0], params["scales"][6] = 500.0, -500.0
+    params["scales"][7:] = -500.0
+    params["means"][6:] = 0
+    found = merge(params, torch.tensor([0] * 3 + [3] * 3 + [6] * 6), torch.ones(12))
+    assert all(torch.equal(found[name][[0, 2]], params[name][[0, 6]]) for name in params)
+    assert all(value.isfinite().all() for value in found.values())
+    assert not torch.equal(found["means"][1], params["means"][3])
+
+
+def test_overlap_is_one_with_oneself_falls_with_distance_and_has_no_unit() -> None:
+    params = field(200)
+    S, means = covariance_of(params), params["means"]
+    indices = torch.stack([torch.arange(200), torch.arange(200).roll(1)], dim=1)
+    found = overlap(means, S, indices, least_width=0.0)
+    torch.testing.assert_close(found[:, 0], torch.ones(200, dtype=torch.float64))
+    assert float(found[:, 1].max()) < 1
+    torch.testing.assert_close(overlap(16 * means, 256 * S, indices, least_width=0.0), found)
+    # Two spheres of width 1 at a distance of 2: exp(-4 / 8).
+    unit = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
+    apart = overlap(torch.tensor([[0.0, 0, 0], [2.0, 0, 0]]).double(), unit, torch.tensor([[1], [0]]), least_width=0.0)
+    assert apart.squeeze(1).tolist() == pytest.approx([math.exp(-0.5)] * 2)
+    flat = torch.diag(torch.tensor([1.0, 1.0, 0.0])).double().expand(2, 3, 3)
+    # Against the formula, with LAPACK's determinants and inverses.
+    S = S + 0.3**2 * torch.eye(3)
+    middle = (S + S.roll(1, dims=0)) / 2
+    offset = means - means.roll(1, dims=0)
+    exponent = -torch.einsum("ni,nij,nj->n", offset, torch.linalg.inv(middle), offset) / 8
+    ratio = (S.det() * S.roll(1, dims=0).det()) ** 0.25 / middle.det() ** 0.5
+    found = overlap(means, covariance_of(params), indices, least_width=0.3)
+    torch.testing.assert_close(found[:, 1], exponent.exp() * ratio)
+    assert overlap(torch.zeros(2, 3).double(), flat, torch.tensor([[1], [0]]), least_width=0.0).isfinite().all()
+
+
+def test_overlap_of_needles_is_known_where_rounding_leaves_no_pivot() -> None:
+    # Two crossed needles of 1e6 by 1e-6 at one spot, turned so that no axis is an axis of the matrices.
+    turn = rotations(torch.tensor([[0.3, -0.5, 0.7, 0.2]]).double())
+    crossed = torch.diag_embed(torch.tensor([[1e6, 1e-6, 1e-6], [1e-6, 1e6, 1e-6]]).double().square())
+    found = overlap(
+        torch.zeros(2, 3).double(), turn @ crossed @ turn.mT, torch.tensor([[0, 1], [1, 0]]), least_width=1e-6
+    )
+    assert found[:, 0].tolist() == [1, 1]
+    assert found.isfinite().all()
+    assert float(found[:, 1].max()) < 1e-3
+
+
+def test_pieces_of_rows_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    params = field(50)
+    indices = torch.randint(50, (50, 4))
+    whole = overlap(params["means"], covariance_of(params), indices, least_width=0.1)
+    heir = torch.arange(50) // 5 * 5
+    merged = merge(params, heir, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    monkeypatch.setattr("sundae_ns.gaussians.covariance.PAIRS", 30)
+    monkeypatch.setattr("sundae_ns.gaussians.merging.ROWS", 7)
+    assert torch.equal(overlap(params["means"], covariance_of(params), indices, least_width=0.1), whole)
+    again = merge(params, heir, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    assert all(torch.equal(again[name], merged[name]) for name in merged)
+
+
+def test_quaternions_and_rotations_are_inverse_at_every_half_turn() -> None:
+    turns = torch.cat([torch.eye(4), torch.randn(200, 4), torch.randn(200, 4) * torch.tensor([1e-4, 1, 1, 1])]).double()
+    torch.testing.assert_close(rotations(quaternions(rotations(turns))), rotations(turns))
+    assert torch.equal(rotations(torch.zeros(1, 4)), torch.eye(3)[None])
+
+
+def test_the_mean_shadow_is_that_of_spheres_and_discs() -> None:
+    found = mean_shadow(torch.tensor([[2.0, 2, 2], [1, 1, 0], [3, 2, 1]]).double())
+    assert float(found[0]) == pytest.approx(4)
+    # A disc's is half its area; a = 3, b = 2, c = 1 has a surface of 48.882.
+    assert float(found[1]) == pytest.approx(0.5, rel=0.012)
+    assert float(found[2]) == pytest.approx(48.882 / (4 * math.pi), rel=0.012)
+
+
+def trained(n: int = 6) -> tuple[dict[str, Parameter], dict[str, torch.optim.Optimizer]]:
+    params = {name: Parameter(value) for name, value in field(n).items()}
+    optimizers: dict[str, torch.optim.Optimizer] = {name: torch.optim.Adam([value]) for name, value in params.items()}
+    torch.stack([value.square().sum() for value in params.values()]).sum().backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+    return params, optimizers
+
+
+def test_rewriting_forgets_directions_where_values_changed_and_keeps_the_rest() -> None:
+    params, optimizers = trained()
+    before = {name: value.detach().clone() for name, value in params.items()}
+    values = {name: value.clone() for name, value in before.items()}
+    values["means"][2] += 1
+    values["opacities"][4] += 1
+    objects, moments = dict(params), {name: dict(optimizers[name].state[params[name]]) for name in params}
+    moments = {name: {k: v.clone() for k, v in entries.items()} for name, entries in moments.items()}
+    rewrite(params, optimizers, values)
+    for name, value in params.items():
+        assert value is objects[name]
+        assert torch.equal(value.detach(), values[name])
+        state, changed = optimizers[name].state[value], values[name] != before[name]
+        assert (state["exp_avg"][changed] == 0).all()
+        assert torch.equal(state["exp_avg"][~changed], moments[name]["exp_avg"][~changed])
+        assert torch.equal(state["exp_avg_sq"], moments[name]["exp_avg_sq"])
+    assert int((params["means"].detach() != before["means"]).sum()) == 3
+
+
+def test_rewriting_refuses_what_does_not_fit_and_changes_nothing() -> None:
+    params, optimizers = trained()
+    before = params["means"].detach().clone()
+    for values in ({"means": before + 1, "colour": before}, {"means": before + 1, "scales": before[:2]}):
+        with pytest.raises(DataError, match="one row a primitive"):
+            rewrite(params, optimizers, values)
+    assert torch.equal(params["means"].detach(), before)

@@ -1,0 +1,123 @@
+"""Moves of 3DGS-MCMC: copies that look like the one they came from, and an exact count."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Adam
+
+from sundae_ns.gaussians.relocation import MAX_COPIES, draw, grow, jitter, relocate, split_evenly
+
+FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
+
+
+def field(n: int = 30) -> tuple[dict[str, Parameter], dict[str, Adam]]:
+    params = {name: Parameter(torch.randn(n, *shape)) for name, shape in FIELD.items()}
+    optimizers = {name: Adam([value], lr=0.01) for name, value in params.items()}
+    torch.stack([value.square().sum() for value in params.values()]).sum().backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+    return params, optimizers
+
+
+def integral(opacity: float, scale: float, copies: int) -> float:
+    """Of what ``copies`` primitives at one place hide along a line, by the midpoint rule."""
+    x = (torch.arange(200_000, dtype=torch.float64) + 0.5) / 200_000 * 24 - 12
+    alpha = opacity * torch.exp(-0.5 * (x / scale) ** 2)
+    return float((1 - (1 - alpha) ** copies).sum() * 24 / 200_000)
+
+
+@given(st.floats(0.006, 0.995), st.integers(1, MAX_COPIES))
+@settings(max_examples=40, deadline=None)
+def test_copies_hide_as_much_as_the_one(opacity: float, copies: int) -> None:
+    new, scales = split_evenly(
+        torch.tensor([opacity], dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64), torch.tensor([copies])
+    )
+    assert 1 - (1 - float(new)) ** copies == pytest.approx(opacity, rel=1e-9)
+    assert integral(float(new), float(scales[0, 0]), copies) == pytest.approx(integral(opacity, 1.0, 1), rel=1e-6)
+
+
+def test_one_copy_is_itself_and_float32_will_do() -> None:
+    opacities, scales = torch.rand(50).clamp(0.01, 0.99), torch.rand(50, 3) + 0.1
+    same, size = split_evenly(opacities, scales, torch.ones(50, dtype=torch.long))
+    torch.testing.assert_close(same, opacities)
+    torch.testing.assert_close(size, scales)
+    many = split_evenly(opacities, scales, torch.full((50,), 10**6))
+    assert many[0].dtype == many[1].dtype == torch.float32
+    assert all(torch.isfinite(value).all() and (value > 0).all() for value in many)
+
+
+@pytest.mark.gpu
+def test_as_gsplats_kernel() -> None:
+    from gsplat.relocation import compute_relocation
+
+    opacities, scales = torch.rand(500).clamp(0.01, 0.99).cuda(), torch.rand(500, 3).cuda() + 0.1
+    copies = torch.randint(1, 20, (500,)).cuda()
+    binoms = torch.tensor([[float(math.comb(n, k)) for k in range(51)] for n in range(51)]).cuda()
+    expected = compute_relocation(opacities, scales, copies.clone(), binoms)
+    for found, wanted in zip(split_evenly(opacities, scales, copies), expected):
+        torch.testing.assert_close(found, wanted, rtol=2e-3, atol=1e-5)
+
+
+def test_draws_follow_the_weights() -> None:
+    weights = torch.tensor([0.0, 1.0, 3.0, 0.0])
+    found = torch.bincount(draw(weights, 40_000), minlength=4)
+    assert found[0] == found[3] == 0
+    assert 0.23 < found[1] / 40_000 < 0.27
+
+
+def moments(optimizers: dict[str, Adam], params: dict[str, Parameter], name: str) -> Tensor:
+    return optimizers[name].state[params[name]]["exp_avg"]
+
+
+def test_dead_primitives_move_onto_living_ones() -> None:
+    params, optimizers = field()
+    params["opacities"].data[:10] = -9.0
+    dead, before = torch.arange(30) < 10, params["means"].detach().clone()
+    objects = dict(params)
+    assert relocate(params, optimizers, dead, 0.005) == 10
+    assert all(params[name] is objects[name] for name in params)
+    assert all(any(torch.equal(mean, other) for other in before[10:]) for mean in params["means"][:10])
+    assert torch.equal(params["means"][10:], before[10:])
+    assert (params["opacities"].sigmoid() >= 0.005 - 1e-6).all()
+    assert not moments(optimizers, params, "means")[:10].any()
+    assert relocate(params, optimizers, torch.ones(30, dtype=torch.bool), 0.005) == 0
+    assert relocate(params, optimizers, torch.zeros(30, dtype=torch.bool), 0.005) == 0
+
+
+def test_growing_adds_exactly_as_many() -> None:
+    params, optimizers = field()
+    old = {name: value.detach().clone() for name, value in params.items()}
+    kept = moments(optimizers, params, "quats").clone()
+    grow(params, optimizers, 7, 0.005)
+    assert {len(value) for value in params.values()} == {37}
+    for name, value in params.items():
+        assert optimizers[name].param_groups[0]["params"] == [value]
+        assert moments(optimizers, params, name).shape == value.shape
+    assert torch.equal(params["means"][:30], old["means"])
+    assert torch.equal(moments(optimizers, params, "quats")[:30], kept)
+    assert not moments(optimizers, params, "quats")[30:].any()
+    grow(params, optimizers, 0, 0.005)
+    assert len(params["means"]) == 37
+
+
+def test_noise_moves_the_transparent_along_their_own_shape() -> None:
+    params, _ = field(2000)
+    with torch.no_grad():
+        params["opacities"].fill_(-9.0)
+        params["opacities"][::2] = 3.0
+        params["scales"].copy_(torch.tensor([0.0, -2.0, -4.0]))
+        params["quats"].copy_(torch.tensor([0.5**0.5, 0.0, 0.0, 0.5**0.5]))  # a quarter turn: x to y
+        before = params["means"].detach().clone()
+    jitter(params, 1.0)
+    moved = (params["means"].detach() - before).std(dim=0)
+    assert (params["means"].detach() - before)[::2].abs().max() < 1e-6
+    # Half of them stand still; covariance, so squares of the scales: 1, e^-4, e^-8.
+    scaled = moved * torch.tensor([math.exp(4), 1.0, math.exp(8)]) * 2**0.5
+    assert ((scaled > 0.55) & (scaled < 0.75)).all(), scaled  # the gate at sigmoid(-9) is 0.62

@@ -1,0 +1,302 @@
+"""The budget finds itself, on a scene of a few pixels: what it keeps, what it writes, and going on in its midst."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import profiler, writer
+from nerfstudio.utils.eval_utils import eval_setup
+from torch import Tensor
+
+from sundae_ns import budget
+from sundae_ns.budget import Budget, bytes_of
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.data import write_scene
+from sundae_ns.errors import CheckpointError, ConfigError, DataError
+from sundae_ns.measure import sizes
+from sundae_ns.method_configs import sundae_auto
+
+STEPS, SAVE, PRUNE_AT, STOP = 90, 10, 20, 70
+Make = Callable[..., Trainer]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("budget") / "scene"
+    return write_scene(folder, train_views=12, test_views=2, width=24, height=24, points=200, samples=1)
+
+
+def tidy() -> None:
+    # nerfstudio keeps its loggers in globals.
+    writer.EVENT_WRITERS.clear()
+    writer.EVENT_STORAGE.clear()
+    writer.GLOBAL_BUFFER.clear()
+    profiler.PROFILER.clear()
+
+
+def set_up(scene: Path, out: Path, *, model_options: dict[str, Any] | None = None, **pruning: Any) -> Trainer:
+    config = deepcopy(sundae_auto.config)
+    config.data = config.pipeline.datamanager.data = scene
+    config.pipeline.datamanager.holdout_every = 4
+    config.output_dir, config.experiment_name, config.timestamp = out, "budget", "now"
+    config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = STEPS, SAVE, False
+    config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
+    config.vis = "tensorboard"
+    config.viewer.quit_on_train_completion = True
+    model = config.pipeline.model
+    model.num_downscales, model.sh_degree, model.sh_degree_interval, model.warmup_length = 0, 1, 5, 10**9
+    model.head.mode, model.head.size, model.head.pixel_unshuffle, model.head.num_features = "residual", "tiny", 1, 5
+    for name, value in (model_options or {}).items():
+        setattr(model, name, value)
+    options = {"prune_at": PRUNE_AT, "stop": STOP, "search_every": 4, "patience": 2, "max_psnr_drop": 0.5, **pruning}
+    for name, value in options.items():
+        load_into = config if hasattr(config, name) else model.pruning
+        setattr(load_into, name, value)
+    torch.manual_seed(7)
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    # Test views are not to be looked at.
+    trainer.pipeline.get_average_eval_image_metrics = None
+    return trainer
+
+
+@pytest.fixture
+def make(scene: Path, tmp_path: Path) -> Iterator[Make]:
+    yield lambda **options: set_up(scene, tmp_path, **options)
+    tidy()
+
+
+class Run:
+    """A finished run."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.trainer, self.folder = trainer, trainer.base_dir
+        self.model: Any = trainer.pipeline.model
+        self.found: dict[str, Any] = json.loads((self.folder / "budget.json").read_text())
+
+    def checkpoint(self, step: int) -> dict[str, Any]:
+        return torch.load(self.trainer.checkpoint_dir / f"step-{step:09d}.ckpt", map_location="cpu", weights_only=True)
+
+
+@pytest.fixture(scope="module")
+def done(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    trainer = set_up(scene, tmp_path_factory.mktemp("done"))
+    trainer.train()
+    yield Run(trainer)
+    tidy()
+
+
+def test_it_cuts_and_keeps_the_target(done: Run) -> None:
+    found, last = done.found, done.found["curve"][-1]
+    assert found["phase"] == "done"
+    assert found["before"] == 200
+    assert found["primitives"] == done.model.num_points < 200
+    assert found["views"] == 3
+    assert found["target"] == pytest.approx(found["reference"] - 0.5)
+    assert (last["phase"], last["step"], last["verdict"]) == ("final", STEPS - 1, "reached")
+    assert last["psnr"] >= found["target"]
+    cuts = [point for point in found["curve"] if point["verdict"] in ("accepted", "rejected")]
+    assert cuts
+    for point in cuts:
+        assert (point["psnr"] >= found["target"]) == (point["verdict"] == "accepted")
+        assert PRUNE_AT < point["step"] <= STOP
+    accepted = [point["primitives"] for point in cuts if point["verdict"] == "accepted"]
+    assert accepted == sorted(set(accepted), reverse=True)
+    assert found["primitives"] == accepted[-1]
+    assert found["cost"]["steps_lost"] <= STOP - PRUNE_AT
+    assert (done.folder / "budget.txt").read_text().count("\n") == len(found["curve"])
+    (report,) = json.loads((done.folder / "prune.json").read_text())
+    assert (report["before"], report["after"], report["peak"]) == (200, found["primitives"], 200)
+
+
+def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:
+    # The head is half a megabyte, the field a few kilobytes.
+    assert done.found["head_dropped"]
+    assert done.model.head is None
+    assert done.model.gauss_params["features"].shape == (done.model.num_points, 0)
+    assert sizes(done.model).total == done.found["curve"][-1]["bytes"]
+    columns = (done.found["degree"] + 1) ** 2 - 1
+    assert done.model.gauss_params["features_rest"].shape[1] == columns
+
+
+def test_flat_colours_stay_flat(done: Run) -> None:
+    rest = done.model.gauss_params["features_rest"]
+    if rest.shape[1]:
+        flat = (rest == 0).flatten(1).all(dim=1)
+        assert int(flat.sum()) >= done.found["zeroed"]
+
+
+def test_what_was_chosen_is_loaded_again(done: Run) -> None:
+    _, pipeline, _, step = eval_setup(done.folder / "config.yml", test_mode="test")
+    model: Any = pipeline.model
+    assert step == STEPS - 1
+    assert model.head is None
+    assert not model.head_active
+    for name, value in done.model.gauss_params.items():
+        assert torch.equal(model.gauss_params[name], value), name
+    assert pipeline.get_average_eval_image_metrics()["psnr"] > 10
+
+
+def same(a: Any, b: Any, where: str = "") -> None:
+    """All tensors and numbers of two states, but times."""
+    if isinstance(a, dict):
+        assert set(a) == set(b), where
+        for key in a:
+            if key != "seconds":
+                same(a[key], b[key], f"{where}/{key}")
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b)):
+            same(x, y, f"{where}/{i}")
+    elif isinstance(a, Tensor):
+        assert torch.equal(a, b), where
+    else:
+        assert a == b or (a != a and b != b), where
+
+
+@pytest.mark.parametrize("phase", ["before", "bands", "field", "done"])
+def test_a_run_resumed_in_the_midst_goes_on_as_if_never_stopped(done: Run, make: Make, phase: str) -> None:
+    states = {step: done.checkpoint(step) for step in range(SAVE, STEPS, SAVE)}
+    phases = {step: s["pipeline"]["_model._extra_state"]["budget"]["numbers"]["phase"] for step, s in states.items()}
+    start = next(step for step, at in phases.items() if at == phase)
+    left = STEPS - 1 - start
+    trainer = make(load_dir=done.trainer.checkpoint_dir, load_step=start, max_num_iterations=left)
+    trainer.train()
+    again = Run(trainer)
+    for part in ("pipeline", "optimizers", "random"):
+        same(done.checkpoint(STEPS - 1)[part], again.checkpoint(STEPS - 1)[part], part)
+
+
+def test_bytes_are_kept_exactly(make: Make) -> None:
+    trainer = make(max_psnr_drop=None, max_bytes=6000)
+    trainer.train()
+    model: Any = trainer.pipeline.model
+    stored = sizes(model).total
+    one_more = stored + bytes_of({name: value[:1] for name, value in model.gauss_params.items()}, None)
+    assert stored <= 6000 < one_more
+    assert Run(trainer).found["curve"][-1]["verdict"] == "reached"
+
+
+def test_primitives_are_kept_exactly(make: Make) -> None:
+    trainer = make(max_psnr_drop=None, max_primitives=37)
+    trainer.train()
+    assert trainer.pipeline.model.num_points == 37
+    assert Run(trainer).found["curve"][-1]["primitives"] == 37
+
+
+@pytest.fixture
+def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """A head of half a megabyte, with 5 features, joins a field of a few kilobytes, in place of a larger one."""
+    monkeypatch.setattr(
+        budget, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
+    )
+    return {"head": HeadConfig(size="small", pixel_unshuffle=1, num_features=13)}
+
+
+def test_a_head_of_the_chosen_size_joins_and_is_loaded_again(make: Make, small_head: dict[str, Any]) -> None:
+    options = {"model_options": small_head, "max_psnr_drop": None, "max_primitives": 37}
+    trainer = make(**options)
+    weights = list(trainer.pipeline.model.head.parameters())
+    trainer.train()
+    run, model = Run(trainer), trainer.pipeline.model
+    assert (run.found["head"], run.found["head_size"], run.found["num_features"]) == (True, "tiny", 5)
+    assert model.gauss_params["features"].shape == (37, 5)
+    assert all(a is b for a, b in zip(weights, model.head.parameters())), "the optimizer holds these"
+    assert sizes(model).total == run.found["curve"][-1]["bytes"]
+    whole = run.checkpoint(STEPS - 1)
+    tidy()
+    start = STEPS - SAVE
+    again = make(**options, load_dir=trainer.checkpoint_dir, load_step=start, max_num_iterations=STEPS - 1 - start)
+    assert again.pipeline.model.head.config.size == "tiny"
+    again.train()
+    for part in ("pipeline", "optimizers", "random"):
+        same(whole[part], Run(again).checkpoint(STEPS - 1)[part], part)
+
+
+def test_a_head_that_does_not_pay_goes_again(make: Make, small_head: dict[str, Any]) -> None:
+    trainer = make(model_options=small_head)
+    trainer.train()
+    found = Run(trainer).found
+    assert found["head_at"] > PRUNE_AT
+    assert (found["head"], found["head_dropped"], found["head_size"]) == (False, True, "")
+    assert trainer.pipeline.model.head is None
+    assert found["curve"][-1]["verdict"] == "reached"
+
+
+@pytest.mark.parametrize(
+    ("primitives", "row", "expected"),
+    [(10**6, 236, ("compact", 13)), (40_000, 236, ("compact", 13)), (20_000, 236, ("tiny", 13)), (20_000, 152, ("tiny", 5)),
+     (60_000, 56, ("tiny", 1)), (3_000, 236, None)],
+)  # fmt: skip
+def test_the_head_that_suits_a_field(primitives: int, row: int, expected: tuple[str, int] | None) -> None:
+    found = budget.head_for(primitives * row, primitives, HeadConfig())
+    assert (found and (found.size, found.num_features)) == expected
+    if found is not None:
+        assert budget.head_bytes(found) <= budget.HEAD_SHARE * primitives * row
+
+
+def test_a_warm_up_by_mcmc_ends_at_its_cap(make: Make) -> None:
+    chain = {"warmup": "mcmc", "mcmc_cap": 260, "warmup_length": 0, "refine_every": 3}
+    trainer = make(model_options=chain, max_psnr_drop=None, max_primitives=37)
+    trainer.train()
+    model: Any = trainer.pipeline.model
+    assert (Run(trainer).found["before"], model.pruning_state["peak"], model.num_points) == (260, 260, 37)
+
+
+def test_a_plain_wall_comes_out_tiny(tmp_path: Path) -> None:
+    """At the same allowed drop a flat, painted wall keeps a tenth of what the embedded scene keeps, and fewer bands."""
+    script, out = Path(__file__).parents[2] / "benchmarks" / "budget.py", tmp_path / "budget.json"
+    options = ["--out", str(out), "--work", str(tmp_path), "--steps", "800"]
+    subprocess.run([sys.executable, str(script), *options], check=True, stdout=subprocess.DEVNULL)
+    still, wall = json.loads(out.read_text())["rows"]
+    assert (still["kind"], wall["kind"]) == ("still-life", "wall")
+    assert 10 * wall["primitives"] <= still["primitives"]
+    assert wall["degree"] < still["degree"]
+    assert wall["curve"][-1]["verdict"] == still["curve"][-1]["verdict"] == "reached"
+
+
+def test_bytes_too_few_for_one_primitive(make: Make) -> None:
+    with pytest.raises(ConfigError, match="max-bytes is 10, and one primitive takes 56; give more"):
+        make(max_psnr_drop=None, max_bytes=10)
+
+
+def test_a_search_that_fails_does_not_lose_the_warm_up(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise DataError("the cause; the mend")
+
+    trainer = make()
+    monkeypatch.setattr(Budget, "_begin", fail)
+    with pytest.raises(DataError, match="the cause"):
+        trainer.train()
+    assert (trainer.checkpoint_dir / f"step-{PRUNE_AT:09d}.ckpt").exists()
+
+
+def test_views_have_to_be_held_back(scene: Path, tmp_path: Path) -> None:
+    trainer = set_up(scene, tmp_path)
+    config = trainer.config
+    tidy()
+    config.pipeline.datamanager.holdout_every = 0
+    with pytest.raises(ConfigError, match="holdout-every"):
+        config.setup(local_rank=0, world_size=1).setup()
+    tidy()
+
+
+def test_a_checkpoint_without_its_search_is_refused(done: Run, make: Make) -> None:
+    model: Any = make().pipeline.model
+    state = {name[len("_model.") :]: value for name, value in done.checkpoint(STEPS - 1)["pipeline"].items()}
+    broken = {**state, "_extra_state": {k: v for k, v in state["_extra_state"].items() if k != "budget"}}
+    with pytest.raises(CheckpointError, match="without a search for a budget"):
+        model.load_state_dict(broken)
+    model.load_state_dict(state)
+    assert model.num_points == done.model.num_points

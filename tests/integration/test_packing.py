@@ -1,0 +1,82 @@
+"""``sundae pack`` and ``sundae unpack`` on a finished run, and nerfstudio's own commands on what comes out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerElement
+from PIL import Image
+
+from sundae_ns.evaluation import psnr
+from sundae_ns.measure import load_run
+
+
+class Packed(NamedTuple):
+    file: Path
+    output: str
+    config: Path
+    """Of the run that was unpacked beside its capture."""
+    blind: Path
+    """Of the one that was unpacked without."""
+
+
+@pytest.fixture(scope="module")
+def packed(tiny: Any, call: Any, tmp_path_factory: pytest.TempPathFactory) -> Packed:
+    folder = tmp_path_factory.mktemp("packed")
+    file = folder / "tiny.sundae"
+    output = call("sundae", "pack", tiny.folder, "-o", file).stdout
+    call("sundae", "unpack", file, "-o", folder / "runs", "--data", tiny.scene)
+    call("sundae", "unpack", file, "-o", folder / "runs", "--name", "blind")
+    config, blind = (folder / "runs" / name / "sundae" / "unpacked" / "config.yml" for name in ("tiny", "blind"))
+    return Packed(file, output, config, blind)
+
+
+def test_the_report_counts_every_byte(packed: Packed) -> None:
+    table = packed.output.partition("bits a primitive")[2]
+    rows = {words[0]: int(words[1].replace(",", "")) for words in map(str.split, table.strip().splitlines())}
+    size = packed.file.stat().st_size
+    assert rows.pop("all") == size
+    assert sum(rows.values()) == size
+    assert {"means", "quats", "scales", "features", "head", "cameras", "header"} <= set(rows)
+
+
+def test_ns_eval_finds_the_same_quality(tiny: Any, packed: Packed, call: Any, tmp_path: Path) -> None:
+    call("ns-eval", "--load-config", packed.config, "--output-path", tmp_path / "out.json")
+    after = json.loads((tmp_path / "out.json").read_text())["results"]
+    run = load_run(tiny.config)
+    assert after["gaussian_count"] == run.model.num_points
+    with torch.no_grad():
+        pictures = [run.model.get_outputs_for_camera(camera) for camera in run.cameras]
+    for name, key in (("rgb", "psnr"), ("base_rgb", "psnr_base")):
+        values = [float(psnr(picture[name], truth)) for picture, truth in zip(pictures, run.truths, strict=True)]
+        assert 0 < abs(after[key] - sum(values) / len(values)) < 0.15
+
+
+def test_ns_render_needs_no_capture(packed: Packed, call: Any, tmp_path: Path) -> None:
+    call(
+        *("ns-render", "interpolate", "--load-config", packed.blind, "--output-path", tmp_path),
+        *("--output-format", "images", "--image-format", "png", "--interpolation-steps", 1, "--pose-source", "train"),
+    )
+    frames = [np.asarray(Image.open(path)) for path in sorted(tmp_path.glob("*.png"))]
+    assert len(frames) > 5
+    assert all(frame.shape == (48, 48, 3) and frame.std() > 5 for frame in frames)
+
+
+def test_the_viewer_shows_a_run_without_its_capture(packed: Packed) -> None:
+    blind, whole = (eval_setup(config, test_mode="test")[1] for config in (packed.blind, packed.config))
+    # The viewer looks at every attribute of everything, pictures of the test views included.
+    names = [name for name, _ in parse_object(blind, ViewerElement, "Custom Elements")]
+    assert any("compensate" in name for name in names)
+    seen = blind.datamanager.train_dataset
+    assert (seen[0]["image"] * 255).byte().shape == (48, 48, 3)
+    camera = seen.cameras[0:1]
+    assert torch.equal(camera.camera_to_worlds, whole.datamanager.train_dataset.cameras[0:1].camera_to_worlds)
+    pictures = [run.model.get_outputs_for_camera(camera)["rgb"] for run in (blind, whole)]
+    assert torch.equal(*pictures)

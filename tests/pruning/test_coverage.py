@@ -1,0 +1,161 @@
+"""Chances, systematic draws, and shares for bands."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from sundae_ns.errors import DataError
+from sundae_ns.pruning import band_shares, inclusion_probabilities, neighbor_order, select_systematic
+
+
+def scores(n: int = 500) -> Tensor:
+    return torch.rand(n, generator=torch.Generator().manual_seed(0), dtype=torch.float64).pow(3) + 1e-3
+
+
+def test_chances_are_in_proportion_until_they_are_certain_and_sum_to_the_count() -> None:
+    values = scores()
+    chances = inclusion_probabilities(values, 200)
+    assert float(chances.sum()) == pytest.approx(200, abs=1e-9)
+    certain = chances == 1
+    assert 0 < int(certain.sum()) < 200
+    assert values[certain].min() > values[~certain].max()
+    ratio = chances[~certain] / values[~certain]
+    torch.testing.assert_close(ratio, ratio[:1].expand_as(ratio))
+    # No more are certain than have to be.
+    assert float(chances[~certain].max()) < 1
+
+
+@pytest.mark.parametrize(
+    ("values", "count", "expected"),
+    [
+        ([1.0, 1, 1, 1], 2, [0.5, 0.5, 0.5, 0.5]),
+        ([1e300, 1e300, 1e-300], 2, [1, 1, 1e-300]),
+        ([5.0, 1, 1], 1, [5 / 7, 1 / 7, 1 / 7]),
+        ([5.0, 1, 1], 2, [1, 0.5, 0.5]),
+        ([3.0, 2, 1], 3, [1, 1, 1]),
+        ([7.0], 1, [1]),
+    ],
+)
+def test_chances_by_hand(values: list[float], count: int, expected: list[float]) -> None:
+    found = inclusion_probabilities(torch.tensor(values, dtype=torch.float64), count)
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64))
+
+
+def test_every_primitive_is_drawn_as_often_as_its_chance_says() -> None:
+    values, order = scores(40), torch.randperm(40)
+    drawn = torch.stack([select_systematic(values, 12, order, seed) for seed in range(1000)]).double().mean(dim=0)
+    # Four standard deviations of a share of 1,000 are 0.063.
+    torch.testing.assert_close(drawn, inclusion_probabilities(values, 12), rtol=0, atol=0.063)
+
+
+def test_every_stretch_keeps_its_expected_number() -> None:
+    values, order = scores(), torch.randperm(500)
+    chances = inclusion_probabilities(values, 100)[order]
+    for seed in range(20):
+        # Where some are certain, they are taken out first: their number is expected too.
+        kept = select_systematic(values, 100, order, seed)[order]
+        gap = (kept.double() - chances).cumsum(0)
+        assert float(gap.max() - gap.min()) < 2 + 1e-9  # between any two places
+
+
+def test_draws_are_spread_more_evenly_than_independent_ones() -> None:
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(1))
+    order, cell = neighbor_order(points), (points * 4).long() @ torch.tensor([16, 4, 1])
+    expected = torch.bincount(cell, minlength=64) / 10
+
+    def unevenness(mask: Tensor) -> float:
+        return float((torch.bincount(cell[mask], minlength=64) - expected).square().mean())
+
+    even = [unevenness(select_systematic(torch.ones(4000), 400, order, seed)) for seed in range(10)]
+    by_chance = [unevenness(torch.randperm(4000) < 400) for _ in range(10)]
+    assert max(even) < 0.5 * min(by_chance)  # measured 0.2
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=40),
+    st.integers(1, 40),
+    st.integers(0, 2**31),
+)
+def test_any_scores_keep_the_exact_count_and_the_unusable_come_last(values: list[float], count: int, seed: int) -> None:
+    count = min(count, len(values))
+    found = torch.tensor(values, dtype=torch.float64)
+    mask = select_systematic(found, count, torch.randperm(len(values)), seed)
+    assert int(mask.sum()) == count
+    infinite, usable = found == math.inf, found > 0
+    assert int((mask & infinite).sum()) == min(count, int(infinite.sum()))
+    assert int((mask & usable).sum()) == min(count, int(usable.sum()))
+
+
+def test_scores_that_differ_by_1e300_lose_no_draw() -> None:
+    values = torch.tensor([1e-300] * 50 + [1e300] * 3, dtype=torch.float64)
+    for seed in range(50):
+        mask = select_systematic(values, 5, torch.arange(53), seed)
+        assert int(mask.sum()) == 5
+        assert mask[50:].all()
+
+
+def test_the_draw_follows_a_permutation_and_its_seed() -> None:
+    points, values = torch.rand(300, 3), scores(300)
+    mask = select_systematic(values, 60, neighbor_order(points), 5)
+    shuffle = torch.randperm(300)
+    shuffled = select_systematic(values[shuffle], 60, neighbor_order(points[shuffle]), 5)
+    assert torch.equal(shuffled, mask[shuffle])
+    assert not torch.equal(select_systematic(values, 60, neighbor_order(points), 6), mask)
+
+
+def test_the_order_walks_through_small_clusters_too() -> None:
+    generator = torch.Generator().manual_seed(0)
+    centers = torch.tensor([[0.0, 0, 0], [1e3, 0, 0], [0, 1e3, 0]])
+    points = (centers[:, None] + 1e-2 * torch.rand(3, 512, 3, generator=generator)).reshape(-1, 3)
+    order = neighbor_order(points)
+    assert sorted(order.tolist()) == list(range(1536))
+    steps = (points[order][1:] - points[order][:-1]).norm(dim=1)
+    # Three clusters, and the one leaf or two that have points of several: measured 15.
+    assert int((steps > 1).sum()) <= 32
+    # Of 512 in a cube of 1e-2, neighbours are about 7e-4 apart, and any two 6.6e-3.
+    assert steps[steps < 1].mean() < 3.5e-3
+
+
+def test_no_band_is_emptied() -> None:
+    response = torch.cat(
+        [torch.full((970,), 1.0), torch.full((20,), 0.1), torch.full((9,), 10.0), torch.tensor([math.nan])]
+    )
+    values = torch.ones(1000)
+    shared, band = band_shares(values, response)
+    assert len(band.unique()) == 4
+    order = torch.sort(band, stable=True).indices
+    for seed in range(20):
+        mask = select_systematic(shared, 40, order, seed)
+        assert int(mask.sum()) == 40
+        # Half of 40 in four equal parts of 5, and the other half by numbers.
+        assert mask[970:990].sum() >= 5
+        assert mask[990:999].sum() >= 5
+        assert mask[999]
+
+
+def test_shares_leave_what_cannot_be_drawn_by_chance_as_it_is() -> None:
+    values = torch.tensor([1.0, math.nan, 0.0, math.inf, 2.0, -1.0])
+    shared, band = band_shares(values, torch.ones(6))
+    torch.testing.assert_close(shared[[1, 2, 3, 5]], values.double()[[1, 2, 3, 5]], equal_nan=True)
+    assert shared[4] == 2 * shared[0]
+    assert len(band.unique()) == 1
+    nothing, _ = band_shares(torch.zeros(3), torch.full((3,), math.nan))
+    assert nothing.tolist() == [0, 0, 0]
+
+
+def test_what_cannot_work_is_said() -> None:
+    with pytest.raises(DataError, match="cannot keep 5 of 3"):
+        inclusion_probabilities(torch.ones(3), 5)
+    with pytest.raises(DataError, match="positive finite"):
+        inclusion_probabilities(torch.tensor([1.0, 0.0]), 1)
+    with pytest.raises(DataError, match="cannot keep 0 of 3"):
+        select_systematic(torch.ones(3), 0, torch.arange(3), 0)
+    with pytest.raises(DataError, match=r"\[3\] and their order \[2\]"):
+        select_systematic(torch.ones(3), 1, torch.arange(2), 0)

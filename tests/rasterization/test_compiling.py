@@ -1,0 +1,77 @@
+"""How loops are compiled: kept on disk, compiled anew when a constant changes, and announced when it takes long."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numba
+import pytest
+
+from sundae_ns.rasterization.cpu import parallel
+
+LOOP = """
+import numpy as np
+from sizes_of_this_test import SIZE
+from sundae_ns.rasterization.cpu.parallel import compiled, share
+
+@compiled
+def loop(begin, end, out):
+    for i in range(begin, end):
+        out[i] = SIZE
+
+out = np.zeros(3)
+share(loop, 3, out)
+"""
+
+
+def test_code_is_kept_and_a_constant_of_another_module_renews_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = tmp_path / "loop.py"
+    source.write_text(LOOP)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+
+    def run(size: int) -> tuple[list[float], int]:
+        module = ModuleType("sizes_of_this_test")
+        module.SIZE = size  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "sizes_of_this_test", module)
+        made: dict[str, Any] = {"__name__": "loop"}
+        exec(compile(LOOP, str(source), "exec"), made)
+        return made["out"].tolist(), sum(made["loop"].stats.cache_hits.values())
+
+    assert run(1) == ([1.0, 1.0, 1.0], 0)
+    assert run(1) == ([1.0, 1.0, 1.0], 1)
+    assert run(2) == ([2.0, 2.0, 2.0], 0)
+
+
+def test_where_nothing_can_be_kept_it_compiles_all_the_same() -> None:
+    """numba finds no folder for a function without a file, as where neither package nor home can be written to."""
+    made: dict[str, Any] = {}
+    exec(compile("def double(x):\n    return 2 * x", "<nowhere>", "exec"), made)
+    assert parallel.compiled(made["double"])(4) == 8
+
+
+def test_a_line_says_that_it_compiles(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    parallel._say_that_it_compiles.cache_clear()
+    monkeypatch.setattr(parallel, "_PATIENCE", 0.05)
+    monkeypatch.setattr(parallel, "_ready", set())
+
+    def slow(begin: int, end: int) -> None:
+        time.sleep(0.5 if begin == end else 0.0)
+
+    def fast(begin: int, end: int) -> None:
+        pass
+
+    parallel.share(fast, 3)
+    assert capsys.readouterr().err == ""
+    parallel.share(slow, 3)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "compiling" in line
+    parallel._ready.clear()
+    parallel.share(slow, 3)
+    parallel.share(slow, 3)
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,194 @@
+"""Error bounds of every attribute, on ordinary and on hard values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from sundae_ns.storage.packing import codebooks, morton, quantize, transform
+
+Floats = NDArray[np.float32]
+KINDS = ("normal", "constant", "huge", "tiny", "outliers", "two values", "far from zero")
+
+
+def values(kind: str, n: int, width: int, seed: int) -> Floats:
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(n, width))
+    if kind == "constant":
+        x[:] = 0.3
+    elif kind == "huge":
+        x *= 1e6
+    elif kind == "tiny":
+        x *= 1e-30
+    elif kind == "outliers":
+        x[rng.random((n, width)) < 0.002] *= 1e6
+    elif kind == "two values":
+        x = np.where(x > 1, 1e4, -1e-4)
+    elif kind == "far from zero":
+        x += 1e6
+    return x.astype(np.float32)
+
+
+hard = given(st.sampled_from(KINDS), st.integers(1, 700), st.integers(0, 2**16))
+few = settings(max_examples=40, deadline=None)
+
+
+def ulp(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rounding of what is returned, and of a product in float32 on the way to it."""
+    return np.spacing(np.abs(x).astype(np.float32)).astype(np.float64)
+
+
+@few
+@hard
+def test_morton_codes_come_back(kind: str, n: int, seed: int) -> None:
+    cells = np.random.default_rng(seed).integers(0, 2**morton.MAX_BITS, (n, 3)).astype(np.uint64)
+    codes = morton.interleave(cells)
+    for axis in range(3):
+        assert np.array_equal(morton.separate(codes, axis), cells[:, axis])
+    assert sorted(morton.scene_order(values(kind, n, 3, seed))) == list(range(n))
+
+
+def test_neighbours_in_the_order_are_near_each_other_despite_one_far_away() -> None:
+    means = np.random.default_rng(0).random((4096, 3)).astype(np.float32)
+    means[7] = 1e6
+    ordered = np.delete(means, 7, axis=0)[morton.scene_order(np.delete(means, 7, axis=0))]
+    with_far = means[morton.scene_order(means)]
+    steps = [np.median(np.linalg.norm(np.diff(m, axis=0), axis=1)) for m in (means, ordered, with_far)]
+    assert steps[1] < steps[0] / 5
+    assert steps[2] < 1.5 * steps[1]
+
+
+@few
+@hard
+def test_uniform(kind: str, n: int, seed: int) -> None:
+    x = values(kind, n, 3, seed)
+    bits = 4 + seed % 13
+    for shared in (False, True):
+        packed = quantize.quantize(x, bits, shared=shared)
+        error = np.abs(quantize.dequantize(packed).astype(np.float64) - x)
+        assert (error <= packed.step / 2 * (1 + 1e-9) + ulp(x)).all()
+        assert len(packed.exceptions) <= 2 * quantize.TAIL * x.size + 6
+
+
+def test_outliers_do_not_ruin_the_range() -> None:
+    x = np.random.default_rng(0).normal(size=(10_000, 1)).astype(np.float32)
+    clean = quantize.quantize(x, 8).step
+    x[17], x[18] = 1e6, -1e9
+    packed = quantize.quantize(x, 8)
+    assert packed.step <= clean
+    assert np.array_equal(quantize.dequantize(packed)[17:19], x[17:19])
+
+
+@few
+@hard
+def test_positions(kind: str, n: int, seed: int) -> None:
+    bits, size = 4 + seed % 18, 16 + seed % 200
+    x = values(kind, n, 3, seed)
+    x = x[morton.scene_order(x)]
+    packed, order = quantize.quantize_positions(x, bits, size)
+    assert sorted(order) == list(range(n))
+    found = quantize.dequantize_positions(packed, bits, size).astype(np.float64)
+    half = (packed.high.astype(np.float64) - packed.low) / (2**bits - 1) / 2
+    block = np.arange(n) // size
+    assert (np.abs(found - x[order]) <= half[block] * (1 + 1e-9) + ulp(x[order])).all()
+    # Each block is sorted, so that its codes differ by little.
+    inner = np.arange(n) % size != 0
+    assert (packed.deltas[inner] < np.uint64(1 << 3 * bits)).all()
+
+
+def test_a_far_primitive_costs_the_others_nothing() -> None:
+    x = np.random.default_rng(0).random((5000, 3)).astype(np.float32)
+    x[3] = 1e6
+    packed, order = quantize.quantize_positions(x[morton.scene_order(x)], 16, 1024)
+    found = quantize.dequantize_positions(packed, 16, 1024)
+    truth = x[morton.scene_order(x)][order]
+    assert np.quantile(np.abs(found - truth).max(axis=1), 0.79) < 1 / 65535 / 2 + 1e-7
+
+
+def angles(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Angles between rotations, radians, exact for small ones too."""
+    a, b = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (a, b))
+    near = np.minimum(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
+    return 4 * np.arcsin(np.minimum(near / 2, 1))
+
+
+@few
+@given(st.integers(1, 500), st.integers(0, 2**16), st.integers(4, 16), st.sampled_from([1e-30, 1.0, 1e30]))
+def test_rotations(n: int, seed: int, bits: int, length: float) -> None:
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=(n, 4))
+    q[rng.random(n) < 0.2] = rng.choice([-0.5, 0.5], size=4)  # corners, where all four are the largest
+    q[rng.random(n) < 0.1] = [0, 0, -1, 0]
+    q = (q * length).astype(np.float32)
+    found = quantize.dequantize_rotations(quantize.quantize_rotations(q, bits), bits)
+    assert np.allclose(np.linalg.norm(found, axis=1), 1, atol=1e-6)
+    assert angles(q.astype(np.float64), found.astype(np.float64)).max() <= quantize.rotation_bound(bits) + 2e-6
+
+
+def test_the_bound_of_rotations_is_not_far_from_what_happens() -> None:
+    rng = np.random.default_rng(0)
+    corner = np.full((100_000, 4), 0.5) + rng.normal(size=(100_000, 4)) * 0.01
+    found = quantize.dequantize_rotations(quantize.quantize_rotations(corner.astype(np.float32), 8), 8)
+    worst = angles(corner, found.astype(np.float64)).max()
+    assert quantize.rotation_bound(8) / 2 < worst <= quantize.rotation_bound(8)
+
+
+def test_no_rotation_stands_for_a_quaternion_of_length_zero() -> None:
+    found = quantize.dequantize_rotations(quantize.quantize_rotations(np.zeros((2, 4), np.float32), 8), 8)
+    assert np.allclose(found, [1, 0, 0, 0], atol=quantize.rotation_bound(8))
+
+
+@few
+@hard
+def test_weights(kind: str, n: int, seed: int) -> None:
+    x = values(kind, n, 18, seed).reshape(n, 2, 3, 3)
+    codes, step = quantize.quantize_weights(x)
+    error = np.abs(quantize.dequantize_weights(codes, step).astype(np.float64) - x).reshape(n, -1)
+    assert (error <= step[:, None] / 2 * (1 + 1e-6) + ulp(x.reshape(n, -1))).all()
+    assert (step <= np.abs(x.reshape(n, -1)).max(axis=1) / 127 * (1 + 1e-6) + 1e-44).all()
+
+
+@few
+@hard
+def test_codebooks(kind: str, n: int, seed: int) -> None:
+    x = values(kind, n, 9, seed)
+    packed = codebooks.fit(x, 1 + seed % 3)
+    found = codebooks.restore(packed).astype(np.float64)
+    others = np.delete(np.arange(n), packed.rows)
+    assert np.array_equal(found[packed.rows].astype(np.float32), x[packed.rows])
+    assert (np.abs(found - x)[others] <= packed.bound).all()
+    assert len(packed.rows) <= codebooks.EXACT * n
+
+
+def test_a_further_codebook_mends_the_ones_before() -> None:
+    x = values("normal", 3000, 9, 0)
+    errors = [np.square(codebooks.restore(codebooks.fit(x, books)) - x).mean() for books in (1, 2, 4)]
+    assert errors[0] < 0.7
+    assert errors[1] < 0.6 * errors[0]
+    assert errors[2] < 0.4 * errors[1]
+
+
+@few
+@hard
+def test_transform(kind: str, n: int, seed: int) -> None:
+    x = values(kind, n, 9, seed)
+    packed = transform.forward(x, 0.03)
+    found = transform.backward(packed).astype(np.float64)
+    assert np.array_equal(found[packed.rows].astype(np.float32), x[packed.rows])
+    # Sums of nine products in float32.
+    slack = 20 * ulp(np.linalg.norm(x.astype(np.float64), axis=1, keepdims=True))
+    assert (np.abs(found - x) <= transform.bound(packed) + slack).all()
+    assert transform.bound(packed) < 0.03 / 2 * 3.2
+
+
+@pytest.mark.parametrize("kind", ["normal", "outliers"])
+def test_a_transform_gathers_what_belongs_together(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    x = np.repeat(values(kind, 2000, 3, 0), 3, axis=1) + 0.001 * rng.normal(size=(2000, 9)).astype(np.float32)
+    packed = transform.forward(x.astype(np.float32), 0.03)
+    zeros = (packed.codes == 0).mean(axis=1)
+    assert (zeros[3:] > 0.98).all()
+    assert (zeros[:3] < 0.2).all()

@@ -1,0 +1,240 @@
+"""Packed scenes as a whole: what comes back, how exact, how large, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import ConfigError, PackError, StorageError
+from sundae_ns.storage.packing import PackConfig, Scene, container, quantize, read_header, read_scene, write_scene
+
+
+def field(n: int = 600, degree: int = 2, features: int = 5, seed: int = 0) -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(seed)
+    made = {
+        "means": torch.randn(n, 3, generator=g),
+        "scales": torch.randn(n, 3, generator=g) - 5,
+        "quats": torch.randn(n, 4, generator=g),
+        "features_dc": torch.randn(n, 3, generator=g),
+        "features_rest": 0.1 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=g),
+        "opacities": 2 * torch.randn(n, 1, generator=g),
+    }
+    return made | ({"features": torch.randn(n, features, generator=g)} if features else {})
+
+
+def head() -> dict[str, Tensor]:
+    g = torch.Generator().manual_seed(1)
+    return {"net.a.weight": torch.randn(4, 3, 3, 3, generator=g), "net.a.bias": torch.randn(4, generator=g)}
+
+
+def cameras(n: int = 3) -> dict[str, Tensor]:
+    return {
+        "poses": torch.eye(4)[:3].repeat(n, 1, 1),
+        "intrinsics": torch.tensor([[500.25, 501.5, 319.5, 239.5]]).double().repeat(n, 1),
+        "sizes": torch.tensor([[640, 480]]).repeat(n, 1),
+    }
+
+
+def matched(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Tensor]:
+    """``found`` in the order of ``truth``, by the nearest centre."""
+    nearest = torch.cdist(truth["means"], found["means"]).argmin(dim=1)
+    assert len(nearest.unique()) == len(nearest)
+    return {name: value[nearest] for name, value in found.items()}
+
+
+@pytest.mark.parametrize("config", [PackConfig(), PackConfig(harmonics="codebooks", feature_books=2, head="fp16")])
+def test_everything_comes_back_within_the_stated_bounds(tmp_path: Path, config: PackConfig) -> None:
+    path, truth = tmp_path / "a.sundae", field()
+    meta = {"model": {"sh_degree": 2}, "name": "überall"}
+    write_scene(path, Scene(truth, head(), cameras(), meta), config)
+    scene = read_scene(path)
+    assert scene.meta == meta
+    assert scene.cameras is not None
+    for name, value in cameras().items():
+        assert torch.equal(scene.cameras[name], value), name
+    about = read_header(path).meta["attributes"]
+    found = matched(scene.field, truth)
+    assert list(found) == list(
+        {name: None for name in ("means", "scales", "quats", "features_dc", "features_rest")}
+    ) + [
+        "opacities",
+        "features",
+    ]
+    for name in ("scales", "features_dc", "features_rest", "opacities", "features"):
+        assert found[name].shape == truth[name].shape
+        bound = torch.tensor(about[name]["bound"])
+        off = (found[name] - truth[name]).abs()
+        if about[name]["codec"] == "codebooks":  # but for the few rows that are exact
+            off = off.reshape(600, -1)
+        assert (off <= bound + 1e-5).all(), name
+        assert off.max() > 0.3 * bound.min(), name
+    assert (found["means"] - truth["means"]).abs().max() < 1e-4
+    turned = (found["quats"] * torch.nn.functional.normalize(truth["quats"])).sum(dim=1).abs().clamp(max=1)
+    assert 2 * torch.arccos(turned).max() <= quantize.rotation_bound(8) + 1e-3
+    assert torch.equal(scene.head["net.a.bias"], head()["net.a.bias"])
+    off = (scene.head["net.a.weight"] - head()["net.a.weight"]).abs().reshape(4, -1)
+    largest = head()["net.a.weight"].reshape(4, -1).abs().amax(dim=1, keepdim=True)
+    assert (off <= largest / 127 / 2 * 1.001 if config.head == "int8" else off <= largest * 2.0**-11).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 17])
+@pytest.mark.parametrize(("degree", "features"), [(0, 0), (3, 13), (4, 1)])
+def test_small_fields(tmp_path: Path, n: int, degree: int, features: int) -> None:
+    truth = field(n, degree, features)
+    report = write_scene(tmp_path / "a.sundae", Scene(truth))
+    scene = read_scene(tmp_path / "a.sundae")
+    assert {name: value.shape for name, value in scene.field.items()} == {k: v.shape for k, v in truth.items()}
+    assert (scene.head, scene.cameras, scene.meta) == ({}, None, {})
+    assert report.bytes == (tmp_path / "a.sundae").stat().st_size
+    assert sum(report.bits.values()) * n / 8 == pytest.approx(report.bytes)
+
+
+def test_constant_attributes_come_back_exactly(tmp_path: Path) -> None:
+    one = field(1)
+    truth = {name: value.repeat(40, *([1] * (value.ndim - 1))) for name, value in one.items()}
+    write_scene(tmp_path / "a.sundae", Scene(truth))
+    found = read_scene(tmp_path / "a.sundae").field
+    for name in ("means", "scales", "opacities", "features"):
+        assert torch.equal(found[name], truth[name]), name
+
+
+def test_a_scene_that_shrinks_to_nothing_is_padded_so_that_it_can_be_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    one = field(1, 3, 13)
+    truth = {name: value.expand(60_000, *value.shape[1:]) for name, value in one.items()}
+    report = write_scene(path, Scene(truth))
+    unpacked = 4 * sum(value.numel() for value in truth.values())
+    assert unpacked > container.SPARE
+    assert report.sections["padding"] > 0
+    assert report.bytes < 1.05 * (unpacked - container.SPARE) / container.MAX_RATIO
+    assert torch.equal(read_scene(path).field["means"], truth["means"])
+
+
+def test_it_takes_few_bytes(tmp_path: Path) -> None:
+    """A guard against a codec that has stopped to compress: this field takes 29 bytes a primitive instead of 272."""
+    g = torch.Generator().manual_seed(0)
+    truth = field(20_000, 3, 9)
+    truth["features_rest"] = (
+        0.05 * torch.randn(20_000, 15, 1, generator=g).expand(-1, -1, 3) * torch.rand(20_000, 1, 1) ** 4
+    )
+    report = write_scene(tmp_path / "a.sundae", Scene(truth))
+    assert report.bits["means"] < 39
+    assert report.bits["features_rest"] < 45
+    assert sum(report.bits.values()) / 8 < 30
+
+
+def test_packing_is_a_function_of_the_scene(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_scene(tmp_path / name, Scene(field(), head(), cameras()), PackConfig(harmonics="codebooks"))
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+@pytest.mark.parametrize(("name", "value"), [("means", torch.nan), ("features", torch.inf), ("quats", -torch.inf)])
+def test_what_is_not_finite_is_refused(tmp_path: Path, name: str, value: float) -> None:
+    broken = field()
+    broken[name][5, 1] = value
+    with pytest.raises(PackError, match="1 of 600 primitives are not finite"):
+        write_scene(tmp_path / "a.sundae", Scene(broken))
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_packed_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    with pytest.raises(PackError, match="no primitives"):
+        write_scene(path, Scene(field(0)))
+    with pytest.raises(PackError, match="no quats"):
+        write_scene(path, Scene({k: v for k, v in field().items() if k != "quats"}))
+    with pytest.raises(PackError, match="scales has shape"):
+        write_scene(path, Scene(field() | {"scales": torch.zeros(600, 2)}))
+    with pytest.raises(PackError, match="features_rest has shape"):
+        write_scene(path, Scene(field() | {"features_rest": torch.zeros(600, 7, 3)}))
+    with pytest.raises(PackError, match="head has weights that are not finite"):
+        write_scene(path, Scene(field(), {"a": torch.full((2, 2), torch.nan)}))
+    with pytest.raises(PackError, match="too large for fp16"):
+        write_scene(path, Scene(field(), {"a": torch.full((2, 2), 1e6)}), PackConfig(head="fp16"))
+    for options in ({"scale_bits": 3}, {"position_bits": 22}, {"harmonics_step": 0.0}, {"head": "int4"}, {"block": 1}):
+        with pytest.raises(ConfigError, match="give"):
+            write_scene(path, Scene(field()), PackConfig(**options))  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_pack_that_fails_leaves_the_older_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.sundae"
+    path.write_bytes(b"years of work")
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("sundae_ns.storage.atomic._flush", full)
+    with pytest.raises(StorageError, match="the disk is full"):
+        write_scene(path, Scene(field()))
+    assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.sundae", b"years of work")]
+
+
+def test_any_altered_byte_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, Scene(field(40, 1, 1), head()))
+    good = path.read_bytes()
+    for place in range(0, len(good), 37):
+        path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
+        with pytest.raises(PackError):
+            read_scene(path)
+    for length in (0, 7, 20, 47, 48, 300, len(good) - 1):
+        path.write_bytes(good[:length])
+        with pytest.raises(PackError, match=r"not a whole packed scene|no packed scene"):
+            read_scene(path)
+    path.write_bytes(good + b"\0")
+    with pytest.raises(PackError, match="its header states"):
+        read_scene(path)
+
+
+def test_another_version_is_told_apart_from_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, Scene(field(20)))
+    content = bytearray(path.read_bytes())
+    content[8] = 2
+    path.write_bytes(content)
+    with pytest.raises(PackError, match="version 2 of the format, this program reads 1"):
+        read_scene(path)
+    with pytest.raises(PackError, match=r"cannot be read \(No such file"):
+        read_scene(tmp_path / "b.sundae")
+
+
+def test_the_file_is_what_its_documentation_says(tmp_path: Path) -> None:
+    """Read by the words of ``docs/packing.md`` alone."""
+    import zstandard
+
+    path = tmp_path / "a.sundae"
+    write_scene(path, Scene(field()))
+    content = path.read_bytes()
+    assert content[:8] == b"\x89SUNDAE\n"
+    version, length = np.frombuffer(content[8:16], "<u4")
+    assert version == 1
+    header = content[48 : 48 + length]
+    assert hashlib.sha256(header).digest() == content[16:48]
+    meta, offset = json.loads(header), 48 + int(length)
+    arrays = {}
+    for section in meta["sections"]:
+        stored = content[offset : offset + sum(section["parts"])]
+        assert hashlib.sha256(stored).hexdigest() == section["sha256"]
+        size = np.dtype(section["dtype"]).itemsize * int(np.prod(section["shape"]))
+        planes, start = [], 0
+        for part in section["parts"]:
+            frame = stored[start : start + part]
+            whole = len(frame) * len(section["parts"]) == size
+            planes.append(frame if whole else zstandard.ZstdDecompressor().decompress(frame))
+            start += part
+        arrays[section["name"]] = (section, planes)
+        offset += len(stored)
+    assert offset == len(content)
+    section, planes = arrays["opacities/codes"]
+    about = meta["attributes"]["opacities"]
+    values = about["low"][0] + np.frombuffer(planes[0], np.uint8) * about["step"][0]
+    assert np.allclose(read_scene(path).field["opacities"][:, 0], values, atol=1e-6)
