@@ -10,13 +10,17 @@ from __future__ import annotations
 import base64
 import io
 import json
+import os
 import queue
 import shutil
+import signal
+import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,7 +107,9 @@ class Browser:
         # Chromium's children write to the folder until they are gone.
         profile = Path(self._stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
         log = self._stack.enter_context(open(profile / "log", "w"))
-        process = subprocess.Popen([*self._command, f"--user-data-dir={profile}"], stdout=log, stderr=log)
+        process = subprocess.Popen(
+            [*self._command, f"--user-data-dir={profile}"], stdout=log, stderr=log, start_new_session=True
+        )
         self._stack.callback(self._end, process)
         address = profile / "DevToolsActivePort"
 
@@ -138,11 +144,12 @@ class Browser:
     def _end(self, process: subprocess.Popen[bytes]) -> None:
         with suppress(BrowserError, ConnectionClosed, AttributeError):
             self.call("Browser.close", browser=True, timeout=5)
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(3)
+        # Its renderers too, which take their time where WebGL is drawn in software.
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
     # --------------------------------------------------------------------------------------------------- the protocol
 
@@ -439,3 +446,55 @@ class ViewerPage(Browser):
             if np.array_equal(last, before):
                 return last
         raise BrowserError("the page does not stop changing")
+
+
+class Server:
+    """A command of nerfstudio's with its viewer on this machine's loopback, in a process of its own.
+
+    Args:
+        command: name in the environment's folder of commands, and its arguments without those of the viewer.
+        log: file for what it writes.
+        ready: words in its output after which it may be talked to.
+    """
+
+    def __init__(self, command: Sequence[object], log: Path, ready: str) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = free.getsockname()[1]
+        self.address, self._log, self._ready = f"http://127.0.0.1:{self._port}", log, ready
+        name, *rest = map(str, command)
+        words = [str(Path(sys.executable).parent / name), *rest]
+        words += ["--viewer.websocket-host", "127.0.0.1", "--viewer.websocket-port", str(self._port)]
+        with log.open("w") as file:
+            self.process = subprocess.Popen(
+                words, stdout=file, stderr=file, stdin=subprocess.DEVNULL, env={**os.environ, "COLUMNS": "160"}
+            )
+
+    def output(self) -> str:
+        """What it has written so far."""
+        return self._log.read_text(errors="replace")
+
+    def complaints(self) -> list[str]:
+        """Words in its output that speak of errors."""
+        return [word for word in ("Traceback", "Exception", "Error") if word in self.output()]
+
+    def listens(self) -> bool:
+        """Whether a browser may come.
+
+        Raises:
+            BrowserError: it has ended.
+        """
+        if self.process.poll() is not None:
+            raise BrowserError(f"it ended with {self.process.returncode}: {self.output()[-3000:]}")
+        with suppress(OSError), socket.create_connection(("127.0.0.1", self._port), 1):
+            return self._ready in self.output()
+        return False
+
+    def stop(self) -> None:
+        """End it, kindly for ten seconds."""
+        self.process.terminate()
+        try:
+            self.process.wait(10)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
