@@ -343,6 +343,9 @@ SLOW = 30.0
 class ViewerPage(Browser):
     """nerfstudio's viewer in a page, used through its controls with mouse and keyboard."""
 
+    seen: NDArray[np.uint8]
+    """The page as it was when it last came to rest, ``[H, W, 3]``."""
+
     def _script(self, body: str) -> Any:
         return self.evaluate(f"(() => {{ {CONTROL} return {body}; }})()")
 
@@ -427,15 +430,32 @@ class ViewerPage(Browser):
                 latest[:] = [start + len(sizes), time.monotonic()]
             if not sizes or sizes[-1] != longest:
                 return False
-            # Where drawing is fast enough, the first picture is of full size as well.
-            return min(sizes) < longest or (len(sizes) > 1 and time.monotonic() - latest[1] > 2)
+            # Where drawing is fast enough, the first picture is of full size as well; if it is the only one, it is either
+            # the last one, or was on its way before.
+            return min(sizes) < longest or time.monotonic() - latest[1] > (2 if len(sizes) > 1 else 6)
 
-        wait_for(done, "a picture of full size", 4 * SLOW)
+        try:
+            wait_for(done, "a picture of full size", 2 * SLOW)
+        except BrowserError as error:
+            raise BrowserError(f"{error}; there came {self.pictures[start:]}") from error
         width, height = self.pictures[-1]
         shown = f"document.body.innerText.includes('Resolution: {width}x{height}px')"
         wait_for(lambda: bool(self.evaluate(shown)), "the page to show it", SLOW)
-        self.still()
+        self.seen = self.still()
         return result
+
+    def rest(self, seconds: float = 1.5) -> None:
+        """Wait until camera and picture have stayed as they are for some time; a page glides on after a drag."""
+        state: list[Any] = [None, 0.0]
+
+        def resting() -> bool:
+            now = (self.camera, len(self.pictures))
+            if now != state[0]:
+                state[:] = [now, time.monotonic()]
+            return time.monotonic() - float(state[1]) > seconds
+
+        wait_for(resting, "the camera to rest", SLOW)
+        self.seen = self.still()
 
     def still(self) -> NDArray[np.uint8]:
         """A screenshot that the next one, some frames later, agrees with."""

@@ -43,7 +43,7 @@ def look_through(points: Tensor, viewmat: Tensor, K: Tensor, width: int, height:
 
     Args:
         points: in world units.
-        viewmat: world-to-camera, OpenCV axes ``[4, 4]``.
+        viewmat: world-to-camera, OpenCV axes ``[4, 4]`` or its first three rows.
         K: intrinsics in pixels ``[3, 3]``.
         width, height: of the picture, pixels.
         name: of the look.
