@@ -42,7 +42,7 @@ pytestmark = [
 SIDE = 256
 """Longer side of pictures after "Fast" has been pressed, pixels."""
 FAR = 48
-MEAN, SHARE = 4.0, 0.02
+MEAN, SHARE = 3.0, 0.02
 """Bounds of the mean difference of screenshot and render, in steps of 255, and of the share of pixels off by ``FAR``."""
 
 
