@@ -20,7 +20,7 @@ def test_objects_become_plain_values_and_nothing_is_run(tmp_path: Path) -> None:
         f"a: !!python/object/apply:os.mkdir ['{mark}']\n"
         f"b: !!python/object/new:os.mkdir\n  args: ['{mark}']\n"
         "c: !!python/name:os.system ''\n"
-        "d: !!python/module:antigravity ''\n"
+        "d: !!python/module:this ''\n"
         "e: &path !!python/object/apply:pathlib.PosixPath [a, b]\n"
         "f: *path\n"
         "g: !!python/tuple [1, 2.5, true]\n" + PIPELINE

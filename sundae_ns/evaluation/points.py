@@ -71,7 +71,7 @@ def look_along_axes(points: Tensor, side: int = 600) -> list[Look]:
         ("from the side", 1, 2, 0, -1.0),
     ):
         moved = (points.double() - middle) * scale
-        tall = float(high[up] - low[up]) * 1.5 * scale
+        tall = float(high[up] - low[up]) * 2.2 * scale  # more, for what stands out of a flat scene
         height = round(min(max(tall, side / 4), side))
         pixels = torch.stack([side / 2 + moved[:, right], height / 2 - moved[:, up]], dim=1)
         depth = sign * moved[:, along]
