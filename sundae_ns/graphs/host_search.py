@@ -6,7 +6,9 @@ clones are grouped first, the tree is built and searched once a position, and gr
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +18,8 @@ from scipy.spatial import cKDTree
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
-CHUNK_ELEMENTS = 2**20
-"""Most candidates at a time: 16 MiB of indices and distances, which stay in the cache."""
+CHUNK_ELEMENTS = 2**18
+"""Most candidates of a thread at a time: 4 MiB of indices and distances, which stay in the cache."""
 
 ROUNDING = 4 * np.finfo(np.float64).eps
 """Distances closer than this, relatively, may be the same or swapped: the tree's own sums may be rounded otherwise."""
@@ -60,8 +62,8 @@ def nearest(coordinates: Floats, k: int, limit: float, dtype: DTypeLike) -> tupl
     positions = _distinct(coordinates)
     first = positions.members[positions.starts]
     tree = cKDTree(positions.coordinates)
-    # Queries that follow each other down the tree find it in the cache; in the order of a field they mostly do not.
-    for rows in _parts(tree.indices, k + 2):
+
+    def search(rows: Ints) -> None:
         # One more than needed shows whether the last one taken ties with the first one left out.
         found, lengths = _query(tree, rows, k + 2)
         if tree.n == n:
@@ -80,9 +82,24 @@ def nearest(coordinates: Floats, k: int, limit: float, dtype: DTypeLike) -> tupl
         tied = (lengths[:, 1:] <= lengths[:, :-1] * (1 + ROUNDING)).any(axis=1)
         for settled in _settled(positions, tree, rows[tied], found[tied], lengths[tied], k + 1):
             _write(indices, distances, positions, *settled)
+
+    # Queries that follow each other down the tree find it in the cache; in the order of a field they mostly do not.
+    _for_each(search, _parts(tree.indices, k + 2))
     if limit < np.inf:
-        _drop_far(coordinates, indices, distances, limit)
+        _for_each(lambda rows: _drop_far(coordinates, indices, distances, limit, rows), _parts(np.arange(n), k))
     return indices, distances
+
+
+def _for_each(work: Callable[[Ints], None], parts: list[Ints]) -> None:
+    """Do all parts, several at a time: none writes where another does, and both scipy and numpy let go of the lock."""
+    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if min(threads, len(parts)) == 1:
+        for part in parts:
+            work(part)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(work, parts):
+            pass
 
 
 def _distinct(coordinates: Floats) -> _Positions:
@@ -118,7 +135,7 @@ def _hash(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 def _query(tree: cKDTree, rows: Ints, asked: int) -> tuple[Ints, Floats]:
     """The nearest positions of the positions ``rows``, nearest first, or all where there are not so many."""
-    lengths, found = tree.query(tree.data[rows], k=np.arange(1, min(asked, tree.n) + 1), workers=-1)
+    lengths, found = tree.query(tree.data[rows], k=np.arange(1, min(asked, tree.n) + 1))
     return found, lengths
 
 
@@ -209,12 +226,9 @@ def _parts(rows: Ints, columns: int) -> list[Ints]:
     return np.array_split(rows, min(len(rows), -(-len(rows) * columns // CHUNK_ELEMENTS)))
 
 
-def _drop_far(coordinates: Floats, indices: Ints, distances: Floats, limit: float) -> None:
-    """Put the own index and ``inf`` in place of neighbours that are not within the limit."""
-    step = max(1, CHUNK_ELEMENTS // indices.shape[1])
-    for start in range(0, len(indices), step):
-        rows = slice(start, start + step)
-        x, y, z = np.moveaxis(coordinates[indices[rows]] - coordinates[rows, None], 2, 0)
-        far = ~(x * x + y * y + z * z < limit)
-        indices[rows] = np.where(far, np.arange(len(indices))[rows, None], indices[rows])
-        distances[rows][far] = np.inf
+def _drop_far(coordinates: Floats, indices: Ints, distances: Floats, limit: float, rows: Ints) -> None:
+    """Put the own index and ``inf`` in place of neighbours of the points ``rows`` that are not within the limit."""
+    x, y, z = np.moveaxis(coordinates[indices[rows]] - coordinates[rows, None], 2, 0)
+    far = ~(x * x + y * y + z * z < limit)
+    indices[rows] = np.where(far, rows[:, None], indices[rows])
+    distances[rows] = np.where(far, np.inf, distances[rows])
