@@ -29,6 +29,8 @@ FLOORS = {
     "budget": 3,
     "densification": 3,
     "model": 3,
+    "preview": 3,
+    "run_folder": 3,
     "trainer": 3,
     "opening": 3,
     "measure": 3,

@@ -9,6 +9,14 @@ from sundae_ns.evaluation.measured import HEAD_OFF, HEAD_ON, Configuration, Meas
 from sundae_ns.evaluation.memory import peak_memory
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.evaluation.picture import ComparisonRow, comparison_sheet, save_comparison, side_by_side
+from sundae_ns.evaluation.points import (
+    Look,
+    draw_points,
+    look_along_axes,
+    look_through,
+    points_sheet,
+    response_histogram,
+)
 from sundae_ns.evaluation.records import COLUMNS, RunRow, append_row, read_rows
 from sundae_ns.evaluation.report import Quality, RunFigures, report_tables, report_text
 from sundae_ns.evaluation.timing import Timing, median_ms
@@ -23,6 +31,7 @@ __all__ = [
     "Frame",
     "Later",
     "LazyOutputs",
+    "Look",
     "Lpips",
     "Measured",
     "Quality",
@@ -36,15 +45,20 @@ __all__ = [
     "display",
     "flip",
     "flip_available",
+    "draw_points",
+    "look_along_axes",
+    "look_through",
     "lpips_weights_available",
     "lpips_weights_path",
     "lpips_weights_url",
     "median_ms",
     "peak_memory",
+    "points_sheet",
     "psnr",
     "read_rows",
     "report_tables",
     "report_text",
+    "response_histogram",
     "save_comparison",
     "side_by_side",
     "ssim",
