@@ -35,6 +35,7 @@ from sundae_ns.densification import CappedStrategy, ChainStrategy, start_of_chai
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, peak_memory, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
+from sundae_ns.gaussians.parameters import rgb_to_logit, sh_to_rgb
 from sundae_ns.preview import Preview, in_viewer
 from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, pixel_detail, response, select_random
 from sundae_ns.rasterization import (
@@ -198,13 +199,18 @@ class SundaeModel(SplatfactoModel):
 
     def _initial_field(self) -> dict[str, Tensor]:
         if self.config.warm_start is None:
-            return self._sparse_field()
-        try:
-            return self._warm_field(self.config.warm_start)
-        except CheckpointError as error:
-            # A finished run must open without what it once started from; training without it is refused.
-            self._warm_start_error = error
-            return self._sparse_field()
+            params = self._sparse_field()
+        else:
+            try:
+                params = self._warm_field(self.config.warm_start)
+            except CheckpointError as error:
+                # A finished run must open without what it once started from; training without it is refused.
+                self._warm_start_error = error
+                params = self._sparse_field()
+        if self.config.sh_degree == 0:
+            # splatfacto's models without harmonics, and nerfstudio's exporter, know colours by their logits.
+            params["features_dc"] = rgb_to_logit(sh_to_rgb(params["features_dc"]))
+        return params
 
     def _sparse_field(self) -> dict[str, Tensor]:
         config = self.config
