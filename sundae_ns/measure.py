@@ -55,12 +55,12 @@ class FrameTimes:
 
 @contextmanager
 def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
-    """Show pictures of ``model`` with the head, or without, as the viewer's check box does."""
-    before, model.compensate.value = model.compensate.value, on
+    """Give pictures of ``model`` the head's correction, or not, outside of a viewer, whose check box is its own."""
+    before, model.compensated = model.compensated, on
     try:
         yield
     finally:
-        model.compensate.value = before
+        model.compensated = before
 
 
 @torch.no_grad()

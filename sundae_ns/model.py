@@ -187,6 +187,8 @@ class SundaeModel(SplatfactoModel):
             torch.tensor([0.1490, 0.1647, 0.2157]) if random_background else get_color(config.background_color)
         )
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
+        self.compensated = True
+        """Whether pictures that nobody looks at in a viewer get the head's correction."""
         self.preview = Preview()
         self._backend: Backend | None = None
         self._response: tuple[Any, Tensor | None] = (None, None)
@@ -524,7 +526,7 @@ class SundaeModel(SplatfactoModel):
         if preview is not None and mask is not None and preview.values is not None:
             rows = mask[preview.mask]
             params = {**params, **{k: v[rows] for k, v in preview.values.items()}}
-        compensate = preview is None and (self.compensate.value or not in_viewer())
+        compensate = preview is None and (self.compensate.value if in_viewer() else self.compensated)
         outputs, splat = self.render(params, view, background, compensate=compensate)
         field, features = dict(self.gaussians), outputs.pop("feature_image")
         later = {
