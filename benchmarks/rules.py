@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import fcntl
 import json
 import shlex
 import time
@@ -34,6 +33,7 @@ from rich.progress import Progress
 
 from sundae_ns import checkpoint
 from sundae_ns.evaluation import RunRow, append_row
+from sundae_ns.evaluation.records import wait_for_lock
 from sundae_ns.measure import sizes
 from sundae_ns.model import SundaeModel
 from sundae_ns.pruning import field_graph, make_policy
@@ -168,7 +168,7 @@ class Bench:
         """The state right before the prune: from the file, or trained into it."""
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(path.with_suffix(".lock"), "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+            wait_for_lock(lock.fileno())
             if not path.exists():
                 self.model.policy = make_policy(replace(self.pruning, mode="off"))
                 started = time.perf_counter()
@@ -322,7 +322,7 @@ def finished(path: Path) -> list[dict[str, Any]]:
 def append(path: Path, line: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        wait_for_lock(file.fileno())
         file.write(json.dumps(line) + "\n")
 
 

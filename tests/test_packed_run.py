@@ -217,7 +217,7 @@ def test_a_capture_is_read_again_as_it_was(parser: Any) -> None:
 
 
 def test_captures_that_are_not_described() -> None:
-    for parser in (BlenderDataParserConfig(), ColmapDataParserConfig(images_path=Path("/home/me/images"))):
+    for parser in (BlenderDataParserConfig(), ColmapDataParserConfig(images_path=Path("/elsewhere/images"))):
         assert packed_run._describe(SundaeDatamanagerConfig(dataparser=parser)) is None
     for stated in (None, {}, {"parser": "blender-data", "options": {}}, {"parser": "colmap", "options": None}):
         with pytest.raises(PackError, match="without --data"):

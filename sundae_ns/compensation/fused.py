@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import NamedTuple, cast
 
@@ -212,6 +214,16 @@ def pixel_stride(picture: Tensor) -> int:
     return pixel
 
 
+@contextmanager
+def aside(device: torch.device) -> Iterator[None]:
+    """Run once what is going to be recorded: it allocates and chooses kernels, neither of which can be recorded."""
+    side = torch.cuda.Stream(device)
+    side.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(side):
+        yield
+    torch.cuda.current_stream(device).wait_stream(side)
+
+
 class _Recording(NamedTuple):
     graph: torch.cuda.CUDAGraph
     folded: Tensor
@@ -280,12 +292,8 @@ class FusedInference:
         return raw
 
     def _record(self, folded: Tensor, launches: Launches) -> _Recording:
-        # What runs first on a stream of its own allocates and chooses kernels, neither of which can be recorded.
-        side = torch.cuda.Stream(folded.device)
-        side.wait_stream(torch.cuda.current_stream(folded.device))
-        with torch.cuda.stream(side):
+        with aside(folded.device):
             self._run(folded, launches)
-        torch.cuda.current_stream(folded.device).wait_stream(side)
         graph = torch.cuda.CUDAGraph()
         # A training loop beside a viewer may allocate meanwhile; only this thread's work belongs to the recording.
         with torch.cuda.graph(graph, capture_error_mode="thread_local"):

@@ -17,6 +17,7 @@ from sundae_ns.compensation.fused import (
     MAX_SIZES,
     Tape,
     Weights,
+    aside,
     bias_of,
     convolutions,
     fold,
@@ -236,16 +237,11 @@ class FusedTraining:
         return to_splatted, to_alpha, [*to_parameters, *to_last]
 
     def _record(self, folded: Tensor, launches: Launches) -> _Pass:
-        device = folded.device
         weights = Weights(self.net, folded.dtype)
-        # What runs first on a stream of its own allocates and chooses kernels, neither of which can be recorded.
-        side = torch.cuda.Stream(device)
-        side.wait_stream(torch.cuda.current_stream(device))
-        with torch.cuda.stream(side):
+        with aside(folded.device):
             tape = network(self.net, weights, folded, launches)
             network_backward(self.net, weights, tape, torch.zeros_like(_last(tape)), launches)
             del tape
-        torch.cuda.current_stream(device).wait_stream(side)
         forward, backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
         with torch.cuda.graph(forward, capture_error_mode="thread_local"):
             weights.refresh()

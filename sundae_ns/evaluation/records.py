@@ -109,7 +109,7 @@ def append_row(path: Path, row: RunRow) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a+b") as file:
-            _lock(file.fileno())
+            wait_for_lock(file.fileno())
             file.seek(0)
             if first := file.readline().decode("utf-8", errors="replace"):
                 _check_header(path, next(csv.reader([first])))
@@ -123,7 +123,7 @@ def append_row(path: Path, row: RunRow) -> None:
         raise DataError(f"{path} cannot be written ({error.strerror}); name another file.") from error
 
 
-def _lock(descriptor: int) -> None:
+def wait_for_lock(descriptor: int) -> None:
     """Wait for a file's lock, which goes with the descriptor; nothing where the system has no ``flock`` (Windows)."""
     if os.name == "posix":
         fcntl.flock(descriptor, fcntl.LOCK_EX)

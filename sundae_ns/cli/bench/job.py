@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
-import os
 import shutil
 import sys
 import time
@@ -27,12 +26,10 @@ from nerfstudio.utils import profiler, writer
 from sundae_ns.cli.bench.plan import Job, done_file, job_folder
 from sundae_ns.errors import BackendError, CheckpointError, SundaeError
 from sundae_ns.evaluation import Lpips, lpips_weights_available
+from sundae_ns.evaluation.records import wait_for_lock
 from sundae_ns.measure import measure_scene
 from sundae_ns.opening import open_scene
 from sundae_ns.storage.atomic import write_text
-
-with contextlib.suppress(ImportError):  # Windows has none.
-    import fcntl
 
 NEVER = 10**9
 
@@ -67,10 +64,9 @@ def perform(job: Job, out: Path) -> None:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Hold a file's lock, which goes with the process; nothing where the system has no ``flock`` (Windows)."""
+    """Hold a file's lock, which goes with the process."""
     with path.open("a") as file:
-        if os.name == "posix":
-            fcntl.flock(file.fileno(), fcntl.LOCK_EX)
+        wait_for_lock(file.fileno())
         yield
 
 
