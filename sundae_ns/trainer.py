@@ -9,15 +9,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 import yaml
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sundae_ns import checkpoint
+from sundae_ns import checkpoint, distributed
+from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, StorageError, SundaeError, out_of_memory
 from sundae_ns.storage.atomic import storage_error, write_text
 
@@ -62,6 +64,40 @@ class SundaeTrainer(Trainer):
 
     config: SundaeTrainerConfig
 
+    def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        if world_size > 1:
+            distributed.check_options(config)
+            config.vis = distributed.without_viewer(config.vis)  # type: ignore[assignment]
+            CONSOLE.quiet = local_rank != 0
+            if config.machine.device_type == "cuda":
+                torch.cuda.set_device(local_rank)
+        # A world of one to nerfstudio, whose pipeline would wrap the model in DDP: that breaks when primitives come and go.
+        super().__init__(config, local_rank, world_size=1)
+        self.ranks = world_size
+
+    @property
+    def shards(self) -> distributed.Shards | None:
+        """The ranks that train together; None where there is one."""
+        return self.pipeline.model.shards
+
+    def setup_optimizers(self) -> Optimizers:
+        """Optimizers of what this process holds, for batches of as many pictures as there are ranks."""
+        if self.ranks == 1:
+            return super().setup_optimizers()
+        model, datamanager = self.pipeline.model, cast(SundaeDatamanager, self.pipeline.datamanager)
+        model.share(distributed.take_shard(model, self.config.machine.seed))
+        datamanager.place = (model.shards.rank, self.ranks)
+        optimizers = distributed.SharedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+        distributed.scale_rates(optimizers, self.ranks)
+        return optimizers
+
+    def eval_iteration(self, step: int) -> None:
+        """nerfstudio's, of which every rank takes its part: the head has to look at the same scale on each."""
+        every = ("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images")
+        if self.shards is not None and any(step_check(step, getattr(self.config, name)) for name in every):
+            self.shards.agree_on_focal(self.pipeline.model)
+        super().eval_iteration(step)
+
     def train(self) -> None:
         """Train.
 
@@ -75,15 +111,19 @@ class SundaeTrainer(Trainer):
         except torch.cuda.OutOfMemoryError as error:
             raise out_of_memory(error, getattr(self.pipeline.model, "num_points", 0)) from error
 
-    @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Save model, optimizers, schedules and random state; older checkpoints go once the new one is on the disk.
+
+        Where several ranks train, each has to call it; the first gathers, and writes what one process would.
 
         Raises:
             StorageError: no room or no right to write; what was there before is whole.
         """
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        state = {
+        shards, model = self.shards, self.pipeline.model
+        if shards is not None:
+            shards.agree_on_focal(model)
+        own = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
             "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
@@ -91,6 +131,9 @@ class SundaeTrainer(Trainer):
             "scalers": self.grad_scaler.state_dict(),
             "random": checkpoint.random_state(),
         }
+        state = own if shards is None else distributed.whole_state(own, shards, list(model.gauss_params))
+        if state is None:
+            return
         checkpoint.save(state, path)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("*.ckpt"):
@@ -104,6 +147,9 @@ class SundaeTrainer(Trainer):
             return
         loaded = checkpoint.load(path)
         try:
+            if self.shards is not None:
+                names = list(self.pipeline.model.gauss_params)
+                loaded = distributed.state_of_rank(loaded, self.shards.rank, self.ranks, names)
             self._restore(loaded)
         except SundaeError:
             raise
@@ -136,3 +182,6 @@ class SundaeTrainer(Trainer):
         self.grad_scaler.load_state_dict(loaded["scalers"])
         if "random" in loaded:  # nerfstudio's own trainer saves none
             checkpoint.set_random_state(loaded["random"])
+        if self.shards is not None:
+            self.shards.recount(self.pipeline.model.gaussians)
+            torch.manual_seed(self.config.machine.seed + self._start_step * self.ranks + self.shards.rank)
