@@ -58,6 +58,7 @@ TIMEOUT = timedelta(minutes=30)
 _FIELD = "_model.gauss_params."
 _EXTRA = "_model._extra_state"
 _GEOMETRY = ("means", "quats", "scales", "opacities")
+_COLORS = ("features_dc", "features_rest")
 
 
 # --------------------------------------------------------------------------------------------------------------- blocks
@@ -207,7 +208,7 @@ class Shards:
         Args:
             params: this rank's primitives.
             view: this rank's camera.
-            colors_of: colours ``[n, 3]`` of a part of the field as a camera sees it.
+            colors_of: colours ``[n, 3]``, as a camera sees them, of primitives with centres and harmonics.
             near_plane: as the rasteriser gets it.
             features: whether features come along.
         """
@@ -217,12 +218,13 @@ class Shards:
             scales = params["scales"].exp()
             ids = [may_be_seen(params["means"], scales, c, near_plane, math.inf).nonzero()[:, 0] for c in cameras]
         route = plan_route(ids)
-        rows = []
-        for camera, chosen in zip(cameras, ids):
-            part = {name: value.index_select(0, chosen) for name, value in params.items()}
-            rows.append(torch.cat([*(part[name] for name in names), colors_of(part, camera)], dim=1))
+        # Picked for all cameras at once: the way back then fills one gradient per parameter, not one per camera.
+        going = {name: params[name].index_select(0, route.ids) for name in [*names, *_COLORS]}
+        parts = zip(*(going[name].split(route.sent) for name in ("means", *_COLORS)))
+        colors = [colors_of(dict(zip(("means", *_COLORS), part)), camera) for part, camera in zip(parts, cameras)]
+        rows = torch.cat([*(going[name] for name in names), torch.cat(colors)], dim=1)
         columns = [params[name].shape[1] for name in names]
-        pieces = exchange(torch.cat(rows), route).split([*columns, 3], dim=1)
+        pieces = exchange(rows, route).split([*columns, 3], dim=1)
         arrived = Arrived(zip([*names, "colors"], pieces))
         arrived.route = route
         return arrived
@@ -564,6 +566,24 @@ def check_options(config: Any) -> None:
     for name, given in refused.items():
         if given:
             raise ConfigError(f"{name} does not work on several GPUs yet; leave it out, or use --machine.num-devices 1")
+
+
+def check_machine(ranks: int, device_type: str) -> None:
+    """Refuse more ranks than ``ns-train`` can start here.
+
+    Raises:
+        ConfigError: the ranks are not on GPUs, or there are not so many.
+    """
+    if device_type != "cuda":
+        raise ConfigError(
+            f"--machine.num-devices {ranks} needs GPUs, and --machine.device-type is {device_type}; "
+            "give --machine.num-devices 1"
+        )
+    found = torch.cuda.device_count()
+    if ranks > found:
+        raise ConfigError(
+            f"--machine.num-devices is {ranks} and there are {found} GPUs; give --machine.num-devices {max(found, 1)}"
+        )
 
 
 def without_viewer(vis: str) -> str:

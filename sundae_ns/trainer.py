@@ -35,7 +35,11 @@ class SundaeTrainerConfig(TrainerConfig):
 
         Raises:
             StorageError: there is no room or no right to write.
+            ConfigError: there are not so many GPUs, or several ranks cannot train with these options.
         """
+        if self.machine.num_devices > 1:
+            distributed.check_machine(self.machine.num_devices, self.machine.device_type)
+            distributed.check_options(self)
         path = self.get_base_dir() / "config.yml"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -463,7 +463,8 @@ def test_the_prune_is_that_of_one_process(folder: Path) -> None:
     one = train(frozen(folder, "one"), 0, 1)
     two = checkpoint.load(models(folder, "two") / "step-000000000.ckpt")["pipeline"]
     for name, value in one.pipeline.model.gauss_params.items():
-        assert torch.equal(value.detach(), two[f"_model.gauss_params.{name}"]), name
+        # Weights of a view are sums over fewer rows here, so that what a merge makes of them differs by rounding.
+        torch.testing.assert_close(value.detach(), two[f"_model.gauss_params.{name}"], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
@@ -528,6 +529,22 @@ def test_what_several_ranks_cannot_do_is_refused(tmp_path: Path, option: str, va
     setattr(owner, name, value)
     with pytest.raises(ConfigError, match="several GPUs"):
         distributed.check_options(config)
+
+
+def test_more_ranks_than_gpus_are_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = configured(tmp_path, "refused")
+    with pytest.raises(ConfigError, match="needs GPUs.*device-type is cpu"):
+        config.save_config()
+    config.machine.device_type = "cuda"
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    with pytest.raises(ConfigError, match="is 2 and there are 1 GPUs; give --machine.num-devices 1"):
+        config.save_config()
+    assert not config.get_base_dir().exists()
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    config.save_config()
+    assert (config.get_base_dir() / "config.yml").exists()
 
 
 def test_shorter_runs_see_as_many_pictures(tmp_path: Path) -> None:
