@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequenc
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from datetime import timedelta
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -399,7 +400,8 @@ class GlobalPruning:
             dist.broadcast(value, 0)
             values[name] = value[start : start + num_primitives(params)].clone()
         rewrite(params, optimizers, values)
-        return replace(report, before=before, dropped_nonfinite=dropped)
+        # In pictures, as checkpoints have it.
+        return replace(report, step=(step + 1) * shards.ranks - 1, before=before, dropped_nonfinite=dropped)
 
 
 def _decide(
@@ -491,7 +493,7 @@ def whole_state(state: Mapping[str, Any], shards: Shards, names: Iterable[str]) 
     def gathered(value: Any) -> Any:
         return shards.gather(value, host=True) if _per_primitive(value, n) else value
 
-    made = _map_state(state, names, gathered, 1 / shards.ranks)
+    made = _map_state(state, names, gathered, Fraction(1, shards.ranks))
     return made if shards.rank == 0 else None
 
 
@@ -509,20 +511,29 @@ def state_of_rank(loaded: Mapping[str, Any], rank: int, ranks: int, names: Itera
     def part(value: Any) -> Any:
         return value[start:end].clone() if _per_primitive(value, n) else value
 
-    return _map_state(loaded, names, part, ranks)
+    return _map_state(loaded, names, part, Fraction(ranks))
 
 
 def _map_state(
-    state: Mapping[str, Any], names: Iterable[str], change: Callable[[Any], Any], factor: float
+    state: Mapping[str, Any], names: Iterable[str], change: Callable[[Any], Any], factor: Fraction
 ) -> dict[str, Any]:
-    """A checkpoint with every per-primitive tensor changed, and rates scaled for batches larger by a factor.
+    """A checkpoint with every per-primitive tensor changed, and rates and steps as of batches larger by a factor.
 
     The entries are gone through in an order that all ranks share.
     """
+
+    def after(step: int) -> int:  # the last step of as many pictures; -1, before the first, stays
+        return math.floor((step + 1) / factor) - 1
+
     pipeline = {key: change(value) if key.startswith(_FIELD) else value for key, value in state["pipeline"].items()}
     if _EXTRA in pipeline:
         extra = pipeline[_EXTRA]
-        pipeline[_EXTRA] = {**extra, "strategy": {key: change(value) for key, value in extra["strategy"].items()}}
+        pipeline[_EXTRA] = {
+            **extra,
+            "step": after(extra["step"]),
+            "strategy": {key: change(value) for key, value in extra["strategy"].items()},
+            "pruning": {**extra["pruning"], "pruned_at": after(extra["pruning"]["pruned_at"])},
+        }
     optimizers, field = {}, set(names)
     for name, held in state["optimizers"].items():
         moments = held["state"]
@@ -531,13 +542,19 @@ def _map_state(
                 key: {kind: value if kind == "step" else change(value) for kind, value in entries.items()}
                 for key, entries in moments.items()
             }
-        groups = [{**group, **_scaled_group(group, factor)} for group in held["param_groups"]]
+        groups = [{**group, **_scaled_group(group, float(factor))} for group in held["param_groups"]]
         optimizers[name] = {"state": moments, "param_groups": groups}
     schedulers = {}
     for name, held in state.get("schedulers", {}).items():
-        rates = {key: [rate * factor**0.5 for rate in held[key]] for key in ("base_lrs", "_last_lr") if key in held}
-        schedulers[name] = {**held, **rates}
-    return {**state, "pipeline": pipeline, "optimizers": optimizers, "schedulers": schedulers}
+        rates = {key: [rate * float(factor) ** 0.5 for rate in held[key]] for key in ("base_lrs", "_last_lr")}
+        decays = []
+        for decay in held["lr_lambdas"]:
+            spans = {key: round(decay[key] / factor) for key in ("max_steps", "warmup_steps")}
+            pruned_at = decay["pruned_at"]
+            decays.append({**decay, **spans, "pruned_at": None if pruned_at is None else after(pruned_at)})
+        schedulers[name] = {**held, **rates, "lr_lambdas": decays, "last_epoch": round(held["last_epoch"] / factor)}
+    parts = {"pipeline": pipeline, "optimizers": optimizers, "schedulers": schedulers}
+    return {**state, "step": after(state["step"]), **parts}
 
 
 # ------------------------------------------------------------------------------------------------------- start and end
@@ -611,7 +628,7 @@ def take_shard(model: SundaeModel, seed: int) -> Shards:
 
 
 def shorten(config: Any, ranks: int) -> Any:
-    """A copy of a configuration whose steps are divided by ``ranks``: as many pictures as before, in larger batches.
+    """A copy of a configuration whose steps are divided by ``ranks``: as many pictures, in larger batches.
 
     Args:
         config: ``SundaeTrainerConfig``.

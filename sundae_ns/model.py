@@ -338,6 +338,10 @@ class SundaeModel(SplatfactoModel):
         """Be one of the ranks that hold the field together, each its block of primitives."""
         self.shards = shards
         self.policy = GlobalPruning(make_policy(self.config.pruning), shards)
+        if isinstance(self.strategy, CappedStrategy):
+            # Opacities are reset, and then each picture is seen once before anything grows or goes.
+            pictures = -(-self.num_train_data // shards.ranks)
+            self.strategy.pause_refine_after_reset = pictures + self.config.refine_every
 
     def arrivals(self, params: Mapping[str, Tensor], view: View, *, features: bool = False) -> Arrived:
         """What this process needs to draw its view, from all ranks; each has to ask, see :mod:`sundae_ns.distributed`."""

@@ -71,6 +71,7 @@ class SundaeTrainer(Trainer):
     def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         if world_size > 1:
             distributed.check_options(config)
+            config = distributed.shorten(config, world_size)
             config.vis = distributed.without_viewer(config.vis)  # type: ignore[assignment]
             CONSOLE.quiet = local_rank != 0
             if config.machine.device_type == "cuda":
@@ -78,6 +79,9 @@ class SundaeTrainer(Trainer):
         # A world of one to nerfstudio, whose pipeline would wrap the model in DDP: that breaks when primitives come and go.
         super().__init__(config, local_rank, world_size=1)
         self.ranks = world_size
+        if world_size > 1:
+            with _named(f"cannot make the run's folder {self.base_dir}"):
+                self.base_dir.mkdir(parents=True, exist_ok=True)  # nerfstudio's own way fails where two make it at once
 
     @property
     def shards(self) -> distributed.Shards | None:
@@ -123,7 +127,6 @@ class SundaeTrainer(Trainer):
         Raises:
             StorageError: no room or no right to write; what was there before is whole.
         """
-        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
         shards, model = self.shards, self.pipeline.model
         if shards is not None:
             shards.agree_on_focal(model)
@@ -138,6 +141,7 @@ class SundaeTrainer(Trainer):
         state = own if shards is None else distributed.whole_state(own, shards, list(model.gauss_params))
         if state is None:
             return
+        path = self.checkpoint_dir / f"step-{state['step']:09d}.ckpt"
         checkpoint.save(state, path)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("*.ckpt"):

@@ -233,6 +233,7 @@ def check_pruning(shards: Shards, **options: Any) -> None:
     assert report is not None
     assert expected is not None
     assert (report.before, report.after, report.dropped_nonfinite) == (200, round(0.3 * 199), 1)
+    assert report.step == 2 * RANKS + 1
     assert (report.tau, report.sigma, report.peak) == (expected.tau, expected.sigma, expected.peak)
     assert state == own_state
     assert sum(shards.counts) == report.after
@@ -266,11 +267,13 @@ def check_averages(shards: Shards) -> None:
 # ----------------------------------------------------------------------------------------------------------- training
 
 
-SAVED_AT, STEPS, KEEP, PRUNE_AT = 13, 20, 0.4, 16
+STEPS, KEEP, PRUNE_AT, SAVE_EVERY = 40, 0.4, 32, 26
+SAVED_AT = SAVE_EVERY + RANKS - 1
+"""Two ranks save after batch 13, which is the last that sees picture 27."""
 
 
 def configured(folder: Path, name: str) -> SundaeTrainerConfig:
-    """A short run on a small scene: it densifies at step 12, prunes at 16, and then the head takes part."""
+    """A short run on a small scene: it densifies at picture 24, prunes at 32, and then the head takes part."""
     import copy
 
     config = copy.deepcopy(sundae_tiny.config)
@@ -278,7 +281,7 @@ def configured(folder: Path, name: str) -> SundaeTrainerConfig:
     config.machine.device_type = "cpu"
     config.machine.num_devices = RANKS
     config.output_dir, config.experiment_name, config.timestamp = folder, name, "now"
-    config.max_num_iterations, config.steps_per_save, config.steps_per_eval_image = STEPS, SAVED_AT, 5
+    config.max_num_iterations, config.steps_per_save, config.steps_per_eval_image = STEPS, SAVE_EVERY, 10
     config.save_only_latest_checkpoint = False
     config.vis = "tensorboard"
     config.viewer.quit_on_train_completion = True
@@ -286,8 +289,8 @@ def configured(folder: Path, name: str) -> SundaeTrainerConfig:
     model: Any = config.pipeline.model
     model.rasterizer = "reference"
     model.pruning.prune_at, model.pruning.keep_ratio = PRUNE_AT, KEEP
-    model.warmup_length, model.refine_every, model.stop_split_at = 2, 3, PRUNE_AT
-    model.densify_grad_thresh, model.reset_alpha_every, model.sh_degree_interval = 0.003, 100, 4
+    model.warmup_length, model.refine_every, model.stop_split_at = 4, 6, PRUNE_AT
+    model.densify_grad_thresh, model.reset_alpha_every, model.sh_degree_interval = 0.003, 100, 8
     return config
 
 
@@ -359,7 +362,7 @@ class DyingTrainer(SundaeTrainer):
     """Killed at a step, as by the system where memory is short."""
 
     def train_iteration(self, step: int) -> Any:
-        if step == SAVED_AT + 2 and dist.get_rank() == 1:
+        if step == (SAVED_AT + 1) // RANKS + 2 and dist.get_rank() == 1:
             os.kill(os.getpid(), signal.SIGKILL)
         return super().train_iteration(step)
 
@@ -440,7 +443,7 @@ def models(folder: Path, name: str) -> Path:
 
 def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
     (report,) = json.loads((models(folder, "train").parent / "prune.json").read_text())
-    assert report["step"] == PRUNE_AT
+    assert report["step"] == PRUNE_AT + RANKS - 1
     assert report["after"] == round(KEEP * report["before"])
     assert report["before"] > 150, "densification added nothing"
     before, after = (
@@ -455,13 +458,20 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
     group = after["optimizers"]["opacities"]["param_groups"][0]
     assert group["lr"] == pytest.approx(0.05, rel=1e-12)
     assert tuple(group["betas"]) == (0.9, 0.999)
-    assert after["pipeline"]["_model._extra_state"]["trained_focal"] is not None
+    extra = after["pipeline"]["_model._extra_state"]
+    assert extra["trained_focal"] is not None
+    assert (after["step"], extra["step"], extra["pruning"]["pruned_at"]) == (STEPS - 1, STEPS - 1, report["step"])
+    schedule = after["schedulers"]["means"]
+    assert schedule["last_epoch"] == STEPS
+    assert schedule["base_lrs"] == pytest.approx([1.6e-4])
+    assert schedule["lr_lambdas"][0]["max_steps"] == sundae_tiny.config.optimizers["means"]["scheduler"].max_steps
+    assert schedule["lr_lambdas"][0]["pruned_at"] == report["step"]
 
 
 def test_the_prune_is_that_of_one_process(folder: Path) -> None:
     """From the same field, views and all: the same primitives stay, with the same values."""
     one = train(frozen(folder, "one"), 0, 1)
-    two = checkpoint.load(models(folder, "two") / "step-000000000.ckpt")["pipeline"]
+    two = checkpoint.load(models(folder, "two") / "step-000000001.ckpt")["pipeline"]
     for name, value in one.pipeline.model.gauss_params.items():
         # Weights of a view are sums over fewer rows here, so that what a merge makes of them differs by rounding.
         torch.testing.assert_close(value.detach(), two[f"_model.gauss_params.{name}"], rtol=1e-5, atol=1e-6)
@@ -480,6 +490,8 @@ def test_a_checkpoint_loads_on_another_number_of_ranks(folder: Path, ranks: int)
     group, whole = (x["optimizers"]["means"]["param_groups"][0] for x in (parts[0], loaded))
     assert group["lr"] == pytest.approx(whole["lr"] * ranks**0.5)
     assert group["betas"] == pytest.approx([beta**ranks for beta in whole["betas"]])
+    assert parts[0]["step"] == (SAVED_AT + 1) // ranks - 1
+    assert parts[0]["schedulers"]["means"]["last_epoch"] == round((SAVED_AT + 1) / ranks)
 
 
 def test_one_process_goes_on_where_two_have_stopped(folder: Path) -> None:
@@ -490,6 +502,7 @@ def test_one_process_goes_on_where_two_have_stopped(folder: Path) -> None:
     assert trainer.optimizers.optimizers["opacities"].param_groups[0]["lr"] == pytest.approx(0.05)
     (report,) = json.loads((models(folder, "alone").parent / "prune.json").read_text())
     assert (report["step"], report["after"]) == (PRUNE_AT, round(KEEP * report["before"]))
+    assert trainer.optimizers.schedulers["means"].last_epoch == trainer.step + 1
 
 
 def test_a_killed_rank_ends_all_with_one_line(folder: Path) -> None:
@@ -552,7 +565,7 @@ def test_shorter_runs_see_as_many_pictures(tmp_path: Path) -> None:
     short = distributed.shorten(config, 2)
     assert (short.max_num_iterations, config.max_num_iterations) == (STEPS // 2, STEPS)
     assert short.pipeline.model.pruning.prune_at == PRUNE_AT // 2
-    assert short.pipeline.model.refine_every == 2
+    assert short.pipeline.model.refine_every == 3
     full = config.optimizers["means"]["scheduler"].max_steps
     assert short.optimizers["means"]["scheduler"].max_steps == full // 2
 
