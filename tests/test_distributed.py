@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -162,6 +163,52 @@ def check_looking_away(shards: Shards) -> None:
     start, end = distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2]
     for name in NAMES:
         torch.testing.assert_close(params[name].grad, whole[name].grad[start:end], rtol=1e-10, atol=1e-14)
+
+
+class Tripling:
+    """A strategy that grows the shard of rank 1 alone, and puts a mark on what it has counted."""
+
+    refine_every = 10
+
+    def step_post_backward(self, params: Any, optimizers: Any, state: Any, step: int, info: Any, packed: bool) -> None:
+        assert packed
+        assert info["means2d"].absgrad is not None
+        if dist.get_rank() != 1:
+            return
+        for name in list(params):
+            params[name] = Parameter(params[name].detach().repeat_interleave(3, dim=0))
+            optimizers[name].param_groups[0]["params"] = [params[name]]
+        state["count"] = state["count"].repeat_interleave(3)
+        state["peak"] = len(params["means"]) + 5  # before it culled
+
+
+def check_drift(shards: Shards) -> None:
+    """Shards that have drifted apart are levelled after a round of densification, in order; the peak is that of all."""
+    start, end = ((0, 60), (60, 90))[shards.rank]
+    params = shard_of(a_field(), start, end)
+    shards.recount(params)
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
+    arrived = shards.arrivals(params, a_view(shards.rank), colors_of, near_plane=0.01, features=True)
+    splat = draw(arrived, arrived["colors"], a_view(shards.rank))
+    splat.info["means2d"].retain_grad()
+    loss_of(splat, shards.rank).backward()
+    model: Any = SimpleNamespace(
+        strategy=Tripling(),
+        strategy_state={"count": torch.arange(start, end), "peak": 100},
+        config=SimpleNamespace(use_absgrad=True),
+        info={**splat.info, "route": arrived.route},
+        gaussians=params,
+        gauss_params=params,
+        optimizers=optimizers,
+        schedule_step=20,
+    )
+    shards.densify(model)
+    assert shards.counts == [75, 75]
+    assert model.strategy_state["peak"] == 60 + 90 + 5
+    every = torch.cat([torch.arange(60), torch.arange(60, 90).repeat_interleave(3)])
+    own = every[75 * shards.rank : 75 * shards.rank + 75]
+    assert torch.equal(model.strategy_state["count"], own)
+    assert torch.equal(params["means"], a_field()["means"][own])
 
 
 def adams(params: dict[str, Parameter], start: int) -> dict[str, torch.optim.Optimizer]:
@@ -344,6 +391,7 @@ CHECKS: tuple[Callable[..., None], ...] = (
     check_drawing,
     check_looking_away,
     check_levelling,
+    check_drift,
     check_pruning,
     partial(check_pruning, redistribution="none", score="response-contribution", selection="top"),
     check_refusal,
@@ -511,6 +559,39 @@ def test_a_killed_rank_ends_all_with_one_line(folder: Path) -> None:
     line = (folder / "died.txt").read_text()
     assert re.fullmatch(r"rank 1 has ended \(killed by SIGKILL\).*--load-dir.*--machine\.num-devices", line)
     assert not (models(folder, "dies") / f"step-{SAVED_AT + STEPS:09d}.ckpt").exists()
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+def test_ns_train_on_two_gpus(tmp_path: Path) -> None:
+    """The command of users; the run opens on one GPU as any other."""
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    write_scene(tmp_path / "scene", train_views=12, test_views=3, width=64, height=48, points=300)
+    options = {
+        "machine.num-devices": 2,
+        "data": tmp_path / "scene",
+        "output-dir": tmp_path,
+        "experiment-name": "gpus",
+        "timestamp": "now",
+        "max-num-iterations": 240,
+        "pipeline.model.pruning.prune-at": 120,
+        "pipeline.model.pruning.keep-ratio": KEEP,
+        "pipeline.model.warmup-length": 10,
+        "pipeline.model.refine-every": 30,
+        "viewer.quit-on-train-completion": True,
+    }
+    words = [str(word) for name, value in options.items() for word in (f"--{name}", value)]
+    program = Path(sys.executable).with_name("ns-train")
+    subprocess.run([str(program), "sundae-tiny", *words], timeout=2 * LIMIT, check=True)
+    run = tmp_path / "gpus" / "sundae-tiny" / "now"
+    (report,) = json.loads((run / "prune.json").read_text())
+    assert report["after"] == round(KEEP * report["before"])
+    _, pipeline, _, step = eval_setup(run / "config.yml", test_mode="test")
+    assert step == 239
+    assert pipeline.model.num_points == report["after"]
+    # 16 dB is far above a field that has not learned, and far below one that has.
+    assert pipeline.get_average_eval_image_metrics()["psnr"] > 16
 
 
 def test_an_error_of_ours_in_a_rank_is_said_as_it_is() -> None:
