@@ -165,6 +165,29 @@ def check_looking_away(shards: Shards) -> None:
         torch.testing.assert_close(params[name].grad, whole[name].grad[start:end], rtol=1e-10, atol=1e-14)
 
 
+def check_an_empty_shard(shards: Shards) -> None:
+    """Fewer primitives than ranks: who holds none still draws what the other holds, and takes a step."""
+    params = shard_of(a_field(), *distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2])
+    optimizers = adams(params, 0)
+    every = torch.zeros(90, dtype=torch.bool)
+    seen = int(draw(a_field(), colors_of(a_field(), a_view(0)), a_view(0)).radii.argmax())
+    every[seen] = True
+    shards.level(params, optimizers, [], every[45 * shards.rank : 45 * shards.rank + 45])
+    assert shards.counts == [0, 1]
+    arrived = shards.arrivals(params, a_view(0), colors_of, near_plane=0.01, features=True)
+    splat = draw(arrived, arrived["colors"], a_view(0))
+    alone = shard_of(a_field(), seen, seen + 1)
+    expected = draw(alone, colors_of(alone, a_view(0)), a_view(0))
+    torch.testing.assert_close(splat.colors, expected.colors)
+    loss_of(splat, 0).backward()
+    loss_of(expected, 0).backward()
+    for name, value in params.items():
+        if shards.rank == 1:  # both ranks have the same picture, so the mean is that of one
+            torch.testing.assert_close(value.grad, alone[name].grad, rtol=1e-10, atol=1e-14)
+        optimizers[name].step()
+        assert len(value) == shards.counts[shards.rank]
+
+
 class Tripling:
     """A strategy that grows the shard of rank 1 alone, and puts a mark on what it has counted."""
 
@@ -391,6 +414,7 @@ CHECKS: tuple[Callable[..., None], ...] = (
     check_drawing,
     check_looking_away,
     check_levelling,
+    check_an_empty_shard,
     check_drift,
     check_pruning,
     partial(check_pruning, redistribution="none", score="response-contribution", selection="top"),
@@ -601,6 +625,21 @@ def test_an_error_of_ours_in_a_rank_is_said_as_it_is() -> None:
     text = "\n\n-- Process 1 terminated with the following error:\nTraceback ...\nsundae_ns.errors.DataError: cause; mend\n"
     assert str(rank_ended(Raised(text))) == "rank 1: cause; mend"
     assert "rank 1 has ended (ValueError: odd)" in str(rank_ended(Raised("Traceback ...\nValueError: odd")))
+
+
+def test_nerfstudios_command_ends_with_one_line() -> None:
+    code = """
+import sys
+sys.argv = ["/usr/bin/ns-train"]
+from torch.multiprocessing.spawn import ProcessExitedException
+from sundae_ns.errors import show_in_one_line
+show_in_one_line()
+raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -9, "SIGKILL")
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT, check=False)
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("sundae: rank 1 has ended (killed by SIGKILL)")
 
 
 @pytest.mark.parametrize(("total", "ranks"), [(10, 3), (2, 4), (0, 2), (9, 1)])
