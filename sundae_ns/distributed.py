@@ -504,7 +504,12 @@ def state_of_rank(loaded: Mapping[str, Any], rank: int, ranks: int, names: Itera
         loaded: the checkpoint.
         rank, ranks: whose part, of how many.
         names: parameters of the field.
+
+    Returns:
+        The part; the checkpoint as it is if it is another method's, which loading then says.
     """
+    if not isinstance(loaded["pipeline"].get(_EXTRA), Mapping):
+        return dict(loaded)
     n = len(loaded["pipeline"][_FIELD + "means"])
     start, end = bounds(n, ranks)[rank : rank + 2]
 

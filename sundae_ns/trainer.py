@@ -67,6 +67,8 @@ class SundaeTrainer(Trainer):
     """Saves atomically, resumes from the newest whole checkpoint, and takes random numbers up where they were left."""
 
     config: SundaeTrainerConfig
+    shards: distributed.Shards | None = None
+    """The ranks that train together; None where there is one."""
 
     def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         if world_size > 1:
@@ -83,18 +85,14 @@ class SundaeTrainer(Trainer):
             with _named(f"cannot make the run's folder {self.base_dir}"):
                 self.base_dir.mkdir(parents=True, exist_ok=True)  # nerfstudio's own way fails where two make it at once
 
-    @property
-    def shards(self) -> distributed.Shards | None:
-        """The ranks that train together; None where there is one."""
-        return self.pipeline.model.shards
-
     def setup_optimizers(self) -> Optimizers:
         """Optimizers of what this process holds, for batches of as many pictures as there are ranks."""
         if self.ranks == 1:
             return super().setup_optimizers()
         model, datamanager = self.pipeline.model, cast(SundaeDatamanager, self.pipeline.datamanager)
-        model.share(distributed.take_shard(model, self.config.machine.seed))
-        datamanager.place = (model.shards.rank, self.ranks)
+        self.shards = distributed.take_shard(model, self.config.machine.seed)
+        model.share(self.shards)
+        datamanager.place = (self.shards.rank, self.ranks)
         optimizers = distributed.SharedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
         distributed.scale_rates(optimizers, self.ranks)
         return optimizers
@@ -127,9 +125,8 @@ class SundaeTrainer(Trainer):
         Raises:
             StorageError: no room or no right to write; what was there before is whole.
         """
-        shards, model = self.shards, self.pipeline.model
-        if shards is not None:
-            shards.agree_on_focal(model)
+        if self.shards is not None:
+            self.shards.agree_on_focal(self.pipeline.model)
         own = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
@@ -138,7 +135,9 @@ class SundaeTrainer(Trainer):
             "scalers": self.grad_scaler.state_dict(),
             "random": checkpoint.random_state(),
         }
-        state = own if shards is None else distributed.whole_state(own, shards, list(model.gauss_params))
+        state: dict[str, Any] | None = own
+        if self.shards is not None:
+            state = distributed.whole_state(own, self.shards, list(self.pipeline.model.gauss_params))
         if state is None:
             return
         path = self.checkpoint_dir / f"step-{state['step']:09d}.ckpt"

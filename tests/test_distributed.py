@@ -566,6 +566,12 @@ def test_a_checkpoint_loads_on_another_number_of_ranks(folder: Path, ranks: int)
     assert parts[0]["schedulers"]["means"]["last_epoch"] == round((SAVED_AT + 1) / ranks)
 
 
+def test_a_checkpoint_of_another_method_is_left_to_the_loader() -> None:
+    """Which names the method and the option; the ranks' own part of it would fail on the first missing key."""
+    loaded = {"step": 3, "pipeline": {"_model.gauss_params.means": torch.zeros(4, 3)}, "optimizers": {}}
+    assert distributed.state_of_rank(loaded, 1, 2, NAMES) == loaded
+
+
 def test_one_process_goes_on_where_two_have_stopped(folder: Path) -> None:
     config = configured(folder, "alone")
     config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
