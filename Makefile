@@ -1,10 +1,11 @@
 # make demo: install, then train and evaluate the embedded scene.   make test: install if need be, then every check.
+# make browser: the viewer in a headless Chromium (apt-get install chromium), which wants a quiet machine.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test install clean
+.PHONY: demo test browser install clean
 
 install: $(INSTALLED)
 
@@ -21,7 +22,10 @@ test: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -m "not browser"
+
+browser: $(INSTALLED)
+	$(BIN)/python -m pytest -q -m browser
 
 clean:
 	rm -rf $(VENV) .demo build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,53 +1,133 @@
-"""Print the measured runs as Markdown tables: python benchmarks/tables.py [results/runs.csv].
+"""The measured runs as Markdown tables.
 
-Branches, whose frames nobody timed, are left out: ``rules_report.py`` shows them.
+    python benchmarks/tables.py [results/runs.csv]     # prints all rows, a table for each scene
+    python benchmarks/tables.py --readme               # writes README's table anew, between its markers
+
+tests/test_readme.py checks that README's table is what this makes of runs.csv and, for packed scenes, of pack.jsonl. Branches,
+whose frames nobody timed, are not printed: ``rules_report.py`` shows them.
 """
 
 from __future__ import annotations
 
-import csv
-import sys
+import argparse
+import json
+from dataclasses import dataclass
 from pathlib import Path
 
-RUNS = Path(__file__).parent / "results" / "runs.csv"
-COLUMNS = (
-    ("method", "method", "{}"),
-    ("variant", "variant", "{}"),
-    ("keep", "keep_ratio", "{:.0%}"),
-    ("primitives", "primitives", "{:,.0f}"),
-    ("PSNR", "psnr", "{:.2f}"),
-    ("SSIM", "ssim", "{:.4f}"),
-    ("PSNR, head off", "psnr_base", "{:.2f}"),
-    ("MB", "bytes_total", "{:.1f}"),
-    ("ms a frame", "ms_frame", "{:.2f}"),
-    ("train s", "train_s", "{:.0f}"),
-    ("prune s", "prune_s", "{:.1f}"),
-    ("peak primitives", "peak_primitives", "{:,.0f}"),
-    ("peak MiB", "peak_vram_mib", "{:,.0f}"),
-    ("commit", "commit", "{}"),
+from sundae_ns.evaluation import RunRow, read_rows
+from sundae_ns.evaluation.document import number, table
+
+ROOT = Path(__file__).parents[1]
+RUNS = ROOT / "benchmarks" / "results" / "runs.csv"
+PACKS = ROOT / "benchmarks" / "results" / "pack.jsonl"
+README = ROOT / "README.md"
+BEGIN = "<!-- made by: python benchmarks/tables.py --readme -->"
+END = "<!-- end of what is made -->"
+MB = 1e6
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A line of README's table: which row of runs.csv, and what it is called there."""
+
+    scene: str
+    method: str
+    variant: str
+    commit: str
+    label: str
+    timed: bool = True
+    """Whether the run had the machine for itself, so that its times say something."""
+    packed: str = ""
+    """Name in pack.jsonl, where a line for the packed run is to follow."""
+
+
+SHOWN = (
+    Shown("bonsai", "splatfacto", "default", "5e4bc58", "splatfacto"),
+    Shown("bonsai", "sundae", "default", "5e4bc58", "sundae"),
+    Shown("bonsai", "sundae", "no-head-branch", "5e4bc58", "the same field, no head", timed=False),
+    Shown("bonsai", "sundae", "band-positions", "2e7bd23", "the paper's band rule (H200, older head)"),
+    Shown("fox", "splatfacto", "default", "5e4bc58", "splatfacto"),
+    Shown("fox", "sundae", "default", "ef71d9f", "sundae", packed="fox, 30,000 steps"),
+    Shown("fox", "sundae", "no-head-branch", "ef71d9f", "the same field, no head", timed=False),
 )
 
 
-def cell(row: dict[str, str], column: str, form: str) -> str:
-    value = row[column]
-    if form == "{}" or not value:
-        return value
-    number = float(value) / (1e6 if column == "bytes_total" else 1)
-    return form.format(number)
+def readme_table(rows: list[RunRow]) -> str:
+    """README's table, of the rows that it shows."""
+    lines, scene = [], ""
+    for shown in SHOWN:
+        key = (shown.scene, shown.method, shown.variant, shown.commit)
+        (row,) = [row for row in rows if (row.scene, row.method, row.variant, row.commit) == key]
+        first = "" if shown.scene == scene else f"{row.scene}, {row.resolution.replace('x', ' x ')}"
+        scene = shown.scene
+        lines.append(
+            [
+                first,
+                shown.label,
+                number(row.primitives, 0),
+                *(number(row.psnr, 2), number(row.ssim, 4), number(row.psnr_base, 2)),
+                number(row.bytes_total / MB, 1),
+                number(row.ms_frame, 2) if shown.timed else "",
+                f"{number(row.train_s, 0)} s" if shown.timed else "",
+            ]
+        )
+        if shown.packed:
+            lines.append(packed_line(shown.packed))
+    heads = ["scene", "method", "primitives", "PSNR", "SSIM", "PSNR, head off", "MB", "ms a frame", "training"]
+    return "\n".join(table(heads, lines))
+
+
+def packed_line(run: str) -> list[str]:
+    """README's line of a run packed with the default options, whose last measurement counts."""
+    measured = [json.loads(line) for line in PACKS.read_text(encoding="utf-8").splitlines()]
+    *_, found = (line for line in measured if line["run"] == run and not line["set"])
+    quality = (number(found["psnr_packed"], 2), "", number(found["psnr_packed_base"], 2))
+    size = number(found["bytes"] / MB, 1)
+    return ["", "the same, packed", number(found["primitives"], 0), *quality, size, "", ""]
+
+
+def with_table(text: str, rows: list[RunRow]) -> str:
+    """README with its table made anew."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    if not after:
+        raise SystemExit(f"README has no markers; put these lines around its table: {BEGIN} and {END}")
+    return f"{before}{BEGIN}\n{readme_table(rows)}\n{END}{after}"
+
+
+def scene_tables(rows: list[RunRow]) -> str:
+    """All rows, a table for each scene."""
+    heads = ["method", "variant", "keep", "primitives", "PSNR", "SSIM", "PSNR, head off", "MB"]
+    heads += ["ms a frame", "train s", "prune s", "peak primitives", "peak MiB", "commit", "GPU"]
+    parts = []
+    for scene in dict.fromkeys(row.scene for row in rows):
+        own = [row for row in rows if row.scene == scene and row.ms_frame is not None]
+        lines = [
+            [
+                *(row.method, row.variant, "" if row.keep_ratio is None else f"{row.keep_ratio:.0%}"),
+                *(number(row.primitives, 0), number(row.psnr, 2), number(row.ssim, 4), number(row.psnr_base, 2)),
+                *(number(row.bytes_total / MB, 1), number(row.ms_frame, 2)),
+                *(number(row.train_s, 0), number(row.prune_s, 1)),
+                *(number(row.peak_primitives, 0), number(row.peak_vram_mib, 0)),
+                *(row.commit, row.gpu.replace("NVIDIA ", "")),
+            ]
+            for row in sorted(own, key=lambda row: (row.method, row.commit, row.variant))
+        ]
+        title = f"**{scene}**, {own[0].resolution} px, every 8th image for test"
+        parts += ["", title, "", *table(heads, lines)]
+    return "\n".join(parts)
 
 
 def main() -> None:
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else RUNS
-    with open(path, newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["ms_frame"]]
-    for scene in dict.fromkeys(row["scene"] for row in rows):
-        own = [row for row in rows if row["scene"] == scene]
-        print(f"\n**{scene}**, {own[0]['resolution']} px, every 8th image for test\n")
-        print("| " + " | ".join([title for title, _, _ in COLUMNS] + ["GPU"]) + " |")
-        print("|" + "---|" * (len(COLUMNS) + 1))
-        for row in sorted(own, key=lambda r: (r["method"], r["commit"], r["variant"])):
-            cells = [cell(row, column, form) for _, column, form in COLUMNS]
-            print("| " + " | ".join([*cells, row["gpu"].replace("NVIDIA ", "")]) + " |")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", type=Path, nargs="?", default=RUNS)
+    parser.add_argument("--readme", action="store_true", help="write README's table anew")
+    options = parser.parse_args()
+    rows = read_rows(options.runs)
+    if options.readme:
+        README.write_text(with_table(README.read_text(encoding="utf-8"), rows), encoding="utf-8")
+    else:
+        print(scene_tables(rows))
 
 
 if __name__ == "__main__":

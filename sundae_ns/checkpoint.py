@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, StorageError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, rgb_to_sh
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.ply import read_ply, sh_degree_of
 from sundae_ns.storage.point_cloud import is_nerfstudio_ply
@@ -248,8 +248,9 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         path: ``.ckpt`` file, a folder of them (the newest counts), or ``.ply`` file.
 
     Returns:
-        The parameters of ``gaussians.parameters`` without features, float32 on the CPU; and whether they are in the
-        coordinates of nerfstudio's model (checkpoints, ``ns-export``) rather than in those of the capture (other ``.ply``).
+        The parameters of ``gaussians.parameters`` without features, float32 on the CPU, colours as harmonics; and whether
+        they are in the coordinates of nerfstudio's model (checkpoints, ``ns-export``) rather than in those of the capture
+        (other ``.ply``).
 
     Raises:
         CheckpointError: there is no such file, or it holds no Gaussian field.
@@ -271,6 +272,9 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
     field = {name: state[key].float() for name, key in keys.items()}
     _check_field(field, path)
+    if field["features_rest"].shape[1] == 0:
+        # Of a model without harmonics these are logits of colours.
+        field["features_dc"] = rgb_to_sh(field["features_dc"].sigmoid())
     return field, True
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import os
+import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -19,8 +21,22 @@ from torch import Tensor
 from sundae_ns.compensation import resize
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
-from sundae_ns.evaluation import median_ms, psnr, ssim
+from sundae_ns.evaluation import (
+    HEAD_OFF,
+    HEAD_ON,
+    ComparisonRow,
+    Configuration,
+    Lpips,
+    Measured,
+    ViewQuality,
+    flip,
+    median_ms,
+    psnr,
+    ssim,
+)
+from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
+from sundae_ns.opening import Opened
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
 
 
@@ -39,12 +55,12 @@ class FrameTimes:
 
 @contextmanager
 def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
-    """Show pictures of ``model`` with the head, or without, as the viewer's check box does."""
-    before, model.compensate.value = model.compensate.value, on
+    """Give pictures of ``model`` the head's correction, or not, outside of a viewer, whose check box is its own."""
+    before, model.compensated = model.compensated, on
     try:
         yield
     finally:
-        model.compensate.value = before
+        model.compensated = before
 
 
 @torch.no_grad()
@@ -192,3 +208,115 @@ def _precision(model: SundaeModel, precision: str) -> Iterator[None]:
         yield
     finally:
         model.head.config = before
+
+
+@torch.no_grad()
+def measure_scene(
+    opened: Opened,
+    *,
+    label: str,
+    lpips: Lpips | None = None,
+    warmup: int = 3,
+    repeats: int = 5,
+    progress: Callable[[], object] | None = None,
+    command: str = "",
+) -> Measured:
+    """Evaluate and time a field on its test views, with the head and without.
+
+    What is timed is the very call whose picture is evaluated, view by view.
+
+    Args:
+        opened: the field.
+        label: its name in tables.
+        lpips: LPIPS; None leaves it out.
+        warmup: untimed renderings of each picture.
+        repeats: timed renderings of each picture; 0 leaves times out.
+        progress: called after each view.
+        command: the command to note as the origin of the figures.
+    """
+    model = opened.model
+    has_head = model.head is not None and model.head_active
+    ways = {HEAD_ON: True, HEAD_OFF: False} if has_head else {HEAD_OFF: False}
+    times: dict[str, list[float]] = {name: [] for name in (*ways, "head")}
+    views: dict[str, list[ViewQuality]] = {name: [] for name in ways}
+    for camera, truth in zip(opened.cameras, opened.truths, strict=True):
+        for name, on in ways.items():
+            with compensation(model, on):
+                picture = model.get_outputs_for_camera(camera)["rgb"]
+            views[name].append(quality(picture, truth, lpips))
+        if repeats:
+            found = frame_times(model, [camera], warmup=warmup, repeats=repeats)
+            for name, on in ways.items():
+                times[name].append(found.frame if on else found.splat)
+            times["head"].append(found.head)
+        if progress is not None:
+            progress()
+    stored = sizes(model)
+    bare = {name: value for name, value in model.gauss_params.items() if name != FEATURES}
+    needed = {HEAD_ON: stored.total, HEAD_OFF: bytes_of(bare)}
+    if opened.packed_bytes is not None:
+        # A packed file is read as a whole, whatever is shown of it.
+        stored, needed = Sizes(opened.packed_bytes), dict.fromkeys(needed, opened.packed_bytes)
+    return Measured(
+        label=label,
+        source=str(opened.source),
+        scene=opened.scene,
+        method=opened.method,
+        variant=opened.variant,
+        keep_ratio=opened.keep_ratio,
+        seed=opened.seed,
+        steps=opened.steps,
+        primitives=model.num_points,
+        bytes_primitives=stored.primitives,
+        bytes_head=stored.head,
+        resolution=_resolution(opened.cameras),
+        configurations=tuple(
+            Configuration(name, median(times[name]) if repeats else None, needed[name], tuple(views[name]))
+            for name in ways
+        ),
+        ms_head=median(times["head"]) if repeats else None,
+        lpips_net=lpips.net if lpips is not None else "",
+        prune_s=opened.prune_s,
+        peak_primitives=model.pruning_state["peak"] or None,
+        gpu=torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "",
+        commit=revision(),
+        command=command,
+    )
+
+
+def quality(picture: Tensor, truth: Tensor, lpips: Lpips | None = None) -> ViewQuality:
+    """Every metric of one picture ``[H, W, 3]`` against its truth."""
+    errors = (flip(picture, truth), None if lpips is None else lpips(picture, truth))
+    return ViewQuality(
+        float(psnr(picture, truth)), float(ssim(picture, truth)), *(None if e is None else float(e) for e in errors)
+    )
+
+
+@torch.no_grad()
+def pictures_of(opened: Opened, index: int) -> ComparisonRow:
+    """Truth, base colours and whole picture of one test view."""
+    outputs = opened.model.get_outputs_for_camera(opened.cameras[index])
+    return ComparisonRow(opened.truths[index], outputs["base_rgb"], outputs["rgb"])
+
+
+def revision() -> str:
+    """Commit of the checkout that runs, or what ``BENCHMARK_COMMIT`` says where the tree travelled without git; or empty."""
+    told = os.environ.get("BENCHMARK_COMMIT")
+    if told:
+        return told
+    folder = Path(__file__).parent
+    # An installed package may lie inside somebody else's repository, whose commit says nothing.
+    if not (folder.parent / ".git").exists():
+        return ""
+    command = ["git", "-C", str(folder), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def _resolution(cameras: Sequence[Cameras]) -> str:
+    """Width x height of the first camera; captures of several sizes say so."""
+    found = {(int(camera.width), int(camera.height)) for camera in cameras}
+    width, height = int(cameras[0].width), int(cameras[0].height)
+    return f"{width}x{height}" + (" and others" if len(found) > 1 else "")

@@ -36,6 +36,8 @@ from sundae_ns.distributed import Arrived, GlobalPruning, Shards
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, peak_memory, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
+from sundae_ns.gaussians.parameters import rgb_to_logit, sh_to_rgb
+from sundae_ns.preview import Preview, in_viewer
 from sundae_ns.pruning import (
     PruneReport,
     PruningConfig,
@@ -197,6 +199,9 @@ class SundaeModel(SplatfactoModel):
             torch.tensor([0.1490, 0.1647, 0.2157]) if random_background else get_color(config.background_color)
         )
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
+        self.compensated = True
+        """Whether pictures that nobody looks at in a viewer get the head's correction."""
+        self.preview = Preview()
         self._backend: Backend | None = None
         self._response: tuple[Any, Tensor | None] = (None, None)
         self.attached = False
@@ -208,13 +213,18 @@ class SundaeModel(SplatfactoModel):
 
     def _initial_field(self) -> dict[str, Tensor]:
         if self.config.warm_start is None:
-            return self._sparse_field()
-        try:
-            return self._warm_field(self.config.warm_start)
-        except CheckpointError as error:
-            # A finished run must open without what it once started from; training without it is refused.
-            self._warm_start_error = error
-            return self._sparse_field()
+            params = self._sparse_field()
+        else:
+            try:
+                params = self._warm_field(self.config.warm_start)
+            except CheckpointError as error:
+                # A finished run must open without what it once started from; training without it is refused.
+                self._warm_start_error = error
+                params = self._sparse_field()
+        if self.config.sh_degree == 0:
+            # splatfacto's models without harmonics, and nerfstudio's exporter, know colours by their logits.
+            params["features_dc"] = rgb_to_logit(sh_to_rgb(params["features_dc"]))
+        return params
 
     def _sparse_field(self) -> dict[str, Tensor]:
         config = self.config
@@ -544,10 +554,17 @@ class SundaeModel(SplatfactoModel):
             return {**outputs, "background": background, "window": window}
 
         mask = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
+        preview = self.preview.decision(self)
+        if preview is not None:
+            mask = preview.mask if mask is None else mask & preview.mask
         if mask is not None and not mask.any():
             return self.get_empty_outputs(view.width, view.height, background)
         params = self.gaussians if mask is None else {k: v[mask] for k, v in self.gaussians.items()}
-        outputs, splat = self.render(params, view, background, compensate=self.compensate.value)
+        if preview is not None and mask is not None and preview.values is not None:
+            rows = mask[preview.mask]
+            params = {**params, **{k: v[rows] for k, v in preview.values.items()}}
+        compensate = preview is None and (self.compensate.value if in_viewer() else self.compensated)
+        outputs, splat = self.render(params, view, background, compensate=compensate)
         field, features = dict(self.gaussians), outputs.pop("feature_image")
         later = {
             "depth": partial(display.fill_depth, outputs["depth"], splat.alpha),
@@ -746,13 +763,17 @@ class SundaeModel(SplatfactoModel):
         write_text(path, json.dumps(reports, indent=2))
 
     @torch.no_grad()
-    def contribution(self, datamanager: SundaeDatamanager) -> Tensor:
+    def contribution(self, datamanager: SundaeDatamanager, pruning: PruningConfig | None = None) -> Tensor:
         """Blending weight of each primitive, summed over the pixels of all training views ``[N]``.
 
         Where the score asks for it, pixels count by the detail of the rendering, for as many cells as primitives seen in it
         are going to be kept.
+
+        Args:
+            datamanager: has the training views.
+            pruning: options of the prune, if they are not those of the model.
         """
-        pruning = self.config.pruning
+        pruning = pruning or self.config.pruning
         share = pruning.share(self.total_points) if pruning.uses_detail else None
         cameras = list(datamanager.training_cameras())
         if self.shards is not None:

@@ -228,12 +228,10 @@ def test_without_the_head_the_picture_is_the_base_exactly() -> None:
     model = perturb(build()).eval()
     on = model.get_outputs_for_camera(camera())
     assert (on["rgb"] - on["base_rgb"]).abs().max() > 1e-3
-    model.compensate.value = False
-    off = model.get_outputs_for_camera(camera())
+    off, _ = model.render(model.gaussians, model.view_of(camera()), on["background"], compensate=False)
     assert torch.equal(off["rgb"], off["base_rgb"])
     # With features in the same pass the sums are taken in another order.
     torch.testing.assert_close(off["base_rgb"], on["base_rgb"], atol=1e-6, rtol=0)
-    model.compensate.value = True
     model.step = 3
     before = model.get_outputs_for_camera(camera())
     assert torch.equal(before["rgb"], before["base_rgb"])
@@ -706,6 +704,21 @@ def test_a_finished_run_opens_without_what_it_started_from(tmp_path: Path) -> No
     orphan.load_state_dict(state)
     assert torch.equal(orphan.means, state["gauss_params.means"])
     Training(orphan)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_colours_are_those_of_the_cloud_and_of_the_warm_start(tmp_path: Path, degree: int) -> None:
+    xyz, rgb = points()
+    model = build(sh_degree=degree, seed_points=(xyz, rgb))
+    shown = model._colors(model.gaussians, model.view_of(camera())).detach()
+    torch.testing.assert_close(shown, rgb / 255, rtol=0, atol=2e-3)
+    torch.save(
+        {"pipeline": {f"_model.{k}": v for k, v in model.state_dict().items()}}, tmp_path / "step-000000001.ckpt"
+    )
+    for wanted in (0, 1):
+        warm = build(sh_degree=wanted, warm_start=tmp_path / "step-000000001.ckpt")
+        again = warm._colors(warm.gaussians, warm.view_of(camera())).detach()
+        torch.testing.assert_close(again, shown, rtol=0, atol=2e-3)
 
 
 def test_a_warm_start_trains_at_full_resolution(tmp_path: Path) -> None:

@@ -3,56 +3,28 @@
 from __future__ import annotations
 
 import json
-import os
-import re
-import subprocess
 import sys
-from collections import deque
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import Any
 
 import torch
 from PIL import Image
 from rich.console import Console
 from rich.progress import Progress
 
+from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.data import write_scene
-from sundae_ns.errors import SundaeError
 from sundae_ns.evaluation import ComparisonRow, Quality, RunFigures, report_text, save_comparison
 
 METHOD = "sundae-tiny"
 SHOWN = 3
 """Test views in the picture."""
-_PERCENT = re.compile(r"^\s*\d+ \(([\d.]+)%\)")
 
 
 def _command(name: str) -> str:
     """A console script beside this interpreter, so that the demo runs what is installed with it."""
     path = Path(sys.executable).parent / name
     return str(path) if path.exists() else name
-
-
-def _run(arguments: list[str], log: Path, on_line: Any = None) -> None:
-    """Run a command with its output in ``log``; on failure, show the end of it."""
-    environment = {**os.environ, "COLUMNS": "160"}
-    last: deque[str] = deque(maxlen=12)
-    with open(log, "w") as file:
-        process = subprocess.Popen(
-            arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment, errors="replace"
-        )
-        assert process.stdout is not None
-        for line in process.stdout:
-            file.write(line)
-            last.append(line.rstrip())
-            if on_line is not None:
-                on_line(line)
-        code = process.wait()
-    if code != 0:
-        tail = "\n".join(last)
-        raise SundaeError(
-            f"{Path(arguments[0]).name} failed with {code}; its whole output is in {log}, it ended so:\n{tail}"
-        )
 
 
 def _picture(path: Path) -> torch.Tensor:
@@ -99,9 +71,9 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         training = progress.add_task(f"ns-train {METHOD}", total=100)
 
         def show(line: str) -> None:
-            found = _PERCENT.match(line)
-            if found:
-                progress.update(training, completed=float(found[1]))
+            percent = percent_of(line)
+            if percent is not None:
+                progress.update(training, completed=percent)
 
         train = [_command("ns-train"), METHOD, "--data", str(scene), "--output-dir", str(out / "runs")]
         train += ["--experiment-name", "demo", "--timestamp", "run"]
@@ -109,7 +81,7 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
             train += ["--max-num-iterations", str(steps)]
         # An earlier demo's prunes are not this one's.
         (run / "prune.json").unlink(missing_ok=True)
-        _run(train, out / "train.log", show)
+        run_logged(train, out / "train.log", show)
         progress.update(training, completed=100)
         progress.add_task("ns-eval", total=None)
         evaluate = [
@@ -119,7 +91,7 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
             "--output-path",
             str(out / "eval.json"),
         ]
-        _run([*evaluate, "--render-output-path", str(out / "renders")], out / "eval.log")
+        run_logged([*evaluate, "--render-output-path", str(out / "renders")], out / "eval.log")
         progress.add_task("Timing frames", total=None)
 
         # nerfstudio is chatty while it imports and loads.

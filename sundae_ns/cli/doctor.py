@@ -95,6 +95,29 @@ def kernels(compile_kernels: bool) -> Finding:
     return Finding("gsplat kernels", True, "run")
 
 
+def own_kernels() -> Finding:
+    """Whether the kernels of this package compile and load: neighbour search, and what lies between the head's layers."""
+    name = "our kernels"
+    if not torch.cuda.is_available():
+        return Finding(name, False, "need a CUDA device", "nothing: on a CPU other code does the same", needed=False)
+    from sundae_ns import nvrtc
+    from sundae_ns.compensation import CompensationHead, HeadConfig, kernels
+    from sundae_ns.errors import BackendError
+    from sundae_ns.graphs import traversal
+
+    device = torch.device("cuda", 0)
+    options = (*traversal.OPTIONS, *traversal.definitions(torch.float32, 16))
+    try:
+        nvrtc.Kernel(traversal.SOURCE, traversal.KERNEL, device, options, traversal.BLOCK)
+        net = CompensationHead(HeadConfig()).net
+        kernels.compiled(device, torch.bfloat16, kernels.definitions(net, True), kernels.FORWARD + kernels.BACKWARD)
+    except BackendError as error:
+        cause, mend = str(error).rsplit(": ", 1)
+        detail = f"{cause}: neighbours are searched on the CPU, and the head runs layer by layer"
+        return Finding(name, False, detail, mend, needed=False)
+    return Finding(name, True, "run")
+
+
 def rasterizer(kernels_finding: Finding) -> Finding:
     """Which rasteriser ``auto`` takes."""
     from sundae_ns.rasterization import numba_problem
@@ -145,6 +168,7 @@ def examine(compile_kernels: bool = False) -> list[Finding]:
         cuda,
         nvcc,
         lambda: kernels_finding,
+        own_kernels,
         lambda: rasterizer(kernels_finding),
         lpips,
         lambda: system_library("usb-1.0", "libusb-1.0-0"),

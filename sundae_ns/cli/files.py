@@ -8,11 +8,9 @@ from typing import Annotated, Literal
 import tyro
 
 
-def _check_out(out: Path) -> None:
-    from sundae_ns.errors import ConfigError, StorageError
+def _check_folder(out: Path) -> None:
+    from sundae_ns.errors import StorageError
 
-    if out.suffix.lower() != ".ply":
-        raise ConfigError(f"{out} is not named .ply, the one format that is written; rename it")
     if not out.parent.is_dir():
         raise StorageError(f"{out.parent} is no folder; make it first, or choose another")
 
@@ -20,24 +18,38 @@ def _check_out(out: Path) -> None:
 def export(
     scene: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    upright: bool = False,
 ) -> int:
-    """Write the base colours of a scene as a 3DGS .ply, which has no place for features or a head.
+    """Write the base colours of a scene as a .ply, .spz or .sog, which have no place for features or a head.
+
+    Antialiased scenes are marked as such. Primitives that are not finite are left out.
 
     Args:
         scene: folder of a run, its config.yml, or a file of sundae pack.
-        out: the .ply; an older one is replaced once the new one is whole.
+        out: the file; its name says the format: .ply (exact), .spz or .sog (much smaller, rounded). An older one is
+            replaced once the new one is whole.
+        upright: turn the scene so that viewers show it upright: nerfstudio's z points up, their -y. For showing only; a
+            warm start takes the coordinates as they were.
     """
     from sundae_ns.packed_run import scene_of_run
-    from sundae_ns.storage import MODEL_FRAME, write_ply
     from sundae_ns.storage.packing import read_scene
+    from sundae_ns.storage.viewers import check_format, write_for_viewers
 
-    _check_out(out)
-    packed = scene.suffix == ".sundae"
-    found = read_scene(scene) if packed else scene_of_run(scene, max_cameras=0)
-    model = found.meta.get("model")
-    antialiased = isinstance(model, dict) and model.get("rasterize_mode") == "antialiased"
-    write_ply(out, found.field, comments=[MODEL_FRAME, *(["SplatRenderMode: mip"] if antialiased else [])])
-    print(f"{out}: {len(found.field['means']):,} primitives{', antialiased' if antialiased else ''}")
+    check_format(out)
+    _check_folder(out)
+    found = read_scene(scene) if scene.suffix == ".sundae" else scene_of_run(scene, max_cameras=0)
+    stated = found.meta.get("model")
+    model = stated if isinstance(stated, dict) else {}
+    antialiased = model.get("rasterize_mode") == "antialiased"
+    written = write_for_viewers(
+        out, found.field, antialiased=antialiased, sigmoid_colors=model.get("sh_degree") == 0, upright=upright
+    )
+    mode = ", antialiased" if antialiased else ""
+    print(f"{out}: {written.primitives:,} primitives, degree {written.degree}{mode}, {written.bytes:,} bytes")
+    if written.dropped:
+        print(f"{written.dropped:,} were not finite (NaN or infinite) and are left out")
+    if written.cut:
+        print(f"harmonics above degree {written.degree} are left out, for which {out.suffix} has no place; .ply has")
     return 0
 
 
@@ -66,11 +78,14 @@ def prune(
         gamma: share that the band selection takes from the high end.
         seed: of random choices.
     """
+    from sundae_ns.errors import ConfigError
     from sundae_ns.pruning import PruningConfig, decide, footprint
     from sundae_ns.storage import read_ply
     from sundae_ns.storage.ply import keep_vertices
 
-    _check_out(out)
+    if out.suffix.lower() != ".ply":
+        raise ConfigError(f"{out} is not named .ply, the one format that is written; rename it")
+    _check_folder(out)
     config = PruningConfig(keep_ratio=keep, score=score, selection=selection, signal=signal, gamma=gamma, seed=seed)
     config.validate()
     field = read_ply(source)

@@ -92,6 +92,61 @@ def demo(out: Annotated[Path, tyro.conf.Positional] = Path(".demo"), steps: int 
     return run_demo(out, steps=steps)
 
 
+@app.command
+def report(
+    runs: Annotated[list[Path], tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    data: Path | None = None,
+    lpips_net: Literal["alex", "vgg", "squeeze"] = "alex",
+    warmup: int = 3,
+    repeats: int = 5,
+) -> int:
+    """Evaluate finished runs on their test views, speed beside error: tables, plots, curves over training.
+
+    Args:
+        runs: folders of runs of sundae and splatfacto, or their config.yml, which are programs: open your own; and packed
+            scenes.
+        out: folder to write.
+        data: where the capture is, if it is not where the runs say; packed scenes do not say.
+        lpips_net: net of LPIPS, which is taken where its weights are at hand; values of different nets do not compare.
+        warmup: untimed renderings of each picture.
+        repeats: timed renderings of each picture; 0 takes no times.
+    """
+    from sundae_ns.cli.report import run_report
+
+    return run_report(runs, out, data=data, lpips_net=lpips_net, warmup=warmup, repeats=repeats)
+
+
+@app.command
+def bands(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    keep_ratio: tuple[float, ...] = (0.01, 0.1, 0.3),
+    signal: Literal["positions", "attributes"] = "positions",
+    gamma: float = 0.5,
+    neighbors: int = 16,
+    bandwidth: Literal["robust", "literal"] = "robust",
+    view: int | None = None,
+) -> int:
+    """Show what the high-pass, the low-pass and the combined rule keep of a field: point clouds, pictures and figures.
+
+    Args:
+        run: a run of sundae or splatfacto (its folder, config.yml or a checkpoint), or a 3DGS .ply.
+        out: folder to write to; made if need be.
+        keep_ratio: shares of the primitives to keep, each in (0, 1].
+        signal: graph signal that is filtered: the paper's positions, or position, colour, opacity and size.
+        gamma: share that the combined rule takes from the high end.
+        neighbors: most neighbours of a primitive in the graph.
+        bandwidth: how reach and width of the graph's edges are found; literal is the paper's.
+        view: training view to look through; by default the one that sees most of the field.
+    """
+    from sundae_ns.cli.bands import run_bands
+    from sundae_ns.pruning import PruningConfig
+
+    config = PruningConfig(signal=signal, gamma=gamma, num_neighbors=neighbors, bandwidth=bandwidth)
+    return run_bands(run, out, keep_ratios=keep_ratio, config=config, view=view)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``sundae``; exits with 2 and one line on an error of ours."""
     try:

@@ -28,7 +28,7 @@ class RunRow:
     method: str
     variant: str
     keep_ratio: float | None
-    seed: int
+    seed: int | None
     steps: int
     primitives: int
     psnr: float | None

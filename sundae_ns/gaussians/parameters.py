@@ -48,6 +48,11 @@ def sh_to_rgb(sh: Tensor) -> Tensor:
     return sh * SH_C0 + 0.5
 
 
+def rgb_to_logit(rgb: Tensor) -> Tensor:
+    """Logit ``[..., 3]`` of a colour ``[..., 3]``, which is kept a thousandth away from 0 and 1."""
+    return torch.logit(rgb.clamp(1e-3, 1 - 1e-3))
+
+
 def finite_mask(params: Mapping[str, Tensor]) -> Tensor:
     """True where every parameter of a primitive is finite: bool ``[N]``."""
     n = num_primitives(params)

@@ -4,7 +4,7 @@
 calls it at its steps and applies the mask with :func:`sundae_ns.gaussians.surgery.keep`.
 """
 
-from sundae_ns.pruning.config import PruningConfig
+from sundae_ns.pruning.config import PruningConfig, band_rule, single_prune
 from sundae_ns.pruning.coverage import band_shares, inclusion_probabilities, neighbor_order, select_systematic
 from sundae_ns.pruning.decision import Decision, decide
 from sundae_ns.pruning.detail import pixel_detail
@@ -27,6 +27,7 @@ __all__ = [
     "PruningPolicy",
     "Response",
     "attribute_signal",
+    "band_rule",
     "band_shares",
     "coherence",
     "color_signal",
@@ -49,4 +50,5 @@ __all__ = [
     "select_sampled",
     "select_systematic",
     "select_top",
+    "single_prune",
 ]

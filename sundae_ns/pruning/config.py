@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 from sundae_ns.errors import ConfigError
@@ -204,3 +204,33 @@ class PruningConfig:
         cap, target = self.max_primitives, self.target_primitives
         if cap is not None and target is not None and target > cap:
             raise ConfigError(f"target_primitives ({target}) is more than max_primitives ({cap}): swap them")
+
+
+def single_prune(config: PruningConfig, keep_ratio: float) -> PruningConfig:
+    """The same choice as one prune to a share: without the mode's schedule, and without its budgets."""
+    return replace(
+        config,
+        mode="one-shot",
+        keep_ratio=keep_ratio,
+        rounds=1,
+        start=0,
+        max_primitives=None,
+        target_primitives=None,
+        max_psnr_drop=None,
+        max_bytes=None,
+    )
+
+
+def band_rule(config: PruningConfig, keep_ratio: float, gamma: float) -> PruningConfig:
+    """The paper's kind of prune to a share: both ends of the response, on a graph of centres, and nothing is merged.
+
+    Of the high end it takes ``gamma``; signal, neighbours and bandwidth are those of ``config``.
+    """
+    return replace(
+        single_prune(config, keep_ratio),
+        score="response",
+        selection="band",
+        gamma=gamma,
+        edges="centres",
+        redistribution="none",
+    )

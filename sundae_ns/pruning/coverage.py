@@ -17,6 +17,10 @@ OCTAVES = 4
 """Bands reach this many octaves of the response to either side of its median; what lies beyond joins the last ones."""
 
 
+LEAST_SHARE = 1e-200
+"""Scores below this share of the largest count as much."""
+
+
 def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
     """Chances ``pi_i = min(1, c s_i)`` that sum to ``count``.
 
@@ -36,8 +40,8 @@ def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
         raise DataError(f"cannot keep {count} of {n} primitives: ask for 1 to {n}")
     if not bool((values > 0).all()) or bool(values.isinf().any()):
         raise DataError("chances need positive finite scores: leave out the others first")
-    # The largest is 1, and so sums cannot overflow.
-    values = values / values.max()
+    # The largest is 1, and so sums cannot overflow; the smallest are not 0, and so neither can what divides by their sum.
+    values = (values / values.max()).clamp_min(LEAST_SHARE)
     ordered = torch.sort(values, descending=True, stable=True).values
     rest = ordered.flip(0).cumsum(0).flip(0)
     room = count - torch.arange(count, dtype=torch.float64)

@@ -49,6 +49,7 @@ def decide(
     contribution: Contribution | None = None,
     *,
     count: int | None = None,
+    graph: NeighborGraph | None = None,
 ) -> Decision:
     """Decide which primitives of a field stay.
 
@@ -62,6 +63,7 @@ def decide(
         contribution: gives the blending weights over the training views, one per primitive of ``params`` ``[N]``;
             called only if the score needs it.
         count: keeps this many, or all if there are not so many, instead of the share.
+        graph: :func:`field_graph` of the finite primitives by the same options, where it is at hand.
 
     Raises:
         ConfigError: an option cannot work, or the score needs a contribution and there is none.
@@ -81,7 +83,10 @@ def decide(
 
     usable = params if n_finite == n else {name: value.detach()[finite] for name, value in params.items()}
     weights = _once(contribution, finite)
-    graph = field_graph(on_graph_device(usable, config), config) if config.uses_graph else None
+    if not config.uses_graph:
+        graph = None
+    elif graph is None:
+        graph = field_graph(on_graph_device(usable, config), config)
     found = response(usable, config, graph) if config.uses_response else None
     coherent = coherence(graph, count, config, finite.device) if graph is not None and config.uses_coherence else None
     values = score(usable, config, found, weights, coherent)

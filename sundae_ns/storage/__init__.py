@@ -1,9 +1,11 @@
-"""Fields on disk and in other frames: .ply files, the count of bytes of primitives and head, similarities. Floor 2."""
+"""Fields on disk and in other frames: .ply, .spz and .sog files, bytes of primitives and head, similarities. Floor 2."""
 
 from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module, megabytes
 from sundae_ns.storage.atomic import replacing, write_text
 from sundae_ns.storage.ply import read_ply, sh_degree_of, write_ply
-from sundae_ns.storage.point_cloud import MODEL_FRAME, is_nerfstudio_ply, read_point_cloud
+from sundae_ns.storage.point_cloud import MODEL_FRAME, is_nerfstudio_ply, read_point_cloud, write_point_cloud
+from sundae_ns.storage.sog import write_sog
+from sundae_ns.storage.spz import write_spz
 from sundae_ns.storage.transform import similarity
 
 __all__ = [
@@ -19,5 +21,8 @@ __all__ = [
     "sh_degree_of",
     "similarity",
     "write_ply",
+    "write_point_cloud",
+    "write_sog",
+    "write_spz",
     "write_text",
 ]

@@ -42,10 +42,13 @@ def sh_degree_of(coefficients: int) -> int | None:
     return next((d for d in range(_MAX_SH_DEGREE + 1) if (d + 1) ** 2 - 1 == coefficients), None)
 
 
-def _check(params: Mapping[str, Tensor]) -> None:
+def check_field(params: Mapping[str, Tensor]) -> None:
+    """Raise ``DataError`` unless all parameters of primitives with base colours are there, in their shapes."""
     missing = [name for name in SPLAT_NAMES if name not in params]
     if missing:
-        raise DataError(f"The field has no {', '.join(missing)}; a .ply needs all of {', '.join(SPLAT_NAMES)}.")
+        raise DataError(
+            f"The field has no {', '.join(missing)}; a file of primitives needs all of {', '.join(SPLAT_NAMES)}."
+        )
     n = num_primitives(params)
     for name, columns in _COLUMNS.items():
         if params[name].shape != (n, len(columns)):
@@ -70,7 +73,7 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
         StorageError: the disk is full, or may not be written to.
     """
     path = Path(path)
-    _check(params)
+    check_field(params)
     n = num_primitives(params)
 
     def columns(name: str) -> NDArray[np.float32]:

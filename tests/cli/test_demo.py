@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sundae_ns.cli.demo import _comparison, _run
+from sundae_ns.cli.demo import _comparison
+from sundae_ns.cli.process import run_logged
 from sundae_ns.errors import SundaeError
 
 
@@ -17,14 +19,14 @@ def test_a_failing_command_shows_its_end_and_keeps_its_log(tmp_path: Path) -> No
     log = tmp_path / "train.log"
     script = "import sys; print('first'); print('the cause', file=sys.stderr); sys.exit(3)"
     with pytest.raises(SundaeError, match="failed with 3") as error:
-        _run([sys.executable, "-c", script], log)
+        run_logged([sys.executable, "-c", script], log)
     assert "the cause" in str(error.value)
     assert "first" in log.read_text()
 
 
 def test_lines_reach_the_progress_bar(tmp_path: Path) -> None:
     lines: list[str] = []
-    _run([sys.executable, "-c", "print('10 (50.00%)'); print('20 (100.00%)')"], tmp_path / "log", lines.append)
+    run_logged([sys.executable, "-c", "print('10 (50.00%)'); print('20 (100.00%)')"], tmp_path / "log", lines.append)
     assert [line.strip() for line in lines] == ["10 (50.00%)", "20 (100.00%)"]
 
 
@@ -38,3 +40,17 @@ def test_comparison_takes_the_pictures_apart(tmp_path: Path) -> None:
     with Image.open(tmp_path / "sheet.png") as sheet:
         colors = {color for _, color in sheet.convert("RGB").getcolors(1 << 20)}
     assert {(255, 255, 255), (200, 200, 200), (245, 245, 245), (50, 50, 50)} <= colors
+
+
+def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
+    pids = []
+
+    def interrupt(line: str) -> None:
+        pids.append(int(line))
+        raise KeyboardInterrupt
+
+    code = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
+    with pytest.raises(KeyboardInterrupt):
+        run_logged([sys.executable, "-c", code], tmp_path / "log.txt", interrupt)
+    with pytest.raises(ProcessLookupError):
+        os.kill(pids[0], 0)

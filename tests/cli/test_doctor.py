@@ -33,6 +33,8 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     """A CUDA device that exists in torch's answers only."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
+    monkeypatch.setattr("sundae_ns.nvrtc.Kernel", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.compensation.kernels.compiled", lambda *_: {})
 
 
 def _kernels(monkeypatch: pytest.MonkeyPatch, problem: str | None) -> None:
@@ -86,6 +88,22 @@ def test_kernels_that_do_not_run(cuda: None, monkeypatch: pytest.MonkeyPatch) ->
     assert not found.ok
     assert "no nvcc" in found.detail
     assert "auto takes reference" in finding("rasteriser", compile_kernels=True).detail
+
+
+def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert finding("our kernels").ok
+
+    def refuse(*_: object) -> None:
+        raise BackendError("a CUDA kernel does not run (too old): update the driver")
+
+    for place in ("sundae_ns.nvrtc.Kernel", "sundae_ns.compensation.kernels.compiled"):
+        with monkeypatch.context() as patch:
+            patch.setattr(place, refuse)
+            found = finding("our kernels")
+        assert not found.ok
+        assert not found.needed
+        assert "layer by layer" in found.detail
+        assert found.mend == "update the driver"
 
 
 def test_built_kernels_are_found_where_torch_puts_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

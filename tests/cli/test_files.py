@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sundae_ns.cli import main
 from sundae_ns.gaussians import SPLAT_NAMES, from_points
+from sundae_ns.gaussians.parameters import SH_C0
 from sundae_ns.storage import is_nerfstudio_ply, read_ply, write_ply
 from sundae_ns.storage.packing import Scene, read_scene, write_scene
 
@@ -39,6 +40,29 @@ def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
     assert all(torch.equal(found[name], truth[name]) for name in SPLAT_NAMES)
     assert is_nerfstudio_ply(tmp_path / "a.ply")
     assert ("SplatRenderMode: mip" in PlyData.read(tmp_path / "a.ply").comments) == (mode == "antialiased")
+
+
+@pytest.mark.parametrize("kind", [".spz", ".sog"])
+def test_export_to_other_formats(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    model = {"rasterize_mode": "antialiased", "sh_degree": 1}
+    write_scene(tmp_path / "a.sundae", Scene(field(), meta={"model": model}))
+    out = tmp_path / f"a{kind}"
+    assert run("export", tmp_path / "a.sundae", "-o", out) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"a{kind}: 200 primitives, degree 1, antialiased, {out.stat().st_size:,} bytes" in said
+    assert out.read_bytes()[:2] == {".spz": b"\x1f\x8b", ".sog": b"PK"}[kind]
+
+
+def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
+    given = field()
+    given["features_rest"] = given["features_rest"][:, :0]
+    write_scene(tmp_path / "a.sundae", Scene(given, meta={"model": {"sh_degree": 0}}))
+    assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply", "--upright") == 0
+    truth = read_scene(tmp_path / "a.sundae").field
+    found = read_ply(tmp_path / "a.ply")
+    # Such a model keeps logits of colours, and a .ply the harmonic of band 0.
+    torch.testing.assert_close(0.5 + SH_C0 * found["features_dc"], truth["features_dc"].sigmoid(), rtol=0, atol=1e-6)
+    torch.testing.assert_close(found["means"][:, 1], -truth["means"][:, 2])
 
 
 @pytest.mark.parametrize(
@@ -81,6 +105,8 @@ def test_prune_keeps_rows_as_they_are(tmp_path: Path, options: list[str], capsys
         (["prune", "in.ply", "-o", "a.ply", "--keep", "0"], "keep_ratio is 0.0"),
         (["prune", "in.ply", "-o", "a.spz"], "not named .ply"),
         (["prune", "in.ply", "-o", "no/a.ply"], "no is no folder"),
+        (["export", "in.ply", "-o", "a.splat"], "not named .ply or .spz or .sog"),
+        (["export", "in.ply", "-o", "no/a.sog"], "no is no folder"),
         (["export", "in.ply", "-o", "a.ply"], "not a run's config.yml"),
         (["export", "nothing.sundae", "-o", "a.ply"], "nothing.sundae cannot be read"),
     ],

@@ -66,9 +66,13 @@ def test_projection_matches_gsplat(antialiased: bool) -> None:
     radii, means2d, depths, conics, compensations = gsplat_torch._fully_fused_projection(
         means, covars, viewmat[None], K[None], WIDTH, HEIGHT, calc_compensations=antialiased
     )
-    seen = radii[0] > 0
+    if radii.dim() == 3:
+        # gsplat 1.5 has a radius for each axis, and culls what no pixel sees; the reference follows 1.4.
+        seen = (radii[0] > 0).all(dim=-1) & (ours.radii > 0)
+    else:
+        seen = radii[0] > 0
+        assert torch.equal(ours.radii, radii[0])
     assert 50 < int(seen.sum()) < 350  # both kinds are there
-    assert torch.equal(ours.radii, radii[0])
     pairs = [(ours.means2d, means2d[0]), (ours.depths, depths[0]), (ours.conics, conics[0])]
     if antialiased:
         pairs.append((ours.compensations, compensations[0]))

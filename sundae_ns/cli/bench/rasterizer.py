@@ -17,6 +17,7 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
+from sundae_ns.cli.bench.shards import parse_shard
 from sundae_ns.errors import BackendError, ConfigError, DataError
 from sundae_ns.rasterization import Backend, BackendName, rasterize, select_backend
 
@@ -89,18 +90,6 @@ def run_rasterizer(
         title = f"{size[0]}x{size[1]}, {channels} channels, primitives of {pixels:g} px, {threads} threads"
         Console().print(_table([rows[case] for case in cases], title))
     return 0
-
-
-def parse_shard(shard: str) -> tuple[int, int]:
-    """``"2/5"``, the second of five parts, as the index from 0 and the number of parts.
-
-    Raises:
-        ConfigError: it is not of that form.
-    """
-    part, _, parts = shard.partition("/")
-    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
-        raise ConfigError(f"{shard!r} is no part of a whole: use i/n with i from 1 to n")
-    return int(part) - 1, int(parts)
 
 
 def draw_view(case: Case) -> tuple[Drawn, Drawn]:

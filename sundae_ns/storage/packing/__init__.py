@@ -1,7 +1,7 @@
 """Packed scenes: a field, its head and its cameras in one small file that can be checked and cannot be run."""
 
 from sundae_ns.storage.packing.config import PackConfig
-from sundae_ns.storage.packing.container import VERSION, read_header
+from sundae_ns.storage.packing.container import VERSION, is_packed, read_header
 from sundae_ns.storage.packing.scene import CAMERAS, PackReport, Scene, read_scene, write_scene
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "PackConfig",
     "PackReport",
     "Scene",
+    "is_packed",
     "read_header",
     "read_scene",
     "write_scene",

@@ -58,14 +58,14 @@ def fit(vectors: NDArray[np.float32], books: int, *, seed: int = 0) -> Codebooks
     steps = torch.zeros(books)
     indices = torch.zeros(books, n, dtype=torch.uint8)
     for book in range(books):
-        centres = _kmeans(rest, entries, generator)
+        centres = kmeans(rest, entries, generator)
         step = (centres.abs().max() / 127).float()
         steps[book] = step
         if step > 0:
             kept[book] = (centres / step.double()).round().clamp(-127, 127).to(torch.int8)
         # What is left is taken from the entries as they are stored, so that the next book mends their rounding too.
         stored = kept[book].float() * step
-        nearest = _nearest(rest, stored.double())
+        nearest = nearest_centre(rest, stored.double())
         indices[book] = nearest.to(torch.uint8)
         rest -= stored.double()[nearest]
     made = Codebooks(
@@ -92,19 +92,19 @@ def restore(packed: Codebooks) -> NDArray[np.float32]:
     return out
 
 
-def _kmeans(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def kmeans(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Centres ``[count, D]`` by Lloyd's rounds on a sample of the rows."""
     sample = rows[torch.randperm(len(rows), generator=generator)[:_SAMPLE]]
     centres = sample[:count].clone()
     for _ in range(_ROUNDS):
-        nearest = _nearest(sample, centres)
+        nearest = nearest_centre(sample, centres)
         number = torch.bincount(nearest, minlength=count)[:, None]
         sums = torch.zeros_like(centres).index_add_(0, nearest, sample)
         centres = torch.where(number > 0, sums / number.clamp_min(1), centres)
     return centres
 
 
-def _nearest(rows: Tensor, centres: Tensor) -> Tensor:
+def nearest_centre(rows: Tensor, centres: Tensor) -> Tensor:
     """Index ``[N]`` of the nearest centre of each row."""
     # |x - c|^2 less |x|^2, in float32: a wrong pick between two like entries costs nothing.
     flat, half = centres.float(), (centres * centres).sum(dim=1).float() / 2

@@ -1,0 +1,132 @@
+"""Exported files of a run, read back by a program of others and rendered; one JSON line a file.
+
+    npm install @playcanvas/splat-transform          # needs node 22; or have it in PATH
+    python benchmarks/bench_export.py --run RUN --views 4 --downscale 2
+
+Each file is turned into a .ply by ``splat-transform``, read from there, and rendered by the run's own rasteriser, without the
+head. ``psnr`` is against the photographs, ``psnr_model`` the same of the model's own base colours, and ``psnr_between`` of the
+file's pictures against the model's. ``theirs`` are the files that splat-transform itself makes of our .ply, for comparison.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import torch
+from rich.progress import track
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from sundae_ns.evaluation import psnr
+from sundae_ns.measure import LoadedRun, load_run
+from sundae_ns.packed_run import scene_of_run
+from sundae_ns.storage import read_ply, write_sog, write_spz
+from sundae_ns.storage.viewers import ANTIALIASED, write_for_viewers
+
+
+def transform(program: str, source: Path, out: Path) -> Path:
+    """Convert a file by splat-transform, without a GPU."""
+    subprocess.run([program, "--quiet", "--overwrite", "--gpu", "cpu", str(source), str(out)], check=True)
+    return out
+
+
+def says_antialiased(ply: Path) -> bool:
+    with ply.open("rb") as file:
+        return ANTIALIASED.encode() in file.read(4096).partition(b"end_header")[0]
+
+
+def smaller(picture: Tensor, factor: int) -> Tensor:
+    """Means of squares of pixels ``[H, W, 3]``."""
+    return avg_pool2d(picture.permute(2, 0, 1), factor).permute(1, 2, 0)
+
+
+@torch.no_grad()
+def pictures_of(
+    run: LoadedRun, field: Mapping[str, Tensor], views: list[int], downscale: int, text: str
+) -> list[Tensor]:
+    model = run.model
+    background = model._get_background_color()
+    made = []
+    for i in track(views, description=text, transient=True):
+        view = model.view_of(run.cameras[i], downscale)
+        made.append(model.render(field, view, background, depth=False, compensate=False)[0]["base_rgb"])
+    return made
+
+
+def mean_psnr(pictures: list[Tensor], truths: list[Tensor]) -> float:
+    return round(sum(float(psnr(a, b)) for a, b in zip(pictures, truths, strict=True)) / len(truths), 3)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--run", type=Path, required=True)
+    parser.add_argument("--views", type=int, default=4)
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--splat-transform", default=shutil.which("splat-transform"))
+    parser.add_argument("--sweep", action="store_true", help="other roundings of harmonics too")
+    options = parser.parse_args()
+    if options.splat_transform is None:
+        parser.error(
+            "splat-transform is not in PATH; npm install @playcanvas/splat-transform, or give --splat-transform"
+        )
+
+    run = load_run(options.run / "config.yml")
+    model = run.model
+    scene = scene_of_run(options.run, max_cameras=0)
+    antialiased = model.config.rasterize_mode == "antialiased"
+    logits = model.config.sh_degree == 0
+    views = torch.linspace(0, len(run.cameras) - 1, min(options.views, len(run.cameras))).round().long().tolist()
+    own = pictures_of(run, dict(model.gauss_params), views, options.downscale, "The model")
+    truths = [
+        smaller(run.truths[i], options.downscale)[: p.shape[0], : p.shape[1]] for i, p in zip(views, own, strict=True)
+    ]
+    # From here on the colours are harmonics, whatever the model has.
+    model.config.sh_degree = max(model.config.sh_degree, 1)
+
+    export = partial(write_for_viewers, params=scene.field, antialiased=antialiased, sigmoid_colors=logits)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for kind in ("ply", "spz", "sog"):
+            export(folder / f"ours.{kind}")
+        files = [folder / f"ours.{kind}" for kind in ("ply", "spz", "sog")]
+        files += [transform(options.splat_transform, files[0], folder / f"theirs.{kind}") for kind in ("spz", "sog")]
+        if options.sweep:
+            field = read_ply(files[0])
+            for step in (128, 32, 16, 8):
+                files.append(folder / f"step-{step}.spz")
+                write_spz(files[-1], field, antialiased=antialiased, harmonics_step=1 / step)
+            for share in (2, 4, 8):
+                files.append(folder / f"palette-{share}.sog")
+                write_sog(files[-1], field, antialiased=antialiased, max_palette=len(field["means"]) // share)
+        for file in files:
+            back = transform(options.splat_transform, file, folder / "back.ply")
+            field = {key: value.to(model.device) for key, value in read_ply(back).items()}
+            pictures = pictures_of(run, field, views, options.downscale, file.name)
+            squared = sum(float(((a - b) ** 2).mean()) for a, b in zip(pictures, own, strict=True)) / len(own)
+            result = {
+                "run": options.run.resolve().parents[1].name,
+                "file": file.name,
+                "bytes": file.stat().st_size,
+                "primitives": len(field["means"]),
+                "antialiased": antialiased,
+                "antialiased_back": says_antialiased(back),
+                "views": len(views),
+                "width": own[0].shape[1],
+                "height": own[0].shape[0],
+                "rasterizer": model.backend.name,
+                "psnr_model": mean_psnr(own, truths),
+                "psnr": mean_psnr(pictures, truths),
+                "psnr_between": None if squared == 0 else round(-10 * torch.tensor(squared).log10().item(), 2),
+            }
+            print(json.dumps(result), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""Train with the viewer open and a browser moving the camera; watch the render thread and memory; print one JSON line.
+
+    python benchmarks/browser_training.py --seconds 300
+
+Exits with 1 if the viewer falls silent, either log has an error, training stands still, or the training process's memory
+still grows by more than ``--allowed`` megabytes a minute in the second half. Needs a Chromium (``apt-get install chromium``).
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import random
+import re
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from browser import Server, ViewerPage, find_chromium, wait_for
+
+from sundae_ns.data import write_scene
+
+PRUNE_AT = 300
+STEP = re.compile(r"(\d+) \(\d+\.\d+%\)")
+"""nerfstudio's table of progress."""
+SLICE = 30.0
+"""Seconds in each of which pictures must arrive."""
+
+
+def resident(pid: int) -> float:
+    """Megabytes of a process in the host's memory."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def last_step(log: str) -> int:
+    """The last step that the log tells of; -1 before the first."""
+    found = STEP.findall(log[-20_000:])
+    return int(found[-1]) if found else -1
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--allowed", type=float, default=5.0, help="megabytes a minute")
+    options = parser.parse_args()
+    chromium = find_chromium()
+    if chromium is None:
+        sys.exit("no Chromium here; apt-get install chromium")
+    chance = random.Random(0)
+    with tempfile.TemporaryDirectory() as folder:
+        scene = write_scene(
+            Path(folder) / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1
+        )
+        words = ["ns-train", "sundae-tiny", "--data", scene, "--output-dir", Path(folder) / "out", "--vis", "viewer"]
+        words += ["--max-num-iterations", 10_000_000, "--steps-per-save", 10_000_000, "--logging.steps-per-log", 10]
+        words += ["--pipeline.model.pruning.prune-at", PRUNE_AT, "--pipeline.model.warmup-length", 5]
+        server = Server(words, Path(folder) / "train.log", "(0.00%)")
+        try:
+            with ViewerPage(chromium, 640, 400) as page:
+                wait_for(server.listens, "ns-train", 180)
+                page.open(server.address)
+                wait_for(lambda: bool(page.pictures), "the first picture", 60)
+                wait_for(lambda: last_step(server.output()) > PRUNE_AT, "the prune", 300)
+                page.press("Hide Train Cams")
+                outputs = page.options("Output type")
+                acts = itertools.cycle(
+                    [
+                        *(lambda name=name: page.choose("Output type", name) for name in outputs),
+                        lambda: page.choose("Output type", outputs[0]),
+                        lambda: page.tick("Neural compensation", False),
+                        lambda: page.slide("Keep ratio", 0.3),
+                        lambda: page.slide("Keep ratio", 0.05),
+                        lambda: page.slide("Keep ratio", 1.1),
+                        lambda: page.tick("Neural compensation", True),
+                    ]
+                )
+                start, first_step = time.monotonic(), last_step(server.output())
+                samples, arrived, acted, next_act = [], [len(page.pictures)], 0, start
+                while (now := time.monotonic()) < start + options.seconds:
+                    if now >= next_act:
+                        next(acts)()
+                        acted, next_act = acted + 1, now + 5
+                    page.drag(200, 250, 200 + chance.uniform(-80, 80), 250 + chance.uniform(-30, 30), seconds=0.5)
+                    samples.append((now - start, resident(server.process.pid), last_step(server.output())))
+                    if now - start > SLICE * len(arrived):
+                        arrived.append(len(page.pictures))
+                arrived.append(len(page.pictures))
+                errors = list(page.errors)
+            listening, complaints = server.listens(), server.complaints()
+        finally:
+            server.stop()
+
+    seconds, memory, steps = np.array(samples, dtype=float).T
+    late = seconds > seconds[-1] / 2
+    growth = float(np.polyfit(seconds[late], memory[late], 1)[0]) * 60
+    slices = np.diff(arrived).tolist()
+    result = {
+        "seconds": round(float(seconds[-1]), 1),
+        "steps": int(steps[-1]) - first_step,
+        "controls_used": acted,
+        "camera_moves": len(samples),
+        "pictures": arrived[-1] - arrived[0],
+        "pictures_in_the_poorest_30_s": min(slices),
+        "page_errors": errors,
+        "log_errors": complaints,
+        "host_mb_first": round(float(memory[0]), 1),
+        "host_mb_middle": round(float(memory[late][0]), 1),
+        "host_mb_last": round(float(memory[-1]), 1),
+        "host_mb_a_minute_second_half": round(growth, 2),
+        "device": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "cpu",
+    }
+    print(json.dumps(result))
+    stuck = min(slices) == 0 or steps[-1] <= steps[late][0]
+    sys.exit(int(stuck or bool(errors) or bool(complaints) or not listening or growth > options.allowed))
+
+
+if __name__ == "__main__":
+    main()

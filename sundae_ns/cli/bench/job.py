@@ -1,0 +1,233 @@
+"""One job of a comparison: trained by nerfstudio, saved, opened again from its files, and measured.
+
+``python -m sundae_ns.cli.bench.job OUT KEY`` does the job of that key, whose description lies in its folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import json
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.scripts.train import _set_random_seed
+from nerfstudio.utils import profiler, writer
+
+from sundae_ns.cli.bench.plan import Job, done_file, job_folder
+from sundae_ns.errors import BackendError, CheckpointError, SundaeError
+from sundae_ns.evaluation import Lpips, lpips_weights_available
+from sundae_ns.measure import measure_scene
+from sundae_ns.opening import open_scene
+from sundae_ns.storage.atomic import write_text
+
+with contextlib.suppress(ImportError):  # Windows has none.
+    import fcntl
+
+NEVER = 10**9
+
+
+def read_result(path: Path) -> dict[str, Any] | None:
+    """Result of a finished job; None if it is not finished.
+
+    Raises:
+        CheckpointError: the file is damaged.
+    """
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} cannot be read ({error}); remove it, and the job is done again") from error
+
+
+def perform(job: Job, out: Path) -> None:
+    """Do a job, unless it is done; a process that does the same one meanwhile is waited for.
+
+    Raises:
+        SundaeError: it cannot be done here.
+    """
+    job_folder(out, job.key).mkdir(parents=True, exist_ok=True)
+    done_file(out, job.key).parent.mkdir(parents=True, exist_ok=True)
+    with _locked(job_folder(out, job.key) / "lock"):
+        if not done_file(out, job.key).exists():
+            result = train_and_measure(job, out)
+            write_text(done_file(out, job.key), json.dumps(result) + "\n")
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    """Hold a file's lock, which goes with the process; nothing where the system has no ``flock`` (Windows)."""
+    with path.open("a") as file:
+        if os.name == "posix":
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX)
+        yield
+
+
+def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
+    """Train, save, open what was saved, and measure it: ``{"job", "measured"}`` as plain values.
+
+    Nothing is evaluated or saved while training is timed, for all methods alike.
+
+    Raises:
+        BackendError: the job needs a CUDA device and there is none.
+        CheckpointError: the warm-up that it needs is not done.
+    """
+    cuda = torch.cuda.is_available()
+    if job.kind == "stock" and not cuda:
+        raise BackendError(f"{job.arm} needs a CUDA device and gsplat's kernels; leave it out with --arms here")
+    config, command = configure(job, out)
+    # What an attempt that was stopped has left: its records would be taken for this one's.
+    shutil.rmtree(config.get_base_dir(), ignore_errors=True)
+    config.save_config()
+    _set_random_seed(config.machine.seed)
+    with _no_lpips():
+        trainer: Trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        save = trainer.save_checkpoint
+        trainer.save_checkpoint = lambda step: None  # type: ignore[method-assign]
+        if cuda:
+            torch.cuda.reset_peak_memory_stats()
+            torch.cuda.synchronize()
+        primitives = _Peak(trainer)
+        started = time.perf_counter()
+        trainer.train()
+        if cuda:
+            torch.cuda.synchronize()
+        seconds = time.perf_counter() - started
+        peak = torch.cuda.max_memory_allocated() / 2**20 if cuda else None
+        save(trainer.step)
+    folder = trainer.base_dir
+    del trainer, save
+    _forget()
+    opened = open_scene(folder)
+    lpips = Lpips(download=False) if lpips_weights_available() else None
+    measured = measure_scene(opened, label=job.key, lpips=lpips, command=command)
+    measured = replace(
+        measured,
+        scene=job.scene,
+        variant=job.arm,
+        seed=job.seed,
+        train_s=seconds,
+        peak_primitives=max(measured.peak_primitives or 0, primitives.peak),
+        peak_vram_mib=peak,
+    )
+    if job.keep_ratio is not None:
+        measured = replace(measured, keep_ratio=job.keep_ratio)
+    return {"job": asdict(job), "measured": measured.as_json()}
+
+
+def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
+    """The configuration as ``ns-train`` would parse it, and that command.
+
+    Raises:
+        CheckpointError: the warm-up that it needs is not done.
+    """
+    arguments = [job.method, "--data", job.data, "--machine.seed", str(job.seed)]
+    arguments += ["--max-num-iterations", str(job.steps), *job.options]
+    if job.kind == "branch":
+        arguments += ["--pipeline.model.warm-start", str(_run_folder(out, job.needs) / "nerfstudio_models")]
+    if job.kind == "mcmc":
+        arguments += ["--pipeline.model.mcmc-cap", str(_cap(job, out))]
+    arguments += job.parser
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)  # type: ignore[arg-type]
+    assert isinstance(config, TrainerConfig)
+    config.pipeline.datamanager.data = config.data
+    config.output_dir = job_folder(out, job.key)
+    config.experiment_name, config.timestamp = job.arm, "run"
+    config.vis = "tensorboard"
+    config.steps_per_save = config.steps_per_eval_batch = NEVER
+    config.steps_per_eval_image = config.steps_per_eval_all_images = NEVER
+    return config, "ns-train " + " ".join(job.scene if word == job.data else word for word in arguments)
+
+
+def _cap(job: Job, out: Path) -> int:
+    """Primitives that a branch of the same share keeps."""
+    result = read_result(done_file(out, str(job.needs)))
+    if result is None:
+        raise CheckpointError(f"{job.key} needs the count of {job.needs}, which is not done; run the whole plan")
+    return max(1, round((job.keep_ratio or 1.0) * int(result["measured"]["primitives"])))
+
+
+def _run_folder(out: Path, key: str | None) -> Path:
+    result = read_result(done_file(out, str(key)))
+    if result is None:
+        raise CheckpointError(f"the warm-up {key} is not done; run the whole plan")
+    # Not what the result says: the folder of a comparison may have moved since.
+    return job_folder(out, str(key)) / result["job"]["arm"] / result["job"]["method"] / "run"
+
+
+class _Peak:
+    """Most primitives before any step of a training. Fields of ours know of those within a step too."""
+
+    def __init__(self, trainer: Trainer) -> None:
+        self.peak = 0
+        self._trainer, self._step = trainer, trainer.train_iteration
+        trainer.train_iteration = self  # type: ignore[method-assign,assignment]
+
+    def __call__(self, step: int) -> Any:
+        self.peak = max(self.peak, self._trainer.pipeline.model.num_points)
+        return self._step(step)
+
+
+class _Nothing(torch.nn.Module):
+    """Stands in for LPIPS in stock splatfacto, which else downloads weights in its constructor."""
+
+    def __init__(self, **_: Any) -> None:
+        super().__init__()
+
+    def forward(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        return torch.tensor(float("nan"))
+
+
+@contextlib.contextmanager
+def _no_lpips() -> Iterator[None]:
+    """Keep stock splatfacto from building LPIPS; nothing is evaluated while it trains."""
+    import torchmetrics.image.lpip as module
+
+    real = module.LearnedPerceptualImagePatchSimilarity
+    module.LearnedPerceptualImagePatchSimilarity = _Nothing  # type: ignore[misc,assignment]
+    try:
+        yield
+    finally:
+        module.LearnedPerceptualImagePatchSimilarity = real  # type: ignore[misc]
+
+
+def _forget() -> None:
+    """Free what a training leaves behind: nerfstudio keeps its loggers in globals."""
+    for writers in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, profiler.PROFILER):
+        writers.clear()
+    writer.GLOBAL_BUFFER.clear()
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+
+
+def read_job(path: Path) -> Job:
+    """Description of a job, from its file."""
+    plain = json.loads(path.read_text(encoding="utf-8"))
+    return Job(**{**plain, "options": tuple(plain["options"]), "parser": tuple(plain["parser"])})
+
+
+def main() -> None:
+    """Do one job; exits with 2 and one line on an error of ours."""
+    out, key = Path(sys.argv[1]), sys.argv[2]
+    try:
+        perform(read_job(job_folder(out, key) / "job.json"), out)
+    except SundaeError as error:
+        print(f"sundae: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

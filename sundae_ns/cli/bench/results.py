@@ -1,0 +1,188 @@
+"""Results of a comparison: read from their files, put into rows of runs.csv, and into tables."""
+
+from __future__ import annotations
+
+import csv
+import json
+import statistics
+from collections.abc import Mapping, Sequence
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from sundae_ns.cli.bench.plan import ARMS
+from sundae_ns.errors import DataError
+from sundae_ns.evaluation import COLUMNS
+from sundae_ns.evaluation.document import number, table
+from sundae_ns.evaluation.measured import HEAD_OFF, MEGABYTE
+from sundae_ns.evaluation.published import DATASETS, MEMBERS, NOTE, SCENES
+from sundae_ns.storage.atomic import write_text
+
+Result = Mapping[str, Any]
+
+
+def read_results(out: Path) -> list[Result]:
+    """All results in a folder, each job once: files of ``done/``, and ``*.jsonl`` beside them, which may be concatenated.
+
+    Raises:
+        DataError: a line is damaged.
+    """
+    found: dict[str, Result] = {}
+    for path in (*sorted(out.glob("*.jsonl")), *sorted((out / "done").glob("*.json"))):
+        for count, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            try:
+                result = json.loads(line)
+                found[result["job"]["key"]] = result
+                _ = result["measured"]["configurations"]
+            except (ValueError, KeyError, TypeError) as error:
+                raise DataError(f"{path}, line {count} is no result of a bench ({error!r}); remove it") from error
+    return list(found.values())
+
+
+def write_results(out: Path, results: Sequence[Result], page: str) -> None:
+    """Write ``results.jsonl``, ``results.csv`` with the columns of runs.csv, and ``table.md``."""
+    buffer = StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows([_cells(result) for result in results])
+    write_text(out / "results.jsonl", "".join(json.dumps(result) + "\n" for result in results))
+    write_text(out / "results.csv", buffer.getvalue())
+    write_text(out / "table.md", page)
+
+
+def _cells(result: Result) -> list[Any]:
+    measured = result["measured"]
+    full, bare = measured["configurations"][0], measured["configurations"][-1]
+    special = {
+        **{name: full["mean"][name] for name in ("psnr", "ssim", "lpips")},
+        **{f"{name}_base": bare["mean"][name] for name in ("psnr", "ssim")},
+        "ms_frame": full["ms"],
+        "ms_splat": bare["ms"],
+        "lpips_net": measured["lpips_net"] if full["mean"]["lpips"] is not None else "",
+    }
+    return [special.get(name, measured.get(name)) for name in COLUMNS]
+
+
+def _group(results: Sequence[Result]) -> dict[tuple[str, str, float | None], list[Result]]:
+    """By scene, arm and share; in the order of scenes, shares and :data:`ARMS`."""
+    groups: dict[tuple[str, str, float | None], list[Result]] = {}
+    for result in results:
+        job = result["job"]
+        groups.setdefault((job["scene"], job["arm"], job["keep_ratio"]), []).append(result)
+    order = {arm: place for place, arm in enumerate(("warm-up", *ARMS))}
+    return dict(sorted(groups.items(), key=lambda item: (item[0][0], item[0][2] or -1.0, order.get(item[0][1], 99))))
+
+
+def _percent(ratio: float | None) -> str:
+    return "" if ratio is None else f"{100 * ratio:g}%"
+
+
+def spread(values: Sequence[float | None], digits: int) -> str:
+    """Mean and, of several, the standard deviation: ``29.03 ± 0.12``; a dash where one is missing."""
+    mean = number(_mean(values), digits)
+    known = [value for value in values if value is not None]
+    return mean if len(known) < max(len(values), 2) else f"{mean} ± {number(statistics.stdev(known), digits)}"
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Mean, if all are known."""
+    known = [value for value in values if value is not None]
+    return statistics.fmean(known) if known and len(known) == len(values) else None
+
+
+def quality_page(results: Sequence[Result], command: str) -> str:
+    """The comparison as a page: every way of rendering has a line, its time beside its error."""
+    lines = ["# Comparison of quality", "", f"    {command}", ""]
+    lines += [
+        "Mean over the seeds, ± their standard deviation. Warm-ups are shared by all arms of a seed; keep is a share of their",
+        "primitives, and their training comes before the arms' own. Arms: ours (`sundae`), the paper's band rule on positions",
+        "(`band`), the highest contribution, as LightGaussian prunes (`contribution`), the control (`random`), each with the",
+        "head and without one (`-no-head`); 3DGS-MCMC of warm-up and fine-tuning together, with as many primitives as the arms",
+        "keep (`mcmc`); stock splatfacto of nerfstudio. ms, MB and errors of a line are of the same way of rendering.",
+    ]
+    heads = ["arm", "rendered with", "keep", "seeds", "primitives", "PSNR, dB", "SSIM", "FLIP", "LPIPS", "MB"]
+    heads += ["ms a frame", "training, s"]
+    for scene in dict.fromkeys(result["job"]["scene"] for result in results):
+        rows = []
+        for (_, arm, ratio), own in _group([r for r in results if r["job"]["scene"] == scene]).items():
+            ways = [r["measured"]["configurations"] for r in own]
+            for place in range(min(len(way) for way in ways)):
+                chosen = [way[place] for way in ways]
+                head = "no head" if len(ways[0]) == 1 else chosen[0]["name"]
+                rows.append(
+                    [
+                        *(arm, head, _percent(ratio), str(len(own))),
+                        spread([r["measured"]["primitives"] for r in own], 0),
+                        *(
+                            spread([c["mean"][metric] for c in chosen], digits)
+                            for metric, digits in (("psnr", 2), ("ssim", 4), ("flip", 4), ("lpips", 4))
+                        ),
+                        spread([c["bytes"] / MEGABYTE for c in chosen], 1),
+                        spread([c["ms"] for c in chosen], 2),
+                        spread([r["measured"]["train_s"] for r in own], 0) if place == 0 else "",
+                    ]
+                )
+        of = [r["measured"] for r in results if r["job"]["scene"] == scene]
+        where = sorted({m["gpu"] or "CPU" for m in of})
+        lines += ["", f"## {scene}, {of[0]['resolution']} px, {', '.join(where)}", "", *table(heads, rows)]
+    return "\n".join([*lines, ""])
+
+
+def paper_page(results: Sequence[Result], missing: Sequence[str], command: str) -> str:
+    """The paper's scenes at its keep ratios, measured figures beside printed ones."""
+    groups = _group([r for r in results if r["job"]["kind"] != "warm-up"])
+    arms = list(dict.fromkeys((arm, ratio) for _, arm, ratio in groups))
+    lines = ["# The paper's scenes", "", f"    {command}", ""]
+    lines += [
+        f"Figures in italics are {NOTE}: its pictures may be cut down otherwise, its SSIM and LPIPS be other variants.",
+        "Measured: means over the test views, with the head where there is one. A mean over a data set stands only where",
+        "all of its scenes are measured; the paper's 3DGS rows of Mip-NeRF 360 are means over nine scenes, not seven.",
+    ]
+    for metric, digits in (("psnr", 2), ("ssim", 4)):
+        name = {"psnr": "PSNR, dB", "ssim": "SSIM"}[metric]
+        heads = ["scene", *(f"{arm} {_percent(ratio)}".rstrip() for arm, ratio in arms)]
+        shares = [0.01, 0.1, 0.3, 0.5]
+        heads += [f"*paper {share:.0%}*" for share in shares]
+        rows = []
+        for dataset, members in MEMBERS.items():
+            by_arm: dict[tuple[str, float | None], list[float | None]] = {arm: [] for arm in arms}
+            for scene in members:
+                cells = []
+                for arm in arms:
+                    own = groups.get((scene, *arm), [])
+                    values = [r["measured"]["configurations"][0]["mean"][metric] for r in own]
+                    by_arm[arm].append(_mean(values))
+                    cells.append(spread(values, digits))
+                rows.append([scene, *cells, *_printed(SCENES, scene, shares, metric)])
+            means = [spread([_mean(values)], digits) for values in by_arm.values()]
+            rows.append([f"**{dataset}**", *means, *_printed(DATASETS, dataset, shares, metric)])
+        lines += ["", f"## {name}", "", *table(heads, rows, words=1)]
+    if missing:
+        lines += ["", f"Not there: {', '.join(missing)}."]
+    return "\n".join([*lines, "", *_sizes(groups), ""])
+
+
+def _printed(rows: Sequence[Any], where: str, shares: Sequence[float], metric: str) -> list[str]:
+    own = {row.keep_ratio: getattr(row, metric) for row in rows if row.where == where}
+    return [f"*{number(own[share], 2 if metric == 'psnr' else 3)}*" if share in own else "-" for share in shares]
+
+
+def _sizes(groups: Mapping[tuple[str, str, float | None], Sequence[Result]]) -> list[str]:
+    """What each of them costs."""
+    heads = ["scene", "arm", "keep", "primitives", "MB", "ms a frame", "PSNR of that rendering", "head off: ms", "PSNR"]
+    rows = []
+    for (scene, arm, ratio), own in groups.items():
+        full = [r["measured"]["configurations"][0] for r in own]
+        bare = [r["measured"]["configurations"][-1] for r in own]
+        with_head = full[0]["name"] != HEAD_OFF
+        rows.append(
+            [
+                *(scene, arm, _percent(ratio)),
+                spread([r["measured"]["primitives"] for r in own], 0),
+                spread([way["bytes"] / MEGABYTE for way in full], 1),
+                *(spread([way["ms"] for way in full], 2), spread([way["mean"]["psnr"] for way in full], 2)),
+                spread([way["ms"] for way in bare], 2) if with_head else "",
+                spread([way["mean"]["psnr"] for way in bare], 2) if with_head else "",
+            ]
+        )
+    return ["## Cost", "", *table(heads, rows)]

@@ -1,0 +1,144 @@
+"""``sundae bands`` on a field alone: what it writes, what its figures say, and how it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData
+from torch import Tensor
+
+from sundae_ns.cli import main
+from sundae_ns.cli.bands import base_colors
+from sundae_ns.gaussians import from_points
+from sundae_ns.pruning import PruningConfig, band_rule, decide, response
+from sundae_ns.storage import read_ply, read_point_cloud, write_ply
+
+N = 300
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as caught:
+        main(["bands", *map(str, arguments)])
+    assert isinstance(caught.value.code, int)
+    return caught.value.code
+
+
+def field(n: int = N) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    points, colors = torch.randn(n, 3, generator=generator), torch.rand(n, 3, generator=generator)
+    return from_points(points, colors, sh_degree=1, num_features=0, generator=generator)
+
+
+@pytest.fixture
+def ply(tmp_path: Path) -> Path:
+    params = field()
+    params["means"][[3, 50]] = torch.nan
+    write_ply(tmp_path / "field.ply", params)
+    return tmp_path / "field.ply"
+
+
+def test_everything_is_written_and_agrees(ply: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "deep" / "er"
+    assert run(ply, "-o", out, "--keep-ratio", 0.1, 0.5, "--gamma", 0.3, "--neighbors", 9) == 0
+    result: dict[str, Any] = json.loads((out / "bands.json").read_text())
+    assert {*result["files"], "bands.json"} == {path.name for path in out.iterdir()}
+    assert (result["primitives"], result["not_finite"], result["num_neighbors"]) == (N, 2, 9)
+    assert "wrote bands.json" in capsys.readouterr().out
+
+    params = {name: value[torch.isfinite(value_of_means(ply))] for name, value in read_ply(ply).items()}
+    config = PruningConfig(signal="positions", num_neighbors=9)
+    magnitude = response(params, band_rule(config, 0.1, 0.3)).magnitude
+    known = magnitude[magnitude.isfinite()]
+    assert result["response"]["known"] == len(known)
+    assert result["isolated"] == len(magnitude) - len(known)
+    assert result["response"]["quantiles"]["0.5"] == pytest.approx(float(known.median()), rel=0.02)
+    points, colors = read_point_cloud(out / "all.ply")
+    assert torch.equal(points, params["means"])
+    assert torch.equal(colors, base_colors(params, logits=False))
+    for figures, keep_ratio in zip(result["bands"], (0.1, 0.5), strict=True):
+        count = round(keep_ratio * (N - 2))
+        masks = {}
+        for name, gamma in (("high", 1.0), ("low", 0.0), ("combined", 0.3)):
+            masks[name] = decide(params, band_rule(config, keep_ratio, gamma)).mask
+            found = PlyData.read(str(out / f"{name}-{keep_ratio}.ply"))["vertex"]
+            kept = torch.from_numpy(np.stack([found["x"], found["y"], found["z"]], axis=1))
+            assert torch.equal(kept, params["means"][masks[name]])
+            expected = magnitude[masks[name]].nan_to_num(nan=-1).float()
+            assert torch.equal(torch.from_numpy(found["response"].copy()), expected)
+            assert figures["kept"][name] == len(kept) == count
+        assert figures["overlap"]["high and low"] == int((masks["high"] & masks["low"]).sum())
+        assert figures["overlap"]["combined and high"] == round(0.3 * count)
+        assert figures["high_from"] == float(magnitude[masks["high"]].min())
+        with Image.open(out / f"bands-{keep_ratio}.png") as sheet:
+            assert len(np.unique(np.asarray(sheet).reshape(-1, 3), axis=0)) > 100
+    with Image.open(out / "response.png") as histogram:
+        assert histogram.width > 500
+
+
+def value_of_means(ply: Path) -> Tensor:
+    """The x of each primitive ``[N]``: NaN where the primitive is not finite."""
+    return read_ply(ply)["means"][:, 0]
+
+
+def test_the_signal_changes_the_choice(ply: Path, tmp_path: Path) -> None:
+    for signal in ("positions", "attributes"):
+        assert run(ply, "-o", tmp_path / signal, "--signal", signal, "--keep-ratio", 0.2) == 0
+    clouds = [read_point_cloud(tmp_path / signal / "high-0.2.ply")[0] for signal in ("positions", "attributes")]
+    assert not torch.equal(*clouds)
+
+
+def test_colours_of_files_and_of_checkpoints_without_harmonics() -> None:
+    params = field()
+    params["features_rest"] = params["features_rest"][:, :0]
+    params["features_dc"] = torch.tensor([[0.0, 1e9, -1e9]]).repeat(N, 1)
+    assert base_colors(params, logits=True)[0].tolist() == [128, 255, 0]
+    assert base_colors(params, logits=False)[0].tolist() == [128, 255, 0]
+    params["features_dc"][:] = 1.0
+    assert base_colors(params, logits=True)[0].tolist() == [round(255 / (1 + np.exp(-1)))] * 3
+    assert base_colors(params, logits=False)[0].tolist() == [round(255 * (0.5 + 0.28209479))] * 3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--keep-ratio", "0"), "keep_ratio is 0.0: use a share"),
+        (("--keep-ratio", "0.1", "1.5"), "keep_ratio is 1.5: use a share"),
+        (("--keep-ratio",), "nothing to keep"),
+        (("--gamma", "2"), "gamma is 2.0"),
+        (("--neighbors", "0"), "num_neighbors is 0"),
+        (("--view", "1"), "no training view 1: the field comes without a run"),
+    ],
+)
+def test_options_that_cannot_work(
+    ply: Path, tmp_path: Path, options: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(ply, "-o", tmp_path / "out", *options) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("sundae: ")
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_fields_that_cannot_be_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(tmp_path / "gone", "-o", tmp_path / "out") == 2
+    write_ply(tmp_path / "one.ply", field(1))
+    assert run(tmp_path / "one.ply", "-o", tmp_path / "out") == 2
+    params = field(5)
+    params["means"][:] = torch.nan
+    write_ply(tmp_path / "nan.ply", params)
+    assert run(tmp_path / "nan.ply", "-o", tmp_path / "out") == 2
+    (tmp_path / "file").touch()
+    write_ply(tmp_path / "few.ply", field(5))
+    assert run(tmp_path / "few.ply", "-o", tmp_path / "file") == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 4
+    assert all(error.startswith("sundae: ") for error in errors)
+    assert "none of the 5 primitives" in errors[2]
+    # Fewer than the neighbours asked for are enough.
+    assert run(tmp_path / "few.ply", "-o", tmp_path / "out") == 0

@@ -1,0 +1,365 @@
+"""Plans of ``sundae bench quality`` and ``paper``, and how they are carried out, with a runner that trains nothing."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from sundae_ns.cli.bench.plan import ARMS, Job, Schedule, done_file, jobs_of_shard, parser_of, plan_scene, schedule_of
+from sundae_ns.cli.bench.quality import run_paper, run_quality
+from sundae_ns.cli.bench.recipes import RECIPES, find_scene
+from sundae_ns.cli.bench.results import read_results, spread
+from sundae_ns.errors import ConfigError, DataError, SundaeError
+from sundae_ns.evaluation import COLUMNS, HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality, read_rows
+from sundae_ns.evaluation.published import RESOLUTIONS
+
+PSNR = {"warm-up": 24.0, "sundae": 27.0, "random": 25.0, "mcmc": 26.0, "splatfacto": 28.0}
+
+
+class Runner:
+    """Finishes jobs without training, and can stop as a signal would."""
+
+    def __init__(self, *, stop_after: int | None = None, broken: str = "") -> None:
+        self.ran: list[str] = []
+        self.stop_after, self.broken = stop_after, broken
+
+    def __call__(self, job: Job, out: Path, on_percent: Callable[[float], object]) -> None:
+        if self.stop_after is not None and len(self.ran) >= self.stop_after:
+            raise KeyboardInterrupt
+        if self.broken and self.broken in job.key:
+            raise SundaeError("it broke")
+        self.ran.append(job.key)
+        on_percent(50)
+        path = done_file(out, job.key)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"job": asdict(job), "measured": measured(job).as_json()}) + "\n")
+
+
+def measured(job: Job) -> Measured:
+    psnr = PSNR[job.arm.removesuffix("-no-head")] + 0.1 * (job.seed - 42)
+    ways = [Configuration(HEAD_OFF, 2.0, 1_000_000, (ViewQuality(psnr - 1, 0.8, 0.2),))]
+    if job.kind == "branch" and not job.arm.endswith("-no-head"):
+        ways.insert(0, Configuration(HEAD_ON, 3.5, 3_000_000, (ViewQuality(psnr, 0.9, 0.1),)))
+    return Measured(
+        label=job.key,
+        source="runs/a",
+        scene=job.scene,
+        method=job.method,
+        variant=job.arm,
+        keep_ratio=job.keep_ratio,
+        seed=job.seed,
+        steps=job.steps,
+        primitives=1000,
+        bytes_primitives=1_000_000,
+        bytes_head=0,
+        resolution="100x80",
+        configurations=tuple(ways),
+        train_s=10.0,
+        peak_primitives=1500,
+    )
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    folder = tmp_path / "fox"
+    folder.mkdir()
+    (folder / "transforms.json").write_text("{}")
+    return folder
+
+
+def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[int, str]:
+    text = StringIO()
+    options: dict[str, Any] = {
+        "arms": ("sundae", "random-no-head", "mcmc", "splatfacto"),
+        "keep_ratios": (0.01, 0.1),
+        "seeds": (42, 43, 44),
+        "repeat_at": (0.1,),
+        "method": "sundae",
+        "warmup_steps": None,
+        "finetune_steps": None,
+        "steps_scale": 1.0,
+        "downscale": 1,
+        "shard": "1/1",
+        "jobs": False,
+    }
+    code = run_quality(
+        capture,
+        out,
+        **{**options, **changed},
+        runner=runner,
+        console=Console(file=text, width=200, force_terminal=False),
+    )
+    return code, text.getvalue()
+
+
+# ----------------------------------------------------------------------------------------------------------------- plans
+
+
+def plan(**changed: Any) -> list[Job]:
+    options: dict[str, Any] = {"arms": ARMS, "keep_ratios": [0.01, 0.1], "seeds": [42, 43], "repeat_at": [0.1]}
+    schedule = Schedule("sundae", 15_000, 15_000)
+    return plan_scene("fox", Path("fox"), (), schedule, **{**options, **changed})
+
+
+def test_seeds_repeat_only_what_is_asked_for() -> None:
+    jobs = plan()
+    assert len({job.key for job in jobs}) == len(jobs)
+    arms = [arm for arm in ARMS if not arm.startswith("splatfacto")]
+    for seed, ratios in ((42, {0.01, 0.1}), (43, {0.1})):
+        own = [job for job in jobs if job.seed == seed]
+        assert {(job.arm, job.keep_ratio) for job in own if job.needs} == {(a, r) for a in arms for r in ratios}
+        assert [job.kind for job in own].count("warm-up") == 1
+        assert {job.arm: job.steps for job in own if job.kind == "stock"} == {
+            "splatfacto": 30_000,
+            "splatfacto-7k": 7_000,
+        }
+
+
+def test_every_arm_of_a_seed_starts_from_its_warm_up_and_trains_as_long() -> None:
+    jobs = plan()
+    place = {job.key: index for index, job in enumerate(jobs)}
+    for job in jobs:
+        if job.needs is not None:
+            warm_up = jobs[place[job.needs]]
+            assert place[warm_up.key] < place[job.key]
+            assert (warm_up.kind, warm_up.seed) == ("warm-up", job.seed)
+            assert job.steps == (30_000 if job.kind == "mcmc" else 15_000)
+            assert (job.steps if job.kind == "mcmc" else warm_up.steps + job.steps) == 30_000
+
+
+def test_arms_differ_in_their_rule_alone() -> None:
+    by_arm = {job.arm: job.options for job in plan(keep_ratios=[0.1], seeds=[42])}
+    head = ("--pipeline.model.head.mode", "off")
+    for arm in ("sundae", "band", "contribution", "random"):
+        assert by_arm[arm + "-no-head"] == (*by_arm[arm], *head)
+        assert by_arm[arm][: len(by_arm["sundae"])] == by_arm["sundae"]
+
+
+@pytest.mark.parametrize("parts", [1, 2, 5, 40])
+def test_shards_divide_the_jobs_and_bring_the_warm_ups_they_need(parts: int) -> None:
+    jobs = plan()
+    shards = [jobs_of_shard(jobs, index, parts) for index in range(parts)]
+    dealt = sorted(job.key for shard in shards for job in shard if job.kind != "warm-up")
+    assert dealt == sorted(job.key for job in jobs if job.kind != "warm-up")
+    for shard in shards:
+        keys = [job.key for job in shard]
+        assert all(job.needs is None or keys.index(job.needs) < keys.index(job.key) for job in shard)
+        assert all(any(other.needs == job.key for other in shard) for job in shard if job.kind == "warm-up")
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"arms": ["best"]},
+        {"arms": []},
+        {"arms": ["sundae", "sundae"]},
+        {"keep_ratios": [0]},
+        {"keep_ratios": []},
+        {"seeds": [1, 1]},
+        {"repeat_at": [0.5]},
+    ],
+)
+def test_plans_that_cannot_be(odd: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        plan(**odd)
+
+
+def test_lengths_come_from_the_method() -> None:
+    assert schedule_of("sundae", warmup=None, finetune=None, scale=1) == Schedule("sundae", 15_000, 15_000)
+    assert schedule_of("sundae", warmup=7, finetune=None, scale=0.5) == Schedule("sundae", 4, 7500, 15_000, 3_500)
+    for method, scale in (("nerfacto", 1.0), ("sundae-continuous", 1.0), ("sundae", 0.0)):
+        with pytest.raises(ConfigError):
+            schedule_of(method, warmup=None, finetune=None, scale=scale)
+
+
+# ------------------------------------------------------------------------------------------------------- carried out
+
+
+def test_stopped_and_continued(capture: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    first = Runner(stop_after=3)
+    code, said = quality(capture, out, first)
+    assert code == 130
+    assert "the same command goes on" in said
+    second = Runner()
+    assert quality(capture, out, second)[0] == 0
+    assert len(first.ran) == 3
+    assert not set(first.ran) & set(second.ran)
+    third = Runner()
+    code, said = quality(capture, out, third)
+    assert (code, third.ran) == (0, [])
+    rows = read_rows(out / "results.csv")
+    assert len(rows) == len(first.ran) + len(second.ran)
+    assert {row.peak_primitives for row in rows} == {1500}
+    with open(out / "results.csv", newline="") as file:
+        assert tuple(next(csv.reader(file))) == COLUMNS
+    assert "table.md" in said
+    assert "done" in quality(capture, out, third, jobs=True)[1]
+
+
+def test_the_page_has_mean_and_spread_beside_each_ways_own_time(capture: Path, tmp_path: Path) -> None:
+    quality(capture, tmp_path / "out", Runner())
+    page = (tmp_path / "out" / "table.md").read_text()
+    assert "--keep-ratios 0.01 0.1 --seeds 42 43 44 --repeat-at 0.1 --method sundae" in page
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| sun")]
+    by_way = {(line[1], line[2]): line for line in lines}
+    on, off = by_way["head on", "10%"], by_way["head off", "10%"]
+    assert (on[3], on[5], on[10]) == ("3", "27.10 ± 0.10", "3.50 ± 0.00")
+    assert (off[3], off[5], off[10]) == ("3", "26.10 ± 0.10", "2.00 ± 0.00")
+    assert by_way["head on", "1%"][5] == "27.00"
+
+
+def test_parts_merge_by_concatenation(capture: Path, tmp_path: Path) -> None:
+    parts = []
+    for index in (1, 2, 3):
+        out = tmp_path / f"part{index}"
+        assert quality(capture, out, Runner(), shard=f"{index}/3")[0] == 0
+        parts.append((out / "results.jsonl").read_text())
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    (whole / "merged.jsonl").write_text("".join(parts))
+    again = Runner()
+    assert quality(capture, whole, again)[0] == 0
+    assert again.ran == []
+    straight = tmp_path / "straight"
+    quality(capture, straight, Runner())
+
+    def figures(path: Path) -> list[str]:
+        return [line for line in (path / "table.md").read_text().splitlines() if line.startswith("|")]
+
+    assert figures(whole) == figures(straight)
+
+
+def test_a_branch_needs_the_warm_up_and_not_its_result_alone(capture: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    quality(capture, out, Runner(), arms=("sundae",), seeds=(42,))
+    (out / "done" / "fox-warm-up-s42.json").unlink()
+    runner = Runner()
+    quality(capture, out, runner, arms=("sundae", "mcmc"), keep_ratios=(0.1,), seeds=(42,))
+    assert runner.ran == ["fox-warm-up-s42", "fox-mcmc-10pct-s42"]
+
+
+def test_a_job_that_fails_stops_only_what_needs_it(capture: Path, tmp_path: Path) -> None:
+    runner = Runner(broken="warm-up-s43")
+    code, said = quality(capture, tmp_path / "out", runner)
+    assert code == 1
+    assert "fox-warm-up-s43 failed: it broke" in said
+    assert not any(key.endswith("s43") and "splatfacto" not in key for key in runner.ran)
+    assert "fox-sundae-10pct-s44" in runner.ran
+    assert quality(capture, tmp_path / "out", Runner())[0] == 0
+
+
+def test_another_plan_does_not_pass_for_this_one(capture: Path, tmp_path: Path) -> None:
+    quality(capture, tmp_path / "out", Runner())
+    with pytest.raises(ConfigError, match="steps"):
+        quality(capture, tmp_path / "out", Runner(), finetune_steps=100)
+
+
+def test_damaged_results_are_refused(capture: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    quality(capture, out, Runner(), arms=("splatfacto",))
+    (out / "more.jsonl").write_text((out / "results.jsonl").read_text() + '{"job"')
+    with pytest.raises(DataError, match="more.jsonl, line 4"):
+        read_results(out)
+
+
+def test_spread() -> None:
+    assert spread([1.0, 2.0, 3.0], 2) == "2.00 ± 1.00"
+    assert spread([1.0], 2) == "1.00"
+    assert spread([1.0, None], 2) == spread([], 2) == "-"
+
+
+# ---------------------------------------------------------------------------------------------------------- the paper's
+
+
+def scene_folder(folder: Path, *pictures: str) -> None:
+    (folder / "sparse" / "0").mkdir(parents=True)
+    for name in pictures:
+        (folder / name).mkdir()
+
+
+@pytest.fixture
+def archives(tmp_path: Path) -> Path:
+    """Empty folders, laid out as the archives unpack."""
+    for recipe in RECIPES:
+        parent = {"Mip-NeRF 360": "360_v2", "Tanks and Temples": "tandt_db/tandt", "Deep Blending": "tandt_db/db"}
+        scene_folder(tmp_path / "data" / parent[recipe.dataset] / recipe.scene, "images", "images_2", "images_4")
+    return tmp_path / "data"
+
+
+def paper(root: Path, out: Path, runner: Runner, **changed: Any) -> tuple[int, str]:
+    text = StringIO()
+    options: dict[str, Any] = {
+        "scenes": (),
+        "arms": ("sundae", "splatfacto"),
+        "keep_ratios": (0.01, 0.1, 0.3, 0.5),
+        "seed": 42,
+        "method": "sundae",
+        "warmup_steps": None,
+        "finetune_steps": None,
+        "steps_scale": 1.0,
+        "shard": "1/1",
+        "jobs": False,
+    }
+    console = Console(file=text, width=200, force_terminal=False)
+    return run_paper(root, out, **{**options, **changed}, runner=runner, console=console), text.getvalue()
+
+
+def cells_of(page: str, first: str) -> list[str]:
+    """The other cells of a line of the table of PSNR."""
+    table = page.partition("## PSNR")[2].partition("## SSIM")[0]
+    line = next(line for line in table.splitlines() if line.startswith(f"| {first} "))
+    return [cell.strip() for cell in line.split("|")[2:-1]]
+
+
+def test_recipes_are_the_papers_eleven_at_its_pictures() -> None:
+    assert len(RECIPES) == 11
+    factors = {recipe.scene: recipe.downscale for recipe in RECIPES}
+    assert (factors["bicycle"], factors["counter"], factors["truck"], factors["playroom"]) == (4, 2, 1, 1)
+    assert set(RESOLUTIONS) <= set(factors)
+
+
+def test_all_scenes_into_one_table_beside_the_papers(archives: Path, tmp_path: Path) -> None:
+    runner = Runner()
+    assert paper(archives, tmp_path / "out", runner)[0] == 0
+    assert len(runner.ran) == 11 * (1 + 4 + 1)
+    page = (tmp_path / "out" / "table.md").read_text()
+    arms = ["splatfacto", "sundae 1%", "sundae 10%", "sundae 30%", "sundae 50%"]
+    assert cells_of(page, "scene")[:5] == arms
+    ours = ["27.00", *["27.00"] * 4]
+    assert cells_of(page, "bicycle") == [*ours, "*23.23*", "*24.36*", "*24.40*", "*24.46*"]
+    assert cells_of(page, "**Tanks and Temples**") == [*ours, "*20.49*", "*22.50*", "*23.46*", "*23.70*"]
+
+
+def test_scenes_that_are_not_there_are_said_and_left_out(archives: Path, tmp_path: Path) -> None:
+    (archives / "360_v2" / "garden").rename(tmp_path / "elsewhere")
+    code, said = paper(archives, tmp_path / "out", Runner(), keep_ratios=(0.1,))
+    assert code == 0
+    assert "left out: garden" in said
+    page = (tmp_path / "out" / "table.md").read_text()
+    assert "Not there: garden." in page
+    # A mean of six of seven is not the data set's.
+    assert cells_of(page, "**Mip-NeRF 360**")[:2] == ["-", "-"]
+
+
+def test_folders_that_cannot_be_used(archives: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="none of the paper's scenes"):
+        paper(archives, tmp_path / "out", Runner(), scenes=("treehill",))
+    with pytest.raises(DataError, match="holds none"):
+        paper(tmp_path / "fresh", tmp_path / "out", Runner())
+    (archives / "360_v2" / "stump" / "images_4").rmdir()
+    with pytest.raises(DataError, match="images_4 does not exist"):
+        paper(archives, tmp_path / "out", Runner())
+    scene_folder(archives / "copy" / "bicycle")
+    with pytest.raises(DataError, match="more than once"):
+        find_scene(archives, "bicycle")
+    with pytest.raises(DataError, match="no capture"):
+        parser_of(archives)

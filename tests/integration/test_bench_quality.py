@@ -1,0 +1,135 @@
+"""``sundae bench quality`` and ``bench paper`` with real, tiny trainings: stopped and continued, and published layouts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from sundae_ns.cli import main
+from sundae_ns.cli.bench.job import perform
+from sundae_ns.cli.bench.plan import Job, parser_of, plan_scene, schedule_of
+from sundae_ns.cli.bench.quality import run_paper
+from sundae_ns.evaluation import read_rows
+from sundae_ns.opening import open_scene
+
+WARMUP, FINETUNE = 12, 8
+
+
+def in_process(job: Job, out: Path, on_percent: Callable[[float], object]) -> None:
+    """A job without a process of its own, which would load everything anew."""
+    perform(job, out)
+
+
+def test_stopped_and_continued(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arms, out = ["sundae", "random-no-head", "mcmc"], tmp_path / "out"
+    schedule = schedule_of("sundae-tiny", warmup=WARMUP, finetune=FINETUNE, scale=1)
+    jobs = plan_scene(
+        tiny.scene.name,
+        tiny.scene.resolve(),
+        parser_of(tiny.scene),
+        schedule,
+        arms=arms,
+        keep_ratios=[0.5],
+        seeds=[42],
+        repeat_at=[0.5],
+    )
+    warm_up, random = (job for job in jobs if job.kind == "warm-up" or job.arm == "random-no-head")
+    for job in jobs:
+        if job is not random:
+            perform(job, out)
+    # What a branch leaves that was cut off in its midst.
+    leftover = out / "jobs" / random.key / "random-no-head" / "sundae-tiny" / "run" / "events.out.tfevents.1.gone"
+    leftover.parent.mkdir(parents=True)
+    leftover.touch()
+    stamps = {path: path.stat().st_mtime_ns for path in (out / "done").iterdir()}
+    assert len(stamps) == 3
+
+    options = ["--method", "sundae-tiny", "--warmup-steps", WARMUP, "--finetune-steps", FINETUNE, "--seeds", 42]
+    options += ["--keep-ratios", 0.5, "--repeat-at", 0.5, "--arms", *arms]
+    with pytest.raises(SystemExit) as caught:
+        main([str(word) for word in ("bench", "quality", tiny.scene, "-o", out, *options)])
+    assert caught.value.code == 0, capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+    assert not leftover.exists()
+    rows = {row.variant: row for row in read_rows(out / "results.csv")}
+    assert set(rows) == {"warm-up", *arms}
+    kept = round(0.5 * rows["warm-up"].primitives)
+    assert {rows[arm].primitives for arm in arms} == {kept}
+    for row in rows.values():
+        assert None not in (row.ms_frame, row.psnr, row.train_s)
+    peaks = {arm: row.peak_primitives for arm, row in rows.items()}
+    assert peaks["sundae"] == peaks["random-no-head"] == peaks["warm-up"] >= rows["warm-up"].primitives
+    assert peaks["mcmc"] == kept
+    assert rows["sundae"].bytes_head > 0 == rows["random-no-head"].bytes_head
+    # What was measured is what lies there: the run can be opened and looked at.
+    assert open_scene(out / "jobs" / warm_up.key / "warm-up" / "sundae-tiny" / "run").steps == WARMUP
+
+
+def published(scene: Path, out: Path, *, factor: int) -> None:
+    """The embedded scene laid out as Mip-NeRF 360 is published: a COLMAP model of large pictures, and ``images_N``."""
+    meta = json.loads((scene / "transforms.json").read_text())
+    width, height = factor * meta["w"] - 1, factor * meta["h"] - factor // 2  # rounded up, by a hair
+    intrinsics = [factor * meta[name] for name in ("fl_x", "fl_y", "cx", "cy")]
+    model = out / "sparse" / "0"
+    model.mkdir(parents=True)
+    (out / "images").mkdir()
+    (out / f"images_{factor}").mkdir()
+    cameras = struct.pack("<QiiQQ4d", 1, 1, 1, width, height, *intrinsics)
+    images = struct.pack("<Q", len(meta["frames"]))
+    for number, frame in enumerate(meta["frames"], start=1):
+        name = Path(frame["file_path"]).name
+        shutil.copy(scene / frame["file_path"], out / f"images_{factor}" / name)
+        with Image.open(scene / frame["file_path"]) as picture:
+            picture.resize((width, height)).save(out / "images" / name)
+        pose = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        turn, shift = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+        x, y, z, w = Rotation.from_matrix(turn).as_quat()
+        images += struct.pack("<i7di", number, w, x, y, z, *shift, 1) + name.encode() + b"\0" + struct.pack("<Q", 0)
+    cloud = np.random.default_rng(0).uniform(-1, 1, (60, 3))
+    points = struct.pack("<Q", len(cloud))
+    for number, point in enumerate(cloud):
+        points += struct.pack("<Q3d3Bd", number, *point, 90, 90, 90, 0.5)
+        points += struct.pack("<Q", 1) + struct.pack("<ii", 1, 0)
+    for name, content in (("cameras", cameras), ("images", images), ("points3D", points)):
+        (model / f"{name}.bin").write_bytes(content)
+
+
+def test_a_scene_as_it_is_published(tiny: Any, tmp_path: Path) -> None:
+    published(tiny.scene, tmp_path / "360_v2" / "bicycle", factor=4)
+    published(tiny.scene, tmp_path / "360_v2" / "counter", factor=2)
+    code = run_paper(
+        tmp_path,
+        tmp_path / "out",
+        scenes=(),
+        arms=("sundae",),
+        keep_ratios=(0.5,),
+        seed=42,
+        method="sundae-tiny",
+        warmup_steps=WARMUP,
+        finetune_steps=FINETUNE,
+        steps_scale=1.0,
+        shard="1/1",
+        jobs=False,
+        runner=in_process,
+    )
+    assert code == 0
+    rows = [row for row in read_rows(tmp_path / "out" / "results.csv") if row.variant == "sundae"]
+    meta = json.loads((tiny.scene / "transforms.json").read_text())
+    assert {row.scene for row in rows} == {"bicycle", "counter"}
+    # The published pictures, not the large ones, rounded as they are.
+    assert {row.resolution for row in rows} == {f"{meta['w']}x{meta['h']}"}
+    opened = open_scene(tmp_path / "out" / "jobs" / "bicycle-sundae-50pct-s42" / "sundae" / "sundae-tiny" / "run")
+    assert len(opened.cameras) == -(-len(meta["frames"]) // 8)
+    assert [float(camera.fx) for camera in opened.cameras] == pytest.approx([meta["fl_x"]] * len(opened.cameras))
+    page = (tmp_path / "out" / "table.md").read_text()
+    assert "*23.23*" in page
+    assert "Not there: bonsai, garden" in page

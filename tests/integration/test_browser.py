@@ -1,0 +1,156 @@
+"""The viewer in a real browser: ``ns-viewer`` on the tiny run, looked at and operated in a headless Chromium.
+
+Screenshots are compared with pictures of the loaded model by the page's own camera. In between lie JPEG at quality 75 and
+the browser's enlarging to the size of its canvas, done here by the same bilinear filter.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import CameraType
+from nerfstudio.utils import colormaps
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.viewer.utils import CameraState, get_camera
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+from viser import transforms
+
+from sundae_ns.preview import rule_config
+from sundae_ns.pruning import decide
+
+ROOT = Path(__file__).parents[2]
+spec = importlib.util.spec_from_file_location("browser", ROOT / "benchmarks" / "browser.py")
+assert spec is not None
+assert spec.loader is not None
+browser = sys.modules["browser"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(browser)
+
+CHROMIUM = browser.find_chromium()
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (apt-get install chromium)"),
+]
+SIDE = 256
+"""Longer side of pictures after "Fast" has been pressed, pixels."""
+FAR = 48
+MEAN, SHARE = 3.0, 0.02
+"""Bounds of the mean difference of screenshot and render, in steps of 255, and of the share of pixels off by ``FAR``."""
+
+
+@pytest.fixture
+def server(tiny: Any, tmp_path: Path) -> Iterator[Any]:
+    """``ns-viewer`` on the tiny run."""
+    command = ("ns-viewer", "--load-config", tiny.config)
+    server = browser.Server(command, tmp_path / "viewer.log", "Caching / undistorting")
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def page() -> Iterator[Any]:
+    with browser.ViewerPage(CHROMIUM, 640, 400) as page:
+        yield page
+
+
+def camera_of(page: Any) -> Any:
+    """nerfstudio's camera for the page's, as its viewer makes it."""
+    seen = page.camera
+    rotation = transforms.SO3(wxyz=np.array(seen.wxyz)) @ transforms.SO3.from_x_radians(np.pi)
+    position = torch.tensor(seen.position, dtype=torch.float64) / 10
+    pose = torch.cat([torch.tensor(rotation.as_matrix()), position[:, None]], dim=1)
+    width, height = page.pictures[-1]
+    return get_camera(CameraState(seen.fov, seen.aspect, pose, CameraType.PERSPECTIVE), height, width)
+
+
+def scene(page: Any) -> NDArray[np.float64]:
+    """What the page last showed of the scene ``[H, W, 3]``, to 255, the axes in its lower left corner blackened."""
+    left, top, width, height = page.canvas()
+    seen = page.seen[top : top + height, left : left + width].astype(float)
+    seen[-80:, :80] = 0
+    return seen
+
+
+def differences(seen: NDArray[np.float64], picture: Tensor) -> tuple[float, float]:
+    """Mean difference of what is seen and a picture ``[H, W, C]``, and the share of pixels that are far off."""
+    options = colormaps.ColormapOptions(normalize=True)
+    shown = (colormaps.apply_colormap(picture, options) * 255).to(torch.uint8).numpy()
+    height, width, _ = seen.shape
+    expected = np.asarray(Image.fromarray(shown).resize((width, height), Image.Resampling.BILINEAR), dtype=float)
+    expected[-80:, :80] = 0
+    error = np.abs(seen - expected)
+    return float(error.mean()), float((error.max(axis=2) > FAR).mean())
+
+
+def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> None:
+    _, pipeline, _, _ = eval_setup(tiny.config, test_mode="test")
+    model = pipeline.model
+    browser.wait_for(server.listens, "ns-viewer", 120)
+    page.open(server.address)
+    browser.wait_for(lambda: bool(page.pictures), "the first picture", 60)
+    page.press("Hide Train Cams")
+    page.settle(lambda: page.press("Fast"), SIDE)
+    page.settle(lambda: page.drag(200, 250, 140, 230), SIDE)
+    page.rest()
+    found: dict[str, tuple[float, float]] = {}
+
+    @torch.no_grad()
+    def outputs() -> dict[str, Tensor]:
+        model.set_background(torch.tensor([38, 42, 55]) / 255)  # what the viewer's menu is set to at first
+        return dict(model.eval().get_outputs_for_camera(camera_of(page)))
+
+    expected = outputs()
+    first = scene(page)
+    found["at first"] = differences(first, expected["rgb"])
+    names = page.options("Output type")
+    # The viewer itself adds the depth that it hands to the browser.
+    assert set(names) == {*expected, "gl_z_buf_depth"}
+    seen = {}
+    for name in (*names[1:], names[0]):
+        page.settle(lambda name=name: page.choose("Output type", name), SIDE)
+        seen[name] = scene(page)
+        if name in expected:
+            found[name] = differences(seen[name], expected[name])
+
+    # So short a training gives the head little to say, less than JPEG; but the same picture stays nearly the same,
+    # also where an earlier one, of lower quality, is still on show.
+    page.settle(lambda: page.tick("Neural compensation", False), SIDE)
+    off = scene(page)
+    found["head off"] = differences(off, expected["base_rgb"])
+    said = np.abs(off - first).mean()
+    assert said > 0
+    assert np.abs(off - seen["base_rgb"]).mean() < 0.3 * said
+
+    def as_at_first() -> bool:
+        page.rest(0.2)
+        return bool(np.abs(scene(page) - first).mean() < 0.3 * said)
+
+    page.settle(lambda: page.tick("Neural compensation", True), SIDE)
+    browser.wait_for(as_at_first, "the picture with the head", 20)
+
+    keep_ratio = page.settle(lambda: page.slide("Keep ratio", 0.1), SIDE)
+    assert 0.05 < keep_ratio < 0.15
+    config = rule_config(model.config.pruning, "as configured", keep_ratio)
+    decision = decide(model.gaussians, config, lambda: model.contribution(pipeline.datamanager, config))
+    assert decision.values is not None
+    part = {name: value[decision.mask] for name, value in model.gaussians.items()} | dict(decision.values)
+    with torch.no_grad():
+        preview, _ = model.render(part, model.view_of(camera_of(page)), expected["background"][0, 0], compensate=False)
+    previewed = scene(page)
+    found["preview"] = differences(previewed, preview["rgb"])
+    assert differences(previewed, expected["base_rgb"])[0] > 2 * found["preview"][0]
+    page.settle(lambda: page.slide("Keep ratio", 1.1), SIDE)
+    browser.wait_for(as_at_first, "the picture without preview", 20)
+
+    print("\n".join(f"{name}: mean {mean:.2f}, far off {far:.4f}" for name, (mean, far) in found.items()))
+    assert all(mean < MEAN and far < SHARE for mean, far in found.values()), found
+    assert page.errors == []
+    assert not server.complaints(), server.output()[-3000:]

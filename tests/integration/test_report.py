@@ -1,0 +1,174 @@
+"""``sundae report`` on the tiny run, and on a run of stock splatfacto with the same primitives."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from nerfstudio.configs.method_configs import method_configs
+
+from sundae_ns.cli import main
+from sundae_ns.evaluation import COLUMNS, flip_available, read_rows
+from sundae_ns.measure import quality
+from sundae_ns.opening import open_scene
+from sundae_ns.packed_run import scene_of_run
+from sundae_ns.storage.packing import write_scene
+
+
+def sundae(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as caught:
+        main([str(argument) for argument in arguments])
+    assert isinstance(caught.value.code, int)
+    return caught.value.code
+
+
+@pytest.fixture(scope="module")
+def stock(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder of splatfacto as nerfstudio writes it, its field that of the tiny run: it cannot train without CUDA."""
+    config = copy.deepcopy(method_configs["splatfacto"])
+    config.data = config.pipeline.datamanager.data = tiny.scene
+    config.experiment_name = "stock"
+    folder = tmp_path_factory.mktemp("stock") / "stock" / "splatfacto" / "now"
+    (folder / "nerfstudio_models").mkdir(parents=True)
+    (folder / "config.yml").write_text(yaml.dump(config))
+    state = torch.load(tiny.checkpoint(tiny.steps - 1), map_location="cpu")["pipeline"]
+    field = {key: value for key, value in state.items() if "gauss_params" in key and not key.endswith(".features")}
+    rest = field["_model.gauss_params.features_rest"]
+    field["_model.gauss_params.features_rest"] = torch.cat([rest, rest.new_zeros(len(rest), 15 - rest.shape[1], 3)], 1)
+    torch.save({"step": 6999, "pipeline": field}, folder / "nerfstudio_models" / "step-000006999.ckpt")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(tiny: Any, stock: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("report")
+    assert sundae("report", tiny.folder, stock / "config.yml", "-o", out, "--warmup", 0, "--repeats", 1) == 0
+    return out
+
+
+def test_files(report: Path) -> None:
+    names = {path.name for path in report.iterdir()}
+    pictures = {"cost.png", "gain.png", "views.png", "curves.png", "errors-1.png", "errors-2.png"}
+    assert names == {"report.json", "report.csv", "report.md"} | pictures
+    text = (report / "report.md").read_text()
+    assert all(f"({name})" in text for name in pictures)
+    assert "Curves of stock/splatfacto: there are no event files" in text
+    with open(report / "report.csv", newline="") as file:
+        assert tuple(next(csv.reader(file))) == COLUMNS
+
+
+def test_rows_are_of_the_runs(report: Path, tiny: Any) -> None:
+    ours, theirs = read_rows(report / "report.csv")
+    assert (ours.scene, ours.method, ours.steps, ours.keep_ratio) == ("scene", "sundae-tiny", tiny.steps, 0.5)
+    assert (theirs.scene, theirs.method, theirs.steps, theirs.keep_ratio) == ("scene", "splatfacto", 7000, 1.0)
+    assert ours.primitives == theirs.primitives
+    # The same primitives, rendered without a head, are the same pictures, whoever's configuration says so.
+    assert ours.psnr_base == theirs.psnr == theirs.psnr_base
+    assert ours.psnr != ours.psnr_base
+    assert min(ours.ms_frame, ours.ms_splat, ours.ms_head, theirs.ms_frame) > 0
+    assert ours.bytes_head > 0 == theirs.bytes_head
+    assert ours.command.startswith("sundae report ")
+
+
+def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any) -> None:
+    ours, theirs = json.loads((report / "report.json").read_text())
+    assert [way["name"] for way in ours["configurations"]] == ["head on", "head off"]
+    assert [way["name"] for way in theirs["configurations"]] == ["head off"]
+    opened = open_scene(tiny.folder)
+    model = opened.model
+    for way, compensate in zip(ours["configurations"], (True, False), strict=True):
+        assert way["ms"] > 0
+        with torch.no_grad():
+            pictures, _ = model.render(
+                model.gaussians,
+                model.view_of(opened.cameras[1]),
+                model._get_background_color(),
+                compensate=compensate,
+            )
+        expected = quality(pictures["rgb"], opened.truths[1])
+        found = way["views"][1]
+        assert (found["psnr"], found["ssim"]) == (pytest.approx(expected.psnr), pytest.approx(expected.ssim))
+        assert (found["flip"] is not None) == flip_available()
+    without = sum(4 * value.numel() for name, value in model.gauss_params.items() if name != "features")
+    assert ours["configurations"][1]["bytes"] == without
+
+
+def test_nerfstudios_own_evaluation_agrees(report: Path, tiny: Any) -> None:
+    ours, _ = json.loads((report / "report.json").read_text())
+    opened = open_scene(tiny.folder)
+    with torch.no_grad():
+        outputs = opened.model.get_outputs_for_camera(opened.cameras[2])
+        theirs, _ = opened.model.get_image_metrics_and_images(outputs, {"image": opened.truths[2]})
+    for way, suffix in zip(ours["configurations"], ("", "_base"), strict=True):
+        for name in ("psnr", "ssim"):
+            assert way["views"][2][name] == pytest.approx(theirs[name + suffix], rel=1e-5)
+
+
+def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+    lines = [line for line in capsys.readouterr().err.strip().splitlines() if line.startswith("sundae: ")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_errors_are_one_line(
+    tiny: Any, stock: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert sundae("report", tmp_path / "nowhere", "-o", tmp_path / "out") == 2
+    assert "does not exist" in one_line(capsys)
+    assert sundae("report", tiny.scene, "-o", tmp_path / "out") == 2
+    assert "is no run" in one_line(capsys)
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "config.yml").write_text(yaml.dump(method_configs["nerfacto"]))
+    assert sundae("report", other, "-o", tmp_path / "out") == 2
+    assert "without Gaussians" in one_line(capsys)
+    (other / "config.yml").write_text("a: [")
+    assert sundae("report", other, "-o", tmp_path / "out") == 2
+    assert "cannot be read" in one_line(capsys)
+    (tmp_path / "file").touch()
+    assert sundae("report", tiny.folder, "-o", tmp_path / "file") == 2
+    assert "choose another folder" in one_line(capsys)
+    assert sundae("report", tiny.folder, "-o", tmp_path / "out", "--repeats", -1) == 2
+    assert "at least 0" in one_line(capsys)
+
+
+def test_a_capture_that_moved(tiny: Any, stock: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run"
+    (run / "nerfstudio_models").mkdir(parents=True)
+    (run / "nerfstudio_models" / "step-000006999.ckpt").symlink_to(stock / "nerfstudio_models" / "step-000006999.ckpt")
+    config = yaml.load((stock / "config.yml").read_text(), Loader=yaml.Loader)
+    config.data = config.pipeline.datamanager.data = tmp_path / "gone"
+    (run / "config.yml").write_text(yaml.dump(config))
+    assert sundae("report", run, "-o", tmp_path / "out") == 2
+    assert "is gone; say with --data" in one_line(capsys)
+    options = ("--data", tiny.scene, "--repeats", 0)
+    assert sundae("report", run, "-o", tmp_path / "out", *options) == 0
+    (row,) = read_rows(tmp_path / "out" / "report.csv")
+    assert row.ms_frame is row.ms_splat is None
+    assert row.psnr is not None
+
+
+def test_a_packed_scene_counts_the_bytes_of_its_file(
+    report: Path, tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    packed = tmp_path / "tiny.sundae"
+    with torch.no_grad():
+        write_scene(packed, scene_of_run(tiny.folder))
+    assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0) == 2
+    assert "say it with --data" in one_line(capsys)
+    assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0, "--data", tiny.scene) == 0
+    (row,) = read_rows(tmp_path / "out" / "report.csv")
+    before = read_rows(report / "report.csv")[0]
+    assert row.bytes_total == packed.stat().st_size < before.bytes_total
+    assert (row.method, row.variant, row.steps) == ("sundae-tiny", "tiny.sundae", tiny.steps)
+    assert (row.primitives, row.seed, row.keep_ratio) == (before.primitives, None, None)
+    assert before.psnr is not None
+    assert before.psnr_base is not None
+    assert row.psnr == pytest.approx(before.psnr, abs=0.15)
+    assert row.psnr_base == pytest.approx(before.psnr_base, abs=0.15)
