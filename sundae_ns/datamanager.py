@@ -146,6 +146,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise DataError(f"{data} cannot be parsed ({reason}); check the capture") from error
         self._order: tuple[int, list[int]] = (-1, [])
+        self.place: tuple[int, int] = (0, 1)
+        """Rank of this process, and of how many that train together: each sees another view at a step."""
 
     def create_train_dataset(self) -> CheckedDataset:
         """The training set, with the transform from the capture's frame to the model's in its metadata."""
@@ -204,7 +206,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         """Camera (on the CPU) and batch of ``step``."""
-        return self._view(self.view_of_step(step))
+        rank, ranks = self.place
+        return self._view(self.view_of_step(step * ranks + rank))
 
     def _load_images(
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]

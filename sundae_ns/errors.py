@@ -48,6 +48,28 @@ class CheckpointError(SundaeError, ValueError):
     """
 
 
+class RankError(SundaeError, RuntimeError):
+    """One of the processes that train one scene together has ended before its time."""
+
+
+def rank_ended(error: BaseException) -> RankError:
+    """The error for a rank that has ended and has taken the others with it: which, why, and how to go on.
+
+    Args:
+        error: ``ProcessExitedException`` or ``ProcessRaisedException`` of ``torch.multiprocessing``.
+    """
+    rank, signal = getattr(error, "error_index", 0), getattr(error, "signal_name", None)
+    last = (str(error).strip().splitlines() or [""])[-1]
+    kind, _, said = last.partition(": ")
+    if kind.startswith(__name__ + "."):
+        return RankError(f"rank {rank}: {said}")  # an error of ours: it says what to do
+    cause = f"killed by {signal}" if signal else last
+    return RankError(
+        f"rank {rank} has ended ({cause}), and so the others were ended; go on from the newest checkpoint with --load-dir, "
+        "on fewer GPUs with a smaller --machine.num-devices"
+    )
+
+
 def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError:
     """The error for a CUDA device without room: how many primitives there were, what was asked for, what to try.
 
@@ -75,6 +97,8 @@ def show_in_one_line() -> None:
     before = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if kind.__name__ in ("ProcessExitedException", "ProcessRaisedException"):
+            error = rank_ended(error)
         if isinstance(error, SundaeError):
             print(f"sundae: {error}", file=sys.stderr)
         else:

@@ -32,12 +32,21 @@ from sundae_ns.budget import Budget
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window, plan, resize, training_window
 from sundae_ns.datamanager import DATASET_FRAME, NO_PICTURES, SundaeDatamanager
 from sundae_ns.densification import CappedStrategy, ChainStrategy, start_of_chain
+from sundae_ns.distributed import Arrived, GlobalPruning, Shards
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError, out_of_memory
 from sundae_ns.evaluation import Later, LazyOutputs, Lpips, display, peak_memory, psnr, ssim
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.gaussians.parameters import rgb_to_logit, sh_to_rgb
 from sundae_ns.preview import Preview, in_viewer
-from sundae_ns.pruning import PruneReport, PruningConfig, make_policy, pixel_detail, response, select_random
+from sundae_ns.pruning import (
+    PruneReport,
+    PruningConfig,
+    PruningPolicy,
+    make_policy,
+    pixel_detail,
+    response,
+    select_random,
+)
 from sundae_ns.rasterization import (
     Backend,
     Rasterization,
@@ -46,6 +55,7 @@ from sundae_ns.rasterization import (
     select_backend,
     spherical_harmonics,
 )
+from sundae_ns.rasterization.sharded import Camera
 from sundae_ns.schedulers import notify_pruned
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.transform import similarity
@@ -172,7 +182,9 @@ class SundaeModel(SplatfactoModel):
             num_cameras=self.num_train_data, device="cpu"
         )
 
-        self.policy = make_policy(config.pruning)
+        self.policy: PruningPolicy | GlobalPruning = make_policy(config.pruning)
+        self.shards: Shards | None = None
+        """The ranks that hold the field together; None where one process holds it all."""
         self.budget = Budget(config.pruning, config.head) if config.pruning.mode == "auto" else None
         self.pruning_state: dict[str, Any] = self.policy.initialize_state()
         self.strategy = self._strategy()
@@ -327,6 +339,25 @@ class SundaeModel(SplatfactoModel):
             self._backend = select_backend(self.config.rasterizer, self.device)
         return self._backend
 
+    @property
+    def total_points(self) -> int:
+        """Primitives of the whole field; ``num_points`` are those that this process holds."""
+        return self.num_points if self.shards is None else self.shards.total
+
+    def share(self, shards: Shards) -> None:
+        """Be one of the ranks that hold the field together, each its block of primitives."""
+        self.shards = shards
+        self.policy = GlobalPruning(make_policy(self.config.pruning), shards)
+        if isinstance(self.strategy, CappedStrategy):
+            # Opacities are reset, and then each picture is seen once before anything grows or goes.
+            pictures = -(-self.num_train_data // shards.ranks)
+            self.strategy.pause_refine_after_reset = pictures + self.config.refine_every
+
+    def arrivals(self, params: Mapping[str, Tensor], view: View, *, features: bool = False) -> Arrived:
+        """What this process needs to draw its view, from all ranks; each has to ask, see :mod:`sundae_ns.distributed`."""
+        assert self.shards is not None
+        return self.shards.arrivals(params, view, self._colors, near_plane=NEAR_PLANE, features=features)
+
     def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """One group per parameter of the field, features included."""
         return {name: [value] for name, value in self.gauss_params.items()}
@@ -421,8 +452,10 @@ class SundaeModel(SplatfactoModel):
             **kwargs,
         )
 
-    def _colors(self, params: Mapping[str, Tensor], view: View) -> Tensor:
+    def _colors(self, params: Mapping[str, Tensor], view: View | Camera) -> Tensor:
         """Colours ``[N, 3]`` of the primitives as this view sees them."""
+        if isinstance(params, Arrived):
+            return params["colors"]
         if self.config.sh_degree == 0:
             return params["features_dc"].sigmoid()
         degree = round((params["features_rest"].shape[1] + 1) ** 0.5) - 1
@@ -453,7 +486,9 @@ class SundaeModel(SplatfactoModel):
         Returns:
             ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
         """
-        compensate = compensate and self.head_active
+        compensate, field = compensate and self.head_active, params
+        if self.shards is not None and not isinstance(params, Arrived):
+            params = self.arrivals(params, view, features=compensate)
         colors = self._colors(params, view)
         channels = torch.cat([colors, params[FEATURES]], dim=1) if compensate else colors
         absgrad = self.training and self.config.use_absgrad and self._densifying and self.config.warmup == "densify"
@@ -467,7 +502,7 @@ class SundaeModel(SplatfactoModel):
             if zoom == 1.0:
                 rgb = self.head(base, splat.colors, splat.alpha)
             elif weight > 0:
-                at_scale, _ = self.render(params, view.zoomed(zoom), background, depth=False)
+                at_scale, _ = self.render(field, view.zoomed(zoom), background, depth=False)
                 correction = at_scale["rgb"] - at_scale["base_rgb"]
                 rgb = base + weight * resize(correction, view.height, view.width)
             if not self.training:
@@ -479,6 +514,8 @@ class SundaeModel(SplatfactoModel):
             "accumulation": splat.alpha,
             "feature_image": features,
         }
+        if isinstance(params, Arrived):
+            splat.info["route"] = params.route
         return pictures, splat
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> _Outputs:  # type: ignore[override]
@@ -630,7 +667,9 @@ class SundaeModel(SplatfactoModel):
 
     def step_post_backward(self, step: int) -> None:
         """Densify."""
-        if self._densifying:
+        if self._densifying and self.shards is not None:
+            self.shards.densify(self)
+        elif self._densifying:
             self.strategy.step_post_backward(
                 params=self.gauss_params,
                 optimizers=self.optimizers,
@@ -647,7 +686,7 @@ class SundaeModel(SplatfactoModel):
         # Between growing and culling there were more than now.
         peaks = (self.pruning_state["peak"], self.strategy_state.get("peak", 0))
         self.pruning_state["peak"] = max(peaks)
-        due = self.policy.due(self.pruning_state, self.schedule_step, self.num_points)
+        due = self.policy.due(self.pruning_state, self.schedule_step, self.total_points)
         evaluate = due and self.config.evaluate_prune and self._prune_at is not None
         before = self._evaluate(pipeline, "warm-up", step) if evaluate else {}
         try:
@@ -696,6 +735,8 @@ class SundaeModel(SplatfactoModel):
     def _evaluate(self, pipeline: Any, label: str, step: int) -> dict[str, float]:
         if not pipeline.datamanager.eval_dataset:
             return {}
+        if self.shards is not None:
+            self.shards.agree_on_focal(self)
         results = pipeline.get_average_eval_image_metrics(step=step)
         CONSOLE.log(f"{label}: PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f} on all test views")
         return {name: results[name] for name in ("psnr", "ssim")}
@@ -711,7 +752,7 @@ class SundaeModel(SplatfactoModel):
         """Write what the prune did to tensorboard, and to ``prune.json`` in the run's folder."""
         scalars = {"before": report.before, "after": report.after, "seconds": report.seconds, "peak": report.peak}
         writer.put_dict(name="Prune", scalar_dict=scalars, step=step)
-        if attributes.trainer is None:
+        if attributes.trainer is None or (self.shards is not None and self.shards.rank != 0):
             return
         path = attributes.trainer.base_dir / "prune.json"
         reports = json.loads(path.read_text()) if path.exists() else []
@@ -733,21 +774,26 @@ class SundaeModel(SplatfactoModel):
             pruning: options of the prune, if they are not those of the model.
         """
         pruning = pruning or self.config.pruning
-        share = pruning.share(self.num_points) if pruning.uses_detail else None
-        total = torch.zeros(self.num_points, device=self.device)
+        share = pruning.share(self.total_points) if pruning.uses_detail else None
         cameras = list(datamanager.training_cameras())
+        if self.shards is not None:
+            return self.shards.contribution(self, cameras, share)
+        total = torch.zeros(self.num_points, device=self.device)
         for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
             total += self.weights_of(self.view_of(camera), share)
         return total
 
-    def weights_of(self, view: View, keep_ratio: float | None = None) -> Tensor:
+    def weights_of(
+        self, view: View, keep_ratio: float | None = None, field: Mapping[str, Tensor] | None = None
+    ) -> Tensor:
         """Blending weight of each primitive, summed over the pixels of one view ``[N]``.
 
         Args:
             view: the camera.
             keep_ratio: share of the primitives that will stay; given, pixels count by the detail that so many can show.
+            field: the primitives, if not those of this process.
         """
-        params, pixels = self.gaussians, None
+        params, pixels = self.gaussians if field is None else field, None
         if keep_ratio is not None:
             # Not the background of training, which may be random: the choice is to be the same from run to run.
             background = self.background_color.to(self.device)
@@ -783,7 +829,7 @@ class SundaeModel(SplatfactoModel):
         metrics: dict[str, Any] = {
             "psnr": psnr(outputs["rgb"].detach().clamp(0, 1), target),
             "psnr_base": psnr(outputs["base_rgb"].detach(), target),
-            "gaussian_count": self.num_points,
+            "gaussian_count": self.total_points,
         }
         self.camera_optimizer.get_metrics_dict(metrics)
         return metrics
@@ -822,7 +868,7 @@ class SundaeModel(SplatfactoModel):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR, SSIM and, where its weights are at hand, LPIPS; each with the head and without (``_base``)."""
         target = self._target(batch, outputs)
-        metrics: dict[str, float] = {"gaussian_count": float(self.num_points)}
+        metrics: dict[str, float] = {"gaussian_count": float(self.total_points)}
         for suffix, picture in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
             metrics["psnr" + suffix] = float(psnr(picture, target))
             metrics["ssim" + suffix] = float(ssim(picture, target))

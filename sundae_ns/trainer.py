@@ -9,15 +9,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 import yaml
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
-from nerfstudio.utils.decorators import check_main_thread
+from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sundae_ns import checkpoint
+from sundae_ns import checkpoint, distributed
+from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, StorageError, SundaeError, out_of_memory
 from sundae_ns.storage.atomic import storage_error, write_text
 
@@ -33,7 +35,11 @@ class SundaeTrainerConfig(TrainerConfig):
 
         Raises:
             StorageError: there is no room or no right to write.
+            ConfigError: there are not so many GPUs, or several ranks cannot train with these options.
         """
+        if self.machine.num_devices > 1:
+            distributed.check_machine(self.machine.num_devices, self.machine.device_type)
+            distributed.check_options(self)
         path = self.get_base_dir() / "config.yml"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -61,6 +67,42 @@ class SundaeTrainer(Trainer):
     """Saves atomically, resumes from the newest whole checkpoint, and takes random numbers up where they were left."""
 
     config: SundaeTrainerConfig
+    shards: distributed.Shards | None = None
+    """The ranks that train together; None where there is one."""
+
+    def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
+        if world_size > 1:
+            distributed.check_options(config)
+            config = distributed.shorten(config, world_size)
+            config.vis = distributed.without_viewer(config.vis)  # type: ignore[assignment]
+            CONSOLE.quiet = local_rank != 0
+            if config.machine.device_type == "cuda":
+                torch.cuda.set_device(local_rank)
+        # A world of one to nerfstudio, whose pipeline would wrap the model in DDP: that breaks when primitives come and go.
+        super().__init__(config, local_rank, world_size=1)
+        self.ranks = world_size
+        if world_size > 1:
+            with _named(f"cannot make the run's folder {self.base_dir}"):
+                self.base_dir.mkdir(parents=True, exist_ok=True)  # nerfstudio's own way fails where two make it at once
+
+    def setup_optimizers(self) -> Optimizers:
+        """Optimizers of what this process holds, for batches of as many pictures as there are ranks."""
+        if self.ranks == 1:
+            return super().setup_optimizers()
+        model, datamanager = self.pipeline.model, cast(SundaeDatamanager, self.pipeline.datamanager)
+        self.shards = distributed.take_shard(model, self.config.machine.seed)
+        model.share(self.shards)
+        datamanager.place = (self.shards.rank, self.ranks)
+        optimizers = distributed.SharedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+        distributed.scale_rates(optimizers, self.ranks)
+        return optimizers
+
+    def eval_iteration(self, step: int) -> None:
+        """nerfstudio's, of which every rank takes its part: the head has to look at the same scale on each."""
+        every = ("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images")
+        if self.shards is not None and any(step_check(step, getattr(self.config, name)) for name in every):
+            self.shards.agree_on_focal(self.pipeline.model)
+        super().eval_iteration(step)
 
     def train(self) -> None:
         """Train.
@@ -75,15 +117,17 @@ class SundaeTrainer(Trainer):
         except torch.cuda.OutOfMemoryError as error:
             raise out_of_memory(error, getattr(self.pipeline.model, "num_points", 0)) from error
 
-    @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Save model, optimizers, schedules and random state; older checkpoints go once the new one is on the disk.
+
+        Where several ranks train, each has to call it; the first gathers, and writes what one process would.
 
         Raises:
             StorageError: no room or no right to write; what was there before is whole.
         """
-        path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        state = {
+        if self.shards is not None:
+            self.shards.agree_on_focal(self.pipeline.model)
+        own = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
             "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
@@ -91,6 +135,12 @@ class SundaeTrainer(Trainer):
             "scalers": self.grad_scaler.state_dict(),
             "random": checkpoint.random_state(),
         }
+        state: dict[str, Any] | None = own
+        if self.shards is not None:
+            state = distributed.whole_state(own, self.shards, list(self.pipeline.model.gauss_params))
+        if state is None:
+            return
+        path = self.checkpoint_dir / f"step-{state['step']:09d}.ckpt"
         checkpoint.save(state, path)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("*.ckpt"):
@@ -104,6 +154,9 @@ class SundaeTrainer(Trainer):
             return
         loaded = checkpoint.load(path)
         try:
+            if self.shards is not None:
+                names = list(self.pipeline.model.gauss_params)
+                loaded = distributed.state_of_rank(loaded, self.shards.rank, self.ranks, names)
             self._restore(loaded)
         except SundaeError:
             raise
@@ -136,3 +189,6 @@ class SundaeTrainer(Trainer):
         self.grad_scaler.load_state_dict(loaded["scalers"])
         if "random" in loaded:  # nerfstudio's own trainer saves none
             checkpoint.set_random_state(loaded["random"])
+        if self.shards is not None:
+            self.shards.recount(self.pipeline.model.gaussians)
+            torch.manual_seed(self.config.machine.seed + self._start_step * self.ranks + self.shards.rank)

@@ -28,6 +28,7 @@ FLOORS = {
     "checkpoint": 3,
     "budget": 3,
     "densification": 3,
+    "distributed": 3,
     "model": 3,
     "preview": 3,
     "run_folder": 3,

@@ -78,12 +78,15 @@ def assemble(image: Tensor, alpha: Tensor, means2d: Tensor, radii: Tensor, chann
     )
 
 
+def per_axis(radii: Tensor) -> Tensor:
+    """Radii ``[N]`` in the shape that strategies of the installed gsplat expect: ``[N]`` in 1.4, ``[N, 2]`` from 1.5."""
+    return radii[:, None].expand(-1, 2) if _radii_per_axis() else radii
+
+
 def _strategy_info(means2d: Tensor, radii: Tensor, width: int, height: int) -> dict[str, Any]:
-    if _radii_per_axis():
-        radii = radii[:, None].expand(-1, 2)
     return {
         "means2d": means2d,
-        "radii": radii[None],
+        "radii": per_axis(radii)[None],
         "width": width,
         "height": height,
         "n_cameras": 1,

@@ -1,0 +1,46 @@
+"""Which primitives a camera may see: never fewer than the rasteriser draws, and not many more."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from sundae_ns.rasterization.projection import project
+from sundae_ns.rasterization.sharded import Camera, may_be_seen
+
+NEAR, FAR = 0.01, 1e10
+
+
+def scattered(seed: int, n: int = 4000) -> tuple[Tensor, Tensor, Tensor]:
+    """Centres all around a camera at the origin, some of them very near; sizes over four decades; rotations."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.randn(n, 3, generator=generator) * torch.rand(n, 1, generator=generator).exp2().pow(3)
+    means[: n // 8, 2] *= 0.01
+    scales = torch.randn(n, 3, generator=generator).mul(1.5).sub(3).exp()
+    return means, torch.randn(n, 4, generator=generator), scales
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("width", "height", "focal", "cx"), [(64, 48, 50.0, 32.0), (300, 20, 20.0, -40.0)])
+def test_all_that_is_drawn_may_be_seen(seed: int, width: int, height: int, focal: float, cx: float) -> None:
+    means, quats, scales = scattered(seed)
+    K = torch.tensor([[focal, 0.0, cx], [0.0, 1.5 * focal, height / 2], [0.0, 0.0, 1.0]])
+    drawn = project(means, quats, scales, torch.eye(4), K, width, height, NEAR, FAR).radii > 0
+    camera = Camera(torch.eye(4), K, torch.tensor([float(width), float(height)]))
+    seen = may_be_seen(means, scales, camera, NEAR, FAR)
+    assert drawn.any()
+    assert not (drawn & ~seen).any()
+    # Looser bounds would send the whole field; these primitives are far larger and nearer than those of a scene.
+    assert seen.sum() < 2 * drawn.sum()
+
+
+def test_what_is_not_a_number_is_not_seen() -> None:
+    means = torch.tensor([[0.0, 0.0, 2.0], [torch.nan, 0.0, 2.0], [0.0, 0.0, torch.nan], [0.0, 0.0, 0.0]])
+    scales = torch.full((4, 3), 0.1)
+    camera = Camera(torch.eye(4), torch.eye(3), torch.tensor([10.0, 10.0]))
+    drawn = project(means, torch.ones(4, 4), scales, torch.eye(4), torch.eye(3), 10, 10, NEAR, FAR).radii > 0
+    seen = may_be_seen(means, scales, camera, NEAR, FAR)
+    assert drawn.tolist()[0]
+    assert not (drawn & ~seen).any()
+    assert not seen[2:].any()
