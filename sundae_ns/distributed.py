@@ -39,7 +39,6 @@ from sundae_ns.pruning.policy import PruningPolicy
 from sundae_ns.pruning.scores import Contribution
 from sundae_ns.rasterization.reference import per_axis
 from sundae_ns.rasterization.sharded import (
-    Camera,
     Route,
     exchange,
     gather_cameras,
@@ -199,7 +198,7 @@ class Shards:
         self,
         params: Mapping[str, Tensor],
         view: View,
-        colors_of: Callable[[Mapping[str, Tensor], View | Camera], Tensor],
+        colors_of: Callable[[Mapping[str, Tensor], Tensor], Tensor],
         *,
         near_plane: float,
         features: bool,
@@ -209,21 +208,19 @@ class Shards:
         Args:
             params: this rank's primitives.
             view: this rank's camera.
-            colors_of: colours ``[n, 3]``, as a camera sees them, of primitives with centres and harmonics.
+            colors_of: colours ``[S, 3]`` of primitives with centres and harmonics, as seen from places ``[S, 3]``.
             near_plane: as the rasteriser gets it.
             features: whether features come along.
         """
         names = [*_GEOMETRY, FEATURES] if features else list(_GEOMETRY)
         cameras = gather_cameras(view.viewmat.detach(), view.K, view.width, view.height)
         with torch.no_grad():
-            scales = params["scales"].exp()
-            ids = [may_be_seen(params["means"], scales, c, near_plane, math.inf).nonzero()[:, 0] for c in cameras]
-        route = plan_route(ids)
+            seen = may_be_seen(params["means"], params["scales"].exp(), cameras, near_plane, math.inf)
+        route = plan_route(seen)
         # Picked for all cameras at once: the way back then fills one gradient per parameter, not one per camera.
         going = {name: params[name].index_select(0, route.ids) for name in [*names, *_COLORS]}
-        parts = zip(*(going[name].split(route.sent) for name in ("means", *_COLORS)))
-        colors = [colors_of(dict(zip(("means", *_COLORS), part)), camera) for part, camera in zip(parts, cameras)]
-        rows = torch.cat([*(going[name] for name in names), torch.cat(colors)], dim=1)
+        centers = torch.cat([center.expand(count, 3) for center, count in zip(cameras.centers, route.sent)])
+        rows = torch.cat([*(going[name] for name in names), colors_of(going, centers)], dim=1)
         columns = [params[name].shape[1] for name in names]
         pieces = exchange(rows, route).split([*columns, 3], dim=1)
         arrived = Arrived(zip([*names, "colors"], pieces))
@@ -250,7 +247,7 @@ class Shards:
         halves = gradients.new_tensor([width / 2, height / 2])
         found = torch.cat([gradients * halves, (radii * (2 / max(width, height)))[:, None]], dim=1)
         found = give_back(found, route)
-        seen = found[:, 2] > 0
+        seen = (found[:, 2] > 0).nonzero()[:, 0]  # once: each search for them waits for the GPU
         ids, found = route.ids[seen], found[seen]
         # The strategy writes radii row by row: of a primitive in several views, each row gets the largest.
         largest = found.new_zeros(self.counts[self.rank]).scatter_reduce_(0, ids, found[:, 2], "amax")
@@ -452,8 +449,8 @@ def average_gradients(params: Iterable[Tensor]) -> None:
     flat = torch.cat([gradient.flatten() for gradient in gradients])
     dist.all_reduce(flat)
     flat /= dist.get_world_size()
-    for gradient, mean in zip(gradients, flat.split([gradient.numel() for gradient in gradients])):
-        gradient.copy_(mean.view_as(gradient))
+    means = flat.split([gradient.numel() for gradient in gradients])
+    torch._foreach_copy_(gradients, [mean.view_as(gradient) for gradient, mean in zip(gradients, means)])
 
 
 def scale_rates(optimizers: Optimizers, ranks: int) -> None:

@@ -55,7 +55,6 @@ from sundae_ns.rasterization import (
     select_backend,
     spherical_harmonics,
 )
-from sundae_ns.rasterization.sharded import Camera
 from sundae_ns.schedulers import notify_pruned
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.transform import similarity
@@ -124,6 +123,11 @@ class View(NamedTuple):
 
     focal: float
     """Focal length in pixels, the mean of both axes; beside K, because reading K back would wait for the GPU."""
+
+    @property
+    def center(self) -> Tensor:
+        """Where the camera stands ``[3]``."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def zoomed(self, factor: float) -> View:
         """The camera that sees the same in a picture whose sides are ``factor`` times as long."""
@@ -452,16 +456,13 @@ class SundaeModel(SplatfactoModel):
             **kwargs,
         )
 
-    def _colors(self, params: Mapping[str, Tensor], view: View | Camera) -> Tensor:
-        """Colours ``[N, 3]`` of the primitives as this view sees them."""
-        if isinstance(params, Arrived):
-            return params["colors"]
+    def _colors(self, params: Mapping[str, Tensor], center: Tensor) -> Tensor:
+        """Colours ``[N, 3]`` of the primitives as seen from a place ``[3]``, or from one each ``[N, 3]``."""
         if self.config.sh_degree == 0:
             return params["features_dc"].sigmoid()
         degree = round((params["features_rest"].shape[1] + 1) ** 0.5) - 1
         if self.config.warm_start is None:
             degree = min(self.step // self.config.sh_degree_interval, degree)
-        center = -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
         coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
         return (spherical_harmonics(degree, params["means"] - center, coeffs, backend=self.backend) + 0.5).clamp_min(0)
 
@@ -489,7 +490,7 @@ class SundaeModel(SplatfactoModel):
         compensate, field = compensate and self.head_active, params
         if self.shards is not None and not isinstance(params, Arrived):
             params = self.arrivals(params, view, features=compensate)
-        colors = self._colors(params, view)
+        colors = params["colors"] if isinstance(params, Arrived) else self._colors(params, view.center)
         channels = torch.cat([colors, params[FEATURES]], dim=1) if compensate else colors
         absgrad = self.training and self.config.use_absgrad and self._densifying and self.config.warmup == "densify"
         splat = self._splat(params, view, channels, render_depth=depth, absgrad=absgrad)

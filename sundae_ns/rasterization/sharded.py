@@ -17,19 +17,24 @@ from torch import Tensor
 from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN
 
 
-class Camera(NamedTuple):
-    """A pinhole camera as every rank knows it; sizes are tensors, so that none has to be read from a GPU."""
+class Cameras(NamedTuple):
+    """Pinhole cameras, one a rank; sizes are tensors, so that none has to be read from a GPU."""
 
-    viewmat: Tensor
-    """World-to-camera ``[4, 4]``."""
-    K: Tensor
-    """Intrinsics in pixels ``[3, 3]``."""
-    size: Tensor
-    """Width and height in pixels ``[2]``."""
+    viewmats: Tensor
+    """World-to-camera ``[R, 4, 4]``."""
+    Ks: Tensor
+    """Intrinsics in pixels ``[R, 3, 3]``."""
+    sizes: Tensor
+    """Width and height in pixels ``[R, 2]``."""
+
+    @property
+    def centers(self) -> Tensor:
+        """Where they stand ``[R, 3]``."""
+        return -(self.viewmats[:, :3, :3].mT @ self.viewmats[:, :3, 3:])[..., 0]
 
 
 @torch.no_grad()
-def gather_cameras(viewmat: Tensor, K: Tensor, width: int, height: int) -> list[Camera]:
+def gather_cameras(viewmat: Tensor, K: Tensor, width: int, height: int) -> Cameras:
     """The cameras of all ranks by rank, detached. Collective.
 
     Args:
@@ -38,14 +43,15 @@ def gather_cameras(viewmat: Tensor, K: Tensor, width: int, height: int) -> list[
         width, height: size of its picture in pixels.
     """
     own = torch.cat([viewmat.reshape(16), K.reshape(9), viewmat.new_tensor([width, height])])
-    every = [torch.empty_like(own) for _ in range(dist.get_world_size())]
-    dist.all_gather(every, own)
-    return [Camera(row[:16].reshape(4, 4), row[16:25].reshape(3, 3), row[25:]) for row in every]
+    every = own.new_empty(dist.get_world_size() * len(own))
+    dist.all_gather_into_tensor(every, own)
+    every = every.view(-1, len(own))
+    return Cameras(every[:, :16].reshape(-1, 4, 4), every[:, 16:25].reshape(-1, 3, 3), every[:, 25:])
 
 
 @torch.no_grad()
-def may_be_seen(means: Tensor, scales: Tensor, camera: Camera, near_plane: float, far_plane: float) -> Tensor:
-    """True for every primitive that a backend gives a radius above 0, and for some others; bool ``[N]``.
+def may_be_seen(means: Tensor, scales: Tensor, cameras: Cameras, near_plane: float, far_plane: float) -> Tensor:
+    """True for every primitive that a backend gives a radius above 0, and for some others; bool ``[R, N]``.
 
     The radius is at most three standard deviations of the footprint, whose variance is at most its trace. A row of the
     perspective map's Jacobian has length ``f / z * sqrt(1 + k^2)`` for a slope k, so the trace is at most
@@ -54,23 +60,24 @@ def may_be_seen(means: Tensor, scales: Tensor, camera: Camera, near_plane: float
     Args:
         means: centres ``[N, 3]``.
         scales: standard deviations, after activation ``[N, 3]``.
-        camera: the camera.
+        cameras: R of them.
         near_plane, far_plane: as the rasteriser gets them.
     """
-    in_camera = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = in_camera[:, 2:]
-    in_range = (z >= near_plane) & (z <= far_plane) & (z > 0)
-    focal, centre = camera.K.diagonal()[:2], camera.K[:2, 2]
-    slopes = in_camera[:, :2] / z
-    margin = 0.5 * FOV_MARGIN * camera.size / focal
-    held = slopes.maximum(-centre / focal - margin).minimum((camera.size - centre) / focal + margin)
-    spread = focal.square() * (1 + held.square())
-    variance = (scales.amax(dim=1, keepdim=True) / z).square() * spread.sum(dim=1, keepdim=True) + 2 * BLUR
-    reach = 3 * variance.sqrt() * 1.001 + 1  # rounding up, and rounding
-    pixels = slopes * focal + centre
-    outside = (pixels + reach <= 0) | (pixels - reach >= camera.size)
-    # Said the other way round, NaN would count as unseen here, and the backends would disagree.
-    return in_range[:, 0] & ~outside.any(dim=1)
+    turned = means @ cameras.viewmats[:, :3, :3].mT + cameras.viewmats[:, None, :3, 3]
+    z = turned[..., 2:]
+    focals, centres = cameras.Ks[:, :2, :2].diagonal(dim1=-2, dim2=-1), cameras.Ks[:, :2, 2]
+    # A row a camera, to be spread over primitives.
+    sizes, focals, centres = (value[:, None] for value in (cameras.sizes, focals, centres))
+    slopes = turned[..., :2] / z
+    margins = 0.5 * FOV_MARGIN * sizes / focals
+    held = slopes.maximum(-centres / focals - margins).minimum((sizes - centres) / focals + margins)
+    spread = (focals * held).square().sum(-1) + focals.square().sum(-1)
+    z = z[..., 0]
+    variance = (scales.amax(dim=1) / z).square() * spread + 2 * BLUR
+    reach = (3.003 * variance.sqrt() + 1)[..., None]  # three deviations, rounding up, and rounding
+    # From the middle of the picture. Said the other way round, NaN would count as unseen here, and the backends would disagree.
+    outside = (slopes * focals + centres - sizes / 2).abs() - reach >= sizes / 2
+    return (z >= max(near_plane, torch.finfo(z.dtype).tiny)) & (z <= far_plane) & ~outside.any(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -86,17 +93,17 @@ class Route:
 
 
 @torch.no_grad()
-def plan_route(ids: list[Tensor]) -> Route:
+def plan_route(seen: Tensor) -> Route:
     """Say how many rows go to each rank, and hear how many come. Collective.
 
     Args:
-        ids: for each rank, the rows of this shard that go there, int64.
+        seen: whether a row of this shard goes to a rank, bool ``[R, N]``.
     """
-    sent = [len(rows) for rows in ids]
-    counts = torch.tensor(sent, device=ids[0].device)
-    incoming = torch.empty_like(counts)
-    dist.all_to_all_single(incoming, counts)
-    return Route(torch.cat(ids), sent, incoming.tolist())
+    sent = seen.sum(dim=1)
+    received = torch.empty_like(sent)
+    dist.all_to_all_single(received, sent)
+    counts = torch.stack([sent, received]).tolist()
+    return Route(seen.nonzero()[:, 1], *counts)
 
 
 def swap(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:

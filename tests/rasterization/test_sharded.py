@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.rasterization.projection import project
-from sundae_ns.rasterization.sharded import Camera, may_be_seen
+from sundae_ns.rasterization.sharded import Cameras, may_be_seen
 
 NEAR, FAR = 0.01, 1e10
 
@@ -27,8 +27,12 @@ def test_all_that_is_drawn_may_be_seen(seed: int, width: int, height: int, focal
     means, quats, scales = scattered(seed)
     K = torch.tensor([[focal, 0.0, cx], [0.0, 1.5 * focal, height / 2], [0.0, 0.0, 1.0]])
     drawn = project(means, quats, scales, torch.eye(4), K, width, height, NEAR, FAR).radii > 0
-    camera = Camera(torch.eye(4), K, torch.tensor([float(width), float(height)]))
-    seen = may_be_seen(means, scales, camera, NEAR, FAR)
+    away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    sizes = torch.tensor([[1.0, 1.0], [float(width), float(height)]])
+    unseen, seen = may_be_seen(
+        means, scales, Cameras(torch.stack([away, torch.eye(4)]), K.expand(2, 3, 3), sizes), NEAR, FAR
+    )
+    assert not (drawn & unseen).any()  # each camera for itself
     assert drawn.any()
     assert not (drawn & ~seen).any()
     # Looser bounds would send the whole field; these primitives are far larger and nearer than those of a scene.
@@ -38,9 +42,9 @@ def test_all_that_is_drawn_may_be_seen(seed: int, width: int, height: int, focal
 def test_what_is_not_a_number_is_not_seen() -> None:
     means = torch.tensor([[0.0, 0.0, 2.0], [torch.nan, 0.0, 2.0], [0.0, 0.0, torch.nan], [0.0, 0.0, 0.0]])
     scales = torch.full((4, 3), 0.1)
-    camera = Camera(torch.eye(4), torch.eye(3), torch.tensor([10.0, 10.0]))
+    cameras = Cameras(torch.eye(4)[None], torch.eye(3)[None], torch.tensor([[10.0, 10.0]]))
     drawn = project(means, torch.ones(4, 4), scales, torch.eye(4), torch.eye(3), 10, 10, NEAR, FAR).radii > 0
-    seen = may_be_seen(means, scales, camera, NEAR, FAR)
+    (seen,) = may_be_seen(means, scales, cameras, NEAR, FAR)
     assert drawn.tolist()[0]
     assert not (drawn & ~seen).any()
     assert not seen[2:].any()
