@@ -213,10 +213,9 @@ class Shards:
             features: whether features come along.
         """
         names = [*_GEOMETRY, FEATURES] if features else list(_GEOMETRY)
-        cameras = gather_cameras(view.viewmat.detach(), view.K, view.width, view.height)
+        cameras = gather_cameras(view.viewmat, view.K, view.width, view.height, near_plane)
         with torch.no_grad():
-            seen = may_be_seen(params["means"], params["scales"].exp(), cameras, near_plane, math.inf)
-        route = plan_route(seen)
+            route = plan_route(may_be_seen(params["means"], params["scales"].exp(), cameras.bounds))
         # Picked for all cameras at once: the way back then fills one gradient per parameter, not one per camera.
         going = {name: params[name].index_select(0, route.ids) for name in [*names, *_COLORS]}
         centers = torch.cat([center.expand(count, 3) for center, count in zip(cameras.centers, route.sent)])
@@ -227,26 +226,40 @@ class Shards:
         arrived.route = route
         return arrived
 
-    @torch.no_grad()
-    def statistics(self, info: Mapping[str, Any], *, absgrad: bool) -> dict[str, Any]:
-        """What gsplat's strategy reads after a backward pass, about this rank's primitives in all views. Collective.
+    def follow(self, info: MutableMapping[str, Any], route: Route, *, absgrad: bool) -> None:
+        """Have what densification wants to know about primitives brought back with their gradients.
 
         Args:
-            info: of this rank's view, with its ``route``.
+            info: of this rank's view, whose centres keep their gradient.
+            route: of the view's primitives.
             absgrad: whether gradients are summed by their absolute values.
+        """
+
+        def found() -> Tensor:
+            centres = info["means2d"]
+            gradients = (centres.absgrad if absgrad else centres.grad)[0]
+            radii = info["radii"][0]
+            radii = (radii if radii.dim() == 1 else radii.amax(dim=-1)).to(gradients.dtype)
+            width, height = info["width"], info["height"]
+            halves = gradients.new_tensor([width / 2, height / 2])
+            return torch.cat([gradients * halves, (radii * (2 / max(width, height)))[:, None]], dim=1)
+
+        route.ask = found
+        info["route"] = route
+
+    @torch.no_grad()
+    def statistics(self, info: Mapping[str, Any]) -> dict[str, Any]:
+        """What gsplat's strategy reads after a backward pass, about this rank's primitives in all views.
+
+        Args:
+            info: of this rank's view, which :meth:`follow` has followed.
 
         Returns:
             ``info`` of a packed rasterisation, in units of half the picture: its width and height are 2.
         """
         route: Route = info["route"]
-        centres = info["means2d"]
-        gradients = (centres.absgrad if absgrad else centres.grad)[0]
-        radii = info["radii"][0]
-        radii = (radii if radii.dim() == 1 else radii.amax(dim=-1)).to(gradients.dtype)
-        width, height = info["width"], info["height"]
-        halves = gradients.new_tensor([width / 2, height / 2])
-        found = torch.cat([gradients * halves, (radii * (2 / max(width, height)))[:, None]], dim=1)
-        found = give_back(found, route)
+        assert route.told is not None
+        found = route.told
         seen = (found[:, 2] > 0).nonzero()[:, 0]  # once: each search for them waits for the GPU
         ids, found = route.ids[seen], found[seen]
         # The strategy writes radii row by row: of a primitive in several views, each row gets the largest.
@@ -267,7 +280,7 @@ class Shards:
         """Densify every shard by itself, and level the shards when they have drifted apart. Collective."""
         strategy, state = model.strategy, model.strategy_state
         peak, state["peak"] = state["peak"], 0
-        info = self.statistics(model.info, absgrad=model.config.use_absgrad)
+        info = self.statistics(model.info)
         params = model.gaussians
         strategy.step_post_backward(
             params=model.gauss_params,
@@ -441,16 +454,16 @@ def average_gradients(params: Iterable[Tensor]) -> None:
     """Give copies of parameters the mean of their gradients over the ranks. Collective, in one message.
 
     Args:
-        params: the same on all ranks, and the same of them with a gradient.
+        params: the same on all ranks, and the same of them with a gradient; gradients lie in memory without gaps.
     """
-    gradients = [value.grad for value in params if value.grad is not None]
+    # As they lie in memory, whatever the order of their axes, which is the same on all ranks.
+    gradients = [value.grad.as_strided((value.numel(),), (1,)) for value in params if value.grad is not None]
     if not gradients:
         return
-    flat = torch.cat([gradient.flatten() for gradient in gradients])
+    flat = torch.cat(gradients)
     dist.all_reduce(flat)
     flat /= dist.get_world_size()
-    means = flat.split([gradient.numel() for gradient in gradients])
-    torch._foreach_copy_(gradients, [mean.view_as(gradient) for gradient, mean in zip(gradients, means)])
+    torch._foreach_copy_(gradients, flat.split([len(gradient) for gradient in gradients]))
 
 
 def scale_rates(optimizers: Optimizers, ranks: int) -> None:

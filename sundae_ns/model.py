@@ -515,8 +515,8 @@ class SundaeModel(SplatfactoModel):
             "accumulation": splat.alpha,
             "feature_image": features,
         }
-        if isinstance(params, Arrived):
-            splat.info["route"] = params.route
+        if self.shards is not None and isinstance(params, Arrived) and self.training and self._densifying:
+            self.shards.follow(splat.info, params.route, absgrad=absgrad)
         return pictures, splat
 
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> _Outputs:  # type: ignore[override]

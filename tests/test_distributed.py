@@ -110,8 +110,9 @@ def check_drawing(shards: Shards) -> None:
     assert 0 < len(arrived["means"]) <= 90
     splat = draw(arrived, arrived["colors"], view)
     splat.info["means2d"].retain_grad()
+    shards.follow(splat.info, arrived.route, absgrad=True)
     loss_of(splat, shards.rank).backward()
-    info = shards.statistics({**splat.info, "route": arrived.route}, absgrad=True)
+    info = shards.statistics(splat.info)
 
     whole = shard_of(a_field(), 0, 90)
     one = [draw(whole, colors_of(whole, a_view(rank).center), a_view(rank)) for rank in range(RANKS)]
@@ -213,12 +214,13 @@ def check_drift(shards: Shards) -> None:
     arrived = shards.arrivals(params, a_view(shards.rank), colors_of, near_plane=0.01, features=True)
     splat = draw(arrived, arrived["colors"], a_view(shards.rank))
     splat.info["means2d"].retain_grad()
+    shards.follow(splat.info, arrived.route, absgrad=True)
     loss_of(splat, shards.rank).backward()
     model: Any = SimpleNamespace(
         strategy=Tripling(),
         strategy_state={"count": torch.arange(start, end), "peak": 100},
         config=SimpleNamespace(use_absgrad=True),
-        info={**splat.info, "route": arrived.route},
+        info=splat.info,
         gaussians=params,
         gauss_params=params,
         optimizers=optimizers,
