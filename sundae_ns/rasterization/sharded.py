@@ -140,7 +140,7 @@ class _Exchange(torch.autograd.Function):
         gradient = gradient / len(route.sent)
         if route.ask is None:
             return swap(gradient, route.received, route.sent), None
-        found = route.ask()
+        found, route.ask = route.ask(), None  # it may hold on to this very graph, which no one would ever free
         both = swap(torch.cat([gradient, found], dim=1), route.received, route.sent)
         gradient, route.told = both.split([gradient.shape[1], found.shape[1]], dim=1)
         return gradient, None
