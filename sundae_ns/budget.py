@@ -31,6 +31,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import Parameter
 
+from sundae_ns.after_step import record, refresh
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.compensation.head import SIZES
 from sundae_ns.datamanager import SundaeDatamanager
@@ -253,7 +254,7 @@ class Budget:
             self._look(run)
         else:
             return
-        model._refresh(run.optimizers)
+        refresh(model, run.optimizers)
         search.seconds += time.perf_counter() - started
         self._write(run)
 
@@ -429,7 +430,7 @@ class Budget:
             isolated=None,
         )
         CONSOLE.log(report.summary())
-        model._record(run.attributes, report, {}, {}, model.step)
+        record(model, run.attributes, report, model.step, before={}, after={})
 
     # --------------------------------------------------------------------------------------------------- the head
 

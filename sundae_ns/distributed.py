@@ -50,7 +50,8 @@ from sundae_ns.rasterization.sharded import (
 )
 
 if TYPE_CHECKING:
-    from sundae_ns.model import SundaeModel, View
+    from sundae_ns.model import SundaeModel
+    from sundae_ns.views import View
 
 DRIFT = 1.1
 """Rows move when the largest shard has more than this times the mean."""
