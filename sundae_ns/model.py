@@ -176,6 +176,11 @@ class SundaeModel(SplatfactoModel):
         return self.schedule_step < self.strategy.refine_stop_iter
 
     @property
+    def most_bands(self) -> int | None:
+        """Highest degree of the harmonics that takes part so far; None for all, as after a warm start."""
+        return None if self.config.warm_start is not None else self.step // max(self.config.sh_degree_interval, 1)
+
+    @property
     def head_active(self) -> bool:
         """Whether the head takes part: it starts when pruning has ended, unless told otherwise, or when auto lets it."""
         if self.budget is not None:
@@ -287,7 +292,7 @@ class SundaeModel(SplatfactoModel):
             backend=self.backend,
             antialiased=config.rasterize_mode == "antialiased",
             logits=config.sh_degree == 0,
-            most_bands=None if config.warm_start is not None else self.step // max(config.sh_degree_interval, 1),
+            most_bands=self.most_bands,
             training=self.training,
             absgrad=self.training and config.use_absgrad and self.densifying and config.warmup == "densify",
             head=self.head if self.head_active else None,

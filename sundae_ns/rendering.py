@@ -51,15 +51,24 @@ class Style:
     """Fetches primitives from other ranks; None where one process holds them all."""
 
 
+def degree_in_use(features_rest: Tensor, most_bands: int | None) -> int:
+    """Degree of the harmonics that pictures are made with.
+
+    Args:
+        features_rest: bands 1 and up ``[N, K, 3]``.
+        most_bands: highest degree that takes part so far; None for all that there are.
+    """
+    degree = sh_degree(features_rest)
+    return degree if most_bands is None else min(most_bands, degree)
+
+
 def colors_of(params: Mapping[str, Tensor], view: View | Camera, style: Style) -> Tensor:
     """Colours ``[N, 3]`` of the primitives as this view sees them."""
     if isinstance(params, Arrived):
         return params["colors"]
     if style.logits:
         return params["features_dc"].sigmoid()
-    degree = sh_degree(params["features_rest"])
-    if style.most_bands is not None:
-        degree = min(style.most_bands, degree)
+    degree = degree_in_use(params["features_rest"], style.most_bands)
     coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
     directions = params["means"] - centre_of(view)
     return (spherical_harmonics(degree, directions, coeffs, backend=style.backend) + 0.5).clamp_min(0)
