@@ -39,7 +39,6 @@ from sundae_ns.losses import chain_losses, picture_loss
 from sundae_ns.preview import Preview, in_viewer
 from sundae_ns.pruning import PruningConfig, PruningPolicy, make_policy
 from sundae_ns.rasterization import Backend, Rasterization, select_backend
-from sundae_ns.rasterization.sharded import Camera
 from sundae_ns.rendering import NEAR_PLANE, Style, colors_of, render, weights_of
 from sundae_ns.views import View, cut, view_of
 
@@ -287,21 +286,23 @@ class SundaeModel(SplatfactoModel):
     @property
     def _style(self) -> Style:
         """How pictures are made at this step."""
-        config = self.config
+        config, shards, densifying = self.config, self.shards, self.training and self.densifying
+        absgrad = densifying and config.use_absgrad and config.warmup == "densify"
         return Style(
             backend=self.backend,
             antialiased=config.rasterize_mode == "antialiased",
             logits=config.sh_degree == 0,
             most_bands=self.most_bands,
             training=self.training,
-            absgrad=self.training and config.use_absgrad and self.densifying and config.warmup == "densify",
+            absgrad=absgrad,
             head=self.head if self.head_active else None,
             trained_focal=self.trained_focal,
-            arrivals=None if self.shards is None else self.arrivals,
+            arrivals=None if shards is None else self.arrivals,
+            follow=None if shards is None or not densifying else partial(shards.follow, absgrad=absgrad),
         )
 
-    def _colors(self, params: Mapping[str, Tensor], view: View | Camera) -> Tensor:
-        return colors_of(params, view, self._style)
+    def _colors(self, params: Mapping[str, Tensor], center: Tensor) -> Tensor:
+        return colors_of(params, center, self._style)
 
     def render(
         self,

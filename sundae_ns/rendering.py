@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,8 +15,8 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.parameters import sh_degree
 from sundae_ns.pruning import pixel_detail
 from sundae_ns.rasterization import Backend, Rasterization, blending_weights, rasterize, spherical_harmonics
-from sundae_ns.rasterization.sharded import Camera
-from sundae_ns.views import View, centre_of
+from sundae_ns.rasterization.sharded import Route
+from sundae_ns.views import View
 
 NEAR_PLANE = 0.01
 
@@ -49,6 +49,8 @@ class Style:
     """Shortest and longest focal length, pixels, of the pictures that the head was trained on."""
     arrivals: Arrivals | None = None
     """Fetches primitives from other ranks; None where one process holds them all."""
+    follow: Callable[[MutableMapping[str, Any], Route], None] | None = None
+    """Told of ``info`` and route of what was fetched, before the backward pass, where ranks densify."""
 
 
 def degree_in_use(features_rest: Tensor, most_bands: int | None) -> int:
@@ -62,16 +64,13 @@ def degree_in_use(features_rest: Tensor, most_bands: int | None) -> int:
     return degree if most_bands is None else min(most_bands, degree)
 
 
-def colors_of(params: Mapping[str, Tensor], view: View | Camera, style: Style) -> Tensor:
-    """Colours ``[N, 3]`` of the primitives as this view sees them."""
-    if isinstance(params, Arrived):
-        return params["colors"]
+def colors_of(params: Mapping[str, Tensor], center: Tensor, style: Style) -> Tensor:
+    """Colours ``[N, 3]`` of the primitives as seen from a place ``[3]``, or from one each ``[N, 3]``."""
     if style.logits:
         return params["features_dc"].sigmoid()
     degree = degree_in_use(params["features_rest"], style.most_bands)
     coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
-    directions = params["means"] - centre_of(view)
-    return (spherical_harmonics(degree, directions, coeffs, backend=style.backend) + 0.5).clamp_min(0)
+    return (spherical_harmonics(degree, params["means"] - center, coeffs, backend=style.backend) + 0.5).clamp_min(0)
 
 
 def splat(params: Mapping[str, Tensor], view: View, channels: Tensor, style: Style, **options: Any) -> Rasterization:
@@ -118,7 +117,7 @@ def render(
     field, head = params, style.head if compensate else None
     if style.arrivals is not None and not isinstance(params, Arrived):
         params = style.arrivals(params, view, features=head is not None)
-    channels = colors_of(params, view, style)
+    channels = params["colors"] if isinstance(params, Arrived) else colors_of(params, view.center, style)
     if head is not None:
         channels = torch.cat([channels, params[FEATURES]], dim=1)
     splatted = splat(params, view, channels, style, render_depth=depth, absgrad=style.absgrad)
@@ -142,8 +141,8 @@ def render(
         "accumulation": splatted.alpha,
         "feature_image": features,
     }
-    if isinstance(params, Arrived):
-        splatted.info["route"] = params.route
+    if style.follow is not None and isinstance(params, Arrived):
+        style.follow(splatted.info, params.route)
     return pictures, splatted
 
 

@@ -9,7 +9,6 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.compensation import Window
-from sundae_ns.rasterization.sharded import Camera
 
 
 class View(NamedTuple):
@@ -24,6 +23,11 @@ class View(NamedTuple):
 
     focal: float
     """Focal length in pixels, the mean of both axes; beside K, because reading K back would wait for the GPU."""
+
+    @property
+    def center(self) -> Tensor:
+        """Where the camera stands ``[3]``."""
+        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     def zoomed(self, factor: float) -> View:
         """The camera that sees the same in a picture whose sides are ``factor`` times as long."""
@@ -62,11 +66,6 @@ def view_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None 
     size = (int(camera.width.item()) // downscale, int(camera.height.item()) // downscale)
     focal = (camera.fx + camera.fy).item() / 2 / downscale
     return View(viewmat.to(device), K.to(device), *size, focal)
-
-
-def centre_of(view: View | Camera) -> Tensor:
-    """Where a camera stands, world units ``[3]``."""
-    return -view.viewmat[:3, :3].T @ view.viewmat[:3, 3]
 
 
 def cut(image: Tensor, window: Window | None) -> Tensor:

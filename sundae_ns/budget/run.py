@@ -22,7 +22,7 @@ from sundae_ns.pruning import PruningConfig, decide
 from sundae_ns.pruning.bands import mean_basis
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.schedulers import notify_pruned
-from sundae_ns.views import View, centre_of
+from sundae_ns.views import View
 
 if TYPE_CHECKING:
     from sundae_ns.model import SundaeModel
@@ -90,7 +90,7 @@ class Run(NamedTuple):
         def weighted() -> Iterator[tuple[Tensor, Tensor]]:
             means = self.params["means"].data
             for view, weight in self.weights():
-                directions = torch.nn.functional.normalize(means - centre_of(view), dim=-1)
+                directions = torch.nn.functional.normalize(means - view.center, dim=-1)
                 yield weight, harmonic_basis(degree, directions)
 
         return mean_basis(weighted())

@@ -30,16 +30,16 @@ def average_gradients(params: Iterable[Tensor]) -> None:
     """Give copies of parameters the mean of their gradients over the ranks. Collective, in one message.
 
     Args:
-        params: the same on all ranks, and the same of them with a gradient.
+        params: the same on all ranks, and the same of them with a gradient; gradients lie in memory without gaps.
     """
-    gradients = [value.grad for value in params if value.grad is not None]
+    # As they lie in memory, whatever the order of their axes, which is the same on all ranks.
+    gradients = [value.grad.as_strided((value.numel(),), (1,)) for value in params if value.grad is not None]
     if not gradients:
         return
-    flat = torch.cat([gradient.flatten() for gradient in gradients])
+    flat = torch.cat(gradients)
     dist.all_reduce(flat)
     flat /= dist.get_world_size()
-    for gradient, mean in zip(gradients, flat.split([gradient.numel() for gradient in gradients])):
-        gradient.copy_(mean.view_as(gradient))
+    torch._foreach_copy_(gradients, flat.split([len(gradient) for gradient in gradients]))
 
 
 def scale_rates(optimizers: Optimizers, ranks: int) -> None:

@@ -23,7 +23,6 @@ from sundae_ns.gaussians.parameters import num_primitives
 from sundae_ns.gaussians.surgery import check_wiring
 from sundae_ns.rasterization.reference import per_axis
 from sundae_ns.rasterization.sharded import (
-    Camera,
     Route,
     exchange,
     gather_cameras,
@@ -177,7 +176,7 @@ class Shards:
         self,
         params: Mapping[str, Tensor],
         view: View,
-        colors_of: Callable[[Mapping[str, Tensor], View | Camera], Tensor],
+        colors_of: Callable[[Mapping[str, Tensor], Tensor], Tensor],
         *,
         near_plane: float,
         features: bool,
@@ -187,48 +186,59 @@ class Shards:
         Args:
             params: this rank's primitives.
             view: this rank's camera.
-            colors_of: colours ``[n, 3]``, as a camera sees them, of primitives with centres and harmonics.
+            colors_of: colours ``[S, 3]`` of primitives with centres and harmonics, as seen from places ``[S, 3]``.
             near_plane: as the rasteriser gets it.
             features: whether features come along.
         """
         names = [*_GEOMETRY, FEATURES] if features else list(_GEOMETRY)
-        cameras = gather_cameras(view.viewmat.detach(), view.K, view.width, view.height)
+        cameras = gather_cameras(view.viewmat, view.K, view.width, view.height, near_plane)
         with torch.no_grad():
-            scales = params["scales"].exp()
-            ids = [may_be_seen(params["means"], scales, c, near_plane, math.inf).nonzero()[:, 0] for c in cameras]
-        route = plan_route(ids)
+            route = plan_route(may_be_seen(params["means"], params["scales"].exp(), cameras.bounds))
         # Picked for all cameras at once: the way back then fills one gradient per parameter, not one per camera.
         going = {name: params[name].index_select(0, route.ids) for name in [*names, *_COLORS]}
-        parts = zip(*(going[name].split(route.sent) for name in ("means", *_COLORS)))
-        colors = [colors_of(dict(zip(("means", *_COLORS), part)), camera) for part, camera in zip(parts, cameras)]
-        rows = torch.cat([*(going[name] for name in names), torch.cat(colors)], dim=1)
+        centers = torch.cat([center.expand(count, 3) for center, count in zip(cameras.centers, route.sent)])
+        rows = torch.cat([*(going[name] for name in names), colors_of(going, centers)], dim=1)
         columns = [params[name].shape[1] for name in names]
         pieces = exchange(rows, route).split([*columns, 3], dim=1)
         arrived = Arrived(zip([*names, "colors"], pieces))
         arrived.route = route
         return arrived
 
-    @torch.no_grad()
-    def statistics(self, info: Mapping[str, Any], *, absgrad: bool) -> dict[str, Any]:
-        """What gsplat's strategy reads after a backward pass, about this rank's primitives in all views. Collective.
+    def follow(self, info: MutableMapping[str, Any], route: Route, *, absgrad: bool) -> None:
+        """Have what densification wants to know about primitives brought back with their gradients.
 
         Args:
-            info: of this rank's view, with its ``route``.
+            info: of this rank's view, whose centres keep their gradient.
+            route: of the view's primitives.
             absgrad: whether gradients are summed by their absolute values.
+        """
+
+        def found() -> Tensor:
+            centres = info["means2d"]
+            gradients = (centres.absgrad if absgrad else centres.grad)[0]
+            radii = info["radii"][0]
+            radii = (radii if radii.dim() == 1 else radii.amax(dim=-1)).to(gradients.dtype)
+            width, height = info["width"], info["height"]
+            halves = gradients.new_tensor([width / 2, height / 2])
+            return torch.cat([gradients * halves, (radii * (2 / max(width, height)))[:, None]], dim=1)
+
+        route.ask = found
+        info["route"] = route
+
+    @torch.no_grad()
+    def statistics(self, info: Mapping[str, Any]) -> dict[str, Any]:
+        """What gsplat's strategy reads after a backward pass, about this rank's primitives in all views.
+
+        Args:
+            info: of this rank's view, which :meth:`follow` has followed.
 
         Returns:
             ``info`` of a packed rasterisation, in units of half the picture: its width and height are 2.
         """
         route: Route = info["route"]
-        centres = info["means2d"]
-        gradients = (centres.absgrad if absgrad else centres.grad)[0]
-        radii = info["radii"][0]
-        radii = (radii if radii.dim() == 1 else radii.amax(dim=-1)).to(gradients.dtype)
-        width, height = info["width"], info["height"]
-        halves = gradients.new_tensor([width / 2, height / 2])
-        found = torch.cat([gradients * halves, (radii * (2 / max(width, height)))[:, None]], dim=1)
-        found = give_back(found, route)
-        seen = found[:, 2] > 0
+        assert route.told is not None
+        found = route.told
+        seen = (found[:, 2] > 0).nonzero()[:, 0]  # once: each search for them waits for the GPU
         ids, found = route.ids[seen], found[seen]
         # The strategy writes radii row by row: of a primitive in several views, each row gets the largest.
         largest = found.new_zeros(self.counts[self.rank]).scatter_reduce_(0, ids, found[:, 2], "amax")
@@ -248,7 +258,7 @@ class Shards:
         """Densify every shard by itself, and level the shards when they have drifted apart. Collective."""
         strategy, state = model.strategy, model.strategy_state
         peak, state["peak"] = state["peak"], 0
-        info = self.statistics(model.info, absgrad=model.config.use_absgrad)
+        info = self.statistics(model.info)
         params = model.gaussians
         strategy.step_post_backward(
             params=model.gauss_params,
