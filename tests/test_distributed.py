@@ -32,10 +32,10 @@ from sundae_ns.data import write_scene
 from sundae_ns.distributed import GlobalPruning, Shards
 from sundae_ns.errors import ConfigError, RankError, rank_ended
 from sundae_ns.method_configs import sundae_tiny
-from sundae_ns.model import View
 from sundae_ns.pruning import PruningConfig, make_policy
 from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
+from sundae_ns.views import View
 
 RANKS = 2
 LIMIT = 240

@@ -21,6 +21,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils import colormaps, writer
 from torch import Tensor
 
+from sundae_ns import rendering
 from sundae_ns.compensation import HeadConfig, resize
 from sundae_ns.datamanager import DATASET_FRAME
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError, MemoryExhaustedError
@@ -162,11 +163,11 @@ def test_every_output_can_be_shown(mode: str, size: tuple[int, int]) -> None:
 def test_outputs_that_nobody_asks_for_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     model = perturb(build()).eval()
     splatted: list[int] = []
-    splat = model._splat
-    monkeypatch.setattr(model, "_splat", lambda *args, **kwargs: splatted.append(1) or splat(*args, **kwargs))
+    rasterize = rendering.rasterize
+    monkeypatch.setattr(rendering, "rasterize", lambda *a, **kwargs: splatted.append(1) or rasterize(*a, **kwargs))
     outputs = model.get_outputs_for_camera(camera())
     assert outputs["rgb"].shape == outputs["base_rgb"].shape
-    assert (len(splatted), model._response[0]) == (1, None)
+    assert (len(splatted), model._response.of) == (1, None)
     assert outputs["response"].max() > 0
     assert len(splatted) == 2
 
