@@ -11,6 +11,7 @@ import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -127,10 +128,14 @@ def load(path: Path) -> dict[str, Any]:
         except Exception as error:  # torch.load raises many kinds; each means the same to the user
             reason = str(error).partition("\n")[0] or type(error).__name__
         else:
-            if isinstance(loaded, dict) and isinstance(loaded.get("pipeline"), Mapping):
+            state = loaded.get("pipeline") if isinstance(loaded, dict) else None
+            if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
+                reason = "it holds no model"
+            elif not isinstance(loaded.get("step"), Integral):
+                reason = "it does not say after which step it was saved"
+            else:
                 _check_extent(loaded, path)
                 return loaded
-            reason = "it holds no model"
     raise CheckpointError(f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file")
 
 

@@ -37,6 +37,7 @@ from sundae_ns.evaluation import (
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.opening import Opened
+from sundae_ns.run_config import load_config
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
 
 
@@ -118,6 +119,7 @@ def load_run(config: Path) -> LoadedRun:
     """
     if not config.is_file():
         raise CheckpointError(f"{config} does not exist; give the config.yml of a run's folder")
+    load_config(config)  # refuses what nerfstudio's reader would run
     _, pipeline, _, _ = eval_setup(config, test_mode="test")
     model = pipeline.model
     if not isinstance(model, SundaeModel):

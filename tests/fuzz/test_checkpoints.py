@@ -175,6 +175,7 @@ ODD: dict[str, Callable[[dict[str, Any]], None]] = {
     "a step that is no number": _at("step", "many"),
     "no model": _at("pipeline", None),
     "a model that is a list": _at("pipeline", [1, 2]),
+    "a number for a name": lambda state: state["pipeline"].update({3: torch.zeros(2)}),
     "no optimizers": _at("optimizers", None),
     "optimizers of another field": _moments,
     "a generator that is none": _at("random", {"python": 1, "numpy": 2, "torch": 3, "cuda": 4}),
