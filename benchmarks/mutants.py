@@ -36,6 +36,7 @@ import pytest
 import scipy.spatial  # noqa: F401
 import torch
 import zstandard  # noqa: F401
+from rich.console import Console
 from rich.progress import track
 
 ROOT = Path(__file__).parents[1]
@@ -246,7 +247,8 @@ def main() -> None:
         if noticed(tests_of(room, ROOT), None):
             raise SystemExit(f"{name}: the tests fail on the code as it is")
         survivors = []
-        for number in track(sample, description=f"Changing and testing {name}", transient=True):
+        console = Console(stderr=True)
+        for number in track(sample, description=f"Changing and testing {name}", transient=True, console=console):
             path, index, kind = every[number]
             tree = deepcopy(trees[path])
             what = change(tree, index, kind)

@@ -116,13 +116,14 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
     """
     config = load_config(path)
     pipeline_config = config.pipeline if isinstance(config, TrainerConfig) else None
-    if pipeline_config is None or not isinstance(getattr(pipeline_config, "model", None), SplatfactoModelConfig):
+    model_config = getattr(pipeline_config, "model", None)
+    if pipeline_config is None or not isinstance(model_config, SplatfactoModelConfig):
         raise CheckpointError(f"{path} is of a method without Gaussians; give runs of sundae or splatfacto")
     folder = path.parent / config.relative_model_dir
     newest, _ = checkpoint.newest_whole(folder)
-    stock = not isinstance(pipeline_config.model, SundaeModelConfig)
+    stock = not isinstance(model_config, SundaeModelConfig)
     if stock:
-        pipeline_config.model = _without_extras(pipeline_config.model, newest)
+        pipeline_config.model = _without_extras(model_config, newest)
         pipeline_config.datamanager = _our_datamanager(cast(FullImageDatamanagerConfig, pipeline_config.datamanager))
     capture = _capture(config, data)
     pipeline_config.datamanager.data = capture

@@ -1,4 +1,4 @@
-"""A run's ``config.yml`` as objects of nerfstudio, without running it: nerfstudio's own reader calls whatever the file names."""
+"""A run's ``config.yml`` as objects of nerfstudio, without running it; nerfstudio's own reader calls whatever it names."""
 
 from __future__ import annotations
 

@@ -146,6 +146,14 @@ def test_the_whole_of_all_parts_is_the_checkpoint_that_they_came_from() -> None:
     assert equal(again, whole)
 
 
+def test_a_step_within_a_batch_becomes_the_last_whole_batch() -> None:
+    """Pictures of a batch that was not whole are seen again rather than left out."""
+    for step, after in ((28, 8), (29, 9), (30, 9), (31, 9), (32, 10), (0, -1)):
+        whole = a_checkpoint(step=step)
+        part = distributed.state_of_rank(whole, 0, RANKS, NAMES)
+        assert (part["step"], part["pipeline"]["_model._extra_state"]["step"]) == (after, after)
+
+
 def test_only_values_of_every_primitive_are_rows() -> None:
     assert distributed._per_primitive(torch.zeros(3, 2), 3)
     for other in (torch.tensor(3.0), torch.zeros(2, 3), [0, 0, 0], 3, None):
