@@ -56,6 +56,7 @@ from sundae_ns.rasterization import (
     spherical_harmonics,
 )
 from sundae_ns.rasterization.sharded import Camera
+from sundae_ns.run_folder import prunes_before
 from sundae_ns.schedulers import notify_pruned
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.transform import similarity
@@ -755,9 +756,8 @@ class SundaeModel(SplatfactoModel):
         if attributes.trainer is None or (self.shards is not None and self.shards.rank != 0):
             return
         path = attributes.trainer.base_dir / "prune.json"
-        reports = json.loads(path.read_text()) if path.exists() else []
         # A run that was killed after a prune and before the next save does that prune again.
-        reports = [earlier for earlier in reports if earlier["step"] < report.step]
+        reports = prunes_before(path, report.step)
         reports.append({**asdict(report), "warm_up": before, "pruned": after})
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, json.dumps(reports, indent=2))

@@ -31,6 +31,7 @@ FLOORS = {
     "distributed": 3,
     "model": 3,
     "preview": 3,
+    "run_config": 3,
     "run_folder": 3,
     "trainer": 3,
     "opening": 3,
