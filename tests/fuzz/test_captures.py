@@ -251,6 +251,23 @@ def _patch(file: str, at: int, content: bytes) -> Callable[[Path], None]:
     return change
 
 
+def _twice(model: Path) -> None:
+    camera = (model / "cameras.bin").read_bytes()[8:]
+    (model / "cameras.bin").write_bytes(struct.pack("<Q", 2) + camera * 2)
+
+
+def _folder(file: str) -> Callable[[Path], None]:
+    def change(model: Path) -> None:
+        (model / file).unlink(missing_ok=True)
+        (model / file).mkdir()
+
+    return change
+
+
+def _spaced(model: Path) -> None:
+    write_text_model(model, ["a picture.png"])
+
+
 _NAME = 8 + 64 + len("frame_00001.png") + 1  # offset of the first image's number of observations
 MODELS: dict[str, tuple[Callable[[Path], None], str]] = {
     "2^63 cameras": (_patch("cameras.bin", 0, struct.pack("<Q", 1 << 63)), "cameras.bin states"),
@@ -274,6 +291,12 @@ MODELS: dict[str, tuple[Callable[[Path], None], str]] = {
     "no points": (lambda model: (model / "points3D.bin").write_bytes(struct.pack("<Q", 0)), "has no points"),
     "no file of images": (lambda model: (model / "images.bin").unlink(), "images.bin does not exist"),
     "no files": (shutil.rmtree, "is no folder"),
+    "no file of cameras": (lambda model: (model / "cameras.bin").unlink(), "holds neither cameras.bin nor cameras.txt"),
+    "a camera twice": (_twice, "camera 1: it stands there twice"),
+    "a folder in the place of a file": (_folder("cameras.bin"), "cannot be read"),
+    "a folder in the place of a text": (_folder("cameras.txt"), "cannot be read"),
+    "a text that is none": (lambda model: (model / "cameras.txt").write_bytes(b"1 PIN\xff\xfe"), "is no text"),
+    "a text with a space in a name": (_spaced, "does not read names with spaces"),
     "no picture": (lambda model: next((model.parents[1] / "images").iterdir()).unlink(), "does not exist"),
 }
 
