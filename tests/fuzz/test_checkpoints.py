@@ -193,6 +193,9 @@ ODD: dict[str, Callable[[dict[str, Any]], None]] = {
     "a centre that is a word": _param("means", lambda value: "here"),
     "two dimensions": _param("means", lambda value: value[:, :2]),
     "colours of no degree": _param("features_rest", lambda value: value.new_zeros(30, 7, 3)),
+    "sparse centres": _param("means", lambda value: value.to_sparse()),
+    "quantized centres": _param("means", lambda value: torch.quantize_per_tensor(value, 0.1, 0, torch.quint8)),
+    "centres without values": _param("means", lambda value: value.to("meta")),
     "a billion primitives in 12 bytes": _param("means", lambda value: torch.zeros(1, 3).expand(10**9, 3)),
 }
 
