@@ -36,7 +36,7 @@ from sundae_ns.rasterization import rasterize, select_backend, spherical_harmoni
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 
 RANKS = 2
-LIMIT = 240
+LIMIT = 600
 """Seconds that a program may take on a busy machine."""
 REFERENCE = select_backend("reference", "cpu")
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "features")
