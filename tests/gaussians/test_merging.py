@@ -226,6 +226,15 @@ def test_rewriting_forgets_directions_where_values_changed_and_keeps_the_rest() 
     assert int((params["means"].detach() != before["means"]).sum()) == 3
 
 
+def test_rewriting_before_the_first_step_and_without_an_optimizer() -> None:
+    params = {name: Parameter(value) for name, value in field(6).items()}
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items() if name != "features"}
+    values = {name: value.detach() + 1 for name, value in params.items()}
+    rewrite(params, optimizers, values)
+    assert all(torch.equal(params[name].detach(), values[name]) for name in params)
+    assert not any(optimizer.state for optimizer in optimizers.values())
+
+
 def test_rewriting_refuses_what_does_not_fit_and_changes_nothing() -> None:
     params, optimizers = trained()
     before = params["means"].detach().clone()

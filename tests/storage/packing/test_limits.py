@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from sundae_ns.errors import ConfigError, PackError
-from sundae_ns.storage.packing import PackConfig, Scene, codebooks, container, quantize, read_scene, write_scene
+from sundae_ns.storage.packing import PackConfig, Scene, codebooks, container, morton, quantize, read_scene, write_scene
 
 Json = dict[str, Any]
 ENDS: dict[str, tuple[Any, Any, Any, Any]] = {
@@ -247,3 +247,49 @@ def test_small_fields_get_small_books_and_a_thousandth_of_the_rows_is_exact() ->
         assert (len(found.rows), found.exact.shape) == (exact, (exact, 3))
         assert found.indices.max() < entries
         assert (np.abs(found.entries).max(axis=(1, 2)) == 127).all() or n == 1
+
+
+def test_the_order_of_points_on_a_line_is_the_line() -> None:
+    """At both ends too, where a code of one bit too many would begin anew; and where most points are one."""
+    x = np.random.default_rng(0).permutation(np.linspace(-3, 5, 500)).astype(np.float32)
+    for axis in range(3):
+        means = np.zeros((500, 3), np.float32)
+        means[:, axis] = x
+        assert np.array_equal(morton.scene_order(means), np.argsort(x))
+        means[:300, axis] = 0
+        ordered = means[morton.scene_order(means), axis]
+        assert (np.diff(ordered) >= 0).all()
+
+
+def test_a_head_that_shrinks_to_nothing_is_padded_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    head = {"a.weight": torch.zeros(1000, 3500)}
+    report = write_scene(path, Scene(scene().field, head))
+    unpacked = 4 * head["a.weight"].numel()
+    assert report.sections["padding"] > 0
+    assert container.SPARE + container.MAX_RATIO * report.bytes >= unpacked
+    assert torch.equal(read_scene(path).head["a.weight"], head["a.weight"])
+
+
+def test_steps_of_books_that_are_too_large_are_refused_one_by_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene(), PackConfig(feature_books=2))
+    resectioned(path, "features/steps", np.array([0.5, 1e38], np.float32))
+    with pytest.raises(PackError):
+        read_scene(path)
+
+
+@pytest.mark.parametrize("tensors", [5, None, {"a.bias": [4]}, [["a.bias", [4]]] * 10_001])
+def test_a_head_has_a_list_of_tensors(tmp_path: Path, tensors: Any) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene())
+    restated(path, lambda meta: meta["attributes"]["head"].update(tensors=tensors))
+    with pytest.raises(PackError):
+        read_scene(path)
+
+
+def test_what_is_no_json_is_not_written(tmp_path: Path) -> None:
+    """Readers refuse a header with NaN."""
+    with pytest.raises(ValueError, match="JSON"):
+        write_scene(tmp_path / "a.sundae", replace(scene(), meta={"scale": float("nan")}))
+    assert not list(tmp_path.iterdir())
