@@ -101,7 +101,9 @@ def _check_extent(value: Any, path: Path) -> None:
     """Refuse tensors that claim more elements than their storage holds, for copying one would fill the memory; and odd ones."""
     if isinstance(value, Tensor):
         if value.layout is not torch.strided or value.is_quantized or value.is_meta:
-            raise CheckpointError(f"{path} holds a tensor that is sparse, quantized or without values; give another file")
+            raise CheckpointError(
+                f"{path} holds a tensor that is sparse, quantized or without values; give another file"
+            )
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
             raise CheckpointError(f"{path} holds a tensor that claims more than it has; give another file")
     elif isinstance(value, Mapping):
