@@ -64,9 +64,9 @@ ROOMS = {
     "packing": Room(("storage/packing/[!_]*.py",), ("storage/packing/test_*.py", "fuzz/test_packs.py")),
     # What ranks say to each other is tried by processes of their own, which import what is on disk.
     "ranks": Room(
-        ("distributed.py",),
+        ("distributed/[!_]*.py",),
         ("test_blocks.py",),
-        ("bounds", "moves", "_per_primitive", "_scaled_group", "state_of_rank", "_map_state", "_decide"),
+        ("bounds", "moves", "per_primitive", "scaled_group", "state_of_rank", "_map_state", "_decide"),
     ),
 }
 

@@ -158,6 +158,21 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
     )
 
 
+def load_run(path: Path) -> Opened:
+    """Open a finished run of sundae by its ``config.yml``, and no other method's.
+
+    Raises:
+        CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
+        DataError: its capture is gone, or cannot be used.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path} does not exist; give the config.yml of a run's folder")
+    model = getattr(getattr(load_config(path), "pipeline", None), "model", None)
+    if not isinstance(model, SundaeModelConfig):
+        raise CheckpointError(f"{path} is a run of another method; give one of sundae")
+    return open_run(path)
+
+
 def _without_extras(stock: SplatfactoModelConfig, field: Path) -> SundaeModelConfig:
     """Configuration of a model of ours that renders a field of splatfacto as splatfacto does."""
     options = {field.name: getattr(stock, field.name) for field in fields(SplatfactoModelConfig) if field.init}

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import Parameter
 
-from sundae_ns import distributed
+from sundae_ns.distributed import bounds, checkpoints, moves, pruning
+from sundae_ns.distributed.shards import per_primitive
 from sundae_ns.errors import ConfigError
 from sundae_ns.pruning import PruningConfig, make_policy
 
@@ -26,7 +27,7 @@ RANKS = 3
 
 @given(st.integers(0, 200), st.integers(1, 9))
 def test_blocks_are_as_even_as_they_can_be(total: int, ranks: int) -> None:
-    ends = distributed.bounds(total, ranks)
+    ends = bounds(total, ranks)
     sizes = [end - start for start, end in pairwise(ends)]
     assert (len(sizes), ends[0], ends[-1]) == (ranks, 0, total)
     assert max(sizes) - min(sizes) <= 1
@@ -35,7 +36,7 @@ def test_blocks_are_as_even_as_they_can_be(total: int, ranks: int) -> None:
 @given(st.lists(st.integers(0, 40), min_size=1, max_size=6))
 def test_moved_rows_lie_in_even_blocks_in_the_same_order(counts: list[int]) -> None:
     ranks = len(counts)
-    plans = [distributed.moves(counts, rank) for rank in range(ranks)]
+    plans = [moves(counts, rank) for rank in range(ranks)]
     rows = iter(range(sum(counts)))
     held = [[next(rows) for _ in range(count)] for count in counts]
     arrived: list[list[int]] = [[] for _ in range(ranks)]
@@ -45,7 +46,7 @@ def test_moved_rows_lie_in_even_blocks_in_the_same_order(counts: list[int]) -> N
             assert plans[other][1][rank] == count, "one sends what the other does not wait for"
             arrived[other] += [held[rank].pop(0) for _ in range(count)]
     assert [row for block in arrived for row in block] == list(range(sum(counts)))
-    ends = distributed.bounds(sum(counts), ranks)
+    ends = bounds(sum(counts), ranks)
     assert [len(block) for block in arrived] == [end - start for start, end in pairwise(ends)]
 
 
@@ -96,7 +97,7 @@ def equal(a: Any, b: Any) -> bool:
 
 def test_parts_of_a_checkpoint_are_rows_of_it_and_steps_of_larger_batches() -> None:
     whole = a_checkpoint()
-    parts = [distributed.state_of_rank(whole, rank, RANKS, NAMES) for rank in range(RANKS)]
+    parts = [checkpoints.state_of_rank(whole, rank, RANKS, NAMES) for rank in range(RANKS)]
     for start, end, part in zip((0, 3, 6), (3, 6, 10), parts):
         for name in NAMES:
             assert torch.equal(
@@ -134,15 +135,13 @@ def test_parts_of_a_checkpoint_are_rows_of_it_and_steps_of_larger_batches() -> N
 def test_the_whole_of_all_parts_is_the_checkpoint_that_they_came_from() -> None:
     whole = a_checkpoint()
     whole["schedulers"]["means"]["lr_lambdas"].pop()  # a step within a batch becomes the last of it
-    parts = [distributed.state_of_rank(whole, rank, RANKS, NAMES) for rank in range(RANKS)]
+    parts = [checkpoints.state_of_rank(whole, rank, RANKS, NAMES) for rank in range(RANKS)]
     held: list[list[Any]] = [[] for _ in parts]
     for part, values in zip(parts, held):
-        distributed._map_state(part, NAMES, lambda value, values=values: values.append(value), Fraction(1, RANKS))
+        checkpoints._map_state(part, NAMES, lambda value, values=values: values.append(value), Fraction(1, RANKS))
     sizes = [len(values[0]) for values in held]
-    together = iter(
-        torch.cat(values) if distributed._per_primitive(values[0], sizes[0]) else values[0] for values in zip(*held)
-    )
-    again = distributed._map_state(parts[0], NAMES, lambda _: next(together), Fraction(1, RANKS))
+    together = iter(torch.cat(values) if per_primitive(values[0], sizes[0]) else values[0] for values in zip(*held))
+    again = checkpoints._map_state(parts[0], NAMES, lambda _: next(together), Fraction(1, RANKS))
     assert equal(again, whole)
 
 
@@ -150,14 +149,14 @@ def test_a_step_within_a_batch_becomes_the_last_whole_batch() -> None:
     """Pictures of a batch that was not whole are seen again rather than left out."""
     for step, after in ((28, 8), (29, 9), (30, 9), (31, 9), (32, 10), (0, -1)):
         whole = a_checkpoint(step=step)
-        part = distributed.state_of_rank(whole, 0, RANKS, NAMES)
+        part = checkpoints.state_of_rank(whole, 0, RANKS, NAMES)
         assert (part["step"], part["pipeline"]["_model._extra_state"]["step"]) == (after, after)
 
 
 def test_only_values_of_every_primitive_are_rows() -> None:
-    assert distributed._per_primitive(torch.zeros(3, 2), 3)
+    assert per_primitive(torch.zeros(3, 2), 3)
     for other in (torch.tensor(3.0), torch.zeros(2, 3), [0, 0, 0], 3, None):
-        assert not distributed._per_primitive(other, 3)
+        assert not per_primitive(other, 3)
 
 
 def a_field(n: int = 60) -> dict[str, Tensor]:
@@ -182,7 +181,7 @@ def test_the_deciding_rank_says_which_rows_stay_and_which_values_change(redistri
     config = PruningConfig(prune_at=1, keep_ratio=0.3, num_neighbors=6, redistribution=redistribution)
     policy = make_policy(config)
     state = policy.initialize_state()
-    (report, counted, changed), params, rows = distributed._decide(policy, field, state, 2, weights)
+    (report, counted, changed), params, rows = pruning._decide(policy, field, state, 2, weights)
     alone: dict[str, Any] = {name: Parameter(value.clone()) for name, value in field.items()}
     own = policy.initialize_state()
     expected = policy.step_post_backward(alone, {}, own, 2, contribution=lambda: weights)
@@ -203,6 +202,6 @@ def test_the_deciding_rank_says_which_rows_stay_and_which_values_change(redistri
 def test_the_deciding_rank_hands_on_an_error_instead_of_raising_it() -> None:
     policy = make_policy(PruningConfig(prune_at=1, keep_ratio=0.3))
     field = a_field()
-    error, params, rows = distributed._decide(policy, field, policy.initialize_state(), 2, None)
+    error, params, rows = pruning._decide(policy, field, policy.initialize_state(), 2, None)
     assert isinstance(error, ConfigError)
     assert len(rows) == len(params["means"]) == 60

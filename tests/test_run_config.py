@@ -11,8 +11,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.measure import load_run
-from sundae_ns.opening import open_scene
+from sundae_ns.opening import load_run, open_scene
 from sundae_ns.packed_run import scene_of_run
 from sundae_ns.run_config import load_config
 
