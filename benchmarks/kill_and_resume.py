@@ -144,6 +144,25 @@ def finish(child: int, log: Path) -> None:
         raise SystemExit(f"a run failed with status {status}; it ended so:\n{log.read_text()[-3000:]}")
 
 
+def was_killed(child: int) -> bool:
+    """Wait for a process, and say whether it was killed."""
+    _, status = os.waitpid(child, 0)
+    return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+
+
+def kill_at_any_time(config: TrainerConfig, log: Path, seconds: float, rng: random.Random) -> bool:
+    """Start a run that takes about so many seconds, and kill it; anew where it has ended by then."""
+    for _ in range(10):
+        child = start(config, log)
+        time.sleep(rng.uniform(0.0, seconds))
+        os.kill(child, signal.SIGKILL)  # the process is not waited for yet, so the number is its own
+        if was_killed(child):
+            return True
+        shutil.rmtree(run_folder(config))
+        seconds *= 0.8  # the machine has less to do than it had
+    return False
+
+
 def run_folder(config: TrainerConfig) -> Path:
     return Path(config.output_dir) / "e" / "sundae-tiny" / "t"
 
@@ -200,13 +219,9 @@ def main() -> None:
         models = run_folder(config) / "nerfstudio_models"
         nth = rng.randint(1, STEPS // SAVE_EVERY)
         if place == ANY:
-            child = start(config, log)
-            time.sleep(rng.uniform(0.0, seconds))
-            os.kill(child, signal.SIGKILL)
+            killed = kill_at_any_time(config, log, seconds, rng)
         else:
-            child = start(config, log, lambda place=place, nth=nth: PLACES[place](nth))
-        _, status = os.waitpid(child, 0)
-        killed = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+            killed = was_killed(start(config, log, lambda place=place, nth=nth: PLACES[place](nth)))
         tally["killed"] += killed
         tally[f"at {place}"] += killed
         try:

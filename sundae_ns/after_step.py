@@ -17,6 +17,7 @@ from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import SundaeError
 from sundae_ns.evaluation import peak_memory
 from sundae_ns.pruning import PruneReport
+from sundae_ns.run_folder import prunes_before
 from sundae_ns.schedulers import notify_pruned
 from sundae_ns.storage.atomic import write_text
 
@@ -111,9 +112,8 @@ def record(
 
 
 def _append(path: Path, report: PruneReport, before: dict[str, float], after: dict[str, float]) -> None:
-    reports = json.loads(path.read_text()) if path.exists() else []
     # A run that was killed after a prune and before the next save does that prune again.
-    reports = [earlier for earlier in reports if earlier["step"] < report.step]
+    reports = prunes_before(path, report.step)
     reports.append({**asdict(report), "warm_up": before, "pruned": after})
     path.parent.mkdir(parents=True, exist_ok=True)
     write_text(path, json.dumps(reports, indent=2))

@@ -11,6 +11,7 @@ import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -97,8 +98,12 @@ def _damage(path: Path) -> str | None:
 
 
 def _check_extent(value: Any, path: Path) -> None:
-    """Refuse tensors that claim more elements than their storage holds: copying one would fill the memory."""
+    """Refuse tensors that claim more elements than their storage holds, for copying one would fill the memory; and odd ones."""
     if isinstance(value, Tensor):
+        if value.layout is not torch.strided or value.is_quantized or value.is_meta:
+            raise CheckpointError(
+                f"{path} holds a tensor that is sparse, quantized or without values; give another file"
+            )
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
             raise CheckpointError(f"{path} holds a tensor that claims more than it has; give another file")
     elif isinstance(value, Mapping):
@@ -127,10 +132,14 @@ def load(path: Path) -> dict[str, Any]:
         except Exception as error:  # torch.load raises many kinds; each means the same to the user
             reason = str(error).partition("\n")[0] or type(error).__name__
         else:
-            if isinstance(loaded, dict) and isinstance(loaded.get("pipeline"), Mapping):
+            state = loaded.get("pipeline") if isinstance(loaded, dict) else None
+            if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
+                reason = "it holds no model"
+            elif not isinstance(loaded.get("step"), Integral):
+                reason = "it does not say after which step it was saved"
+            else:
                 _check_extent(loaded, path)
                 return loaded
-            reason = "it holds no model"
     raise CheckpointError(f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file")
 
 

@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 from typing import Any, cast
 
 import torch
-import yaml
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.trainer import TrainerConfig
@@ -23,7 +22,7 @@ from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.packed_run import write_run
 from sundae_ns.pruning import PruningConfig
-from sundae_ns.run_folder import CLASS, read_config
+from sundae_ns.run_config import load_config
 from sundae_ns.storage.packing import is_packed, read_scene
 
 
@@ -59,8 +58,7 @@ def open_scene(path: Path, *, data: Path | None = None) -> Opened:
     """Open a finished scene. This is the one place that knows the kinds; a new kind is one more branch here.
 
     Args:
-        path: folder of a run, or its ``config.yml``, which is a program (see README): open your own. Or a packed scene,
-            of which nothing is run.
+        path: folder of a run, its ``config.yml``, or a packed scene; nothing in them is run.
         data: where the capture is, if not where the run says. A packed scene does not say.
 
     Raises:
@@ -116,19 +114,16 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
         CheckpointError: the run is of another method, or has no whole checkpoint.
         DataError: its capture is gone, or cannot be used.
     """
-    try:
-        config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
-    except Exception as error:  # classes that are gone or have moved raise of many kinds
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise CheckpointError(f"{path} cannot be read ({reason}); was it written by another version?") from error
+    config = load_config(path)
     pipeline_config = config.pipeline if isinstance(config, TrainerConfig) else None
-    if pipeline_config is None or not isinstance(pipeline_config.model, SplatfactoModelConfig):
+    model_config = getattr(pipeline_config, "model", None)
+    if pipeline_config is None or not isinstance(model_config, SplatfactoModelConfig):
         raise CheckpointError(f"{path} is of a method without Gaussians; give runs of sundae or splatfacto")
     folder = path.parent / config.relative_model_dir
     newest, _ = checkpoint.newest_whole(folder)
-    stock = not isinstance(pipeline_config.model, SundaeModelConfig)
+    stock = not isinstance(model_config, SundaeModelConfig)
     if stock:
-        pipeline_config.model = _without_extras(pipeline_config.model, newest)
+        pipeline_config.model = _without_extras(model_config, newest)
         pipeline_config.datamanager = _our_datamanager(cast(FullImageDatamanagerConfig, pipeline_config.datamanager))
     capture = _capture(config, data)
     pipeline_config.datamanager.data = capture
@@ -172,9 +167,8 @@ def load_run(path: Path) -> Opened:
     """
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist; give the config.yml of a run's folder")
-    model = read_config(path)["pipeline"].get("model")
-    kind = str(model.get(CLASS)) if isinstance(model, dict) else ""
-    if not kind.startswith("object:sundae_ns."):
+    model = getattr(getattr(load_config(path), "pipeline", None), "model", None)
+    if not isinstance(model, SundaeModelConfig):
         raise CheckpointError(f"{path} is a run of another method; give one of sundae")
     return open_run(path)
 

@@ -34,6 +34,7 @@ from sundae_ns.errors import CheckpointError, PackError, StorageError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rendering import degree_in_use
+from sundae_ns.run_config import load_config
 from sundae_ns.storage.atomic import storage_error, write_text
 from sundae_ns.storage.packing import Scene
 
@@ -59,8 +60,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100) -> Scene:
     Spherical harmonics that were not trained yet are left out, and so are the features of a head that takes no part.
 
     Args:
-        run: folder of a run of sundae or splatfacto, or its ``config.yml``. nerfstudio's configurations are programs: give
-            a run of your own.
+        run: folder of a run of sundae or splatfacto, or its ``config.yml``, which is not run.
         max_cameras: most training cameras, evenly chosen; with 0, the capture need not be there any more.
 
     Raises:
@@ -98,16 +98,9 @@ def scene_of_run(run: Path, *, max_cameras: int = 100) -> Scene:
 
 
 def _read_config(path: Path) -> TrainerConfig:
-    try:
-        config = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.Loader)
-    except OSError as error:
-        raise CheckpointError(
-            f"{path} cannot be read ({error.strerror}); give the folder of a finished run, or its config.yml"
-        ) from error
-    except Exception as error:  # yaml calls what the file names, which may raise anything
-        reason = " ".join(str(error).split())[:200]
-        raise CheckpointError(f"{path} is not a run's config.yml ({reason}); give the folder of a run") from error
-    if not isinstance(config, TrainerConfig) or not isinstance(config.pipeline.model, SplatfactoModelConfig):
+    config = load_config(path)
+    model = getattr(getattr(config, "pipeline", None), "model", None)
+    if not isinstance(config, TrainerConfig) or not isinstance(model, SplatfactoModelConfig):
         raise CheckpointError(f"{path} is a run of another method; give one of sundae or splatfacto")
     return config
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,6 +52,21 @@ def read_config(path: Path) -> dict[str, Any]:
     if not isinstance(loaded, dict) or not isinstance(loaded.get("pipeline"), dict):
         raise CheckpointError(f"{path} is not a run's config.yml; give a run's folder")
     return loaded
+
+
+def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
+    """Records of the prunes of a run before a step, from its ``prune.json``; none if there is no such file.
+
+    A file that cannot be read is set aside under another name: it is no reason to end a training.
+    """
+    try:
+        records = json.loads(path.read_text(encoding="utf-8"))
+        return [record for record in records if record["step"] < step]
+    except FileNotFoundError:
+        return []
+    except (ValueError, TypeError, KeyError):
+        path.replace(path.with_suffix(".damaged.json"))
+        return []
 
 
 def find_config(path: Path) -> Path | None:

@@ -154,9 +154,12 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "empty folder": (lambda path: path.mkdir(), "holds no checkpoint"),
     "no checkpoint": (lambda path: path.write_text("hello"), "cannot be read"),
     "empty file": (lambda path: path.write_bytes(b""), "cannot be read"),
-    "only tensors": (_save({"weight": torch.zeros(2)}), "cannot be read"),
+    "only tensors": (_save({"weight": torch.zeros(2)}), "it holds no model"),
+    "no step": (_save({"pipeline": {"_model.field.weight": torch.zeros(2)}}), "after which step it was saved"),
+    "a step of words": (_save({"step": "3", "pipeline": {}}), "after which step it was saved"),
+    "a number for a name": (_save({"step": 3, "pipeline": {3: torch.zeros(2)}}), "it holds no model"),
     "a list": (_save([1, 2]), "cannot be read"),
-    "of another method": (_save({"pipeline": {"_model.field.weight": torch.zeros(2)}}), "no Gaussian field"),
+    "of another method": (_save({"step": 3, "pipeline": {"_model.field.weight": torch.zeros(2)}}), "no Gaussian field"),
 }
 
 

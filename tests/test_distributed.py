@@ -38,7 +38,7 @@ from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 from sundae_ns.views import View
 
 RANKS = 2
-LIMIT = 240
+LIMIT = 600
 """Seconds that a program may take on a busy machine."""
 REFERENCE = select_backend("reference", "cpu")
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "features")

@@ -36,6 +36,7 @@ FLOORS = {
     "model": 3,
     "preview": 3,
     "rendering": 3,
+    "run_config": 3,
     "run_folder": 3,
     "trainer": 3,
     "opening": 3,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from sundae_ns.errors import CheckpointError, DataError
-from sundae_ns.run_folder import CLASS, find_config, read_config, training_cameras
+from sundae_ns.run_folder import CLASS, find_config, prunes_before, read_config, training_cameras
 
 PIPELINE = "pipeline: !!python/object:some.Pipeline\n  datamanager: null\n"
 
@@ -85,6 +85,19 @@ def test_the_configuration_is_found_from_anywhere_in_its_run(tmp_path: Path) -> 
     assert [find_config(place) for place in places] == [run / "config.yml"] * 4
     assert find_config(tmp_path) is None
     assert find_config(tmp_path / "gone") is None
+
+
+def test_earlier_prunes_are_kept_and_what_cannot_be_read_is_set_aside(tmp_path: Path) -> None:
+    path = tmp_path / "prune.json"
+    assert prunes_before(path, 5) == []
+    path.write_text('[{"step": 3, "before": 9}, {"step": 7}]')
+    assert prunes_before(path, 7) == [{"step": 3, "before": 9}]
+    assert path.exists()
+    for text in ('[{"step": 3', "", '"step"', "3", '[{"before": 9}]', "[3]", '[{"step": "3"}]'):
+        path.write_text(text)
+        assert prunes_before(path, 7) == []
+        assert not path.exists()
+        assert (tmp_path / "prune.damaged.json").read_text() == text
 
 
 @pytest.mark.parametrize(

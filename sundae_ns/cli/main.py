@@ -104,7 +104,7 @@ def report(
     """Evaluate finished runs on their test views, speed beside error: tables, plots, curves over training.
 
     Args:
-        runs: folders of runs of sundae and splatfacto, or their config.yml, which are programs: open your own; and packed
+        runs: folders of runs of sundae and splatfacto, or their config.yml, which is read and not run; and packed
             scenes.
         out: folder to write.
         data: where the capture is, if it is not where the runs say; packed scenes do not say.

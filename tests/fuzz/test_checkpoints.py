@@ -175,6 +175,7 @@ ODD: dict[str, Callable[[dict[str, Any]], None]] = {
     "a step that is no number": _at("step", "many"),
     "no model": _at("pipeline", None),
     "a model that is a list": _at("pipeline", [1, 2]),
+    "a number for a name": lambda state: state["pipeline"].update({3: torch.zeros(2)}),
     "no optimizers": _at("optimizers", None),
     "optimizers of another field": _moments,
     "a generator that is none": _at("random", {"python": 1, "numpy": 2, "torch": 3, "cuda": 4}),
@@ -192,6 +193,9 @@ ODD: dict[str, Callable[[dict[str, Any]], None]] = {
     "a centre that is a word": _param("means", lambda value: "here"),
     "two dimensions": _param("means", lambda value: value[:, :2]),
     "colours of no degree": _param("features_rest", lambda value: value.new_zeros(30, 7, 3)),
+    "sparse centres": _param("means", lambda value: value.to_sparse()),
+    "quantized centres": _param("means", lambda value: torch.quantize_per_tensor(value, 0.1, 0, torch.quint8)),
+    "centres without values": _param("means", lambda value: value.to("meta")),
     "a billion primitives in 12 bytes": _param("means", lambda value: torch.zeros(1, 3).expand(10**9, 3)),
 }
 

@@ -92,6 +92,26 @@ def test_without_weight_nothing_changes_and_weights_have_no_unit() -> None:
     assert all(torch.allclose(small[name], plain[name]) for name in params)
 
 
+def test_a_weight_that_is_not_a_number_counts_as_none() -> None:
+    params, heir, w = field(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
+    w[[1, 7]] = 0
+    expected = merge(params, heir, w)
+    for odd in (torch.nan, torch.inf, -1.0):
+        w[[1, 7]] = odd
+        found = merge(params, heir, w)
+        assert all(torch.equal(found[name], expected[name]) for name in params), odd
+
+
+def test_one_axis_that_overflows_leaves_its_group_as_it_is_and_others_are_merged() -> None:
+    params = field()
+    params["scales"][2, 1] = 400.0
+    params["quats"][2] = torch.tensor([1.0, 0, 0, 0]).double()
+    found = merge(params, torch.tensor([0] * 6 + [6] * 6), torch.ones(12))
+    assert all(torch.equal(found[name][0], params[name][0]) for name in params)
+    assert not torch.equal(found["means"][1], params["means"][6])
+    assert all(value.isfinite().all() for value in found.values())
+
+
 def test_extremes_stay_finite() -> None:
     params = {name: value.float() for name, value in field().items()}
     params["scales"][0] = torch.tensor([1e-8, 1e3, 1.0]).log()
@@ -204,6 +224,15 @@ def test_rewriting_forgets_directions_where_values_changed_and_keeps_the_rest() 
         assert torch.equal(state["exp_avg"][~changed], moments[name]["exp_avg"][~changed])
         assert torch.equal(state["exp_avg_sq"], moments[name]["exp_avg_sq"])
     assert int((params["means"].detach() != before["means"]).sum()) == 3
+
+
+def test_rewriting_before_the_first_step_and_without_an_optimizer() -> None:
+    params = {name: Parameter(value) for name, value in field(6).items()}
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items() if name != "features"}
+    values = {name: value.detach() + 1 for name, value in params.items()}
+    rewrite(params, optimizers, values)
+    assert all(torch.equal(params[name].detach(), values[name]) for name in params)
+    assert not any(optimizer.state for optimizer in optimizers.values())
 
 
 def test_rewriting_refuses_what_does_not_fit_and_changes_nothing() -> None:

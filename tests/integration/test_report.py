@@ -130,7 +130,7 @@ def test_errors_are_one_line(
     assert "without Gaussians" in one_line(capsys)
     (other / "config.yml").write_text("a: [")
     assert sundae("report", other, "-o", tmp_path / "out") == 2
-    assert "cannot be read" in one_line(capsys)
+    assert "is not a run's config.yml" in one_line(capsys)
     (tmp_path / "file").touch()
     assert sundae("report", tiny.folder, "-o", tmp_path / "file") == 2
     assert "choose another folder" in one_line(capsys)

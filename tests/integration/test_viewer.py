@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.eval_utils import eval_setup
@@ -89,3 +91,30 @@ def test_training_state_of_the_viewer_does_not_show(pipeline: Any) -> None:
     model.train()
     model.eval()
     assert torch.equal(model.get_outputs_for_camera(view)["rgb"], expected)
+
+
+def listening(port: int) -> set[str]:
+    """Addresses at which something listens on a port, as Linux tells them: hexadecimal, 0100007F is 127.0.0.1."""
+    found = set()
+    for table in ("tcp", "tcp6"):
+        path = Path("/proc/net") / table
+        for line in path.read_text().splitlines()[1:] if path.exists() else []:
+            words = line.split()
+            address, _, number = words[1].partition(":")
+            if words[3] == "0A" and int(number, 16) == port:
+                found.add(address)
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="looks where Linux lists sockets")
+def test_the_viewer_listens_where_the_user_asked_and_nowhere_else(trainer_of: Any) -> None:
+    def change(config: Any) -> None:
+        config.vis, config.viewer.websocket_host = "viewer", "127.0.0.1"
+        config.get_base_dir().mkdir(parents=True)  # ns-train has written config.yml there by then
+
+    assert ViewerConfig().websocket_host == "0.0.0.0", "README says so"
+    server = trainer_of(change).viewer_state.viser_server
+    try:
+        assert listening(server.get_port()) == {"0100007F"}
+    finally:
+        server.stop()

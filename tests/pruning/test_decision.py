@@ -12,6 +12,7 @@ from torch import Tensor
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians.parameters import rgb_to_sh
 from sundae_ns.pruning import PruningConfig, attribute_signal, decide, position_signal, response, score
+from sundae_ns.pruning.scores import Response
 
 PLAIN = PruningConfig(selection="sampled", score="response-contribution", edges="centres", redistribution="none")
 """A score and independent draws, none of what the default rule adds."""
@@ -36,7 +37,10 @@ def ones(n: int = 60) -> Tensor:
 
 
 @pytest.mark.parametrize("selection", ["band", "sampled", "top"])
-@pytest.mark.parametrize("name", ["response-contribution", "response", "contribution", "opacity", "random"])
+@pytest.mark.parametrize(
+    "name",
+    ["response-contribution", "response", "contribution", "opacity", "random", "coherence", "coherence-contribution"],
+)
 @pytest.mark.parametrize("keep_ratio", [0.001, 0.1, 0.25, 1.0])
 def test_every_score_and_selection_keeps_the_exact_count(name: Any, selection: Any, keep_ratio: float) -> None:
     params = field()
@@ -187,3 +191,30 @@ def test_a_contribution_of_nan_counts_as_none() -> None:
     values = score(field(), config, None, lambda: torch.arange(60.0).index_fill(0, torch.tensor([7]), torch.nan))
     assert values[7] == 0
     assert values[8] == 8
+
+
+def test_scores_by_hand() -> None:
+    params, weights = field(3), torch.tensor([2.0, 0.5, torch.nan])
+    found = Response(torch.tensor([4.0, torch.nan, 9.0]), 1.0, 1.0, 1)
+    coherent = torch.tensor([0.1, 0.2, 0.4]).double()
+    expected = {
+        "contribution": [2.0, 0.5, 0.0],
+        "detail-contribution": [2.0, 0.5, 0.0],
+        "random": [1.0, 1.0, 1.0],
+        "coherence": [0.1, 0.2, 0.4],
+        "coherence-contribution": [0.2, 0.1, 0.0],
+        # Nothing is known of the second, which gets the lower median, 2.
+        "response-contribution": [4.0, 1.0, 0.0],
+    }
+    for name, values in expected.items():
+        config = replace(PLAIN, score=name)  # type: ignore[arg-type]
+        assert score(params, config, found, lambda: weights, coherent).tolist() == pytest.approx(values), name
+    assert score(params, replace(PLAIN, score="response"), found, None)[[0, 2]].tolist() == [2, 3]
+    opacities = score(params, replace(PLAIN, score="opacity"), None, None)
+    assert torch.equal(opacities, params["opacities"].double().sigmoid().flatten())
+    with pytest.raises(ConfigError, match="needs a coherence"):
+        score(params, replace(PLAIN, score="coherence"), found, None)
+    with pytest.raises(ConfigError, match="needs a graph response"):
+        score(params, replace(PLAIN, score="response"), None, None)
+    nothing = Response(torch.full((3,), torch.nan), 1.0, 1.0, 3)
+    assert score(params, replace(PLAIN, score="response-contribution"), nothing, lambda: weights)[0] == 2

@@ -343,6 +343,10 @@ def test_budgets_that_cannot_work_name_the_mend(options: dict[str, object], mess
     assert "\n" not in str(caught.value)
 
 
+def test_a_target_may_be_the_cap() -> None:
+    PruningConfig(mode="continuous", max_primitives=5, target_primitives=5).validate()
+
+
 @pytest.mark.parametrize("budget", [{}, {"max_psnr_drop": 0.5}, {"max_bytes": 100}, {"max_primitives": 1}])
 def test_one_budget_is_enough(budget: dict[str, object]) -> None:
     PruningConfig(mode="auto", stop=20000, **budget).validate()  # type: ignore[arg-type]

@@ -108,6 +108,7 @@ def test_how_deep_to_cut_follows_from_what_the_last_cut_cost() -> None:
     found.cut(30.3, 353, step=3)
     assert found.judge(30.3, 4, patience=4) == "accepted"
     assert found.slope == pytest.approx(0.3), "a lucky cut does not make the next one cheap"
+    assert (found.cuts, found.rejected) == (2, 0)
 
 
 @pytest.mark.parametrize(
@@ -139,8 +140,22 @@ def test_state_goes_through_a_checkpoint() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"phase": "lunch"}, {"accepted": "many"}, {"degree": 9}, {"curve": [{"step": 1}]}, {"new": 1}, {"cuts": 0.5}],
+    [
+        {"phase": "lunch"},
+        {"accepted": "many"},
+        {"degree": 5},
+        {"degree": -2},
+        {"num_features": 1025},
+        {"curve": [{"step": 1}]},
+        {"new": 1},
+        {"cuts": 0.5},
+    ],
 )
 def test_a_foreign_state_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(CheckpointError, match="search for a budget"):
+        Search.from_state({**search().state(), **change})
+
+
+def test_states_at_the_ends_of_what_can_be_are_taken() -> None:
+    for change in ({"degree": 4}, {"degree": -1}, {"num_features": 1024}, {"num_features": -1}):
         Search.from_state({**search().state(), **change})

@@ -1,0 +1,110 @@
+"""A run's ``config.yml`` as objects of nerfstudio, without running it; nerfstudio's own reader calls whatever it names."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Iterator
+from enum import Enum
+from functools import cache
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import yaml
+from yaml.constructor import ConstructorError
+
+from sundae_ns.errors import CheckpointError
+
+_PATHS = {"PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"}
+_GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
+
+
+class _ConfigLoader(yaml.SafeLoader):
+    """Makes configurations again, and nothing else: no constructor is called, nor any function that a file names."""
+
+
+@cache
+def _trusted_packages() -> frozenset[str]:
+    """Packages whose classes a configuration may name: nerfstudio's, ours, torch, and plug-ins, which nerfstudio imports."""
+    plugins = {point.value.partition(":")[0] for group in _GROUPS for point in entry_points(group=group)}
+    return frozenset({"nerfstudio", "sundae_ns", "gsplat", "torch"} | {name.partition(".")[0] for name in plugins})
+
+
+def _named(name: str, node: yaml.Node) -> Any:
+    """The class or function of a dotted name; it has to be at home in a package that is trusted."""
+    module, _, attribute = name.rpartition(".")
+    found = None
+    if module.partition(".")[0] in _trusted_packages():
+        try:
+            found = getattr(importlib.import_module(module), attribute, None)
+        except ImportError:
+            found = None
+        home = str(getattr(found, "__module__", "")).partition(".")[0]
+        if home not in _trusted_packages() or not isinstance(found, (type, FunctionType)):
+            found = None
+    if found is None:
+        raise ConstructorError(None, None, f"it names {name}", node.start_mark)
+    return found
+
+
+def _make_name(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
+    return _named(suffix, node)
+
+
+def _make_object(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Iterator[Any]:
+    kind = _named(suffix, node)
+    if not isinstance(kind, type) or not dataclasses.is_dataclass(kind) or not isinstance(node, yaml.MappingNode):
+        raise ConstructorError(None, None, f"{suffix} is no configuration", node.start_mark)
+    made = kind.__new__(kind)
+    yield made
+    state = loader.construct_mapping(node, deep=True)
+    # Setting a configuration up calls its target.
+    if not isinstance(state.get("_target", type), type):
+        raise ConstructorError(None, None, f"the target of {suffix} is no class", node.start_mark)
+    for field in dataclasses.fields(kind):  # options that came after the run was saved
+        if field.name not in state and field.default_factory is not dataclasses.MISSING:
+            state[field.name] = field.default_factory()
+    vars(made).update(state)
+
+
+def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
+    """A path, or a member of an enumeration: what else is made by a call is refused."""
+    arguments = loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else []
+    module, _, name = suffix.rpartition(".")
+    if module.partition(".")[0] == "pathlib" and name in _PATHS and all(isinstance(a, str) for a in arguments):
+        return Path(*arguments)
+    kind = _named(suffix, node)
+    if not isinstance(kind, type) or not issubclass(kind, Enum) or len(arguments) != 1:
+        raise ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)
+    return kind(arguments[0])
+
+
+_PYTHON = "tag:yaml.org,2002:python/"
+_ConfigLoader.add_constructor(_PYTHON + "tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
+_ConfigLoader.add_multi_constructor(_PYTHON + "name:", _make_name)
+_ConfigLoader.add_multi_constructor(_PYTHON + "object:", _make_object)
+_ConfigLoader.add_multi_constructor(_PYTHON + "object/apply:", _make_value)
+
+
+def load_config(path: Path) -> Any:
+    """What a run's ``config.yml`` describes, as objects of nerfstudio, without running anything that it asks for.
+
+    nerfstudio's own commands call whatever the file names. Here configurations are made again as they were saved, and only
+    classes of nerfstudio, of this package, of torch, and of installed plug-ins are known.
+
+    Raises:
+        CheckpointError: it cannot be read, is no configuration, or asks for something else.
+    """
+    try:
+        return yaml.load(path.read_text(encoding="utf-8"), Loader=_ConfigLoader)
+    except OSError as error:
+        raise CheckpointError(
+            f"{path} cannot be read ({error.strerror}); give the folder of a finished run, or its config.yml"
+        ) from error
+    except Exception as error:  # PyYAML, enumerations and modules that are gone raise of many kinds
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise CheckpointError(
+            f"{path} is not a run's config.yml, or of another version ({reason}); give the folder of a run"
+        ) from error

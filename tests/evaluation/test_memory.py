@@ -1,0 +1,23 @@
+"""Peak memory of this process."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sundae_ns.evaluation.memory import peak_memory
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="compares with what Linux tells")
+def test_the_peak_is_in_bytes_and_never_below_what_is_taken_now() -> None:
+    size = 64 << 20
+    held = np.ones(size, np.uint8)
+    now = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    peak = peak_memory(torch.device("cpu"))
+    assert held.nbytes <= now <= peak * 1.01
+    del held
+    assert peak_memory(torch.device("cpu")) >= peak

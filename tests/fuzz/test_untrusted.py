@@ -1,0 +1,173 @@
+"""Files from strangers whose insides name places outside: reading one writes nothing, starts nothing and asks no network.
+
+The interpreter itself tells what a reader does (PEP 578).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import stat
+import sys
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from sundae_ns import checkpoint
+from sundae_ns.errors import SundaeError
+from sundae_ns.gaussians import from_points
+from sundae_ns.packed_run import write_run
+from sundae_ns.storage import read_ply, write_ply
+from sundae_ns.storage.packing import Scene, container, read_scene, write_scene
+from sundae_ns.storage.viewers import write_for_viewers
+
+PLACES = (
+    "../../outside",
+    "/tmp/outside-of-sundae",
+    "..\\..\\outside",
+    "a/../../../outside",
+    "~/outside",
+    "$HOME/outside",
+)
+ACTS = ("os.mkdir", "os.rename", "os.remove", "os.link", "os.symlink", "os.chmod", "os.system", "os.exec", "os.fork")
+ACTS += ("os.posix_spawn", "subprocess.Popen", "socket.connect", "socket.bind", "shutil.unpack_archive")
+done: list[str] | None = None
+"""What has been done while somebody looks; None while nobody does. Hooks of the interpreter stay for good."""
+
+
+def note(event: str, arguments: tuple[Any, ...]) -> None:
+    if done is None:
+        return
+    if event == "open":
+        path, mode, flags = arguments
+        writes = isinstance(mode, str) and any(letter in mode for letter in "wax+")
+        if writes or (isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)):
+            done.append(f"open {path!r} to write")
+    elif event in ACTS:
+        done.append(f"{event} {arguments!r}")
+
+
+sys.addaudithook(note)
+
+
+@contextmanager
+def watched() -> Iterator[list[str]]:
+    global done  # noqa: PLW0603
+    done = []
+    try:
+        yield done
+    finally:
+        done = None
+
+
+def test_the_watch_sees_what_it_should(tmp_path: Path) -> None:
+    with watched() as found:
+        (tmp_path / "a").mkdir()
+        (tmp_path / "a" / "b").write_text("x")
+        (tmp_path / "a" / "b").read_text()
+    assert [line.split()[0] for line in found] == ["os.mkdir", "open"]
+
+
+def field() -> dict[str, torch.Tensor]:
+    points = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
+    return from_points(points, points, sh_degree=1, num_features=0)
+
+
+def a_checkpoint(path: Path, place: str) -> None:
+    """One whose archive also has members outside, a link among them, and whose tensors are named so."""
+    buffer = io.BytesIO()
+    state = {f"_model.gauss_params.{name}": value for name, value in field().items()}
+    torch.save({"step": 3, "pipeline": state | {place: torch.zeros(2)}}, buffer)
+    with zipfile.ZipFile(buffer, "a", zipfile.ZIP_STORED) as archive:
+        archive.writestr(place, b"outside")
+        link = zipfile.ZipInfo("archive/link")
+        link.external_attr = (stat.S_IFLNK | 0o777) << 16
+        archive.writestr(link, place)
+    path.write_bytes(buffer.getvalue())
+
+
+def a_pack(path: Path, place: str) -> None:
+    """One with a section of that name, and the name in whatever its header says."""
+    write_scene(path, Scene(field(), meta={"source": {"method": place}, "name": place, "model": {"sh_degree": 1}}))
+    header = container.read_header(path)
+    meta = {name: value for name, value in header.meta.items() if name != "sections"}
+    arrays = container.read_sections(path, header)
+    container.write(path, meta, {**arrays, place: arrays["means/low"]})
+
+
+def a_ply(path: Path, place: str) -> None:
+    write_ply(path, field(), comments=[place, f"TextureFile {place}"])
+
+
+CASES: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], Any]]] = {
+    "a.ckpt": (a_checkpoint, checkpoint.load),
+    "b.ckpt": (a_checkpoint, checkpoint.read_field),
+    "a.sundae": (a_pack, read_scene),
+    "a.ply": (a_ply, read_ply),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("name", CASES)
+def test_nothing_leaves_the_file(tmp_path: Path, name: str, place: str, verdict: Any) -> None:
+    make, read = CASES[name]
+    path = tmp_path / "deep" / "er" / name
+    path.parent.mkdir(parents=True)
+    make(path, place)
+    with watched() as found:
+        verdict(lambda: read(path), path.stat().st_size)
+    assert found == []
+    assert [entry.name for entry in path.parent.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_an_unpacked_run_stays_in_the_folder_that_was_asked_for(tmp_path: Path, place: str) -> None:
+    a_pack(tmp_path / "a.sundae", place)
+    scene = read_scene(tmp_path / "a.sundae")
+    out = tmp_path / "deep" / "er" / "runs"
+    with watched() as found:
+        try:
+            write_run(scene, out, place)
+        except SundaeError:
+            pass
+    assert all(str(tmp_path) in line for line in found), found
+    outside = [path for path in tmp_path.rglob("*") if path.is_file() and not path.is_relative_to(out)]
+    assert outside == [tmp_path / "a.sundae"]
+    assert not Path("/tmp/outside-of-sundae").exists()
+
+
+def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:
+    """A .sog is a zip that others unpack."""
+    write_for_viewers(tmp_path / "a.sog", field())
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        names = archive.namelist()
+    assert "meta.json" in names
+    assert all(Path(name).name == name for name in names)
+
+
+def test_a_capture_may_not_make_its_reader_write(tmp_path: Path, verdict: Any) -> None:
+    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    from sundae_ns.data import write_scene as write_capture
+    from sundae_ns.datamanager import LightNerfstudioParser, check_capture
+
+    data = write_capture(tmp_path / "scene", train_views=3, test_views=1, width=16, height=16, points=30, samples=1)
+    for place in PLACES:
+        copy = Path(shutil.copytree(data, tmp_path / "copy"))
+        meta = json.loads((copy / "transforms.json").read_text())
+        meta["frames"][0]["file_path"] = place
+        meta["ply_file_path"] = place
+        (copy / "transforms.json").write_text(json.dumps(meta))
+        parser = NerfstudioDataParserConfig(_target=LightNerfstudioParser, data=copy)
+        with watched() as found:
+            error = verdict(lambda parser=parser, copy=copy: check_capture(parser, copy, ("train",)), 10**4)
+        assert error is not None
+        assert found == []
+        shutil.rmtree(copy)

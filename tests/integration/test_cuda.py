@@ -1,0 +1,112 @@
+"""What only a GPU can show: memory that really runs out, and resuming where sums come out in any order."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+
+from sundae_ns import checkpoint
+from sundae_ns.errors import MemoryExhaustedError
+
+pytestmark = pytest.mark.gpu
+ROOM = 256 << 20
+"""Bytes that training may take beyond what it has when it starts."""
+
+
+@pytest.fixture
+def little_memory() -> Iterator[Any]:
+    """Limits what torch may take of the GPU; all of it is free again afterwards."""
+
+    def limit(bytes_: int) -> None:
+        torch.cuda.set_per_process_memory_fraction(bytes_ / torch.cuda.get_device_properties(0).total_memory)
+
+    yield limit
+    torch.cuda.set_per_process_memory_fraction(1.0)
+    torch.cuda.empty_cache()
+
+
+def quality(trainer: Any) -> dict[str, float]:
+    trainer.pipeline.eval()
+    found: dict[str, float] = trainer.pipeline.get_average_eval_image_metrics()
+    return found
+
+
+def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkpoint(
+    tiny: Any, trainer_of: Any, little_memory: Any
+) -> None:
+    """The field all but doubles every few steps, until the GPU has no more for it."""
+
+    def growing(config: Any) -> None:
+        config.max_num_iterations, config.steps_per_save = 400, 10
+        model = config.pipeline.model
+        model.pruning.mode = "off"
+        model.warmup_length, model.refine_every, model.stop_split_at = 4, 5, 400
+        model.densify_grad_thresh, model.cull_alpha_thresh = 0.0, 0.005
+        model.reset_alpha_every, model.stop_screen_size_at = 1000, 0
+
+    trainer = trainer_of(growing)
+    torch.cuda.empty_cache()
+    little_memory(torch.cuda.memory_reserved() + ROOM)
+    with pytest.raises(MemoryExhaustedError) as raised:
+        trainer.train()
+    line = str(raised.value)
+    found = re.fullmatch(
+        r"the GPU's memory is full: [\d.]+ [KMG]iB more were asked for, with ([\d,]+) primitives; try "
+        r"--pipeline\.datamanager\.cache-images cpu \(.*\), --pipeline\.datamanager\.camera-res-scale-factor 0\.5 \(.*\), "
+        r"or --pipeline\.model\.pruning\.mode continuous --pipeline\.model\.pruning\.max-primitives (\d+) \(.*\); "
+        r"--load-dir goes on from the last checkpoint",
+        line,
+    )
+    assert found, line
+    count = int(found[1].replace(",", ""))
+    assert count > 10 * tiny.points
+    assert int(found[2]) == count // 2
+
+    saved, passed_over = checkpoint.newest_whole(trainer.checkpoint_dir)
+    assert passed_over == []
+    step = checkpoint.load(saved)["step"]
+    assert step >= 10
+    little_memory(torch.cuda.get_device_properties(0).total_memory)
+
+    def onwards(config: Any) -> None:
+        config.load_dir, config.max_num_iterations = saved.parent, 2
+        config.pipeline.model.pruning.mode, config.pipeline.model.stop_split_at = "off", 0
+
+    again = trainer_of(onwards)
+    again.train()
+    assert again.step == step + 2
+
+
+@pytest.mark.parametrize("start", [30, 45, 60])
+def test_a_resumed_run_keeps_as_many_and_is_as_good(tiny: Any, trainer_of: Any, start: int) -> None:
+    """Stopped before the warm-up's end, right at the prune, and after it; compared with the run that never stopped."""
+    folder = tiny.checkpoints
+    if start == tiny.prune_at:
+
+        def to_the_prune(config: Any) -> None:
+            config.load_dir, config.load_step, config.max_num_iterations = folder, 30, tiny.prune_at - 30
+
+        stopped = trainer_of(to_the_prune)
+        stopped.train()
+        folder = stopped.checkpoint_dir
+
+    def onwards(config: Any) -> None:
+        config.load_dir, config.load_step, config.max_num_iterations = folder, start, tiny.steps - 1 - start
+
+    resumed = trainer_of(onwards)
+    resumed.train()
+
+    def finished(config: Any) -> None:
+        config.load_dir, config.load_step = tiny.checkpoints, tiny.steps - 1
+
+    whole = trainer_of(finished)
+    (report,) = json.loads((tiny.folder / "prune.json").read_text())
+    assert resumed.pipeline.model.num_points == whole.pipeline.model.num_points == report["after"]
+    a, b = quality(resumed), quality(whole)
+    assert a["psnr"] == pytest.approx(b["psnr"], abs=0.05)
+    assert a["psnr_base"] == pytest.approx(b["psnr_base"], abs=0.05)

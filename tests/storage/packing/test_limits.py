@@ -1,0 +1,295 @@
+"""Both ends of everything that has ends: options that are just right and just wrong, and headers that state the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sundae_ns.errors import ConfigError, PackError
+from sundae_ns.storage.packing import PackConfig, Scene, codebooks, container, morton, quantize, read_scene, write_scene
+
+Json = dict[str, Any]
+ENDS: dict[str, tuple[Any, Any, Any, Any]] = {
+    # too little, least, most, too much
+    "position_bits": (3, 4, 21, 22),
+    "block": (15, 16, 1 << 20, (1 << 20) + 1),
+    "scale_bits": (3, 4, 16, 17),
+    "rotation_bits": (3, 4, 16, 17),
+    "color_bits": (3, 4, 16, 17),
+    "opacity_bits": (3, 4, 16, 17),
+    "feature_bits": (3, 4, 16, 17),
+    "harmonics_books": (0, 1, 32, 33),
+    "feature_books": (-1, 0, 32, 33),
+    "level": (0, 1, 22, 23),
+    "harmonics_step": (0.99e-4, 1e-4, 1.0, 1.01),
+}
+
+
+def scene(n: int = 40, degree: int = 1, features: int = 3) -> Scene:
+    g = torch.Generator().manual_seed(0)
+    field = {
+        "means": torch.randn(n, 3, generator=g),
+        "scales": torch.randn(n, 3, generator=g) - 4,
+        "quats": torch.randn(n, 4, generator=g),
+        "features_dc": torch.randn(n, 3, generator=g),
+        "features_rest": 0.1 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=g),
+        "opacities": torch.randn(n, 1, generator=g),
+    }
+    if features:
+        field["features"] = torch.randn(n, features, generator=g)
+    head = {"a.weight": torch.randn(4, 3, 3, 3, generator=g), "a.bias": torch.randn(4, generator=g)}
+    cameras = {
+        "poses": torch.eye(4)[:3].repeat(2, 1, 1),
+        "intrinsics": torch.tensor([[50.0, 51.0, 32.0, 24.0]]).double().repeat(2, 1),
+        "sizes": torch.tensor([[64, 48], [32, 24]]),
+    }
+    return Scene(field, head, cameras)
+
+
+@pytest.mark.parametrize("name", ENDS)
+def test_options_reach_to_their_ends_and_no_further(tmp_path: Path, name: str) -> None:
+    config = PackConfig(harmonics="codebooks" if name == "harmonics_books" else "transform")
+    below, least, most, above = ENDS[name]
+    for value in (below, above):
+        with pytest.raises(ConfigError, match=name.replace("_", "-")):
+            replace(config, **{name: value}).validate()
+    sizes = []
+    for value in (least, most):
+        path = tmp_path / f"{value}.sundae"
+        write_scene(path, scene(), replace(config, **{name: value}))
+        found = read_scene(path)
+        assert {k: v.shape for k, v in found.field.items()} == {k: v.shape for k, v in scene().field.items()}
+        assert all(torch.isfinite(value).all() for value in found.field.values())
+        sizes.append(path.stat().st_size)
+    if name.endswith("bits"):
+        assert sizes[0] < sizes[1]
+
+
+def restated(path: Path, change: Callable[[Json], None]) -> None:
+    """The same sections behind a header that states something else, its checksum right."""
+    content = path.read_bytes()
+    (length,) = struct.unpack("<I", content[12:16])
+    meta = json.loads(content[48 : 48 + length])
+    change(meta)
+    text = json.dumps(meta).encode()
+    path.write_bytes(
+        content[:12] + struct.pack("<I", len(text)) + hashlib.sha256(text).digest() + text + content[48 + length :]
+    )
+
+
+def resectioned(path: Path, name: str, array: Any) -> None:
+    """The same file with another array in the place of a section, all checksums right."""
+    header = container.read_header(path)
+    meta = {key: value for key, value in header.meta.items() if key != "sections"}
+    container.write(path, meta, {**container.read_sections(path, header), name: array})
+
+
+STATED: dict[str, tuple[str, str, tuple[Any, ...]]] = {
+    "means": ("means", "bits", (3, 22, 16.0, "16", True, None)),
+    "blocks": ("means", "block", (15, (1 << 20) + 1)),
+    "quats": ("quats", "bits", (3, 17)),
+    "scales": ("scales", "bits", (3, 17, 0, -1)),
+    "opacities": ("opacities", "low", ([], [0.0, 0.0], ["0"], [True], [1e39], [-1e39], 0.0)),
+    "colours": ("features_dc", "step", ([1.0, 1.0], [1.0, 1.0, None])),
+    "harmonics": ("features_rest", "step", ("0.02", None, 1e39)),
+    "a codec": ("scales", "codec", ("blocks", None, ["uniform"])),
+}
+
+
+@pytest.mark.parametrize("case", STATED)
+def test_headers_just_beyond_the_ends_are_refused(tmp_path: Path, case: str) -> None:
+    attribute, key, values = STATED[case]
+    for value in values:
+        path = tmp_path / "a.sundae"
+        write_scene(path, scene())
+        restated(path, lambda meta, value=value: meta["attributes"][attribute].update({key: value}))
+        with pytest.raises(PackError):
+            read_scene(path)
+
+
+SECTIONS: dict[str, tuple[str, Any]] = {
+    "a picture without width": ("cameras/sizes", np.array([[64, 48], [0, 24]], np.uint32)),
+    "a picture of 65,537 pixels": ("cameras/sizes", np.array([[65537, 48], [32, 24]], np.uint32)),
+    "a camera too few": ("cameras/sizes", np.array([[64, 48]], np.uint32)),
+    "a pose that is infinite": ("cameras/poses", np.full((2, 3, 4), np.inf, np.float32)),
+    "an exception outside": ("scales/places", np.array([120], np.uint32)),
+    "an exact row outside": ("features_rest/rows", np.array([40], np.uint32)),
+    "a basis of another size": ("features_rest/basis", np.zeros(80, np.int8)),
+    "one primitive too many": ("opacities/codes", np.zeros((1, 41), np.uint8)),
+    "a head without its last weight": ("head/weights", np.zeros(107, np.int8)),
+    "a head without its last bias": ("head/plain", np.zeros(3, np.float32)),
+    "a head with a step too few": ("head/steps", np.zeros(3, np.float32)),
+    "weights that are not finite": ("head/steps", np.full(4, np.nan, np.float32)),
+    "blocks that are too few": ("means/low", np.zeros((0, 3), np.float32)),
+    "crumbs that are too few": ("quats/largest", np.zeros(9, np.uint8)),
+}
+
+
+@pytest.mark.parametrize("case", SECTIONS)
+def test_sections_just_beyond_the_ends_are_refused(tmp_path: Path, case: str) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene())
+    name, array = SECTIONS[case]
+    assert name in container.read_header(path).sections
+    resectioned(path, name, array)
+    with pytest.raises(PackError):
+        read_scene(path)
+
+
+def test_what_lies_at_the_ends_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene())
+    before = read_scene(path)
+    resectioned(path, "cameras/sizes", np.array([[65536, 1], [1, 65536]], np.uint32))
+    resectioned(path, "scales/places", np.array([119], np.uint32))
+    resectioned(path, "scales/exceptions", np.array([7.5], np.float32))
+    found = read_scene(path)
+    assert found.cameras is not None
+    assert found.cameras["sizes"].tolist() == [[65536, 1], [1, 65536]]
+    assert float(found.field["scales"][39, 2]) == 7.5
+    assert int((found.field["scales"] != before.field["scales"]).sum()) == 1
+
+
+@pytest.mark.parametrize(("books", "fits"), [(1, True), (32, True), (0, False), (33, False)])
+def test_books_of_a_file(tmp_path: Path, books: int, fits: bool) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene(), PackConfig(feature_books=1))
+    resectioned(path, "features/indices", np.zeros((books, 40), np.uint8))
+    resectioned(path, "features/entries", np.ones((books, 3), np.int8))
+    resectioned(path, "features/steps", np.full(books, 0.5, np.float32))
+    resectioned(path, "features/rows", np.zeros(0, np.uint32))
+    resectioned(path, "features/exact", np.zeros((0, 3), np.float32))
+    if fits:
+        assert torch.equal(read_scene(path).field["features"], torch.full((40, 3), 0.5 * books))
+    else:
+        with pytest.raises(PackError):
+            read_scene(path)
+
+
+@pytest.mark.parametrize(("entry", "width", "fits"), [(0, 3, True), (1, 3, False), (0, 4, False)])
+def test_entries_of_a_book(tmp_path: Path, entry: int, width: int, fits: bool) -> None:
+    """One book with one entry: index 1 is outside, and an entry of 4 numbers is none of 3 features."""
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene(), PackConfig(feature_books=1))
+    indices = np.zeros((1, 40), np.uint8)
+    indices[0, 39] = entry
+    resectioned(path, "features/indices", indices)
+    resectioned(path, "features/entries", np.ones((1, width), np.int8))
+    if fits:
+        read_scene(path)
+    else:
+        with pytest.raises(PackError):
+            read_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("shape", "fits"),
+    [([4, 3, 3, 3], True), ([4, 27], True), ([4, 27, 1, 1, 1], True), ([4, 27, 1, 1, 1, 1], False), ([4, 28], False)],
+)
+def test_shapes_of_the_head(tmp_path: Path, shape: list[int], fits: bool) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene())
+    restated(path, lambda meta: meta["attributes"]["head"].update(tensors=[["a.bias", [4]], ["a.weight", shape]]))
+    if fits:
+        assert list(read_scene(path).head["a.weight"].shape) == shape
+    else:
+        with pytest.raises(PackError):
+            read_scene(path)
+
+
+def test_a_header_that_nobody_could_read_is_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    meta = {"name": "x" * container.MAX_HEADER}
+    with pytest.raises(PackError, match="the header would take"):
+        write_scene(path, replace(scene(), meta=meta))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_that_goes_away_meanwhile_is_said_to(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene())
+    header = container.read_header(path)
+    path.unlink()
+    with pytest.raises(PackError, match=r"cannot be read \(No such file"):
+        container.read_sections(path, header)
+
+
+@pytest.mark.parametrize("bits", [8, 9])
+def test_codes_are_as_wide_as_their_bits(tmp_path: Path, bits: int) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene(), PackConfig(scale_bits=bits, rotation_bits=bits))
+    sections = container.read_header(path).sections
+    expected = np.uint8 if bits == 8 else np.dtype("<u2")
+    assert sections["scales/codes"].dtype == sections["quats/codes"].dtype == expected
+    assert quantize.code_type(bits) == expected
+
+
+def test_a_centre_that_nobody_is_nearest_to_stays_where_it_is() -> None:
+    rows = torch.full((50, 2), 3.0).double()
+    centres = codebooks.kmeans(rows, 4, torch.Generator().manual_seed(0))
+    assert torch.equal(centres, rows[:4])
+
+
+def test_small_fields_get_small_books_and_a_thousandth_of_the_rows_is_exact() -> None:
+    rng = np.random.default_rng(0)
+    for n, entries, exact in ((1, 1, 0), (31, 1, 0), (32, 2, 0), (999, 62, 0), (1000, 62, 1), (5000, 256, 5)):
+        found = codebooks.fit(rng.normal(size=(n, 3)).astype(np.float32), 2)
+        assert found.entries.shape == (2, entries, 3)
+        assert (len(found.rows), found.exact.shape) == (exact, (exact, 3))
+        assert found.indices.max() < entries
+        assert (np.abs(found.entries).max(axis=(1, 2)) == 127).all() or n == 1
+
+
+def test_the_order_of_points_on_a_line_is_the_line() -> None:
+    """At both ends too, where a code of one bit too many would begin anew; and where most points are one."""
+    x = np.random.default_rng(0).permutation(np.linspace(-3, 5, 500)).astype(np.float32)
+    for axis in range(3):
+        means = np.zeros((500, 3), np.float32)
+        means[:, axis] = x
+        assert np.array_equal(morton.scene_order(means), np.argsort(x))
+        means[:300, axis] = 0
+        ordered = means[morton.scene_order(means), axis]
+        assert (np.diff(ordered) >= 0).all()
+
+
+def test_a_head_that_shrinks_to_nothing_is_padded_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    head = {"a.weight": torch.zeros(1000, 3500)}
+    report = write_scene(path, Scene(scene().field, head))
+    unpacked = 4 * head["a.weight"].numel()
+    assert report.sections["padding"] > 0
+    assert container.SPARE + container.MAX_RATIO * report.bytes >= unpacked
+    assert torch.equal(read_scene(path).head["a.weight"], head["a.weight"])
+
+
+def test_steps_of_books_that_are_too_large_are_refused_one_by_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene(), PackConfig(feature_books=2))
+    resectioned(path, "features/steps", np.array([0.5, 1e38], np.float32))
+    with pytest.raises(PackError):
+        read_scene(path)
+
+
+@pytest.mark.parametrize("tensors", [5, None, {"a.bias": [4]}, [["a.bias", [4]]] * 10_001])
+def test_a_head_has_a_list_of_tensors(tmp_path: Path, tensors: Any) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene())
+    restated(path, lambda meta: meta["attributes"]["head"].update(tensors=tensors))
+    with pytest.raises(PackError):
+        read_scene(path)
+
+
+def test_what_is_no_json_is_not_written(tmp_path: Path) -> None:
+    """Readers refuse a header with NaN."""
+    with pytest.raises(ValueError, match="JSON"):
+        write_scene(tmp_path / "a.sundae", replace(scene(), meta={"scale": float("nan")}))
+    assert not list(tmp_path.iterdir())

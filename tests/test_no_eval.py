@@ -1,0 +1,70 @@
+"""No line of the package runs what a file says: no eval, no pickle, no unsafe YAML, no shell."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+NEVER = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "torch.hub.load", "np.load", "numpy.load"}
+NEVER |= {"yaml.unsafe_load", "yaml.full_load", "yaml.load_all", "shelve.open", "shutil.unpack_archive"}
+READERS = {"pickle", "marshal", "dill", "cloudpickle", "joblib"}
+SAFE_LOADERS = {"_PlainLoader", "_ConfigLoader", "SafeLoader"}
+METHODS = {"extract", "extractall"}
+"""Of archives: nothing is unpacked to a disk."""
+
+
+def dotted(node: ast.expr) -> str:
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return node.id if isinstance(node, ast.Name) else "?"
+
+
+def sins(source: str) -> Iterator[str]:
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        name = dotted(node.func)
+        options = {word.arg: ast.unparse(word.value) for word in node.keywords}
+        module, _, method = name.rpartition(".")
+        loader = options.get("Loader", ast.unparse(node.args[1]) if len(node.args) > 1 else "")
+        if (
+            name in NEVER
+            or (module in READERS and method in ("load", "loads", "Unpickler"))
+            or (name == "torch.load" and options.get("weights_only") != "True")
+            or (name == "yaml.load" and loader.rpartition(".")[2] not in SAFE_LOADERS)
+            or options.get("shell", "False") != "False"
+            or (isinstance(node.func, ast.Attribute) and node.func.attr in METHODS)
+        ):
+            yield f"line {node.lineno}: {ast.unparse(node)}"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "eval(text)",
+        "exec(text)",
+        "import os; os.system(text)",
+        "pickle.loads(data)",
+        "torch.load(path)",
+        "torch.load(path, weights_only=False)",
+        "yaml.load(text, Loader=yaml.Loader)",
+        "yaml.load(text, yaml.FullLoader)",
+        "yaml.unsafe_load(text)",
+        "subprocess.run(text, shell=True)",
+        "zipfile.ZipFile(path).extractall(folder)",
+        "np.load(path, allow_pickle=True)",
+    ],
+)
+def test_it_would_be_noticed(source: str) -> None:
+    assert list(sins(source))
+
+
+def test_the_package_has_none_of_it() -> None:
+    files = [*(ROOT / "sundae_ns").rglob("*.py"), *(ROOT / "method_configs").rglob("*.py")]
+    assert len(files) > 100
+    found = {str(path.relative_to(ROOT)): list(sins(path.read_text(encoding="utf-8"))) for path in files}
+    assert {name: lines for name, lines in found.items() if lines} == {}
