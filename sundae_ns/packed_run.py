@@ -53,7 +53,7 @@ hands paths of pictures to ffmpeg through one."""
 # -------------------------------------------------------------------------------------------------------------- packing
 
 
-def scene_of_run(run: Path, *, max_cameras: int = 100) -> Scene:
+def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> Scene:
     """What is needed to show a finished run: the field, the head if it takes part, and some training cameras.
 
     Spherical harmonics that were not trained yet are left out, and so are the features of a head that takes no part.
@@ -62,6 +62,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100) -> Scene:
         run: folder of a run of sundae or splatfacto, or its ``config.yml``. nerfstudio's configurations are programs: give
             a run of your own.
         max_cameras: most training cameras, evenly chosen; with 0, the capture need not be there any more.
+        data: the capture, if it is not where the run says.
 
     Raises:
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
@@ -81,6 +82,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100) -> Scene:
     else:
         field.pop(FEATURES, None)
     manager = _manager(config)
+    manager.data = data or manager.data
     meta = {
         "source": {"method": config.method_name, "step": int(loaded["step"])},
         "model": {

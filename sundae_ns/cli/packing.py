@@ -14,18 +14,21 @@ def pack(
     run: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     max_cameras: int = 100,
+    finetune: int = 0,
+    data: Path | None = None,
     position_bits: int = 16,
     block: int = 1024,
-    scale_bits: int = 8,
-    rotation_bits: int = 8,
-    color_bits: int = 8,
-    opacity_bits: int = 8,
+    scale_bits: int | None = None,
+    rotation_bits: int | None = None,
+    color_bits: int | None = None,
+    opacity_bits: int | None = None,
     harmonics: Literal["transform", "codebooks"] = "transform",
-    harmonics_step: float = 0.02,
+    harmonics_step: float | None = None,
     harmonics_books: int = 4,
-    feature_bits: int = 7,
+    feature_bits: int | None = None,
     feature_books: int = 0,
     head: Literal["int8", "fp16"] = "int8",
+    head_bits: int | None = None,
     level: int = 19,
 ) -> int:
     """Pack a finished run into one file with everything that is needed to show the scene, and say what takes how much.
@@ -34,6 +37,9 @@ def pack(
         run: folder of a run of sundae or splatfacto, or its config.yml.
         out: the file to write, scene.sundae for example; an older one is replaced once the new one is whole.
         max_cameras: most training cameras to keep for looking around; 0: none, and the capture need not be there.
+        finetune: train for so many steps first, with this very rounding in the loop; 1000 are enough. The run is only read.
+            What a scene can learn to live with is then rounded more coarsely: fewer bytes at the same quality.
+        data: the capture, if it is not where the run says.
         position_bits: bits of each coordinate within a block, 4 to 21.
         block: primitives of a block of positions: smaller ones are more exact and take more bytes.
         scale_bits: bits of each log-scale, 4 to 16.
@@ -46,39 +52,55 @@ def pack(
         feature_bits: bits of each feature, 4 to 16.
         feature_books: residual codebooks of the feature vectors instead, up to 32.
         head: weights of the head.
+        head_bits: bits of each weight of an int8 head, 3 to 8.
         level: effort of the entropy coder, 1 to 22; unpacking is as fast at all of them.
     """
-    import torch
     from rich.progress import Progress
 
-    from sundae_ns.errors import StorageError
+    from sundae_ns.errors import ConfigError, StorageError
     from sundae_ns.packed_run import scene_of_run
-    from sundae_ns.storage.packing import PackConfig, write_scene
+    from sundae_ns.storage.packing import FINETUNED, PackConfig, fit_scene, write_fitted
 
-    config = PackConfig(
-        position_bits=position_bits,
-        block=block,
-        scale_bits=scale_bits,
-        rotation_bits=rotation_bits,
-        color_bits=color_bits,
-        opacity_bits=opacity_bits,
-        harmonics=harmonics,
-        harmonics_step=harmonics_step,
-        harmonics_books=harmonics_books,
-        feature_bits=feature_bits,
-        feature_books=feature_books,
-        head=head,
-        level=level,
-    )
+    if finetune < 0:
+        raise ConfigError(f"finetune is {finetune}; give the number of steps, or 0 for none")
+    given = {
+        "scale_bits": scale_bits,
+        "rotation_bits": rotation_bits,
+        "color_bits": color_bits,
+        "opacity_bits": opacity_bits,
+        "harmonics_step": harmonics_step,
+        "feature_bits": feature_bits,
+        "head_bits": head_bits,
+    }
+    fixed = {
+        "position_bits": position_bits,
+        "block": block,
+        "harmonics": harmonics,
+        "harmonics_books": harmonics_books,
+        "feature_books": feature_books,
+        "head": head,
+        "level": level,
+    }
+    chosen = {name: value for name, value in given.items() if value is not None}
+    config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, **fixed})  # type: ignore[arg-type]
     config.validate()
     if not out.parent.is_dir():
         raise StorageError(f"{out.parent} is no folder; make it first, or choose another")
-    with Progress(transient=True) as progress, torch.no_grad():
-        task = progress.add_task("Reading the run", total=2)
+    with Progress(transient=True) as progress:
+        task = progress.add_task("Reading the run", total=2 + finetune)
         with redirect_stdout(StringIO()):  # nerfstudio is chatty while it reads a capture
-            scene = scene_of_run(run, max_cameras=max_cameras)
-        progress.update(task, advance=1, description="Packing")
-        report = write_scene(out, scene, config)
+            scene = scene_of_run(run, max_cameras=max_cameras, data=data)
+            progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
+            if finetune:
+                from sundae_ns.packing_finetune import finetune as train
+
+                scene, codecs = train(
+                    run, scene, config, finetune, data=data, progress=lambda _: progress.advance(task)
+                )
+            else:
+                scene, codecs = fit_scene(scene, config)
+        progress.update(task, description="Packing")
+        report = write_fitted(out, scene, codecs)
     print(f"{out}: {report.primitives:,} primitives in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
     print(f"{'':14}{'bytes':>12}{'bits a primitive':>20}")
     for name, bits in report.bits.items():

@@ -1,7 +1,7 @@
 """Packed scenes: a field, its head and its cameras in one small file that can be checked and cannot be run."""
 
 from sundae_ns.storage.packing.codecs import Codecs
-from sundae_ns.storage.packing.config import PackConfig
+from sundae_ns.storage.packing.config import FINETUNED, PackConfig
 from sundae_ns.storage.packing.container import VERSION, is_packed, read_header
 from sundae_ns.storage.packing.scene import (
     CAMERAS,
@@ -15,6 +15,7 @@ from sundae_ns.storage.packing.scene import (
 
 __all__ = [
     "CAMERAS",
+    "FINETUNED",
     "VERSION",
     "Codecs",
     "PackConfig",

@@ -205,6 +205,7 @@ class Codecs(NamedTuple):
         """The same on another device."""
         return _moved(self, device)
 
+    @torch.no_grad()
     def rounded(self, field: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """What will be read of a field whose primitives stand in the order of these codecs; positions stay as they are."""
         made = dict(field)
@@ -213,6 +214,7 @@ class Codecs(NamedTuple):
             made[name] = codec.rounded(values.reshape(len(values), -1)).reshape(values.shape)
         return made
 
+    @torch.no_grad()
     def rounded_head(self, head: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """What will be read of the head."""
         return {name: value if self.head is None else self.head.rounded(name, value) for name, value in head.items()}

@@ -69,3 +69,15 @@ class PackConfig:
         for name, choices in (("head", HeadFormat), ("harmonics", HarmonicsCodec)):
             if getattr(self, name) not in get_args(choices):
                 raise ConfigError(f"{name} is {getattr(self, name)!r}; give one of {', '.join(get_args(choices))}")
+
+
+FINETUNED: dict[str, int | float] = {
+    "scale_bits": 7,
+    "rotation_bits": 7,
+    "color_bits": 7,
+    "opacity_bits": 6,
+    "harmonics_step": 0.04,
+    "feature_bits": 5,
+    "head_bits": 6,
+}
+"""Coarser options, for scenes that have learnt to live with them (``sundae_ns.packing_finetune``)."""

@@ -1,0 +1,154 @@
+"""A short fine-tune of a finished run with the packer's own rounding in the loop, so that it learns to live with it.
+
+The model holds rounded values, those that a reader of the packed file will decode; the optimizer moves exact ones beside them,
+by the gradients at the rounded ones (the straight-through estimator of Bengio, Leonard and Courville, 2013). So the model,
+its losses and its rasteriser need know nothing of rounding. Grids, bases and steps are fitted once, before the first step, and
+the file is written by the same: what was trained is what is stored.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import CheckpointError, ConfigError, out_of_memory
+from sundae_ns.model import SundaeModel
+from sundae_ns.opening import open_pipeline
+from sundae_ns.storage.packing import Codecs, PackConfig, Scene, fit_scene
+
+RATES = {
+    "features_dc": 2.5e-4,
+    "features_rest": 5e-5,
+    "opacities": 5e-3,
+    "scales": 5e-4,
+    "quats": 1e-4,
+    "features": 2.5e-4,
+    "head": 1e-4,
+}
+"""Rates of Adam at their highest: of the field a tenth of those that it was trained with, of the head likewise. Positions are
+rounded once and stay: at the end of training they move by less than their rounding anyway, and everything else learns around
+where they ended up."""
+RISE = 0.05
+"""Share of the steps in which rates rise: Adam knows no gradients at first. They then fall to 0, so that values settle."""
+
+
+def rate_factor(step: int, steps: int) -> float:
+    """Share of the highest rate at a step of 0 to ``steps`` - 1: a short rise, then half a cosine."""
+    rise = max(round(RISE * steps), 1)
+    if step < rise:
+        return (step + 1) / (rise + 1)
+    return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(steps - rise, 1)))
+
+
+def finetune(
+    run: Path,
+    scene: Scene,
+    config: PackConfig,
+    steps: int,
+    *,
+    data: Path | None = None,
+    progress: Callable[[float], object] | None = None,
+) -> tuple[Scene, Codecs]:
+    """Train what a run shows with the rounding of its pack in the loop. The run itself is only read.
+
+    Args:
+        run: folder of a run of sundae or splatfacto, or its ``config.yml``.
+        scene: the same run, as ``packed_run.scene_of_run`` gives it.
+        config: in how many bits it will be packed.
+        steps: how many, at least 1.
+        data: the capture, if it is not where the run says.
+        progress: called after each step with its loss.
+
+    Returns:
+        The trained scene and the codecs it was trained with, for ``storage.packing.write_fitted``.
+
+    Raises:
+        ConfigError: an option cannot work.
+        CheckpointError: the run still densifies, or cannot be opened.
+        DataError: its capture is gone, or cannot be used.
+        MemoryExhaustedError: the GPU's memory is full.
+    """
+    if steps < 1:
+        raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")
+    scene, codecs = fit_scene(scene, config)
+    opened = open_pipeline(run / "config.yml" if run.is_dir() else run, data=data, test_mode="val")
+    pipeline, model = opened.pipeline, opened.model
+    if model._densifying:
+        raise CheckpointError(f"{run} was still growing when it was saved; train it to its end, or pack it as it is")
+    _place(model, scene.field)
+    codecs = codecs.to(model.device)
+    pipeline.train()
+    shown = {name: model.gauss_params[name] for name in codecs.field}
+    weights = dict(model.head.named_parameters()) if model.head is not None and scene.head else {}
+    exact = {name: value.detach().clone() for name, value in shown.items()}
+    exact_weights = {name: value.detach().clone() for name, value in weights.items()}
+    optimizer = _optimizer(exact, exact_weights)
+    highest = [group["lr"] for group in optimizer.param_groups]
+    try:
+        for step in range(steps):
+            for group, rate in zip(optimizer.param_groups, highest, strict=True):
+                group["lr"] = rate * rate_factor(step, steps)
+            _show(shown, codecs.rounded(exact))
+            _show(weights, codecs.rounded_head(exact_weights))
+            if weights:
+                model.step = opened.step + 1 + step  # chooses the window of a large picture
+            loss: Tensor = sum(pipeline.get_train_loss_dict(opened.step + 1 + step)[1].values())
+            pipeline.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            _hand_over(exact, shown)
+            _hand_over(exact_weights, weights)
+            optimizer.step()
+            if codecs.head is not None:
+                for name, value in exact_weights.items():
+                    value.data = codecs.head.within(name, value.data)
+            if progress is not None:
+                progress(loss.item())
+    except torch.cuda.OutOfMemoryError as error:
+        raise out_of_memory(error, model.num_points) from error
+    field = {name: exact.get(name, value).detach().cpu() for name, value in scene.field.items()}
+    head = {name: value.detach().cpu() for name, value in exact_weights.items()}
+    source = {**scene.meta.get("source", {}), "finetuned": steps}
+    return replace(scene, field=field, head=head, meta={**scene.meta, "source": source}), codecs.to(torch.device("cpu"))
+
+
+def _place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
+    """Give the model this field, in this order; what the field does not have takes no part in the pictures."""
+    n = len(field["means"])
+    for name, value in model.gauss_params.items():
+        new = field.get(name)
+        value.data = value.data.new_zeros(n, *value.shape[1:]) if new is None else new.to(value.data)
+        value.requires_grad_(name in field and name != "means")
+    # Lengths of quaternions are free, and rounded ones are of length 1, to which gradients belong.
+    model.gauss_params["quats"].data = torch.nn.functional.normalize(model.gauss_params["quats"].data)
+
+
+def _optimizer(field: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> torch.optim.Optimizer:
+    groups = [{"params": [value.requires_grad_()], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()]
+    if weights:
+        groups.append(
+            {"params": [value.requires_grad_() for value in weights.values()], "lr": RATES["head"], "eps": 1e-8}
+        )
+    return torch.optim.Adam(groups, fused=all(value.is_cuda for value in field.values()))
+
+
+@torch.no_grad()
+def _show(shown: Mapping[str, Tensor], rounded: Mapping[str, Tensor]) -> None:
+    """Write into parameters in place: recorded graphs of the head read them where they are."""
+    for name, value in shown.items():
+        value.copy_(rounded[name])
+
+
+@torch.no_grad()
+def _hand_over(exact: Mapping[str, Tensor], shown: Mapping[str, Tensor]) -> None:
+    """Gradients at the rounded values become those of the exact ones."""
+    for name, value in exact.items():
+        gradient = shown[name].grad
+        if gradient is not None and name == "quats":
+            # Rounding may have turned a quaternion to its negative, the same rotation.
+            gradient = gradient * (value * shown[name]).sum(dim=1, keepdim=True).sign()
+        value.grad = gradient
