@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -83,37 +83,75 @@ def finetune(
     _place(model, scene.field)
     codecs = codecs.to(model.device)
     pipeline.train()
-    shown = {name: model.gauss_params[name] for name in codecs.field}
     weights = dict(model.head.named_parameters()) if model.head is not None and scene.head else {}
-    exact = {name: value.detach().clone() for name, value in shown.items()}
-    exact_weights = {name: value.detach().clone() for name, value in weights.items()}
-    optimizer = _optimizer(exact, exact_weights)
+    field = _Through.of({name: model.gauss_params[name] for name in codecs.field}, codecs.rounded)
+    head = _Through.of(weights, codecs.rounded_head)
+    optimizer = _optimizer(field.exact, head.exact)
     highest = [group["lr"] for group in optimizer.param_groups]
     try:
-        for step in range(steps):
-            for group, rate in zip(optimizer.param_groups, highest, strict=True):
-                group["lr"] = rate * rate_factor(step, steps)
-            _show(shown, codecs.rounded(exact))
-            _show(weights, codecs.rounded_head(exact_weights))
-            if weights:
-                model.step = opened.step + 1 + step  # chooses the window of a large picture
-            loss: Tensor = sum(pipeline.get_train_loss_dict(opened.step + 1 + step)[1].values())
-            pipeline.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            _hand_over(exact, shown)
-            _hand_over(exact_weights, weights)
-            optimizer.step()
-            if codecs.head is not None:
-                for name, value in exact_weights.items():
-                    value.data = codecs.head.within(name, value.data)
-            if progress is not None:
-                progress(loss.item())
+        with torch.random.fork_rng([torch.cuda.current_device()] if model.device.type == "cuda" else []):
+            torch.manual_seed(opened.config.machine.seed)  # of random backgrounds
+            for step in range(steps):
+                for group, rate in zip(optimizer.param_groups, highest, strict=True):
+                    group["lr"] = rate * rate_factor(step, steps)
+                field.show()
+                head.show()
+                at = opened.step + 1 + step
+                if weights:
+                    model.step = at  # chooses the window of a large picture
+                loss: Tensor = sum(pipeline.get_train_loss_dict(at)[1].values())
+                pipeline.zero_grad(set_to_none=True)
+                loss.backward()  # type: ignore[no-untyped-call]
+                field.take_gradients()
+                head.take_gradients()
+                optimizer.step()
+                if codecs.head is not None:
+                    for name, value in head.exact.items():
+                        value.data = codecs.head.within(name, value.data)
+                if progress is not None:
+                    progress(loss.item())
     except torch.cuda.OutOfMemoryError as error:
         raise out_of_memory(error, model.num_points) from error
-    field = {name: exact.get(name, value).detach().cpu() for name, value in scene.field.items()}
-    head = {name: value.detach().cpu() for name, value in exact_weights.items()}
     source = {**scene.meta.get("source", {}), "finetuned": steps}
-    return replace(scene, field=field, head=head, meta={**scene.meta, "source": source}), codecs.to(torch.device("cpu"))
+    trained = Scene(
+        {name: field.exact.get(name, value).detach().cpu() for name, value in scene.field.items()},
+        {name: value.detach().cpu() for name, value in head.exact.items()},
+        scene.cameras,
+        {**scene.meta, "source": source},
+    )
+    return trained, codecs.to(torch.device("cpu"))
+
+
+class _Through(NamedTuple):
+    """Parameters of the model, which hold rounded values, and the exact values that are trained beside them."""
+
+    shown: Mapping[str, Tensor]
+    exact: dict[str, Tensor]
+    rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
+
+    @classmethod
+    def of(
+        cls, shown: Mapping[str, Tensor], rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
+    ) -> _Through:
+        """Exact values begin as those of the parameters."""
+        return cls(shown, {name: value.detach().clone().requires_grad_() for name, value in shown.items()}, rounded)
+
+    @torch.no_grad()
+    def show(self) -> None:
+        """Round into the parameters, in place: recorded graphs of the head read them where they are."""
+        rounded = self.rounded(self.exact)
+        for name, value in self.shown.items():
+            value.copy_(rounded[name])
+
+    @torch.no_grad()
+    def take_gradients(self) -> None:
+        """Gradients at the rounded values become those of the exact ones."""
+        for name, value in self.exact.items():
+            gradient = self.shown[name].grad
+            if gradient is not None and name == "quats":
+                # Rounding may have turned a quaternion to its negative, the same rotation.
+                gradient = gradient * (value * self.shown[name]).sum(dim=1, keepdim=True).sign()
+            value.grad = gradient
 
 
 def _place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
@@ -127,28 +165,8 @@ def _place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
     model.gauss_params["quats"].data = torch.nn.functional.normalize(model.gauss_params["quats"].data)
 
 
-def _optimizer(field: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> torch.optim.Optimizer:
-    groups = [{"params": [value.requires_grad_()], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()]
-    if weights:
-        groups.append(
-            {"params": [value.requires_grad_() for value in weights.values()], "lr": RATES["head"], "eps": 1e-8}
-        )
+def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> torch.optim.Optimizer:
+    groups = [{"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()]
+    if head:
+        groups.append({"params": list(head.values()), "lr": RATES["head"], "eps": 1e-8})
     return torch.optim.Adam(groups, fused=all(value.is_cuda for value in field.values()))
-
-
-@torch.no_grad()
-def _show(shown: Mapping[str, Tensor], rounded: Mapping[str, Tensor]) -> None:
-    """Write into parameters in place: recorded graphs of the head read them where they are."""
-    for name, value in shown.items():
-        value.copy_(rounded[name])
-
-
-@torch.no_grad()
-def _hand_over(exact: Mapping[str, Tensor], shown: Mapping[str, Tensor]) -> None:
-    """Gradients at the rounded values become those of the exact ones."""
-    for name, value in exact.items():
-        gradient = shown[name].grad
-        if gradient is not None and name == "quats":
-            # Rounding may have turned a quaternion to its negative, the same rotation.
-            gradient = gradient * (value * shown[name]).sum(dim=1, keepdim=True).sign()
-        value.grad = gradient
