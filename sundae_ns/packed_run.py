@@ -77,8 +77,11 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
     coefficients = (_degree_in_use(model, field) + 1) ** 2 - 1
     field["features_rest"] = field["features_rest"][:, :coefficients]
     head: dict[str, Tensor] = {}
+    kind: dict[str, Any] | None = None
     if model.head is not None and model.head_active:
         head = dict(model.head.state_dict())
+        # The head's own: a budget may have chosen a smaller one than the model's configuration names.
+        kind = {name: getattr(model.head.config, name) for name in _HEAD_OPTIONS}
     else:
         field.pop(FEATURES, None)
     manager = _manager(config)
@@ -89,7 +92,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
             "sh_degree": model.config.sh_degree,
             "rasterize_mode": model.config.rasterize_mode,
             "background_color": model.config.background_color,
-            "head": {name: getattr(model.config.head, name) for name in _HEAD_OPTIONS} if head else None,
+            "head": kind,
             "trained_focal": list(model.trained_focal) if head and model.trained_focal else None,
         },
         "frame": _frame(path.parent / _FRAME_FILE),

@@ -151,6 +151,9 @@ class _Through(NamedTuple):
             if gradient is not None and name == "quats":
                 # Rounding may have turned a quaternion to its negative, the same rotation.
                 gradient = gradient * (value * self.shown[name]).sum(dim=1, keepdim=True).sign()
+            if gradient is not None and name == "features_rest":
+                # Primitives that have no bands, because they look the same from everywhere, cost next to nothing.
+                gradient = gradient.masked_fill((value == 0).flatten(1).all(dim=1)[:, None, None], 0.0)
             value.grad = gradient
 
 
