@@ -22,17 +22,16 @@ from sundae_ns.opening import open_pipeline
 from sundae_ns.storage.packing import Codecs, PackConfig, Scene, fit_scene
 
 RATES = {
-    "features_dc": 2.5e-4,
-    "features_rest": 5e-5,
-    "opacities": 5e-3,
-    "scales": 5e-4,
-    "quats": 1e-4,
-    "features": 2.5e-4,
-    "head": 1e-4,
+    "features_dc": 5e-4,
+    "features_rest": 1e-4,
+    "opacities": 1e-2,
+    "scales": 1e-3,
+    "quats": 2e-4,
+    "features": 5e-4,
+    "head": 2e-4,
 }
-"""Rates of Adam at their highest: of the field a tenth of those that it was trained with, of the head likewise. Positions are
-rounded once and stay: at the end of training they move by less than their rounding anyway, and everything else learns around
-where they ended up."""
+"""Rates of Adam at their highest: about a fifth of those that a run begins with. Positions are rounded once and stay: at the
+end of training they hardly move any more, and everything else learns around where they ended up."""
 RISE = 0.05
 """Share of the steps in which rates rise: Adam knows no gradients at first. They then fall to 0, so that values settle."""
 
