@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -55,6 +56,7 @@ def pack(
         head_bits: bits of each weight of an int8 head, 3 to 8.
         level: effort of the entropy coder, 1 to 22; unpacking is as fast at all of them.
     """
+    from rich.console import Console
     from rich.progress import Progress
 
     from sundae_ns.errors import ConfigError, StorageError
@@ -86,7 +88,8 @@ def pack(
     config.validate()
     if not out.parent.is_dir():
         raise StorageError(f"{out.parent} is no folder; make it first, or choose another")
-    with Progress(transient=True) as progress:
+    # The bar keeps its place to write to where what nerfstudio prints is held back.
+    with Progress(console=Console(file=sys.stdout), transient=True) as progress:
         task = progress.add_task("Reading the run", total=2 + finetune)
         with redirect_stdout(StringIO()):  # nerfstudio is chatty while it reads a capture
             scene = scene_of_run(run, max_cameras=max_cameras, data=data)
