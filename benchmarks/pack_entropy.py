@@ -4,8 +4,8 @@
 
 ``bytes_order0``: the entropy of every byte plane by itself, which a perfect coder without contexts would reach, beside what
 zstandard took. ``bits``: for each attribute, bits a primitive that its values would need less if they were predicted, the mean
-logarithm of how much narrower they get: ``transform`` by decorrelating the channels, ``neighbours`` beside that by a linear guess
-from the mean of the four primitives before in the file and the nearest of the 256 before.
+logarithm of how much narrower they get: ``transform`` by decorrelating the channels, ``neighbours`` beside that by a linear
+guess from the mean of the four primitives before in the file and the nearest of the 256 before.
 """
 
 from __future__ import annotations
