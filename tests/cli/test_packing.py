@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from dataclasses import fields
 from pathlib import Path
 
@@ -28,6 +29,9 @@ def test_options_are_those_of_the_configuration() -> None:
     for field in fields(PackConfig):
         # Those that a fine-tune changes are only known when it is known whether there is one.
         assert options[field.name].default == (None if field.name in FINETUNED else field.default), field.name
+        if field.name in FINETUNED:
+            (line,) = re.findall(rf"^ +{field.name}: (.*)$", pack.__doc__ or "", re.MULTILINE)
+            assert line.endswith(f"; by default {field.default}, {FINETUNED[field.name]} with a fine-tune.")
     assert set(options) == {"run", "out", "max_cameras", "finetune", "data"} | {
         field.name for field in fields(PackConfig)
     }
