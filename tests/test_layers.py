@@ -36,6 +36,7 @@ FLOORS = {
     "opening": 3,
     "measure": 3,
     "packed_run": 3,
+    "packing_finetune": 3,
     "method_configs": 4,
     "cli": 4,
 }
