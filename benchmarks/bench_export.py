@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from sundae_ns.evaluation import psnr
-from sundae_ns.measure import LoadedRun, load_run
+from sundae_ns.opening import Opened, load_run
 from sundae_ns.packed_run import scene_of_run
 from sundae_ns.storage import read_ply, write_sog, write_spz
 from sundae_ns.storage.viewers import ANTIALIASED, write_for_viewers
@@ -48,9 +48,7 @@ def smaller(picture: Tensor, factor: int) -> Tensor:
 
 
 @torch.no_grad()
-def pictures_of(
-    run: LoadedRun, field: Mapping[str, Tensor], views: list[int], downscale: int, text: str
-) -> list[Tensor]:
+def pictures_of(run: Opened, field: Mapping[str, Tensor], views: list[int], downscale: int, text: str) -> list[Tensor]:
     model = run.model
     background = model._get_background_color()
     made = []

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr
-from sundae_ns.measure import load_run
+from sundae_ns.opening import load_run
 from sundae_ns.packed_run import scene_of_run, write_run
 from sundae_ns.packing_finetune import finetune
 from sundae_ns.storage.packing import (

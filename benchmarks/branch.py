@@ -25,9 +25,11 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
+from sundae_ns import rendering
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.compensation.head import SIZES
 from sundae_ns.evaluation import psnr
+from sundae_ns.losses import picture_loss
 from sundae_ns.model import SundaeModel
 
 RESULTS = Path(__file__).parent / "results" / "branches.jsonl"
@@ -101,7 +103,8 @@ def with_picture_loss_on_base(get_loss_dict: Any) -> Any:
         losses = get_loss_dict(self, outputs, batch, metrics)
         if "base_loss" in losses:
             target = self._target(batch, outputs)
-            losses["base_loss"] = self.config.base_loss_weight * self._picture_loss(outputs["base_rgb"], target)
+            loss = picture_loss(outputs["base_rgb"], target, self.ssim, self.config.ssim_lambda)
+            losses["base_loss"] = self.config.base_loss_weight * loss
         return losses
 
     return wrapped
@@ -110,12 +113,12 @@ def with_picture_loss_on_base(get_loss_dict: Any) -> Any:
 def apart(splat: Any) -> Any:
     """The head's loss moves features and head only: what it sees of the field has no gradients."""
 
-    def wrapped(self: SundaeModel, params: Any, view: Any, channels: Tensor, **options: Any) -> Any:
-        if not self.training or channels.shape[1] == 3:
-            return splat(self, params, view, channels, **options)
-        seen = splat(self, params, view, channels[:, :3], **options)
+    def wrapped(params: Any, view: Any, channels: Tensor, style: rendering.Style, **options: Any) -> Any:
+        if not style.training or channels.shape[1] == 3:
+            return splat(params, view, channels, style, **options)
+        seen = splat(params, view, channels[:, :3], style, **options)
         still = {name: value.detach() for name, value in params.items()}
-        features = splat(self, still, view, channels[:, 3:], render_depth=False)
+        features = splat(still, view, channels[:, 3:], style, render_depth=False)
         return replace(seen, colors=torch.cat([seen.colors, features.colors], dim=-1))
 
     return wrapped
@@ -223,7 +226,7 @@ def main() -> None:
     if options.dropout is not None:
         CompensationHead.forward = with_dropout(CompensationHead.forward, options.dropout)  # type: ignore[method-assign]
     if options.apart:
-        SundaeModel._splat = apart(SundaeModel._splat)  # type: ignore[method-assign]
+        rendering.splat = apart(rendering.splat)
         CompensationHead.forward = unmoved(CompensationHead.forward)  # type: ignore[method-assign]
     if options.skip is not None:
         built = CompensationHead.__init__

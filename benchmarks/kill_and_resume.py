@@ -32,8 +32,8 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts import train
 from rich.progress import track
 
+import sundae_ns.after_step
 import sundae_ns.checkpoint
-import sundae_ns.model
 import sundae_ns.pruning.policy
 import sundae_ns.storage.atomic
 from sundae_ns.data import write_scene
@@ -101,7 +101,7 @@ PLACES: dict[str, Callable[[int], None]] = {
     "save: the older one not yet gone": lambda n: after(n, sundae_ns.checkpoint, "save", when_done),
     "prune: deciding": lambda n: after(1, sundae_ns.pruning.policy, "decide", at_once),
     "prune: sliced": lambda n: after(1, sundae_ns.pruning.policy, "keep", when_done),
-    "prune: half recorded": lambda n: after(1, sundae_ns.model, "write_text", half_recorded),
+    "prune: half recorded": lambda n: after(1, sundae_ns.after_step, "write_text", half_recorded),
 }
 ANY = "any time"
 

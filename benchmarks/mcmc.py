@@ -27,11 +27,9 @@ from gsplat.strategy import MCMCStrategy
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from torch import Tensor
 
+from sundae_ns.densification import start_of_chain
+from sundae_ns.losses import chain_losses
 from sundae_ns.model import SundaeModel, SundaeModelConfig
-
-INITIAL_OPACITY = 0.5
-INITIAL_WIDTH = 0.1
-REGULARISATION = 0.01
 
 
 @dataclass
@@ -57,9 +55,8 @@ class McmcModel(SundaeModel):
             cap_max=self.config.most, refine_stop_iter=self.config.refine_until
         )
         self.strategy_state = self.strategy.initialize_state()  # type: ignore[call-arg]
-        with torch.no_grad():
-            self.gauss_params["opacities"].fill_(torch.logit(torch.tensor(INITIAL_OPACITY)))
-            self.gauss_params["scales"].add_(torch.log(torch.tensor(INITIAL_WIDTH)))
+        for name, value in start_of_chain(self.gaussians).items():
+            self.gauss_params[name].data = value.detach()
 
     def step_post_backward(self, step: int) -> None:
         rate = self.optimizers["means"].param_groups[0]["lr"]
@@ -67,8 +64,7 @@ class McmcModel(SundaeModel):
 
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, Tensor]:
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
-        losses["opacity"] = REGULARISATION * self.gauss_params["opacities"].sigmoid().mean()
-        losses["scale"] = REGULARISATION * self.gauss_params["scales"].exp().mean()
+        losses.update(chain_losses(self.gaussians))
         return losses
 
 

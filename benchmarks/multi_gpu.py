@@ -1,7 +1,7 @@
 """One scene on one, two and four GPUs: pictures a second, quality after as many pictures, memory of each GPU.
 
-    python benchmarks/multi_gpu.py --scene bonsai --data ../shared/scenes/bonsai --gpus 1 2 4
-    python benchmarks/multi_gpu.py --scene bonsai --data ... --gpus 1 2 4 --field RUN/nerfstudio_models --primitives 10000000
+    python benchmarks/multi_gpu.py --scene bonsai --data ../shared/scenes/bonsai --gpus 1 2 4 --save-field warm.ckpt
+    python benchmarks/multi_gpu.py --scene bonsai --data ... --gpus 1 2 4 --field warm.ckpt --primitives 10000000
     python benchmarks/multi_gpu.py --scene bonsai --data ... --gpus 1 2 --field ... --primitives 2000 --steps 12 --cpu
 
 The first line trains whole runs. ``--steps`` counts pictures, the same on any number of GPUs, and test views are rendered
@@ -57,8 +57,8 @@ def tile(field: dict[str, torch.Tensor], count: int) -> dict[str, torch.Tensor]:
 class Clock:
     """Wraps the trainer's iteration: seconds of training alone, and the quality at even distances."""
 
-    def __init__(self, trainer: Any, ranks: int, looks: int, warm: int) -> None:
-        self.trainer, self.ranks, self.warm = trainer, ranks, warm
+    def __init__(self, trainer: Any, ranks: int, looks: int, warm: int, save: Path | None) -> None:
+        self.trainer, self.ranks, self.warm, self.save = trainer, ranks, warm, save
         self.iterate, trainer.train_iteration = trainer.train_iteration, self
         every = max(trainer.config.max_num_iterations // looks, 1) if looks else 0
         self.looks = {every * (i + 1) for i in range(looks)}
@@ -82,6 +82,9 @@ class Clock:
         if step in self.looks:
             self.pause()
             self.look(step)
+        if self.save is not None and self.ranks == 1 and step == self.trainer.pipeline.model.config.pruning.prune_at:
+            self.pause()
+            checkpoint.save({"step": step, "pipeline": self.trainer.pipeline.state_dict()}, self.save)
         if self.started is None and step * self.ranks >= self.warm:
             self.started = self._now()
         if self.started is not None:
@@ -117,7 +120,7 @@ def measure(rank: int, ranks: int, meeting: str, options: argparse.Namespace, ex
     trainer: Any = config.setup(local_rank=rank, world_size=ranks)
     trainer.setup()
     trainer.save_checkpoint = lambda step: None
-    clock = Clock(trainer, ranks, options.looks, WARM if options.field is not None and cuda else 0)
+    clock = Clock(trainer, ranks, options.looks, WARM if options.field is not None and cuda else 0, options.save_field)
     if cuda:
         torch.cuda.reset_peak_memory_stats()
     trainer.train()
@@ -215,6 +218,7 @@ def main() -> None:
     parser.add_argument("--gpus", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--steps", type=int, help="pictures")
     parser.add_argument("--field", type=Path, help="a field to tile: a checkpoint, a folder of them, or a .ply")
+    parser.add_argument("--save-field", type=Path, help="write what one GPU has right before its prune, for --field")
     parser.add_argument("--primitives", type=int, default=10_000_000, help="of the tiled field")
     parser.add_argument("--looks", type=int, help="times that test views are rendered on the way (default 12, tiled 0)")
     parser.add_argument("--seed", type=int, default=42)

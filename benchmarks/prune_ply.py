@@ -14,7 +14,7 @@ import torch
 
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.measure import load_run
+from sundae_ns.opening import load_run
 from sundae_ns.pruning import PruningConfig, decide, footprint
 
 RULES: list[dict[str, Any]] = [

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -26,7 +24,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 
 from sundae_ns.evaluation import RunRow, append_row, median_ms, psnr, ssim
-from sundae_ns.measure import frame_times, sizes
+from sundae_ns.measure import frame_times, revision, sizes
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage import Sizes, bytes_of
 
@@ -113,13 +111,11 @@ def evaluate(pipeline: Any) -> dict[str, float]:
 
 
 def commit() -> str:
-    """The revision measured: of this checkout, or told by ``BENCHMARK_COMMIT`` where the tree travelled without git."""
-    told = os.environ.get("BENCHMARK_COMMIT")
-    if told:
-        return told
-    return subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
-    ).stdout.strip()
+    """The revision measured; a figure without one is not taken."""
+    found = revision()
+    if not found:
+        raise SystemExit("no commit to note beside the figures: run in a checkout, or name it in BENCHMARK_COMMIT")
+    return found
 
 
 def main() -> None:

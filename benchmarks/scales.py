@@ -16,7 +16,7 @@ import torch
 
 from sundae_ns.compensation import resize
 from sundae_ns.evaluation import psnr
-from sundae_ns.measure import load_run
+from sundae_ns.opening import load_run
 
 RESULTS = Path(__file__).parent / "results" / "scales.json"
 FACTORS = (0.25, 0.4, 0.5, 0.7, 0.9, 1.0, 1.1, 1.37, 2.0, 3.0)
@@ -28,7 +28,8 @@ def main() -> None:
     parser.add_argument("--load-config", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
-    model, cameras, truths = load_run(options.load_config)
+    run = load_run(options.load_config)
+    model, cameras, truths = run.model, run.cameras, run.truths
     background, trained = model._get_background_color(), model.trained_focal
     lines = []
     for factor in FACTORS:

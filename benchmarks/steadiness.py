@@ -18,7 +18,7 @@ from nerfstudio.cameras.cameras import Cameras
 from rich.progress import track
 
 from sundae_ns.evaluation import Frame, change
-from sundae_ns.measure import load_run
+from sundae_ns.opening import load_run
 
 RESULTS = Path(__file__).parent / "results" / "steadiness.json"
 
@@ -30,7 +30,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=30, help="frames from one test camera to the next")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
-    model, cameras, _ = load_run(options.load_config)
+    run = load_run(options.load_config)
+    model, cameras = run.model, run.cameras
     first = cameras[0]
     stations = Cameras(
         torch.cat([camera.camera_to_worlds for camera in cameras]).cpu(),

@@ -199,7 +199,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     def _view(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         batch = dict(self.cached_train[index])
-        batch["image"] = batch["image"].to(self.device)
+        batch["image"] = batch["image"].to(self.device, non_blocking=True)  # pinned, where it waits in host memory
         camera = self.train_dataset.cameras[index : index + 1]
         camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
         return camera, batch

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -18,6 +18,9 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from sundae_ns.gaussians.relocation import grow, jitter, relocate
+
+if TYPE_CHECKING:
+    from sundae_ns.model import SundaeModelConfig
 
 
 def limit_growth(state: MutableMapping[str, Any], room: int, threshold: float, radius: float | None) -> None:
@@ -124,3 +127,40 @@ class ChainStrategy:
             grow(params, optimizers, min(self.cap, int((1 + self.growth) * n)) - n, self.min_opacity)
             state["peak"] = max(state.get("peak", 0), len(params["means"]))
         jitter(params, self.noise * optimizers["means"].param_groups[0]["lr"])
+
+
+def make_strategy(config: SundaeModelConfig, pictures: int) -> CappedStrategy | ChainStrategy:
+    """How the field of a model grows, until the prune that would be undone by it.
+
+    Args:
+        config: of the model.
+        pictures: how many the field is trained on; each is seen once after opacities are reset, before anything grows.
+    """
+    pruning = config.pruning
+    continuous = pruning.mode == "continuous"
+    stop = min(config.stop_split_at, pruning.stop if continuous else pruning.ends_growth_at or config.stop_split_at)
+    cap = pruning.max_primitives if continuous else None
+    if config.warmup == "mcmc":
+        return ChainStrategy(
+            cap=min(config.mcmc_cap, cap or config.mcmc_cap),
+            refine_start_iter=config.warmup_length,
+            refine_stop_iter=stop,
+            refine_every=config.refine_every,
+        )
+    return CappedStrategy(
+        cap=cap,
+        prune_opa=config.cull_alpha_thresh,
+        grow_grad2d=config.densify_grad_thresh,
+        grow_scale3d=config.densify_size_thresh,
+        grow_scale2d=config.split_screen_size,
+        prune_scale3d=config.cull_scale_thresh,
+        prune_scale2d=config.cull_screen_size,
+        refine_scale2d_stop_iter=config.stop_screen_size_at,
+        refine_start_iter=config.warmup_length,
+        refine_stop_iter=stop,
+        reset_every=config.reset_alpha_every * config.refine_every,
+        refine_every=config.refine_every,
+        pause_refine_after_reset=pictures + config.refine_every,
+        absgrad=config.use_absgrad,
+        verbose=False,
+    )

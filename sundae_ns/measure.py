@@ -11,16 +11,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import NamedTuple, cast
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from sundae_ns.compensation import resize
-from sundae_ns.datamanager import SundaeDatamanager
-from sundae_ns.errors import BackendError, CheckpointError, ConfigError
+from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.evaluation import (
     HEAD_OFF,
     HEAD_ON,
@@ -99,37 +96,6 @@ def sizes(model: SundaeModel) -> Sizes:
     return Sizes(bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head))
 
 
-class LoadedRun(NamedTuple):
-    """A finished run."""
-
-    model: SundaeModel
-    """In evaluation mode."""
-    cameras: list[Cameras]
-    """Test cameras, each of shape ``(1,)``."""
-    truths: list[Tensor]
-    """What they photographed ``[H, W, 3]``, in [0, 1], over the model's background."""
-
-
-def load_run(config: Path) -> LoadedRun:
-    """Open a finished run.
-
-    Raises:
-        CheckpointError: there is no such run, or it is of another method.
-    """
-    if not config.is_file():
-        raise CheckpointError(f"{config} does not exist; give the config.yml of a run's folder")
-    _, pipeline, _, _ = eval_setup(config, test_mode="test")
-    model = pipeline.model
-    if not isinstance(model, SundaeModel):
-        raise CheckpointError(f"{config} is a run of another method; give one of sundae")
-    cameras, truths = [], []
-    for camera, batch in cast(SundaeDatamanager, pipeline.datamanager).fixed_indices_eval_dataloader:
-        cameras.append(camera.to(pipeline.device))
-        image = model.get_gt_img(batch["image"])
-        truths.append(model.composite_with_background(image, model._get_background_color()))
-    return LoadedRun(model, cameras, truths)
-
-
 @dataclass(frozen=True)
 class FrameFigures:
     """Speed of a configuration beside its own error; means over the test views."""
@@ -151,7 +117,7 @@ class FrameFigures:
 
 @torch.no_grad()
 def frame_figures(
-    run: LoadedRun, *, factor: float = 1.0, precision: str | None = None, warmup: int = 3, repeats: int = 5
+    run: Opened, *, factor: float = 1.0, precision: str | None = None, warmup: int = 3, repeats: int = 5
 ) -> FrameFigures:
     """Time the frames of a run at a size and a precision, and compare these very frames with the truth resized alike.
 

@@ -23,6 +23,7 @@ from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.packed_run import write_run
 from sundae_ns.pruning import PruningConfig
+from sundae_ns.run_folder import CLASS, read_config
 from sundae_ns.storage.packing import is_packed, read_scene
 
 
@@ -188,6 +189,22 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
         prune_s=0.0 if pruning.mode == "off" else _prune_seconds(path.parent / "prune.json"),
         curves=path.parent,
     )
+
+
+def load_run(path: Path) -> Opened:
+    """Open a finished run of sundae by its ``config.yml``, and no other method's.
+
+    Raises:
+        CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
+        DataError: its capture is gone, or cannot be used.
+    """
+    if not path.is_file():
+        raise CheckpointError(f"{path} does not exist; give the config.yml of a run's folder")
+    model = read_config(path)["pipeline"].get("model")
+    kind = str(model.get(CLASS)) if isinstance(model, dict) else ""
+    if not kind.startswith("object:sundae_ns."):
+        raise CheckpointError(f"{path} is a run of another method; give one of sundae")
+    return open_run(path)
 
 
 def _without_extras(stock: SplatfactoModelConfig, field: Path) -> SundaeModelConfig:

@@ -33,9 +33,9 @@ from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, PackError, StorageError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
+from sundae_ns.rendering import degree_in_use
 from sundae_ns.storage.atomic import storage_error, write_text
 from sundae_ns.storage.packing import Scene
-from sundae_ns.storage.ply import sh_degree_of
 
 TIMESTAMP = "unpacked"
 _FRAME_FILE = "dataparser_transforms.json"
@@ -74,7 +74,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
     loaded = checkpoint.load(source)
     model = _restored(cast(SplatfactoModelConfig, config.pipeline.model), loaded, source)
     field = {name: value.detach() for name, value in model.gauss_params.items()}
-    coefficients = (_degree_in_use(model, field) + 1) ** 2 - 1
+    coefficients = (degree_in_use(field["features_rest"], model.most_bands) + 1) ** 2 - 1
     field["features_rest"] = field["features_rest"][:, :coefficients]
     head: dict[str, Tensor] = {}
     kind: dict[str, Any] | None = None
@@ -150,14 +150,6 @@ def _restored(found: SplatfactoModelConfig, loaded: Mapping[str, Any], source: P
         reason = " ".join(str(error).split())[:200]
         raise CheckpointError(f"{source} does not fit its own config.yml ({reason}); give another run") from error
     return model
-
-
-def _degree_in_use(model: SundaeModel, field: Mapping[str, Tensor]) -> int:
-    """Degree of the spherical harmonics that pictures are made with at the model's step."""
-    degree = sh_degree_of(field["features_rest"].shape[1]) or 0
-    if model.config.warm_start is not None:
-        return degree
-    return min(model.step // max(model.config.sh_degree_interval, 1), degree)
 
 
 def _frame(path: Path) -> dict[str, Any] | None:

@@ -77,7 +77,7 @@ def finetune(
     scene, codecs = fit_scene(scene, config)
     opened = open_pipeline(run / "config.yml" if run.is_dir() else run, data=data, test_mode="val")
     pipeline, model = opened.pipeline, opened.model
-    if model._densifying:
+    if model.densifying:
         raise CheckpointError(f"{run} was still growing when it was saved; train it to its end, or pack it as it is")
     _place(model, scene.field)
     codecs = codecs.to(model.device)

@@ -19,7 +19,7 @@ from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from sundae_ns import checkpoint, distributed
-from sundae_ns.datamanager import SundaeDatamanager
+from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, StorageError, SundaeError, out_of_memory
 from sundae_ns.storage.atomic import storage_error, write_text
 
@@ -75,6 +75,8 @@ class SundaeTrainer(Trainer):
             distributed.check_options(config)
             config = distributed.shorten(config, world_size)
             config.vis = distributed.without_viewer(config.vis)  # type: ignore[assignment]
+            # A copy of all pictures on each GPU may take more than its shard.
+            cast(SundaeDatamanagerConfig, config.pipeline.datamanager).cache_images = "cpu"
             CONSOLE.quiet = local_rank != 0
             if config.machine.device_type == "cuda":
                 torch.cuda.set_device(local_rank)

@@ -96,9 +96,11 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
 
         # nerfstudio is chatty while it imports and loads.
         with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
-            from sundae_ns.measure import frame_times, load_run, sizes
+            from sundae_ns.measure import frame_times, sizes
+            from sundae_ns.opening import load_run
 
-            model, cameras, _ = load_run(run / "config.yml")
+            opened = load_run(run / "config.yml")
+            model, cameras = opened.model, opened.cameras
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
     _comparison(out / "renders", out / "comparison.png")
 

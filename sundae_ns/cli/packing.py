@@ -19,10 +19,10 @@ def pack(
     data: Path | None = None,
     position_bits: int = 16,
     block: int = 1024,
-    scale_bits: int | None = None,
-    rotation_bits: int | None = None,
-    color_bits: int | None = None,
-    opacity_bits: int | None = None,
+    scale_bits: int = 8,
+    rotation_bits: int = 8,
+    color_bits: int = 8,
+    opacity_bits: int = 8,
     harmonics: Literal["transform", "codebooks"] = "transform",
     harmonics_step: float | None = None,
     harmonics_books: int = 4,
@@ -43,14 +43,14 @@ def pack(
         data: the capture, if it is not where the run says.
         position_bits: bits of each coordinate within a block, 4 to 21.
         block: primitives of a block of positions: smaller ones are more exact and take more bytes.
-        scale_bits: bits of each log-scale, 4 to 16; by default 8, 7 with a fine-tune.
-        rotation_bits: bits of each of the three stored components of a rotation, 4 to 16; by default 8, 7 with a fine-tune.
-        color_bits: bits of each channel of the view-independent colour, 4 to 16; by default 8, 7 with a fine-tune.
-        opacity_bits: bits of the logit of the opacity, 4 to 16; by default 8, 6 with a fine-tune.
+        scale_bits: bits of each log-scale, 4 to 16.
+        rotation_bits: bits of each of the three stored components of a rotation, 4 to 16.
+        color_bits: bits of each channel of the view-independent colour, 4 to 16.
+        opacity_bits: bits of the logit of the opacity, 4 to 16.
         harmonics: view-dependent colour, transformed and rounded, or by residual codebooks: fewer bytes, more loss.
-        harmonics_step: step that transformed coefficients are rounded to; by default 0.02, 0.04 with a fine-tune.
+        harmonics_step: step that transformed coefficients are rounded to; by default 0.02, 0.03 with a fine-tune.
         harmonics_books: residual codebooks of the view-dependent colour: bytes a primitive, 1 to 32.
-        feature_bits: bits of each feature, 4 to 16; by default 7, 5 with a fine-tune.
+        feature_bits: bits of each feature, 4 to 16; by default 7, 6 with a fine-tune.
         feature_books: residual codebooks of the feature vectors instead, up to 32.
         head: weights of the head.
         head_bits: bits of each weight of an int8 head, 3 to 8; by default 8, 6 with a fine-tune.
@@ -66,10 +66,6 @@ def pack(
     if finetune < 0:
         raise ConfigError(f"finetune is {finetune}; give the number of steps, or 0 for none")
     given = {
-        "scale_bits": scale_bits,
-        "rotation_bits": rotation_bits,
-        "color_bits": color_bits,
-        "opacity_bits": opacity_bits,
         "harmonics_step": harmonics_step,
         "feature_bits": feature_bits,
         "head_bits": head_bits,
@@ -77,6 +73,10 @@ def pack(
     fixed = {
         "position_bits": position_bits,
         "block": block,
+        "scale_bits": scale_bits,
+        "rotation_bits": rotation_bits,
+        "color_bits": color_bits,
+        "opacity_bits": opacity_bits,
         "harmonics": harmonics,
         "harmonics_books": harmonics_books,
         "feature_books": feature_books,

@@ -38,6 +38,11 @@ def num_primitives(params: Mapping[str, Tensor]) -> int:
     return params["means"].shape[0]
 
 
+def sh_degree(features_rest: Tensor) -> int:
+    """Degree of spherical harmonics whose bands 1 and up are ``[N, K, 3]``, K = (degree + 1)^2 - 1."""
+    return round((features_rest.shape[1] + 1) ** 0.5) - 1
+
+
 def rgb_to_sh(rgb: Tensor) -> Tensor:
     """Band-0 coefficient ``[..., 3]`` whose colour is ``rgb`` ``[..., 3]`` in [0, 1]."""
     return (rgb - 0.5) / SH_C0

@@ -138,6 +138,16 @@ class PruningConfig:
         """Step of the one-shot mode's last round."""
         return self.prune_at + (self.rounds - 1) * self.round_every
 
+    @property
+    def ends_growth_at(self) -> int | None:
+        """Step of the prune that follows densification; None where there is none."""
+        return self.prune_at if self.mode in ("one-shot", "auto") else None
+
+    @property
+    def settled_at(self) -> int:
+        """Step after which the field keeps its primitives."""
+        return self.stop if self.mode == "continuous" else self.last_prune
+
     def validate(self) -> None:
         """Check every option.
 

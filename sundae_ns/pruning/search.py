@@ -15,7 +15,7 @@ This module holds the decisions, as plain numbers; :mod:`sundae_ns.budget` acts 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
@@ -212,21 +212,3 @@ class Search:
                 f"the checkpoint does not say where its search for a budget stood ({error}); give another"
             ) from error
         return search
-
-
-def curve_text(points: Sequence[Point], target: float, width: int = 40) -> str:
-    """The curve as lines of text, one a look, the fewest primitives last; bars are dB above the worst look."""
-    if not points:
-        return ""
-    low = min([point.psnr for point in points] + [target])
-    span = max([point.psnr for point in points] + [target]) - low or 1.0
-    mark = round((target - low) / span * (width - 1))
-    lines = []
-    for point in sorted(points, key=lambda point: (-point.primitives, point.step)):
-        bar = list("#" * round((point.psnr - low) / span * (width - 1)) + " " * width)[:width]
-        bar[mark] = "|"
-        lines.append(
-            f"{point.primitives:>10,}  {''.join(bar)} {point.psnr:7.3f} dB  {point.psnr - target:+.3f} to the target  "
-            f"step {point.step}, {point.since_cut} after the cut, {point.phase}, {point.verdict}"
-        )
-    return "\n".join(lines)

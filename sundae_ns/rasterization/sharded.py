@@ -7,6 +7,7 @@ default process group; each function that says "collective" is to be called by a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,63 +18,71 @@ from torch import Tensor
 from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN
 
 
-class Camera(NamedTuple):
-    """A pinhole camera as every rank knows it; sizes are tensors, so that none has to be read from a GPU."""
+class Cameras(NamedTuple):
+    """What ranks know of each other's cameras: where they stand, and what they cannot see."""
 
-    viewmat: Tensor
-    """World-to-camera ``[4, 4]``."""
-    K: Tensor
-    """Intrinsics in pixels ``[3, 3]``."""
-    size: Tensor
-    """Width and height in pixels ``[2]``."""
+    centers: Tensor
+    """Where they stand ``[R, 3]``."""
+    bounds: Tensor
+    """From :func:`frustum_bounds` ``[R, 5, 5]``."""
 
 
 @torch.no_grad()
-def gather_cameras(viewmat: Tensor, K: Tensor, width: int, height: int) -> list[Camera]:
-    """The cameras of all ranks by rank, detached. Collective.
+def frustum_bounds(viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float) -> Tensor:
+    """Five linear forms of ``(x, y, z, 1, s)``, s the largest scale; no primitive with one above 0 is drawn ``[5, 5]``.
+
+    A backend draws nothing whose distance from the picture is more than its radius, at most three standard deviations of
+    the footprint, whose variance is at most its trace. A row of the perspective map's Jacobian has length
+    ``f / z * sqrt(1 + k^2)`` for a slope k, which is held to what the picture shows and a margin beside it, so the trace is at
+    most ``(s / z)^2 C^2`` with one C for a camera, plus the blur. Multiplied by z, this is linear. The fifth is the near plane.
 
     Args:
-        viewmat: this rank's world-to-camera transform ``[4, 4]``.
-        K: its intrinsics in pixels ``[3, 3]``.
-        width, height: size of its picture in pixels.
+        viewmat: world-to-camera transform ``[4, 4]``.
+        K: intrinsics in pixels ``[3, 3]``.
+        width, height: size of the picture in pixels.
+        near_plane: as the rasteriser gets it.
     """
-    own = torch.cat([viewmat.reshape(16), K.reshape(9), viewmat.new_tensor([width, height])])
-    every = [torch.empty_like(own) for _ in range(dist.get_world_size())]
-    dist.all_gather(every, own)
-    return [Camera(row[:16].reshape(4, 4), row[16:25].reshape(3, 3), row[25:]) for row in every]
+    size = K.new_tensor([width, height])
+    off_axis = K[:2, 2] - size / 2
+    held = off_axis.abs() + (0.5 + 0.5 * FOV_MARGIN) * size
+    reach = 3.003 * (K[:2, :2].square().sum() + held.square().sum()).sqrt()  # a bit more, for rounding
+    # From the middle of the picture: half of its size, the blur, the rounding up of the radius, and a pixel for rounding.
+    rows = torch.cat([K[:2], -K[:2]])
+    rows[:, 2] = torch.cat([off_axis, -off_axis]) - (size / 2 + 3 * (2 * BLUR) ** 0.5 + 2).repeat(2)
+    sides = torch.cat([rows @ viewmat[:3], -reach.expand(4, 1)], dim=1)
+    near = torch.cat([-viewmat[2], viewmat.new_zeros(1)])
+    near[3] += max(near_plane, torch.finfo(near.dtype).tiny)
+    return torch.cat([sides, near[None]])
 
 
 @torch.no_grad()
-def may_be_seen(means: Tensor, scales: Tensor, camera: Camera, near_plane: float, far_plane: float) -> Tensor:
-    """True for every primitive that a backend gives a radius above 0, and for some others; bool ``[N]``.
+def gather_cameras(viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float) -> Cameras:
+    """The cameras of all ranks by rank, detached. Collective. Arguments are this rank's; see :func:`frustum_bounds`."""
+    center = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    own = torch.cat([center, frustum_bounds(viewmat, K, width, height, near_plane).flatten()])
+    every = own.new_empty(dist.get_world_size() * len(own))
+    dist.all_gather_into_tensor(every, own)
+    every = every.view(-1, len(own))
+    return Cameras(every[:, :3], every[:, 3:].view(-1, 5, 5))
 
-    The radius is at most three standard deviations of the footprint, whose variance is at most its trace. A row of the
-    perspective map's Jacobian has length ``f / z * sqrt(1 + k^2)`` for a slope k, so the trace is at most
-    ``(s / z)^2 (fx^2 (1 + kx^2) + fy^2 (1 + ky^2))`` for the largest scale s, plus the blur.
+
+@torch.no_grad()
+def may_be_seen(means: Tensor, scales: Tensor, bounds: Tensor) -> Tensor:
+    """True for every primitive that a backend gives a radius above 0, and for some others; bool ``[R, N]``.
 
     Args:
         means: centres ``[N, 3]``.
         scales: standard deviations, after activation ``[N, 3]``.
-        camera: the camera.
-        near_plane, far_plane: as the rasteriser gets them.
+        bounds: of R cameras, from :func:`frustum_bounds` ``[R, 5, 5]``.
     """
-    in_camera = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    z = in_camera[:, 2:]
-    in_range = (z >= near_plane) & (z <= far_plane) & (z > 0)
-    focal, centre = camera.K.diagonal()[:2], camera.K[:2, 2]
-    slopes = in_camera[:, :2] / z
-    margin = 0.5 * FOV_MARGIN * camera.size / focal
-    held = slopes.maximum(-centre / focal - margin).minimum((camera.size - centre) / focal + margin)
-    spread = focal.square() * (1 + held.square())
-    variance = (scales.amax(dim=1, keepdim=True) / z).square() * spread.sum(dim=1, keepdim=True) + 2 * BLUR
-    reach = 3 * variance.sqrt() * 1.001 + 1  # rounding up, and rounding
-    pixels = slopes * focal + centre
-    outside = (pixels + reach <= 0) | (pixels - reach >= camera.size)
-    # Said the other way round, NaN would count as unseen here, and the backends would disagree.
-    return in_range[:, 0] & ~outside.any(dim=1)
+    largest = scales.amax(dim=1, keepdim=True)
+    rows = torch.cat([means, torch.ones_like(largest), largest], dim=1)
+    above = (bounds.flatten(0, 1) @ rows.T).view(len(bounds), 5, -1)
+    # Asked so that what is not a number may be seen, where backends disagree, but not in depth, where none draws it.
+    return ~(above[:, :4] > 0).any(dim=1) & (above[:, 4] <= 0)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Route:
     """Who sent what where in one exchange."""
 
@@ -83,20 +92,24 @@ class Route:
     """How many went to each rank; the sum is S."""
     received: list[int]
     """How many came from each rank; the sum is M."""
+    ask: Callable[[], Tensor] | None = None
+    """Called in the backward pass: what was found about the rows that came ``[M, E]``, to travel with their gradients."""
+    told: Tensor | None = None
+    """What the others' ``ask`` said about the rows that went, not divided by anything ``[S, E]``."""
 
 
 @torch.no_grad()
-def plan_route(ids: list[Tensor]) -> Route:
+def plan_route(seen: Tensor) -> Route:
     """Say how many rows go to each rank, and hear how many come. Collective.
 
     Args:
-        ids: for each rank, the rows of this shard that go there, int64.
+        seen: whether a row of this shard goes to a rank, bool ``[R, N]``.
     """
-    sent = [len(rows) for rows in ids]
-    counts = torch.tensor(sent, device=ids[0].device)
-    incoming = torch.empty_like(counts)
-    dist.all_to_all_single(incoming, counts)
-    return Route(torch.cat(ids), sent, incoming.tolist())
+    sent = seen.sum(dim=1)
+    received = torch.empty_like(sent)
+    dist.all_to_all_single(received, sent)
+    counts = torch.stack([sent, received]).tolist()
+    return Route(seen.nonzero()[:, 1], *counts)
 
 
 def swap(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
@@ -124,14 +137,20 @@ class _Exchange(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
         route: Route = ctx.route
-        return swap(gradient, route.received, route.sent) / len(route.sent), None
+        gradient = gradient / len(route.sent)
+        if route.ask is None:
+            return swap(gradient, route.received, route.sent), None
+        found, route.ask = route.ask(), None  # it may hold on to this very graph, which no one would ever free
+        both = swap(torch.cat([gradient, found], dim=1), route.received, route.sent)
+        gradient, route.told = both.split([gradient.shape[1], found.shape[1]], dim=1)
+        return gradient, None
 
 
 def exchange(rows: Tensor, route: Route) -> Tensor:
     """Send rows to the ranks of their cameras. Collective, and so is the backward pass.
 
     Gradients come back divided by the number of ranks: what all ranks' losses together do to a row is what their mean
-    does to it on one process.
+    does to it on one process. They bring along what ``route.ask`` says, which is set on all ranks or on none.
 
     Args:
         rows: in the order of ``route.ids`` ``[S, D]``.

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from sundae_ns.gaussians.parameters import sh_degree
 from sundae_ns.rasterization.harmonics import harmonic_basis
 
 
@@ -42,7 +43,7 @@ def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tenso
         features_rest: ``[N, K, 3]`` bands 1 and up, K = (degree + 1)^2 - 1.
         rotation: ``[3, 3]``.
     """
-    degree = round((features_rest.shape[1] + 1) ** 0.5) - 1
+    degree = sh_degree(features_rest)
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
     before = harmonic_basis(degree, directions)

@@ -207,7 +207,7 @@ def test_primitives_are_kept_exactly(make: Make) -> None:
 def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """A head of half a megabyte, with 5 features, joins a field of a few kilobytes, in place of a larger one."""
     monkeypatch.setattr(
-        budget, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
+        budget.sizes, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
     )
     return {"head": HeadConfig(size="small", pixel_unshuffle=1, num_features=13)}
 

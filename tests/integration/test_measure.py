@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import yaml
+from nerfstudio.configs.method_configs import method_configs
 
 from sundae_ns.cli import main
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import psnr
-from sundae_ns.measure import compensation, frame_figures, frame_times, load_run, sizes
+from sundae_ns.measure import compensation, frame_figures, frame_times, sizes
+from sundae_ns.opening import load_run
 
 
 def test_figures_of_a_run(tiny: Any) -> None:
-    model, cameras, truths = load_run(tiny.config)
+    run = load_run(tiny.config)
+    model, cameras, truths = run.model, run.cameras, run.truths
     assert [truth.shape[:2] for truth in truths] == [(int(c.height), int(c.width)) for c in cameras]
     assert all(0 <= truth.min() <= truth.max() <= 1 for truth in truths)
     times = frame_times(model, cameras[:1], warmup=0, repeats=1)
@@ -31,7 +36,7 @@ def test_figures_of_a_run(tiny: Any) -> None:
 
 def test_frames_are_judged_as_they_are_timed(tiny: Any) -> None:
     run = load_run(tiny.config)
-    run = run._replace(cameras=run.cameras[:2], truths=run.truths[:2])
+    run = replace(run, cameras=run.cameras[:2], truths=run.truths[:2])
     whole = frame_figures(run, warmup=0, repeats=1)
     assert (whole.width, whole.height) == run.truths[0].shape[1::-1]
     assert (whole.precision, whole.views) == ("fp32", 2)
@@ -94,4 +99,10 @@ def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixt
 
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="does not exist"):
+        load_run(tmp_path / "config.yml")
+
+
+def test_a_run_of_another_method(tmp_path: Path) -> None:
+    (tmp_path / "config.yml").write_text(yaml.dump(method_configs["splatfacto"]))
+    with pytest.raises(CheckpointError, match="another method"):
         load_run(tmp_path / "config.yml")

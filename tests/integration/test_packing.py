@@ -15,7 +15,7 @@ from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
 
 from sundae_ns.evaluation import psnr
-from sundae_ns.measure import load_run
+from sundae_ns.opening import load_run
 
 
 class Packed(NamedTuple):

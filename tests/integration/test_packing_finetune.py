@@ -19,8 +19,8 @@ from sundae_ns.cli import main
 from sundae_ns.cli.packing import pack
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.evaluation import psnr
-from sundae_ns.measure import load_run
 from sundae_ns.model import SundaeModel
+from sundae_ns.opening import load_run
 from sundae_ns.packed_run import scene_of_run, write_run
 from sundae_ns.packing_finetune import finetune, rate_factor
 from sundae_ns.storage.packing import FINETUNED, PackConfig, Scene, fit_scene, read_header, read_scene, write_fitted
@@ -110,7 +110,7 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     shutil.copytree(tiny.folder, run)
     text = (run / "config.yml").read_text()
     (run / "config.yml").write_text(text.replace(f"- {tiny.scene.name}\n", "- elsewhere\n"))
-    words = ["pack", str(run), "-o", str(file), "--finetune", "3", "--opacity-bits", "8"]
+    words = ["pack", str(run), "-o", str(file), "--finetune", "3", "--feature-bits", "9"]
     with pytest.raises(SystemExit, match="2"):
         main(words)
     assert "elsewhere does not exist" in capsys.readouterr().err
@@ -119,8 +119,8 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert f"{file}: " in capsys.readouterr().out
     meta = read_header(file).meta
     assert meta["source"]["finetuned"] == 3
-    bits = {name: about.get("bits") for name, about in meta["attributes"].items()}
-    assert (bits["opacities"], bits["scales"]) == (8, FINETUNED["scale_bits"])
+    stored = meta["attributes"]
+    assert (stored["features"]["bits"], stored["features_rest"]["step"]) == (9, FINETUNED["harmonics_step"])
 
 
 def test_an_interrupt_leaves_nothing(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.pruning.search import DEEPEST, SHALLOWEST, Point, Search, curve_text
+from sundae_ns.pruning.search import DEEPEST, SHALLOWEST, Point, Search
 
 
 def search(accepted: int = 1000, **options: Any) -> Search:
@@ -144,15 +144,3 @@ def test_state_goes_through_a_checkpoint() -> None:
 def test_a_foreign_state_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(CheckpointError, match="search for a budget"):
         Search.from_state({**search().state(), **change})
-
-
-def test_curve_as_text() -> None:
-    points = [
-        Point(i, "field", count, 0, psnr, "accepted", 5) for i, (count, psnr) in enumerate([(500, 29.0), (1000, 31.0)])
-    ]
-    lines = curve_text(points, target=30.0).splitlines()
-    assert [int(line.split()[0].replace(",", "")) for line in lines] == [1000, 500]
-    assert lines[0].count("#") > lines[1].count("#")
-    assert "+1.000 to the target" in lines[0]
-    assert len({line.index("|") for line in lines}) == 1
-    assert curve_text([], 30.0) == ""

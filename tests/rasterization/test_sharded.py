@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.rasterization.projection import project
-from sundae_ns.rasterization.sharded import Camera, may_be_seen
+from sundae_ns.rasterization.sharded import frustum_bounds, may_be_seen
 
 NEAR, FAR = 0.01, 1e10
 
@@ -22,25 +22,30 @@ def scattered(seed: int, n: int = 4000) -> tuple[Tensor, Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize(("width", "height", "focal", "cx"), [(64, 48, 50.0, 32.0), (300, 20, 20.0, -40.0)])
-def test_all_that_is_drawn_may_be_seen(seed: int, width: int, height: int, focal: float, cx: float) -> None:
+@pytest.mark.parametrize(
+    ("width", "height", "focal", "cx", "most"), [(64, 48, 50.0, 32.0, 2), (300, 20, 20.0, -40.0, 6)]
+)
+def test_all_that_is_drawn_may_be_seen(
+    seed: int, width: int, height: int, focal: float, cx: float, most: float
+) -> None:
     means, quats, scales = scattered(seed)
     K = torch.tensor([[focal, 0.0, cx], [0.0, 1.5 * focal, height / 2], [0.0, 0.0, 1.0]])
     drawn = project(means, quats, scales, torch.eye(4), K, width, height, NEAR, FAR).radii > 0
-    camera = Camera(torch.eye(4), K, torch.tensor([float(width), float(height)]))
-    seen = may_be_seen(means, scales, camera, NEAR, FAR)
+    away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    bounds = torch.stack([frustum_bounds(pose, K, width, height, NEAR) for pose in (away, torch.eye(4))])
+    unseen, seen = may_be_seen(means, scales, bounds)
+    assert not (drawn & unseen).any()  # each camera for itself
     assert drawn.any()
     assert not (drawn & ~seen).any()
     # Looser bounds would send the whole field; these primitives are far larger and nearer than those of a scene.
-    assert seen.sum() < 2 * drawn.sum()
+    assert seen.sum() < most * drawn.sum()
 
 
 def test_what_is_not_a_number_is_not_seen() -> None:
     means = torch.tensor([[0.0, 0.0, 2.0], [torch.nan, 0.0, 2.0], [0.0, 0.0, torch.nan], [0.0, 0.0, 0.0]])
     scales = torch.full((4, 3), 0.1)
-    camera = Camera(torch.eye(4), torch.eye(3), torch.tensor([10.0, 10.0]))
     drawn = project(means, torch.ones(4, 4), scales, torch.eye(4), torch.eye(3), 10, 10, NEAR, FAR).radii > 0
-    seen = may_be_seen(means, scales, camera, NEAR, FAR)
+    (seen,) = may_be_seen(means, scales, frustum_bounds(torch.eye(4), torch.eye(3), 10, 10, NEAR)[None])
     assert drawn.tolist()[0]
     assert not (drawn & ~seen).any()
     assert not seen[2:].any()

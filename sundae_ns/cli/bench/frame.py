@@ -6,7 +6,7 @@ import json as jsonlib
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
@@ -15,7 +15,8 @@ from rich.progress import track
 from rich.table import Table
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.measure import FrameFigures, frame_figures, load_run
+from sundae_ns.measure import FrameFigures, frame_figures
+from sundae_ns.opening import load_run
 
 
 def run_frame(
@@ -32,7 +33,7 @@ def run_frame(
         raise ConfigError(f"{repeats} timed runs of {views} views measure nothing: use at least 1 of each")
     with redirect_stdout(sys.stderr):  # what nerfstudio says while it loads is no figure
         run = load_run(load_config)
-    run = run._replace(cameras=run.cameras[:views], truths=run.truths[:views])
+    run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
     device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
     every = ("fp32", "bf16", "fp16") if device != "cpu" and run.model.head is not None else (None,)
     wanted: Sequence[str | None] = precisions or every

@@ -71,9 +71,6 @@ def run_quality(
         seeds=seeds,
         repeat_at=repeat_at,
     )
-    if jobs:
-        show_jobs(jobs_of_shard(plan, *part), out, console)
-        return 0
     command = _command(
         ["sundae", "bench", "quality", str(scene), "-o", str(out)],
         arms=arms,
@@ -86,8 +83,7 @@ def run_quality(
         steps_scale=steps_scale,
         downscale=downscale,
     )
-    own = jobs_of_shard(plan, *part)
-    return _carry_out(own, out, runner or spawn, lambda results: quality_page(results, command), console)
+    return _list_or_do(plan, part, out, lambda results: quality_page(results, command), jobs, runner, console)
 
 
 def run_paper(
@@ -117,9 +113,6 @@ def run_paper(
     plan, missing = plan_paper(root.resolve(), schedule, scenes=scenes, arms=arms, keep_ratios=keep_ratios, seed=seed)
     if missing:
         console.print(f"[yellow]Not there, and left out: {', '.join(missing)}", highlight=False)
-    if jobs:
-        show_jobs(jobs_of_shard(plan, *part), out, console)
-        return 0
     command = _command(
         ["sundae", "bench", "paper", str(root), "-o", str(out)],
         scenes=scenes,
@@ -131,8 +124,7 @@ def run_paper(
         finetune_steps=finetune_steps,
         steps_scale=steps_scale,
     )
-    own = jobs_of_shard(plan, *part)
-    return _carry_out(own, out, runner or spawn, lambda results: paper_page(results, missing, command), console)
+    return _list_or_do(plan, part, out, lambda results: paper_page(results, missing, command), jobs, runner, console)
 
 
 def _command(words: list[str], **options: object) -> str:
@@ -233,12 +225,22 @@ def _check_same(job: Job, result: Result, out: Path) -> None:
         )
 
 
-def _carry_out(
-    jobs: Sequence[Job], out: Path, runner: Runner, page: Callable[[Sequence[Result]], str], console: Console
+def _list_or_do(
+    plan: Sequence[Job],
+    part: tuple[int, int],
+    out: Path,
+    page: Callable[[Sequence[Result]], str],
+    only_list: bool,
+    runner: Runner | None,
+    console: Console,
 ) -> int:
-    """Do the jobs and write the tables; the exit code."""
+    """List this shard's part of a plan, or do it and write the tables; the exit code."""
+    own = jobs_of_shard(plan, *part)
+    if only_list:
+        show_jobs(own, out, console)
+        return 0
     try:
-        failed = run_jobs(jobs, out, runner, console)
+        failed = run_jobs(own, out, runner or spawn, console)
     except KeyboardInterrupt:
         console.print("stopped; the same command goes on from here", highlight=False)
         return STOPPED

@@ -71,13 +71,5 @@ class PackConfig:
                 raise ConfigError(f"{name} is {getattr(self, name)!r}; give one of {', '.join(get_args(choices))}")
 
 
-FINETUNED: dict[str, int | float] = {
-    "scale_bits": 7,
-    "rotation_bits": 7,
-    "color_bits": 7,
-    "opacity_bits": 6,
-    "harmonics_step": 0.04,
-    "feature_bits": 5,
-    "head_bits": 6,
-}
+FINETUNED: dict[str, int | float] = {"harmonics_step": 0.03, "feature_bits": 6, "head_bits": 6}
 """Coarser options, for scenes that have learnt to live with them (``sundae_ns.packing_finetune``)."""

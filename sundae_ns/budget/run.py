@@ -1,0 +1,159 @@
+"""The field under search: what held-back and training views say of it, and how it is cut and brought back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
+from nerfstudio.engine.optimizers import Optimizers
+from torch import Tensor
+
+from sundae_ns.budget.sizes import bytes_of
+from sundae_ns.datamanager import SundaeDatamanager
+from sundae_ns.evaluation import psnr
+from sundae_ns.gaussians import FEATURES, keep
+from sundae_ns.gaussians.parameters import sh_degree
+from sundae_ns.gaussians.rewriting import rewrite
+from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, restore, restore_module, snapshot
+from sundae_ns.pruning import PruningConfig, decide
+from sundae_ns.pruning.bands import mean_basis
+from sundae_ns.rasterization.harmonics import harmonic_basis
+from sundae_ns.schedulers import notify_pruned
+from sundae_ns.views import View
+
+if TYPE_CHECKING:
+    from sundae_ns.model import SundaeModel
+
+MAX_VIEWS = 64
+"""Training views, evenly chosen, that each scoring looks at: it is repeated at each cut."""
+
+
+class Run(NamedTuple):
+    """What a step of the search works on."""
+
+    model: SundaeModel
+    attributes: TrainingCallbackAttributes
+    datamanager: SundaeDatamanager
+
+    @classmethod
+    def of(cls, model: SundaeModel, attributes: TrainingCallbackAttributes) -> Run:
+        """The run of a callback."""
+        assert attributes.pipeline is not None
+        return cls(model, attributes, cast(SundaeDatamanager, attributes.pipeline.datamanager))
+
+    @property
+    def optimizers(self) -> Optimizers:
+        """All of them."""
+        assert self.attributes.optimizers is not None
+        return self.attributes.optimizers
+
+    @property
+    def params(self) -> Any:
+        """The field."""
+        return self.model.gaussians
+
+    @property
+    def degree(self) -> int:
+        """Of the field's harmonics."""
+        return sh_degree(self.params["features_rest"])
+
+    @property
+    def row(self) -> int:
+        """Bytes of a primitive without features."""
+        return bytes_of({name: value[:1] for name, value in self.params.items() if name != FEATURES}, None)
+
+    # ------------------------------------------------------------------------------------------------------- views
+
+    def weights(self, keep_ratio: float | None = None) -> Iterator[tuple[View, Tensor]]:
+        """Some training views, evenly chosen, and the blending weights of the primitives in each ``[N]``."""
+        cameras = list(self.datamanager.training_cameras())
+        stride = -(-len(cameras) // MAX_VIEWS)
+        for camera in cameras[::stride]:
+            view = self.model.view_of(camera)
+            yield view, self.model.weights_of(view, keep_ratio)
+
+    @torch.no_grad()
+    def contribution(self, keep_ratio: float | None = None) -> Tensor:
+        """The sum of these weights ``[N]``."""
+        total = torch.zeros(self.model.num_points, device=self.model.device)
+        for _, weight in self.weights(keep_ratio):
+            total += weight
+        return total
+
+    @torch.no_grad()
+    def view_basis(self, degree: int) -> tuple[Tensor, Tensor]:
+        """What the harmonics up to ``degree`` are on average over the views that see a primitive, and their products."""
+
+        def weighted() -> Iterator[tuple[Tensor, Tensor]]:
+            means = self.params["means"].data
+            for view, weight in self.weights():
+                directions = torch.nn.functional.normalize(means - view.center, dim=-1)
+                yield weight, harmonic_basis(degree, directions)
+
+        return mean_basis(weighted())
+
+    @torch.no_grad()
+    def measure(self) -> float:
+        """Mean PSNR over the held-back views, dB, the head included where it takes part."""
+        model = self.model
+        training = model.training
+        model.eval()
+        background = model._get_background_color()
+        values = []
+        for camera, batch in self.datamanager.holdout_views:
+            pictures, _ = model.render(self.params, model.view_of(camera), background, depth=False)
+            target = model.composite_with_background(model.get_gt_img(batch["image"]), background)
+            values.append(psnr(pictures["rgb"], target))
+        model.train(training)
+        return float(torch.stack([torch.as_tensor(value) for value in values]).mean())
+
+    # ------------------------------------------------------------------------------------------------------- fields
+
+    def keep(self, mask: Tensor) -> None:
+        """Leave the primitives of a mask, bool ``[N]``."""
+        keep(self.params, self.optimizers.optimizers, self.model.pruning_state, mask)
+
+    def cut_to(self, count: int, config: PruningConfig) -> None:
+        """Keep ``count`` primitives, chosen as ``config`` says.
+
+        Raises:
+            DataError: the field cannot be scored.
+        """
+        step = self.model.schedule_step
+        options = replace(config, seed=config.seed + step)
+        ratio = count / self.model.num_points if options.uses_detail else None
+        decision = decide(self.params, options, lambda: self.contribution(ratio), count=count)
+        self.keep(decision.mask)
+        if decision.values is not None:
+            rewrite(self.params, self.optimizers.optimizers, decision.values)
+        self.model.pruning_state["pruned_at"] = step
+        self.model.pruning_state["num_prunes"] += 1
+
+    def snapshot(self, *, head: bool) -> dict[str, Snapshot]:
+        """Copies of the field, and of the head where it takes part, with what the optimizers know of them."""
+        optimizers = self.optimizers.optimizers
+        saved = {"field": snapshot(self.params, optimizers)}
+        if head:
+            assert self.model.head is not None
+            saved["head"] = module_snapshot(self.model.head.parameters(), optimizers["compensation"])
+        return saved
+
+    def restore(self, saved: dict[str, Snapshot] | None) -> None:
+        """Go back to a snapshot."""
+        assert saved is not None
+        optimizers = self.optimizers.optimizers
+        restore(self.params, optimizers, saved["field"])
+        if "head" in saved:
+            assert self.model.head is not None
+            restore_module(self.model.head.parameters(), optimizers["compensation"], saved["head"])
+        # Whatever is kept per count of primitives is stale.
+        self.model.pruning_state["num_prunes"] += 1
+
+    def restart_rates(self, *, head: bool) -> None:
+        """Restart the rates of the field, or those of the head."""
+        schedulers = self.optimizers.schedulers
+        restarted = {name: value for name, value in schedulers.items() if (name == "compensation") == head}
+        notify_pruned(restarted, self.model.step)

@@ -1,0 +1,315 @@
+"""Who holds which primitives of a field, and how the ranks draw and densify as one.
+
+Collectives are those of ``torch.distributed`` on the default process group. Functions that say "collective" are to be
+called by all ranks, in the same order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+import torch.distributed as dist
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import track
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Optimizer
+
+from sundae_ns.gaussians import FEATURES
+from sundae_ns.gaussians.parameters import num_primitives
+from sundae_ns.gaussians.surgery import check_wiring
+from sundae_ns.rasterization.reference import per_axis
+from sundae_ns.rasterization.sharded import (
+    Route,
+    exchange,
+    gather_cameras,
+    give_back,
+    may_be_seen,
+    plan_route,
+    swap,
+)
+
+if TYPE_CHECKING:
+    from sundae_ns.model import SundaeModel
+    from sundae_ns.views import View
+
+DRIFT = 1.1
+"""Rows move when the largest shard has more than this times the mean."""
+_GEOMETRY = ("means", "quats", "scales", "opacities")
+_COLORS = ("features_dc", "features_rest")
+
+
+def bounds(total: int, ranks: int) -> list[int]:
+    """Where the blocks of ``total`` rows begin, and where the last one ends: ``ranks + 1`` numbers.
+
+    Blocks differ by at most one row.
+    """
+    return [total * rank // ranks for rank in range(ranks + 1)]
+
+
+def moves(counts: Sequence[int], rank: int) -> tuple[list[int], list[int]]:
+    """How many rows a rank sends to and gets from each, so that all have as many, and the order stays.
+
+    Args:
+        counts: rows of each rank now.
+        rank: which rank asks.
+    """
+    ranks, new = len(counts), bounds(sum(counts), len(counts))
+    old = [sum(counts[:r]) for r in range(ranks + 1)]
+
+    def shared(holder: int, taker: int) -> int:
+        return max(0, min(old[holder + 1], new[taker + 1]) - max(old[holder], new[taker]))
+
+    return [shared(rank, other) for other in range(ranks)], [shared(other, rank) for other in range(ranks)]
+
+
+class Arrived(dict[str, Tensor]):
+    """Primitives that have come to this rank for one view, by the names of the parameters, and ``colors`` ``[M, 3]``."""
+
+    route: Route
+
+
+class Shards:
+    """This rank's place among the ranks, and how many primitives each holds.
+
+    Args:
+        device: of the field; tensors of collectives are on it.
+    """
+
+    def __init__(self, device: torch.device | str) -> None:
+        self.rank, self.ranks = dist.get_rank(), dist.get_world_size()
+        self.device = torch.device(device)
+        self.counts = [0] * self.ranks
+        """Primitives of each rank."""
+
+    @property
+    def total(self) -> int:
+        """Primitives of all ranks."""
+        return sum(self.counts)
+
+    def numbers(self, *own: int) -> list[list[int]]:
+        """Some whole numbers of each rank, by rank. Collective."""
+        mine = torch.tensor(own, device=self.device)
+        every = [torch.empty_like(mine) for _ in range(self.ranks)]
+        dist.all_gather(every, mine)
+        return [row.tolist() for row in every]
+
+    def recount(self, params: Mapping[str, Tensor]) -> None:
+        """Let every rank know what each holds. Collective."""
+        self.counts = [count for (count,) in self.numbers(num_primitives(params))]
+
+    def announce(self, thing: Any) -> Any:
+        """What rank 0 says, a plain value, on every rank. Collective."""
+        box = [thing]
+        dist.broadcast_object_list(box, src=0, device=self.device)
+        return box[0]
+
+    def gather(self, rows: Tensor, *, host: bool = False) -> Tensor | None:
+        """Rows of all ranks, in order, on rank 0; None on the others. Collective.
+
+        Args:
+            rows: per-primitive values of this rank ``[N_r, ...]``.
+            host: gather in host memory, so that the GPU has to hold no more than one other rank's rows.
+        """
+        rows = rows.detach().contiguous()
+        if self.rank != 0:
+            if len(rows):
+                dist.send(rows, 0)
+            return None
+        parts = [rows.cpu() if host else rows]
+        for other, count in enumerate(self.counts[1:], start=1):
+            part = rows.new_empty(count, *rows.shape[1:])
+            if count:
+                dist.recv(part, other)
+            parts.append(part.cpu() if host else part)
+        return torch.cat(parts)
+
+    @torch.no_grad()
+    def level(
+        self,
+        params: MutableMapping[str, Parameter],
+        optimizers: Mapping[str, Optimizer],
+        states: Iterable[MutableMapping[str, Any]],
+        mask: Tensor | None = None,
+    ) -> None:
+        """Move rows until all ranks hold as many, in the same order; with a mask, of those alone that stay. Collective.
+
+        Parameters are replaced as :func:`sundae_ns.gaussians.surgery.keep` replaces them: gradients are not carried over,
+        moments are, and other holders of the old ones are to be refreshed.
+
+        Args:
+            params: this rank's primitives ``[N_r, ...]``.
+            optimizers: of one parameter each, by name; others are left alone.
+            states: running states; their tensors of N_r rows move too.
+            mask: True for primitives that stay, bool ``[N_r]``; None for all.
+        """
+        check_wiring(params, optimizers)
+        n = num_primitives(params)
+        kept = [count for (count,) in self.numbers(n if mask is None else int(mask.sum()))]
+        sent, received = moves(kept, self.rank)
+
+        def moved(value: Tensor) -> Tensor:
+            return swap(value if mask is None else value[mask], sent, received)
+
+        for name, old in list(params.items()):
+            new = Parameter(moved(old.detach()), requires_grad=old.requires_grad)
+            if name in optimizers:
+                optimizer = optimizers[name]
+                moments = optimizer.state.pop(old, None)
+                if moments is not None:
+                    optimizer.state[new] = {
+                        key: moved(value) if key != "step" and isinstance(value, Tensor) else value
+                        for key, value in moments.items()
+                    }
+                optimizer.param_groups[0]["params"] = [new]
+            params[name] = new
+        for state in states:
+            state.update({key: moved(value) for key, value in state.items() if per_primitive(value, n)})
+        self.counts = [end - start for start, end in zip(*_pairs(bounds(sum(kept), self.ranks)))]
+
+    # ---------------------------------------------------------------------------------------------------- rendering
+
+    def arrivals(
+        self,
+        params: Mapping[str, Tensor],
+        view: View,
+        colors_of: Callable[[Mapping[str, Tensor], Tensor], Tensor],
+        *,
+        near_plane: float,
+        features: bool,
+    ) -> Arrived:
+        """The primitives of all ranks that this rank's view may see; differentiable. Collective.
+
+        Args:
+            params: this rank's primitives.
+            view: this rank's camera.
+            colors_of: colours ``[S, 3]`` of primitives with centres and harmonics, as seen from places ``[S, 3]``.
+            near_plane: as the rasteriser gets it.
+            features: whether features come along.
+        """
+        names = [*_GEOMETRY, FEATURES] if features else list(_GEOMETRY)
+        cameras = gather_cameras(view.viewmat, view.K, view.width, view.height, near_plane)
+        with torch.no_grad():
+            route = plan_route(may_be_seen(params["means"], params["scales"].exp(), cameras.bounds))
+        # Picked for all cameras at once: the way back then fills one gradient per parameter, not one per camera.
+        going = {name: params[name].index_select(0, route.ids) for name in [*names, *_COLORS]}
+        centers = torch.cat([center.expand(count, 3) for center, count in zip(cameras.centers, route.sent)])
+        rows = torch.cat([*(going[name] for name in names), colors_of(going, centers)], dim=1)
+        columns = [params[name].shape[1] for name in names]
+        pieces = exchange(rows, route).split([*columns, 3], dim=1)
+        arrived = Arrived(zip([*names, "colors"], pieces))
+        arrived.route = route
+        return arrived
+
+    def follow(self, info: MutableMapping[str, Any], route: Route, *, absgrad: bool) -> None:
+        """Have what densification wants to know about primitives brought back with their gradients.
+
+        Args:
+            info: of this rank's view, whose centres keep their gradient.
+            route: of the view's primitives.
+            absgrad: whether gradients are summed by their absolute values.
+        """
+
+        def found() -> Tensor:
+            centres = info["means2d"]
+            gradients = (centres.absgrad if absgrad else centres.grad)[0]
+            radii = info["radii"][0]
+            radii = (radii if radii.dim() == 1 else radii.amax(dim=-1)).to(gradients.dtype)
+            width, height = info["width"], info["height"]
+            halves = gradients.new_tensor([width / 2, height / 2])
+            return torch.cat([gradients * halves, (radii * (2 / max(width, height)))[:, None]], dim=1)
+
+        route.ask = found
+        info["route"] = route
+
+    @torch.no_grad()
+    def statistics(self, info: Mapping[str, Any]) -> dict[str, Any]:
+        """What gsplat's strategy reads after a backward pass, about this rank's primitives in all views.
+
+        Args:
+            info: of this rank's view, which :meth:`follow` has followed.
+
+        Returns:
+            ``info`` of a packed rasterisation, in units of half the picture: its width and height are 2.
+        """
+        route: Route = info["route"]
+        assert route.told is not None
+        found = route.told
+        seen = (found[:, 2] > 0).nonzero()[:, 0]  # once: each search for them waits for the GPU
+        ids, found = route.ids[seen], found[seen]
+        # The strategy writes radii row by row: of a primitive in several views, each row gets the largest.
+        largest = found.new_zeros(self.counts[self.rank]).scatter_reduce_(0, ids, found[:, 2], "amax")
+        packed = found[:, :2].clone()
+        packed.grad = found[:, :2].clone()
+        packed.absgrad = packed.grad  # type: ignore[attr-defined]
+        return {
+            "width": 2,
+            "height": 2,
+            "n_cameras": 1,
+            "radii": per_axis(largest[ids]),
+            "gaussian_ids": ids,
+            "means2d": packed,
+        }
+
+    def densify(self, model: SundaeModel) -> None:
+        """Densify every shard by itself, and level the shards when they have drifted apart. Collective."""
+        strategy, state = model.strategy, model.strategy_state
+        peak, state["peak"] = state["peak"], 0
+        info = self.statistics(model.info)
+        params = model.gaussians
+        strategy.step_post_backward(
+            params=model.gauss_params,
+            optimizers=model.optimizers,
+            state=state,
+            step=model.schedule_step,
+            info=info,
+            packed=True,
+        )
+        if model.schedule_step % strategy.refine_every == 0:
+            numbers = self.numbers(num_primitives(params), max(state["peak"], num_primitives(params)))
+            self.counts = [count for count, _ in numbers]
+            peak = max(peak, sum(most for _, most in numbers))
+            if max(self.counts) > DRIFT * self.total / self.ranks:
+                self.level(params, model.optimizers, [state])
+        state["peak"] = peak
+
+    @torch.no_grad()
+    def contribution(self, model: SundaeModel, cameras: Sequence[Any], share: float | None) -> Tensor:
+        """Blending weights of this rank's primitives, summed over all views in their order ``[N_r]``. Collective.
+
+        Args:
+            model: the model.
+            cameras: every training camera; each rank draws one of every R.
+            share: see :meth:`sundae_ns.model.SundaeModel.weights_of`.
+        """
+        sums = torch.zeros(self.counts[self.rank], device=self.device)
+        rounds = range(0, len(cameras), self.ranks)
+        for first in track(rounds, description="Contribution of primitives", transient=True, console=CONSOLE):
+            # Where views run out the last is drawn again, since all ranks have to take part, and not counted.
+            view = model.view_of(cameras[min(first + self.rank, len(cameras) - 1)])
+            arrived = model.arrivals(model.gaussians, view)
+            weights = give_back(model.weights_of(view, share, arrived)[:, None], arrived.route)[:, 0]
+            by_view = zip(arrived.route.ids.split(arrived.route.sent), weights.split(arrived.route.sent))
+            for ids, added in list(by_view)[: len(cameras) - first]:
+                sums[ids] += added
+        return sums
+
+    def agree_on_focal(self, model: SundaeModel) -> None:
+        """Let all ranks know the focal lengths of the pictures that any has trained the head on. Collective."""
+        low, high = model.trained_focal or (math.inf, -math.inf)
+        ends = torch.tensor([low, -high], device=self.device, dtype=torch.float64)
+        dist.all_reduce(ends, dist.ReduceOp.MIN)
+        low, high = ends.tolist()
+        model.trained_focal = None if math.isinf(low) else (low, -high)
+
+
+def _pairs(ends: list[int]) -> tuple[list[int], list[int]]:
+    return ends[:-1], ends[1:]
+
+
+def per_primitive(value: Any, n: int) -> bool:
+    """Whether a value has a row for each of ``n`` primitives."""
+    return isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] == n
