@@ -3,11 +3,14 @@
     python benchmarks/bench_pack.py                              # 1,000,000 random primitives, which pack worst
     python benchmarks/bench_pack.py --run RUN --views 6          # a finished run, at the size that it was trained at
     python benchmarks/bench_pack.py --run RUN --set harmonics=codebooks feature_bits=5
+    python benchmarks/bench_pack.py --run RUN --views 99 --finetune 1000                # as sundae pack --finetune 1000
 
 Random primitives have no structure that an entropy coder could use; they measure time. Of a run, the test views are rendered
 before and after: ``psnr`` and ``psnr_packed`` are against the photographs, each with the head and without (``_base``), and
 ``psnr_between`` is of the packed model's pictures against the unpacked one's: where it is B, a model of PSNR P keeps about
-P - 10 log10(1 + 10^((P - B) / 10)) dB.
+P - 10 log10(1 + 10^((P - B) / 10)) dB. With ``--finetune`` the packed model has been trained on with rounding in the loop, and
+the other is still the run as it was; options are the coarser ones of ``FINETUNED``, changed by ``--set``. ``--plain`` leaves
+the training out, so that what these options cost by themselves can be seen.
 """
 
 from __future__ import annotations
@@ -19,18 +22,28 @@ import time
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 from typing import Any
 
 import torch
-from rich.progress import track
+from rich.progress import Progress, track
 from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr
 from sundae_ns.opening import load_run
 from sundae_ns.packed_run import scene_of_run, write_run
-from sundae_ns.storage.packing import PackConfig, PackReport, Scene, read_scene, write_scene
+from sundae_ns.packing_finetune import finetune
+from sundae_ns.storage.packing import (
+    FINETUNED,
+    Codecs,
+    PackConfig,
+    PackReport,
+    Scene,
+    fit_scene,
+    read_scene,
+    write_fitted,
+)
 
 
 def random_scene(n: int) -> Scene:
@@ -49,13 +62,28 @@ def random_scene(n: int) -> Scene:
     return Scene(field, dict(CompensationHead(HeadConfig(num_features=features)).state_dict()))
 
 
-def config_of(settings: list[str]) -> PackConfig:
+def config_of(settings: list[str], finetuned: bool) -> PackConfig:
     kinds = {field.name: type(field.default) for field in fields(PackConfig)}
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = dict(FINETUNED) if finetuned else {}
     for setting in settings:
         name, _, value = setting.partition("=")
         values[name] = kinds[name](value)
     return PackConfig(**values)
+
+
+def prepared(run: Path | None, scene: Scene, config: PackConfig, steps: int) -> tuple[Scene, Codecs, list[float]]:
+    """The scene as it will be written, trained before if steps are given, its codecs, and the loss of each step."""
+    losses: list[float] = []
+    if run is None or steps == 0:
+        return *fit_scene(scene, config), losses
+    with Progress(transient=True) as progress:
+        task = progress.add_task("Fine-tuning", total=steps)
+
+        def note(loss: float) -> None:
+            losses.append(loss)
+            progress.advance(task)
+
+        return *finetune(run, scene, config, steps, progress=note), losses
 
 
 def seconds(action: Callable[[], Any]) -> tuple[float, float]:
@@ -110,22 +138,31 @@ def main() -> None:
     parser.add_argument("--run", type=Path)
     parser.add_argument("--views", type=int, default=6)
     parser.add_argument("--set", nargs="*", default=[], metavar="OPTION=VALUE", help="fields of PackConfig")
+    parser.add_argument(
+        "--finetune", type=int, default=0, metavar="STEPS", help="train with rounding in the loop first"
+    )
+    parser.add_argument("--plain", action="store_true", help="with --finetune: its options, but no training")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
 
     torch.set_num_threads(options.threads)
-    config = config_of(options.set)
+    config = config_of(options.set, options.finetune > 0)
+    steps = 0 if options.plain else options.finetune
     scene = random_scene(options.primitives) if options.run is None else scene_of_run(options.run)
     with tempfile.TemporaryDirectory() as name:
         file = Path(name) / "scene.sundae"
         start = time.perf_counter()
-        report = write_scene(file, scene, config)
-        packing = time.perf_counter() - start
+        scene, codecs, losses = prepared(options.run, scene, config, steps)
+        tuning = time.perf_counter() - start
+        report = write_fitted(file, scene, codecs)
+        packing = time.perf_counter() - start - (tuning if steps else 0)
         times = [seconds(lambda: read_scene(file)) for _ in range(options.repeats)]
         result = {
             "run": None if options.run is None else options.run.resolve().parents[1].name,
             "set": options.set,
+            "finetune": options.finetune,
+            "finetune_steps": steps,
             "threads": options.threads,
             **sizes(report),
             "s_pack": round(packing, 2),
@@ -134,6 +171,10 @@ def main() -> None:
             "s_unpack_worst": round(max(times)[0], 3),
             "core_s_unpack": round(median(busy for _, busy in times), 3),
         }
+        if losses:
+            tenth = max(len(losses) // 10, 1)
+            result["s_finetune"] = round(tuning, 1)
+            result["loss_first_last_tenth"] = [round(mean(part), 5) for part in (losses[:tenth], losses[-tenth:])]
         if options.run is not None:
             result |= quality(options.run, file, Path(name), options.views)
     print(json.dumps(result))

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -104,11 +104,30 @@ def open_packed(path: Path, *, data: Path | None) -> Opened:
     )
 
 
-def open_run(path: Path, *, data: Path | None = None) -> Opened:
-    """Open a finished run of sundae or of splatfacto by its ``config.yml``.
+class OpenedPipeline(NamedTuple):
+    """A run's pipeline with the state of its newest whole checkpoint."""
+
+    config: TrainerConfig
+    pipeline: Any
+    """nerfstudio's, its type unknown to mypy beyond the base class."""
+    model: SundaeModel
+    step: int
+    """Of the checkpoint."""
+    capture: Path
+
+
+def open_pipeline(
+    path: Path, *, data: Path | None = None, test_mode: Literal["test", "val", "inference"] = "test"
+) -> OpenedPipeline:
+    """Open a run of sundae or of splatfacto by its ``config.yml``, on the GPU if there is one. The run is only read.
 
     A field of splatfacto is opened as a model of ours without a head, so that all methods are rendered and timed by the
     same code, on a CPU too.
+
+    Args:
+        path: the run's ``config.yml``, which is a program: open your own.
+        data: where the capture is, if not where the run says.
+        test_mode: which views nerfstudio is to have beside those of training.
 
     Raises:
         CheckpointError: the run is of another method, or has no whole checkpoint.
@@ -129,15 +148,24 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
     pipeline_config.datamanager.data = capture
 
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    # The config is nerfstudio's, its type unknown to mypy beyond the base class.
-    pipeline: Any = pipeline_config.setup(device=device, test_mode="test")
+    pipeline: Any = pipeline_config.setup(device=device, test_mode=test_mode)
     loaded = checkpoint.load(newest)
     if stock:
         pipeline.model.step = int(loaded["step"])
     else:
         pipeline.load_pipeline(loaded["pipeline"], loaded["step"])
+    return OpenedPipeline(config, pipeline, cast(SundaeModel, pipeline.model), int(loaded["step"]), capture)
+
+
+def open_run(path: Path, *, data: Path | None = None) -> Opened:
+    """Open a finished run in evaluation mode, with its test views; see :func:`open_pipeline`.
+
+    Raises:
+        CheckpointError: the run is of another method, or has no whole checkpoint.
+        DataError: its capture is gone, or cannot be used.
+    """
+    config, pipeline, model, step, capture = open_pipeline(path, data=data)
     pipeline.eval()
-    model = cast(SundaeModel, pipeline.model)
     cameras, truths = _test_views(model, pipeline.datamanager)
     if not cameras:
         raise DataError(f"{capture} has no test views, so there is nothing to measure {path.parent} on")
@@ -152,8 +180,8 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
         variant=config.experiment_name or "",
         keep_ratio=1.0 if pruning.mode == "off" else pruning.keep_ratio,
         seed=config.machine.seed,
-        steps=int(loaded["step"]) + 1,
-        prune_s=0.0 if stock or pruning.mode == "off" else _prune_seconds(path.parent / "prune.json"),
+        steps=step + 1,
+        prune_s=0.0 if pruning.mode == "off" else _prune_seconds(path.parent / "prune.json"),
         curves=path.parent,
     )
 

@@ -54,7 +54,7 @@ hands paths of pictures to ffmpeg through one."""
 # -------------------------------------------------------------------------------------------------------------- packing
 
 
-def scene_of_run(run: Path, *, max_cameras: int = 100) -> Scene:
+def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> Scene:
     """What is needed to show a finished run: the field, the head if it takes part, and some training cameras.
 
     Spherical harmonics that were not trained yet are left out, and so are the features of a head that takes no part.
@@ -62,6 +62,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100) -> Scene:
     Args:
         run: folder of a run of sundae or splatfacto, or its ``config.yml``, which is not run.
         max_cameras: most training cameras, evenly chosen; with 0, the capture need not be there any more.
+        data: the capture, if it is not where the run says.
 
     Raises:
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
@@ -76,18 +77,22 @@ def scene_of_run(run: Path, *, max_cameras: int = 100) -> Scene:
     coefficients = (degree_in_use(field["features_rest"], model.most_bands) + 1) ** 2 - 1
     field["features_rest"] = field["features_rest"][:, :coefficients]
     head: dict[str, Tensor] = {}
+    kind: dict[str, Any] | None = None
     if model.head is not None and model.head_active:
         head = dict(model.head.state_dict())
+        # The head's own: a budget may have chosen a smaller one than the model's configuration names.
+        kind = {name: getattr(model.head.config, name) for name in _HEAD_OPTIONS}
     else:
         field.pop(FEATURES, None)
     manager = _manager(config)
+    manager.data = data or manager.data
     meta = {
         "source": {"method": config.method_name, "step": int(loaded["step"])},
         "model": {
             "sh_degree": model.config.sh_degree,
             "rasterize_mode": model.config.rasterize_mode,
             "background_color": model.config.background_color,
-            "head": {name: getattr(model.config.head, name) for name in _HEAD_OPTIONS} if head else None,
+            "head": kind,
             "trained_focal": list(model.trained_focal) if head and model.trained_focal else None,
         },
         "frame": _frame(path.parent / _FRAME_FILE),

@@ -42,6 +42,7 @@ FLOORS = {
     "opening": 3,
     "measure": 3,
     "packed_run": 3,
+    "packing_finetune": 3,
     "views": 3,
     "method_configs": 4,
     "cli": 4,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -14,6 +15,8 @@ def pack(
     run: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     max_cameras: int = 100,
+    finetune: int = 0,
+    data: Path | None = None,
     position_bits: int = 16,
     block: int = 1024,
     scale_bits: int = 8,
@@ -21,11 +24,12 @@ def pack(
     color_bits: int = 8,
     opacity_bits: int = 8,
     harmonics: Literal["transform", "codebooks"] = "transform",
-    harmonics_step: float = 0.02,
+    harmonics_step: float | None = None,
     harmonics_books: int = 4,
-    feature_bits: int = 7,
+    feature_bits: int | None = None,
     feature_books: int = 0,
     head: Literal["int8", "fp16"] = "int8",
+    head_bits: int | None = None,
     level: int = 19,
 ) -> int:
     """Pack a finished run into one file with everything that is needed to show the scene, and say what takes how much.
@@ -34,51 +38,72 @@ def pack(
         run: folder of a run of sundae or splatfacto, or its config.yml.
         out: the file to write, scene.sundae for example; an older one is replaced once the new one is whole.
         max_cameras: most training cameras to keep for looking around; 0: none, and the capture need not be there.
+        finetune: train for so many steps first, 1000 for example, with this very rounding in the loop. The run is only read.
+            What a scene can learn to live with is then rounded more coarsely, which takes fewer bytes.
+        data: the capture, if it is not where the run says.
         position_bits: bits of each coordinate within a block, 4 to 21.
         block: primitives of a block of positions: smaller ones are more exact and take more bytes.
         scale_bits: bits of each log-scale, 4 to 16.
-        rotation_bits: bits of each of the three components that are stored of a rotation, 4 to 16.
+        rotation_bits: bits of each of the three stored components of a rotation, 4 to 16.
         color_bits: bits of each channel of the view-independent colour, 4 to 16.
         opacity_bits: bits of the logit of the opacity, 4 to 16.
         harmonics: view-dependent colour, transformed and rounded, or by residual codebooks: fewer bytes, more loss.
-        harmonics_step: step that transformed coefficients are rounded to.
+        harmonics_step: step that transformed coefficients are rounded to; by default 0.02, 0.03 with a fine-tune.
         harmonics_books: residual codebooks of the view-dependent colour: bytes a primitive, 1 to 32.
-        feature_bits: bits of each feature, 4 to 16.
+        feature_bits: bits of each feature, 4 to 16; by default 7, 6 with a fine-tune.
         feature_books: residual codebooks of the feature vectors instead, up to 32.
         head: weights of the head.
+        head_bits: bits of each weight of an int8 head, 3 to 8; by default 8, 6 with a fine-tune.
         level: effort of the entropy coder, 1 to 22; unpacking is as fast at all of them.
     """
-    import torch
+    from rich.console import Console
     from rich.progress import Progress
 
-    from sundae_ns.errors import StorageError
+    from sundae_ns.errors import ConfigError, StorageError
     from sundae_ns.packed_run import scene_of_run
-    from sundae_ns.storage.packing import PackConfig, write_scene
+    from sundae_ns.storage.packing import FINETUNED, PackConfig, fit_scene, write_fitted
 
-    config = PackConfig(
-        position_bits=position_bits,
-        block=block,
-        scale_bits=scale_bits,
-        rotation_bits=rotation_bits,
-        color_bits=color_bits,
-        opacity_bits=opacity_bits,
-        harmonics=harmonics,
-        harmonics_step=harmonics_step,
-        harmonics_books=harmonics_books,
-        feature_bits=feature_bits,
-        feature_books=feature_books,
-        head=head,
-        level=level,
-    )
+    if finetune < 0:
+        raise ConfigError(f"finetune is {finetune}; give the number of steps, or 0 for none")
+    given = {
+        "harmonics_step": harmonics_step,
+        "feature_bits": feature_bits,
+        "head_bits": head_bits,
+    }
+    fixed = {
+        "position_bits": position_bits,
+        "block": block,
+        "scale_bits": scale_bits,
+        "rotation_bits": rotation_bits,
+        "color_bits": color_bits,
+        "opacity_bits": opacity_bits,
+        "harmonics": harmonics,
+        "harmonics_books": harmonics_books,
+        "feature_books": feature_books,
+        "head": head,
+        "level": level,
+    }
+    chosen = {name: value for name, value in given.items() if value is not None}
+    config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, **fixed})  # type: ignore[arg-type]
     config.validate()
     if not out.parent.is_dir():
         raise StorageError(f"{out.parent} is no folder; make it first, or choose another")
-    with Progress(transient=True) as progress, torch.no_grad():
-        task = progress.add_task("Reading the run", total=2)
+    # The bar keeps its place to write to where what nerfstudio prints is held back.
+    with Progress(console=Console(file=sys.stdout), transient=True) as progress:
+        task = progress.add_task("Reading the run", total=2 + finetune)
         with redirect_stdout(StringIO()):  # nerfstudio is chatty while it reads a capture
-            scene = scene_of_run(run, max_cameras=max_cameras)
-        progress.update(task, advance=1, description="Packing")
-        report = write_scene(out, scene, config)
+            scene = scene_of_run(run, max_cameras=max_cameras, data=data)
+            progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
+            if finetune:
+                from sundae_ns.packing_finetune import finetune as train
+
+                scene, codecs = train(
+                    run, scene, config, finetune, data=data, progress=lambda _: progress.advance(task)
+                )
+            else:
+                scene, codecs = fit_scene(scene, config)
+        progress.update(task, description="Packing")
+        report = write_fitted(out, scene, codecs)
     print(f"{out}: {report.primitives:,} primitives in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
     print(f"{'':14}{'bytes':>12}{'bits a primitive':>20}")
     for name, bits in report.bits.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 from dataclasses import fields
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import torch
 from sundae_ns.cli import main
 from sundae_ns.cli.packing import pack
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage.packing import PackConfig, Scene, write_scene
+from sundae_ns.storage.packing import FINETUNED, PackConfig, Scene, write_scene
 
 
 def run(*arguments: object) -> int:
@@ -26,8 +27,14 @@ def test_options_are_those_of_the_configuration() -> None:
     """They are written out a second time so that ``sundae --help`` need not import torch."""
     options = inspect.signature(pack).parameters
     for field in fields(PackConfig):
-        assert options[field.name].default == field.default, field.name
-    assert set(options) == {"run", "out", "max_cameras"} | {field.name for field in fields(PackConfig)}
+        # Those that a fine-tune changes are only known when it is known whether there is one.
+        assert options[field.name].default == (None if field.name in FINETUNED else field.default), field.name
+        if field.name in FINETUNED:
+            (line,) = re.findall(rf"^ +{field.name}: (.*)$", pack.__doc__ or "", re.MULTILINE)
+            assert line.endswith(f"; by default {field.default}, {FINETUNED[field.name]} with a fine-tune.")
+    assert set(options) == {"run", "out", "max_cameras", "finetune", "data"} | {
+        field.name for field in fields(PackConfig)
+    }
 
 
 @pytest.mark.parametrize(
@@ -36,6 +43,7 @@ def test_options_are_those_of_the_configuration() -> None:
         (["pack", "nothing", "-o", "a.sundae"], "nothing cannot be read"),
         (["pack", "nothing", "-o", "a.sundae", "--scale-bits", "2"], "scale-bits is 2; give 4 to 16"),
         (["pack", "nothing", "-o", "no/a.sundae"], "no is no folder"),
+        (["pack", "nothing", "-o", "a.sundae", "--finetune", "-1"], "finetune is -1"),
         (["unpack", "nothing"], "nothing cannot be read"),
         (["unpack", "cut.sundae"], "not a whole packed scene"),
         (["unpack", "harmed.sundae"], "the checksum of"),

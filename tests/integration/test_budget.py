@@ -23,8 +23,12 @@ from sundae_ns.budget import Budget, bytes_of
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.data import write_scene
 from sundae_ns.errors import CheckpointError, ConfigError, DataError
+from sundae_ns.evaluation import psnr
 from sundae_ns.measure import sizes
 from sundae_ns.method_configs import sundae_auto
+from sundae_ns.packed_run import scene_of_run, write_run
+from sundae_ns.packing_finetune import finetune
+from sundae_ns.storage.packing import PackConfig, read_scene, write_fitted
 
 STEPS, SAVE, PRUNE_AT, STOP = 90, 10, 20, 70
 Make = Callable[..., Trainer]
@@ -130,6 +134,10 @@ def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:
     assert done.model.gauss_params["features_rest"].shape[1] == columns
 
 
+def test_it_can_be_packed(done: Run, tmp_path: Path) -> None:
+    shown_alike_when_packed(done, tmp_path)
+
+
 def test_flat_colours_stay_flat(done: Run) -> None:
     rest = done.model.gauss_params["features_rest"]
     if rest.shape[1]:
@@ -204,7 +212,9 @@ def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return {"head": HeadConfig(size="small", pixel_unshuffle=1, num_features=13)}
 
 
-def test_a_head_of_the_chosen_size_joins_and_is_loaded_again(make: Make, small_head: dict[str, Any]) -> None:
+def test_a_head_of_the_chosen_size_joins_and_is_loaded_again(
+    make: Make, small_head: dict[str, Any], tmp_path: Path
+) -> None:
     options = {"model_options": small_head, "max_psnr_drop": None, "max_primitives": 37}
     trainer = make(**options)
     weights = list(trainer.pipeline.model.head.parameters())
@@ -222,6 +232,20 @@ def test_a_head_of_the_chosen_size_joins_and_is_loaded_again(make: Make, small_h
     again.train()
     for part in ("pipeline", "optimizers", "random"):
         same(whole[part], Run(again).checkpoint(STEPS - 1)[part], part)
+    shown_alike_when_packed(run, tmp_path)
+
+
+def shown_alike_when_packed(run: Run, folder: Path) -> None:
+    """What a budget has chosen goes through a pack, fine-tune included."""
+    scene = scene_of_run(run.folder)
+    trained, codecs = finetune(run.folder, scene, PackConfig(), 1)
+    write_fitted(folder / "a.sundae", trained, codecs)
+    found = eval_setup(write_run(read_scene(folder / "a.sundae"), folder, "packed"), test_mode="test")[1].model
+    assert (found.head is None) == (run.model.head is None)
+    camera = run.trainer.pipeline.datamanager.train_dataset.cameras[0:1]
+    with torch.no_grad():
+        pictures = [model.eval().get_outputs_for_camera(camera)["rgb"] for model in (run.model, found)]
+    assert psnr(*pictures) > 30
 
 
 def test_a_head_that_does_not_pay_goes_again(make: Make, small_head: dict[str, Any]) -> None:

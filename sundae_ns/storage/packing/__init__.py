@@ -1,17 +1,30 @@
 """Packed scenes: a field, its head and its cameras in one small file that can be checked and cannot be run."""
 
-from sundae_ns.storage.packing.config import PackConfig
+from sundae_ns.storage.packing.codecs import Codecs
+from sundae_ns.storage.packing.config import FINETUNED, PackConfig
 from sundae_ns.storage.packing.container import VERSION, is_packed, read_header
-from sundae_ns.storage.packing.scene import CAMERAS, PackReport, Scene, read_scene, write_scene
+from sundae_ns.storage.packing.scene import (
+    CAMERAS,
+    PackReport,
+    Scene,
+    fit_scene,
+    read_scene,
+    write_fitted,
+    write_scene,
+)
 
 __all__ = [
     "CAMERAS",
+    "FINETUNED",
     "VERSION",
+    "Codecs",
     "PackConfig",
     "PackReport",
     "Scene",
+    "fit_scene",
     "is_packed",
     "read_header",
     "read_scene",
+    "write_fitted",
     "write_scene",
 ]

@@ -41,6 +41,22 @@ class Codebooks(NamedTuple):
     bound: float
 
 
+class Books(NamedTuple):
+    """Books without the rows that they were fitted to."""
+
+    entries: Tensor
+    """In steps, int8 ``[S, K, D]``."""
+    steps: Tensor
+    """float32 ``[S]``."""
+    rows: Tensor
+    """Rows that are stored exactly, rising ``[E]``."""
+
+
+def books_of(packed: Codebooks) -> Books:
+    """The books that rows were packed with."""
+    return Books(*(torch.from_numpy(x) for x in (packed.entries, packed.steps, packed.rows.astype(np.int64))))
+
+
 def fit(vectors: NDArray[np.float32], books: int, *, seed: int = 0) -> Codebooks:
     """Find books, and the entries of each row.
 
@@ -64,30 +80,58 @@ def fit(vectors: NDArray[np.float32], books: int, *, seed: int = 0) -> Codebooks
         if step > 0:
             kept[book] = (centres / step.double()).round().clamp(-127, 127).to(torch.int8)
         # What is left is taken from the entries as they are stored, so that the next book mends their rounding too.
-        stored = kept[book].float() * step
-        nearest = nearest_centre(rest, stored.double())
-        indices[book] = nearest.to(torch.uint8)
-        rest -= stored.double()[nearest]
+        indices[book] = _take(rest, kept[book].float() * step).to(torch.uint8)
+    books_alone = Books(kept, steps, torch.zeros(0, dtype=torch.int64))
+    error = (target - _sums(indices, books_alone)).abs().amax(dim=1)
+    worst = error.topk(int(n * EXACT)).indices.sort().values
+    return _packed(vectors, indices, books_alone._replace(rows=worst))
+
+
+def encode(vectors: NDArray[np.float32], books: Books) -> Codebooks:
+    """Entries of vectors ``[N, D]`` in given books; the rows of ``books.rows`` are kept exactly."""
+    return _packed(vectors, _pick(torch.from_numpy(np.ascontiguousarray(vectors)), books), books)
+
+
+def rounded(vectors: Tensor, books: Books) -> Tensor:
+    """What :func:`restore` makes of :func:`encode`: ``[N, D]``; to the bit on a CPU, in float32 elsewhere."""
+    return _sums(_pick(vectors, books), books).index_copy(0, books.rows, vectors[books.rows])
+
+
+def _packed(vectors: NDArray[np.float32], indices: Tensor, books: Books) -> Codebooks:
+    rows = books.rows.numpy()
     made = Codebooks(
-        indices.numpy(), kept.numpy(), steps.numpy(), np.zeros(0, np.uint32), np.zeros((0, width), np.float32), 0.0
+        indices.numpy(), books.entries.numpy(), books.steps.numpy(), rows.astype(np.uint32), vectors[rows], 0.0
     )
-    error = np.abs(vectors.astype(np.float64) - restore(made)).max(axis=1)
-    count = int(n * EXACT)
-    worst = np.sort(np.argpartition(error, n - count)[n - count :]) if count else np.zeros(0, np.int64)
-    others = np.delete(error, worst)
-    return made._replace(
-        rows=worst.astype(np.uint32), exact=vectors[worst], bound=float(others.max()) if len(others) else 0.0
-    )
+    return made._replace(bound=float(np.abs(vectors.astype(np.float64) - restore(made)).max(initial=0.0)))
+
+
+def _take(rest: Tensor, stored: Tensor) -> Tensor:
+    """Nearest entry of one book ``[N]``; it is taken off ``rest``."""
+    nearest = nearest_centre(rest, stored.double())
+    rest -= stored.double()[nearest]
+    return nearest
+
+
+def _pick(vectors: Tensor, books: Books) -> Tensor:
+    """Entry of each book for each vector ``[S, N]``, one book after the other."""
+    rest = vectors.double().clone()
+    tables = books.entries.float() * books.steps[:, None, None]
+    return torch.stack([_take(rest, table) for table in tables]).to(torch.uint8)
+
+
+def _sums(indices: Tensor, books: Books) -> Tensor:
+    """Vectors ``[N, D]`` of entries ``[S, N]``."""
+    count, entries, width = books.entries.shape
+    table = (books.entries.float() * books.steps[:, None, None]).reshape(-1, width)
+    names = indices.T.int() + torch.arange(0, count * entries, entries, dtype=torch.int32, device=indices.device)
+    # The sum of a few rows of a table: torch does it in one pass, on several threads.
+    return F.embedding_bag(names, table, mode="sum")
 
 
 def restore(packed: Codebooks) -> NDArray[np.float32]:
-    """Counterpart of :func:`fit`: ``[N, D]``."""
-    books, entries, width = packed.entries.shape
-    table = torch.from_numpy(packed.entries.astype(np.float32) * packed.steps[:, None, None]).reshape(-1, width)
-    names = packed.indices.T.astype(np.int32)
-    names += np.arange(0, books * entries, entries, dtype=np.int32)
-    # The sum of a few rows of a table: torch does it in one pass, on several threads.
-    out: NDArray[np.float32] = F.embedding_bag(torch.from_numpy(names), table, mode="sum").numpy()
+    """Counterpart of :func:`encode`: ``[N, D]``."""
+    indices, entries, steps = (torch.from_numpy(x.copy()) for x in (packed.indices, packed.entries, packed.steps))
+    out: NDArray[np.float32] = _sums(indices, Books(entries, steps, torch.zeros(0, dtype=torch.int64))).numpy()
     out[packed.rows] = packed.exact
     return out
 

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from sundae_ns.errors import ConfigError
 
-HeadCodec = Literal["int8", "fp16"]
+HeadFormat = Literal["int8", "fp16"]
 HarmonicsCodec = Literal["transform", "codebooks"]
 
 
@@ -38,8 +38,10 @@ class PackConfig:
     """Bits of each feature, 4 to 16; the residual codebooks of feature-books replace them."""
     feature_books: int = 0
     """Residual codebooks of the feature vectors, up to 32; 0: each feature by itself, with feature-bits."""
-    head: HeadCodec = "int8"
+    head: HeadFormat = "int8"
     """Weights of the head: int8 with a step for each output channel, or fp16."""
+    head_bits: int = 8
+    """Bits of each weight of an int8 head, 3 to 8: fewer are stored in fewer bytes."""
     level: int = 19
     """Effort of the entropy coder (zstandard), 1 to 22; unpacking is as fast at all of them."""
 
@@ -55,6 +57,7 @@ class PackConfig:
             "block": (16, 1 << 20),
             "harmonics_books": (1, 32),
             "feature_books": (0, 32),
+            "head_bits": (3, 8),
             "level": (1, 22),
         }
         for name, (least, most) in ranges.items():
@@ -63,6 +66,10 @@ class PackConfig:
                 raise ConfigError(f"{name.replace('_', '-')} is {value}; give {least} to {most}")
         if not 1e-4 <= self.harmonics_step <= 1:
             raise ConfigError(f"harmonics-step is {self.harmonics_step}; give 0.0001 to 1")
-        for name, choices in (("head", HeadCodec), ("harmonics", HarmonicsCodec)):
+        for name, choices in (("head", HeadFormat), ("harmonics", HarmonicsCodec)):
             if getattr(self, name) not in get_args(choices):
                 raise ConfigError(f"{name} is {getattr(self, name)!r}; give one of {', '.join(get_args(choices))}")
+
+
+FINETUNED: dict[str, int | float] = {"harmonics_step": 0.03, "feature_bits": 6, "head_bits": 6}
+"""Coarser options, for scenes that have learnt to live with them (``sundae_ns.packing_finetune``)."""

@@ -1,7 +1,8 @@
 """Numbers in few bits: ranges that outliers cannot ruin, positions in blocks, smallest-three rotations, network weights.
 
 Each pair of functions states its error bound. Bounds leave out the rounding to float32 of what is returned, at most half a
-unit in its last place.
+unit in its last place. What rounds is written once, in torch: files are made of ``levels``, and training with rounding in the
+loop sees ``rounded`` of the same.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sundae_ns.storage.packing.morton import interleave, separate
 
@@ -26,8 +29,58 @@ def code_type(bits: int) -> type[np.unsignedinteger[Any]]:
     return np.uint8 if bits <= 8 else np.uint16
 
 
+class Grid(NamedTuple):
+    """Even levels of each channel; see :func:`fit_grid`."""
+
+    low: Tensor
+    """Value of code 0, float64 ``[C]``."""
+    high: Tensor
+    """Value of the last code; what lies beyond either is kept exactly. float64 ``[C]``."""
+    step: Tensor
+    """Distance of neighbouring levels, 0 where a channel is constant, float64 ``[C]``."""
+    bits: int
+
+
+def fit_grid(values: Floats, bits: int, *, shared: bool = False) -> Grid:
+    """Levels for values like these; the outermost :data:`TAIL` at either end is left out where it is far off.
+
+    Args:
+        values: ``[N, C]``, finite, N at least 1.
+        bits: 1 to 16.
+        shared: give all channels one range.
+    """
+    columns = values.T.astype(np.float64)
+    rows = columns.reshape(1, -1) if shared else columns
+    least, most = rows.min(axis=1), rows.max(axis=1)
+    low, high = np.quantile(rows, [TAIL, 1 - TAIL], axis=1, method="nearest")
+    # An end is only cut off where that makes the step a quarter finer; else it costs more than it gains.
+    worth = 1.25 * (high - low) < most - least
+    ends = (np.where(worth, low, least), np.where(worth, high, most))
+    low, high = (torch.from_numpy(np.broadcast_to(end, len(columns)).copy()) for end in ends)
+    return Grid(low, high, (high - low) / (2**bits - 1), bits)
+
+
+def levels(values: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
+    """Nearest levels of values ``[N, C]`` as float64 ``[N, C]``, and which lie outside of the range ``[N, C]``."""
+    exact = values.double()
+    safe = torch.where(grid.step > 0, grid.step, 1.0)
+    outside = (exact < grid.low) | (exact > grid.high)
+    return ((exact - grid.low) / safe).round().clamp(0, 2**grid.bits - 1), outside
+
+
+def at_levels(levels: Tensor, low: Tensor, step: Tensor) -> Tensor:
+    """Values of levels, float32; all arguments are float64 and broadcast."""
+    return (low + levels * step).float()
+
+
+def rounded(values: Tensor, grid: Grid) -> Tensor:
+    """What :func:`dequantize` makes of :func:`quantize`, to the bit, on any device: float32 ``[N, C]``."""
+    found, outside = levels(values, grid)
+    return torch.where(outside, values, at_levels(found, grid.low, grid.step))
+
+
 class Uniform(NamedTuple):
-    """Values ``[N, C]`` on an even grid a channel; |error| is at most half of the channel's ``step``."""
+    """Values ``[N, C]`` on a grid; |error| is at most half of the channel's ``step``."""
 
     codes: Codes
     """``[C, N]`` unsigned."""
@@ -41,39 +94,23 @@ class Uniform(NamedTuple):
     """Their values, exact ``[E]``."""
 
 
-def quantize(values: Floats, bits: int, *, shared: bool = False) -> Uniform:
-    """Round to ``2^bits`` levels a channel; the outermost :data:`TAIL` at either end is kept exactly where it is far off.
-
-    Args:
-        values: ``[N, C]``, finite, N at least 1.
-        bits: 1 to 16.
-        shared: give all channels one range.
-    """
-    columns = values.T.astype(np.float64)
-    rows = columns.reshape(1, -1) if shared else columns
-    least, most = rows.min(axis=1), rows.max(axis=1)
-    low, high = np.quantile(rows, [TAIL, 1 - TAIL], axis=1, method="nearest")
-    # An end is only cut off where that makes the step a quarter finer; else it costs more than it gains.
-    worth = 1.25 * (high - low) < most - least
-    low, high = np.where(worth, low, least), np.where(worth, high, most)
-    low, high = (np.broadcast_to(end, len(columns)).copy() for end in (low, high))
-    step = (high - low) / (2**bits - 1)
-    safe = np.where(step > 0, step, 1.0)[:, None]
-    levels = np.rint((columns - low[:, None]) / safe)
-    outside = (columns < low[:, None]) | (columns > high[:, None])
-    places = np.flatnonzero(outside).astype(np.uint32)
-    codes = np.clip(levels, 0, 2**bits - 1).astype(code_type(bits))
-    return Uniform(codes, low, step, places, np.ascontiguousarray(values.T).reshape(-1)[places])
+def quantize(values: Floats, grid: Grid) -> Uniform:
+    """Round values ``[N, C]``, finite, to the levels of a grid; those outside of its range are kept exactly."""
+    found, outside = levels(torch.from_numpy(values), grid)
+    codes = found.T.numpy().astype(code_type(grid.bits), order="C")
+    places = np.flatnonzero(outside.T.numpy()).astype(np.uint32)
+    exceptions = np.ascontiguousarray(values.T).reshape(-1)[places]
+    return Uniform(codes, grid.low.numpy(), grid.step.numpy(), places, exceptions)
 
 
 def dequantize(packed: Uniform) -> Floats:
     """Counterpart of :func:`quantize`: ``[N, C]``."""
     channels, n = packed.codes.shape
+    every = torch.arange(int(np.iinfo(packed.codes.dtype).max) + 1, dtype=torch.float64)
+    tables = at_levels(every, *(torch.from_numpy(ends)[:, None] for ends in (packed.low, packed.step))).numpy()
     out = np.empty((n, channels), np.float32)
     for c in range(channels):
-        levels = np.arange(int(np.iinfo(packed.codes.dtype).max) + 1)
-        table = (packed.low[c] + levels * packed.step[c]).astype(np.float32)
-        out[:, c] = table[packed.codes[c]]
+        out[:, c] = tables[c][packed.codes[c]]
     column, row = np.divmod(packed.places.astype(np.int64), max(n, 1))
     out[row, column] = packed.exceptions
     return out
@@ -155,60 +192,110 @@ def rotation_bound(bits: int) -> float:
     return 2 * off / (1 - (3**0.5 / 2 + off) ** 2) ** 0.5
 
 
-def quantize_rotations(quats: Floats, bits: int) -> Rotations:
-    """Keep the three smallest components of each quaternion, whose sign is free.
+def rotation_levels(quats: Tensor, bits: int) -> tuple[Tensor, Tensor]:
+    """Nearest levels of the three smallest components, float64 ``[3, N]``, and which of wxyz is left out ``[N]``.
 
     Args:
         quats: wxyz ``[N, 4]``, finite, any length; one of length zero counts as no rotation, as rasterisers show it.
         bits: a component, 4 to 16.
     """
-    q = quats.astype(np.float64)
-    scale = np.abs(q).max(axis=1, keepdims=True)
-    q = np.where(scale > 0, q / np.where(scale > 0, scale, 1.0), [1.0, 0.0, 0.0, 0.0])
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    largest = np.abs(q).argmax(axis=1)
-    rows = np.arange(len(q))
-    q *= np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
-    others = np.arange(4)[None] != largest[:, None]
-    three = q[others].reshape(-1, 3)
-    codes = np.rint((three / _ROOT_HALF + 1) / 2 * (2**bits - 1)).clip(0, 2**bits - 1)
-    return Rotations(np.ascontiguousarray(codes.T).astype(code_type(bits)), largest.astype(np.uint8))
+    q = quats.double()
+    scale = q.abs().amax(dim=1, keepdim=True)
+    q = torch.where(scale > 0, q / torch.where(scale > 0, scale, 1.0), q.new_tensor([1.0, 0.0, 0.0, 0.0]))
+    largest = q.abs().argmax(dim=1)
+    # Sums are written out, so that they do not depend on the device or on the number of rows.
+    w, x, y, z = q.T
+    length = (w * w + x * x + y * y + z * z).sqrt()
+    sign = torch.where(q.gather(1, largest[:, None])[:, 0] < 0, -1.0, 1.0)
+    w, x, y, z = (component / length * sign for component in (w, x, y, z))
+    three = torch.stack(
+        [torch.where(largest <= i, after, before) for i, (before, after) in enumerate(((w, x), (x, y), (y, z)))]
+    )
+    found = ((three / _ROOT_HALF + 1) / 2 * (2**bits - 1)).round()
+    return found.clamp(0, 2**bits - 1), largest
+
+
+def _component(levels: Tensor, bits: int) -> Tensor:
+    """Components of unit quaternions at levels (float64), float32."""
+    return ((levels * 2 / (2**bits - 1) - 1) * _ROOT_HALF).float()
+
+
+def _unit(three: Tensor, largest: Tensor) -> Tensor:
+    """Unit quaternions wxyz ``[N, 4]``, the largest component positive, of the others ``[3, N]``, float32."""
+    a, b, c = three
+    fourth = (1 - (a * a + b * b + c * c)).clamp_min(0).sqrt()
+    places = []
+    for i in range(4):
+        other = torch.where(largest < i, three[max(i - 1, 0)], three[min(i, 2)])
+        places.append(torch.where(largest == i, fourth, other))
+    w, x, y, z = places
+    length = (w * w + x * x + y * y + z * z).sqrt().clamp_min(torch.finfo(torch.float32).tiny)
+    return torch.stack([place / length for place in places], dim=1)
+
+
+def rounded_rotations(quats: Tensor, bits: int) -> Tensor:
+    """What :func:`dequantize_rotations` makes of :func:`quantize_rotations`, to the bit, on any device: ``[N, 4]``."""
+    found, largest = rotation_levels(quats, bits)
+    return _unit(_component(found, bits), largest)
+
+
+def quantize_rotations(quats: Floats, bits: int) -> Rotations:
+    """Keep the three smallest components of each quaternion, whose sign is free; arguments as :func:`rotation_levels`."""
+    found, largest = rotation_levels(torch.from_numpy(quats), bits)
+    return Rotations(found.numpy().astype(code_type(bits)), largest.numpy().astype(np.uint8))
 
 
 def dequantize_rotations(packed: Rotations, bits: int) -> Floats:
     """Counterpart of :func:`quantize_rotations`: unit quaternions wxyz ``[N, 4]``, the largest component positive."""
-    levels = np.arange(int(np.iinfo(packed.codes.dtype).max) + 1)
-    table = ((levels * 2 / (2**bits - 1) - 1) * _ROOT_HALF).astype(np.float32)
-    three = table[packed.codes]
-    fourth = np.sqrt(np.maximum(1 - (three * three).sum(axis=0), 0))
-    out = np.empty((len(fourth), 4), np.float32)
-    for component in range(4):
-        place = np.where(packed.largest < component, three[max(component - 1, 0)], three[min(component, 2)])
-        out[:, component] = np.where(packed.largest == component, fourth, place)
-    norm = np.sqrt((out * out).sum(axis=1, keepdims=True))
-    out /= np.maximum(norm, np.finfo(np.float32).tiny)
+    every = torch.arange(int(np.iinfo(packed.codes.dtype).max) + 1, dtype=torch.float64)
+    three = _component(every, bits).numpy()[packed.codes]
+    out: Floats = _unit(torch.from_numpy(three), torch.from_numpy(packed.largest)).numpy()
     return out
 
 
-def quantize_weights(weight: Floats) -> tuple[NDArray[np.int8], Floats]:
-    """Round weights to int8 with one step for each output channel; |error| is at most half of the channel's step.
+def weight_steps(weight: Tensor, bits: int) -> Tensor:
+    """A step for each output channel of weights ``[O, ...]``, the largest within 2^(bits - 1) - 1 of it: float32 ``[O]``."""
+    step = weight.reshape(len(weight), -1).double().abs().amax(dim=1) / (2 ** (bits - 1) - 1)
+    stored = step.float()
+    # Rounded up, so that the largest weight does not end one step short.
+    return torch.where(step > 0, torch.nextafter(stored, torch.full_like(stored, torch.inf)), 0.0)
+
+
+def weight_levels(weight: Tensor, step: Tensor, bits: int) -> Tensor:
+    """Nearest levels of weights ``[O, ...]``, float64."""
+    wide = step.reshape(-1, *([1] * (weight.ndim - 1))).double()
+    most = 2 ** (bits - 1) - 1
+    return (weight.double() / torch.where(wide > 0, wide, 1.0)).round().clamp(-most, most)
+
+
+def weights_at(levels: Tensor, step: Tensor) -> Tensor:
+    """Weights at levels ``[O, ...]``, float32."""
+    return levels.float() * step.reshape(-1, *([1] * (levels.ndim - 1)))
+
+
+def rounded_weights(weight: Tensor, step: Tensor, bits: int) -> Tensor:
+    """What :func:`dequantize_weights` makes of :func:`quantize_weights`, to the bit, on any device: ``[O, ...]``."""
+    return weights_at(weight_levels(weight, step, bits), step)
+
+
+def quantize_weights(weight: Floats, step: Floats, bits: int = 8) -> NDArray[np.int8]:
+    """Round weights ``[O, ...]``, finite; |error| is at most half of the channel's step where :func:`weight_steps` made it.
 
     Args:
         weight: ``[O, ...]``, finite.
+        step: of each output channel ``[O]``.
+        bits: 2 to 8.
 
     Returns:
-        Codes ``[O, ...]`` and steps ``[O]``.
+        Codes ``[O, ...]``.
     """
-    flat = weight.reshape(len(weight), -1).astype(np.float64)
-    step = np.abs(flat).max(axis=1, initial=0.0) / 127
-    # A step is rounded up, so that the largest weight is still within 127 of them.
-    stored = np.nextafter(
-        step.astype(np.float32), np.float32(np.inf), where=step > 0, out=np.zeros(len(step), np.float32)
+    codes: NDArray[np.int8] = (
+        weight_levels(torch.from_numpy(weight), torch.from_numpy(step), bits).to(torch.int8).numpy()
     )
-    codes = np.rint(flat / np.where(stored > 0, stored, 1.0).astype(np.float64)[:, None])
-    return codes.astype(np.int8).reshape(weight.shape), stored
+    return codes
 
 
 def dequantize_weights(codes: NDArray[np.int8], step: Floats) -> Floats:
     """Counterpart of :func:`quantize_weights`."""
-    return codes.astype(np.float32) * step.reshape(-1, *([1] * (codes.ndim - 1)))
+    out: Floats = weights_at(torch.from_numpy(codes.astype(np.float32)), torch.from_numpy(step.copy())).numpy()
+    return out

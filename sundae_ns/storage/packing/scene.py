@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as default
 from functools import partial
 from pathlib import Path
@@ -22,9 +22,9 @@ from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives
 from sundae_ns.storage.packing import codebooks, container, quantize, transform
 from sundae_ns.storage.packing.codebooks import Codebooks
-from sundae_ns.storage.packing.config import HeadCodec, PackConfig
+from sundae_ns.storage.packing.codecs import Codecs, as_matrix, fit, part_crumbs
+from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array
-from sundae_ns.storage.packing.morton import scene_order
 from sundae_ns.storage.packing.quantize import Blocks, Rotations, Uniform
 from sundae_ns.storage.packing.transform import Transformed
 from sundae_ns.storage.ply import sh_degree_of
@@ -68,16 +68,6 @@ class PackReport(NamedTuple):
         return sums
 
 
-def _array(values: Tensor) -> NDArray[np.float32]:
-    array: NDArray[np.float32] = values.detach().to("cpu", torch.float32).numpy()
-    return array
-
-
-def _matrix(values: Tensor) -> NDArray[np.float32]:
-    """``[N, ...]`` as contiguous float32 ``[N, C]`` on the CPU."""
-    return np.ascontiguousarray(_array(values).reshape(len(values), -1))
-
-
 def _check(params: Mapping[str, Tensor]) -> None:
     missing = [name for name in SPLAT_NAMES if name not in params]
     if missing:
@@ -109,71 +99,25 @@ def _check(params: Mapping[str, Tensor]) -> None:
 # ------------------------------------------------------------------------------------------------------------- encoding
 
 
-def _encode_uniform(
-    name: str, values: NDArray[np.float32], bits: int, shared: bool = False
-) -> tuple[dict[str, Any], dict[str, Array]]:
-    made = quantize.quantize(values, bits, shared=shared)
-    about = {
-        "codec": "uniform",
-        "bits": bits,
-        "low": made.low.tolist(),
-        "step": made.step.tolist(),
-        "bound": (made.step / 2).tolist(),
-    }
-    codes = made.codes
-    if shared:
-        # Channels of a colour are alike: the first and the last are told by how far they are from the middle one.
-        about["differences"] = True
-        codes = np.stack([codes[0] - codes[1], codes[1], codes[2] - codes[1]])
-    return about, {f"{name}/codes": codes, f"{name}/places": made.places, f"{name}/exceptions": made.exceptions}
+def fit_scene(scene: Scene, config: PackConfig | None = None) -> tuple[Scene, Codecs]:
+    """Choose how to store a scene.
 
+    Args:
+        scene: at least one primitive, all finite.
+        config: in how many bits.
 
-def _encode_books(name: str, values: NDArray[np.float32], books: int) -> tuple[dict[str, Any], dict[str, Array]]:
-    made = codebooks.fit(values, books)
-    arrays: dict[str, Array] = {
-        "indices": made.indices,
-        "entries": made.entries.reshape(books, -1),
-        "steps": made.steps,
-        "rows": made.rows,
-        "exact": made.exact,
-    }
-    about = {"codec": "codebooks", "width": values.shape[1], "bound": made.bound}
-    return about, {f"{name}/{part}": array for part, array in arrays.items()}
+    Returns:
+        The scene with its primitives in the order in which they are stored and their positions rounded, and the codecs.
 
-
-def _encode_transform(name: str, values: NDArray[np.float32], step: float) -> tuple[dict[str, Any], dict[str, Array]]:
-    made = transform.forward(values, step)
-    arrays: dict[str, Array] = {
-        "codes": made.codes,
-        "basis": made.basis.reshape(-1),
-        "rows": made.rows,
-        "exact": made.exact,
-    }
-    about = {"codec": "transform", "step": step, "bound": transform.bound(made)}
-    return about, {f"{name}/{part}": array for part, array in arrays.items()}
-
-
-def _encode_head(head: Mapping[str, Tensor], codec: HeadCodec) -> tuple[dict[str, Any], dict[str, Array]]:
-    names = sorted(head)
-    values = {name: _array(head[name]) for name in names}
-    if not all(np.isfinite(value).all() for value in values.values()):
-        raise PackError("the head has weights that are not finite; go back to an earlier checkpoint")
-    tensors = [[name, list(values[name].shape)] for name in names]
-    weights = [values[name] for name in names if values[name].ndim > 1]
-    plain = [values[name].reshape(-1) for name in names if values[name].ndim <= 1]
-    none = np.zeros(0, np.float32)
-    arrays: dict[str, Array] = {"head/plain": np.concatenate([*plain, none])}
-    if codec == "int8":
-        coded = [quantize.quantize_weights(weight) for weight in weights]
-        arrays["head/weights"] = np.concatenate([*(codes.reshape(-1) for codes, _ in coded), np.zeros(0, np.int8)])
-        arrays["head/steps"] = np.concatenate([*(step for _, step in coded), none])
-    else:
-        largest = max((float(np.abs(weight).max(initial=0.0)) for weight in weights), default=0.0)
-        if largest > np.finfo(np.float16).max:
-            raise PackError(f"the head has a weight of {largest:.3g}, too large for fp16; pack it with int8")
-        flat = np.concatenate([*(weight.reshape(-1) for weight in weights), none])
-        arrays["head/weights"] = flat.astype(np.float16)
-    return {"codec": codec, "tensors": tensors}, arrays
+    Raises:
+        ConfigError: an option cannot work.
+        PackError: the field has no primitives, odd shapes or values that are not finite.
+    """
+    config = config or PackConfig()
+    config.validate()
+    _check(scene.field)
+    field, codecs = fit(scene.field, scene.head, config)
+    return replace(scene, field=field), codecs
 
 
 def write_scene(path: Path, scene: Scene, config: PackConfig | None = None) -> PackReport:
@@ -189,41 +133,32 @@ def write_scene(path: Path, scene: Scene, config: PackConfig | None = None) -> P
         PackError: the field has no primitives, odd shapes or values that are not finite.
         StorageError: no room or no right to write.
     """
-    config = config or PackConfig()
-    config.validate()
-    _check(scene.field)
-    values = {name: _matrix(scene.field[name]) for name in (*SPLAT_NAMES, FEATURES) if name in scene.field}
-    order = scene_order(values["means"])
-    blocks, within = quantize.quantize_positions(values["means"][order], config.position_bits, config.block)
-    order = order[within]
-    values = {name: value[order] for name, value in values.items()}
+    return write_fitted(path, *fit_scene(scene, config))
 
+
+def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
+    """Pack a scene by codecs that were fitted to it, or to what it was before it was trained with them.
+
+    Args:
+        path: the file; its folder must exist.
+        scene: primitives in the order of :func:`fit_scene`. Positions are those of the codecs, whatever it has.
+        codecs: from :func:`fit_scene`.
+
+    Raises:
+        PackError: values are not finite, or it is another scene.
+        StorageError: no room or no right to write.
+    """
+    _check(scene.field)
+    config, blocks = codecs.config, codecs.blocks
+    n = num_primitives(scene.field)
+    wanted = {"means", "features_rest", *codecs.field}
+    if n != len(blocks.deltas) or set(scene.field) != wanted or bool(scene.head) != (codecs.head is not None):
+        raise PackError("the codecs were fitted to another scene; fit them again")
     about: dict[str, Any] = {"means": {"codec": "blocks", "bits": config.position_bits, "block": config.block}}
     arrays: dict[str, Array] = {"means/deltas": blocks.deltas, "means/low": blocks.low, "means/high": blocks.high}
-    rotations = quantize.quantize_rotations(values["quats"], config.rotation_bits)
-    about["quats"] = {
-        "codec": "smallest-three",
-        "bits": config.rotation_bits,
-        "bound": quantize.rotation_bound(config.rotation_bits),
-    }
-    arrays |= {"quats/codes": rotations.codes, "quats/largest": _join_crumbs(rotations.largest)}
-    encoded = {
-        "scales": _encode_uniform("scales", values["scales"], config.scale_bits),
-        "opacities": _encode_uniform("opacities", values["opacities"], config.opacity_bits),
-        "features_dc": _encode_uniform("features_dc", values["features_dc"], config.color_bits, shared=True),
-    }
-    if values["features_rest"].shape[1]:
-        rest = values["features_rest"]
-        if config.harmonics == "transform":
-            encoded["features_rest"] = _encode_transform("features_rest", rest, config.harmonics_step)
-        else:
-            encoded["features_rest"] = _encode_books("features_rest", rest, config.harmonics_books)
-    if FEATURES in values and config.feature_books:
-        encoded[FEATURES] = _encode_books(FEATURES, values[FEATURES], config.feature_books)
-    elif FEATURES in values:
-        encoded[FEATURES] = _encode_uniform(FEATURES, values[FEATURES], config.feature_bits)
-    if scene.head:
-        encoded["head"] = _encode_head(scene.head, config.head)
+    encoded = {name: codec.encode(name, as_matrix(scene.field[name])) for name, codec in codecs.field.items()}
+    if codecs.head is not None:
+        encoded["head"] = codecs.head.encode(scene.head)
     for name, (described, made) in encoded.items():
         about[name] = described
         arrays |= made
@@ -231,27 +166,12 @@ def write_scene(path: Path, scene: Scene, config: PackConfig | None = None) -> P
         for name, (dtype, _) in CAMERAS.items():
             arrays[f"cameras/{name}"] = scene.cameras[name].detach().cpu().numpy().astype(dtype)
 
-    meta = {**scene.meta, "primitives": len(order), "attributes": about}
-    unpacked = sum(value.nbytes for value in values.values()) + sum(4 * value.numel() for value in scene.head.values())
+    meta = {**scene.meta, "primitives": n, "attributes": about}
+    unpacked = 4 * sum(value.numel() for value in (*scene.field.values(), *scene.head.values()))
     size = container.write(path, meta, arrays, unpacked=unpacked, level=config.level)
     sections = {name: section.length for name, section in container.read_header(path).sections.items()}
     sections["header"] = size - sum(sections.values())
-    return PackReport(len(order), size, sections)
-
-
-def _join_crumbs(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Numbers of two bits ``[N]``, four to a byte, the first lowest."""
-    padded = np.zeros(-(-len(values) // 4) * 4, np.uint8)
-    padded[: len(values)] = values
-    four = padded.reshape(-1, 4)
-    joined: NDArray[np.uint8] = np.bitwise_or.reduce(four << np.array([0, 2, 4, 6], np.uint8), axis=1)
-    return joined
-
-
-def _part_crumbs(packed: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
-    """Counterpart of :func:`_join_crumbs`."""
-    parted: NDArray[np.uint8] = packed[:, None] >> np.array([0, 2, 4, 6], np.uint8) & np.uint8(3)
-    return parted.reshape(-1)[:n]
+    return PackReport(n, size, sections)
 
 
 # ------------------------------------------------------------------------------------------------------------- decoding
@@ -323,7 +243,7 @@ def _decode_quats(reader: _Reader, n: int) -> NDArray[np.float32]:
     about = reader.about("quats", ("smallest-three",))
     bits = reader.number(about, "bits", 4, 16)
     codes = reader.section("quats/codes", (_code(bits),), (3, n))
-    largest = _part_crumbs(reader.section("quats/largest", ("|u1",), (-(-n // 4),)), n)
+    largest = part_crumbs(reader.section("quats/largest", ("|u1",), (-(-n // 4),)), n)
     return quantize.dequantize_rotations(Rotations(codes, largest), bits)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ def test_uniform(kind: str, n: int, seed: int) -> None:
     x = values(kind, n, 3, seed)
     bits = 4 + seed % 13
     for shared in (False, True):
-        packed = quantize.quantize(x, bits, shared=shared)
+        packed = quantize.quantize(x, quantize.fit_grid(x, bits, shared=shared))
         error = np.abs(quantize.dequantize(packed).astype(np.float64) - x)
         assert (error <= packed.step / 2 * (1 + 1e-9) + ulp(x)).all()
         assert len(packed.exceptions) <= 2 * quantize.TAIL * x.size + 6
@@ -75,9 +76,9 @@ def test_uniform(kind: str, n: int, seed: int) -> None:
 
 def test_outliers_do_not_ruin_the_range() -> None:
     x = np.random.default_rng(0).normal(size=(10_000, 1)).astype(np.float32)
-    clean = quantize.quantize(x, 8).step
+    clean = quantize.fit_grid(x, 8).step.numpy()
     x[17], x[18] = 1e6, -1e9
-    packed = quantize.quantize(x, 8)
+    packed = quantize.quantize(x, quantize.fit_grid(x, 8))
     assert packed.step <= clean
     assert np.array_equal(quantize.dequantize(packed)[17:19], x[17:19])
 
@@ -146,7 +147,8 @@ def test_no_rotation_stands_for_a_quaternion_of_length_zero() -> None:
 @hard
 def test_weights(kind: str, n: int, seed: int) -> None:
     x = values(kind, n, 18, seed).reshape(n, 2, 3, 3)
-    codes, step = quantize.quantize_weights(x)
+    step = quantize.weight_steps(torch.from_numpy(x), 8).numpy()
+    codes = quantize.quantize_weights(x, step)
     error = np.abs(quantize.dequantize_weights(codes, step).astype(np.float64) - x).reshape(n, -1)
     assert (error <= step[:, None] / 2 * (1 + 1e-6) + ulp(x.reshape(n, -1))).all()
     assert (step <= np.abs(x.reshape(n, -1)).max(axis=1) / 127 * (1 + 1e-6) + 1e-44).all()
@@ -176,7 +178,7 @@ def test_a_further_codebook_mends_the_ones_before() -> None:
 @hard
 def test_transform(kind: str, n: int, seed: int) -> None:
     x = values(kind, n, 9, seed)
-    packed = transform.forward(x, 0.03)
+    packed = transform.forward(x, transform.fit_basis(x, 0.03))
     found = transform.backward(packed).astype(np.float64)
     assert np.array_equal(found[packed.rows].astype(np.float32), x[packed.rows])
     # Sums of nine products in float32.
@@ -189,7 +191,8 @@ def test_transform(kind: str, n: int, seed: int) -> None:
 def test_a_transform_gathers_what_belongs_together(kind: str) -> None:
     rng = np.random.default_rng(0)
     x = np.repeat(values(kind, 2000, 3, 0), 3, axis=1) + 0.001 * rng.normal(size=(2000, 9)).astype(np.float32)
-    packed = transform.forward(x.astype(np.float32), 0.03)
+    x = x.astype(np.float32)
+    packed = transform.forward(x, transform.fit_basis(x, 0.03))
     zeros = (packed.codes == 0).mean(axis=1)
     assert (zeros[3:] > 0.98).all()
     assert (zeros[:3] < 0.2).all()

@@ -1,0 +1,198 @@
+"""What a codec rounds to is what a reader decodes, to the bit, also for values that it was not fitted to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sundae_ns.errors import PackError
+from sundae_ns.storage.packing import (
+    PackConfig,
+    Scene,
+    codebooks,
+    fit_scene,
+    quantize,
+    read_scene,
+    transform,
+    write_fitted,
+    write_scene,
+)
+
+Floats = NDArray[np.float32]
+few = settings(max_examples=40, deadline=None)
+hard = given(
+    st.sampled_from(["normal", "constant", "huge", "tiny", "outliers"]), st.integers(1, 500), st.integers(0, 2**16)
+)
+
+
+def values(kind: str, n: int, width: int, seed: int) -> Floats:
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(n, width))
+    if kind == "constant":
+        x[:] = 0.3
+    elif kind == "outliers":
+        x[rng.random((n, width)) < 0.002] *= 1e6
+    return (x * {"huge": 1e6, "tiny": 1e-30}.get(kind, 1.0)).astype(np.float32)
+
+
+def drifted(x: Floats, seed: int) -> Floats:
+    """What training makes of values: some leave the range."""
+    rng = np.random.default_rng(seed + 1)
+    moved = x + 0.05 * x.std() * rng.normal(size=x.shape)
+    moved[rng.random(len(x)) < 0.01] *= 3
+    return moved.astype(np.float32)
+
+
+@few
+@hard
+def test_uniform(kind: str, n: int, seed: int) -> None:
+    x = values(kind, n, 3, seed)
+    grid = quantize.fit_grid(x, 4 + seed % 13, shared=seed % 2 == 0)
+    for y in (x, drifted(x, seed)):
+        packed = quantize.quantize(y, grid)
+        assert np.array_equal(quantize.rounded(torch.from_numpy(y), grid).numpy(), quantize.dequantize(packed))
+        assert packed.codes.max() < 2**grid.bits
+
+
+@few
+@given(st.integers(1, 500), st.integers(0, 2**16), st.integers(4, 16))
+def test_rotations(n: int, seed: int, bits: int) -> None:
+    q = values("normal", n, 4, seed)
+    q[::7] = [0.5, -0.5, 0.5, 0.5]
+    q[::11] = 0
+    found = quantize.dequantize_rotations(quantize.quantize_rotations(q, bits), bits)
+    assert np.array_equal(quantize.rounded_rotations(torch.from_numpy(q), bits).numpy(), found)
+
+
+@few
+@hard
+def test_weights(kind: str, n: int, seed: int) -> None:
+    x, bits = values(kind, n, 18, seed).reshape(n, 2, 3, 3), 3 + seed % 6
+    step = quantize.weight_steps(torch.from_numpy(x), bits)
+    for y in (x, drifted(x, seed)):
+        codes = quantize.quantize_weights(y, step.numpy(), bits)
+        found = quantize.rounded_weights(torch.from_numpy(y), step, bits).numpy()
+        assert np.array_equal(found, quantize.dequantize_weights(codes, step.numpy()))
+        assert np.abs(codes.astype(int)).max() < 2 ** (bits - 1)
+
+
+@few
+@hard
+def test_transform(kind: str, n: int, seed: int) -> None:
+    x = values(kind, n, 9, seed)
+    basis = transform.fit_basis(x, 0.03)
+    for y in (x, drifted(x, seed)):
+        packed = transform.forward(y, basis)
+        assert np.array_equal(transform.rounded(torch.from_numpy(y), basis).numpy(), transform.backward(packed))
+        assert np.abs(packed.codes.astype(int)).max(initial=0) <= basis.limit
+
+
+@few
+@hard
+def test_codebooks(kind: str, n: int, seed: int) -> None:
+    x = values(kind, n, 9, seed)
+    books = codebooks.books_of(codebooks.fit(x, 1 + seed % 3))
+    for y in (x, drifted(x, seed)):
+        packed = codebooks.encode(y, books)
+        found = codebooks.restore(packed)
+        assert np.array_equal(codebooks.rounded(torch.from_numpy(y), books).numpy(), found)
+        assert np.abs(found.astype(np.float64) - y).max() <= packed.bound
+
+
+def scene(n: int = 700) -> Scene:
+    g = torch.Generator().manual_seed(0)
+    field = {
+        "means": torch.randn(n, 3, generator=g),
+        "scales": torch.randn(n, 3, generator=g) - 5,
+        "quats": torch.randn(n, 4, generator=g),
+        "features_dc": torch.randn(n, 3, generator=g),
+        "features_rest": 0.1 * torch.randn(n, 8, 3, generator=g),
+        "opacities": 2 * torch.randn(n, 1, generator=g),
+        "features": torch.randn(n, 5, generator=g),
+    }
+    return Scene(field, {"a.weight": torch.randn(4, 3, 3, 3, generator=g), "a.bias": torch.randn(4, generator=g)})
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        PackConfig(block=100),
+        PackConfig(scale_bits=5, rotation_bits=6, feature_bits=4, head_bits=4, harmonics_step=0.1, position_bits=10),
+        PackConfig(harmonics="codebooks", feature_books=2, head="fp16", feature_bits=12),
+    ],
+)
+def test_a_file_holds_what_training_saw(tmp_path: Path, config: PackConfig) -> None:
+    fitted, codecs = fit_scene(scene(), config)
+    g = torch.Generator().manual_seed(1)
+    moved = {name: value + 0.02 * torch.randn(value.shape, generator=g) for name, value in fitted.field.items()}
+    assert codecs.head is not None
+    head = {name: codecs.head.within(name, 1.1 * value) for name, value in fitted.head.items()}
+    write_fitted(tmp_path / "a.sundae", Scene(moved, head), codecs)
+    found = read_scene(tmp_path / "a.sundae")
+    seen, seen_head = codecs.rounded(moved), codecs.rounded_head(head)
+    assert torch.equal(found.field["means"], fitted.field["means"])
+    for name in codecs.field:
+        assert torch.equal(found.field[name], seen[name]), name
+        assert not torch.equal(seen[name], moved[name]), name
+    assert found.head.keys() == head.keys()
+    for name, value in found.head.items():
+        assert torch.equal(value, seen_head[name]), name
+
+
+def test_packing_is_fitting_and_writing(tmp_path: Path) -> None:
+    write_scene(tmp_path / "a.sundae", scene(), PackConfig(feature_bits=5))
+    write_fitted(tmp_path / "b.sundae", *fit_scene(scene(), PackConfig(feature_bits=5)))
+    assert (tmp_path / "a.sundae").read_bytes() == (tmp_path / "b.sundae").read_bytes()
+
+
+def without(name: str) -> Scene:
+    whole = scene()
+    return Scene({key: value for key, value in whole.field.items() if key != name}, whole.head)
+
+
+@pytest.mark.parametrize("other", [scene(650), without("features"), Scene(scene().field)])
+def test_codecs_of_another_scene_are_refused(tmp_path: Path, other: Scene) -> None:
+    _, codecs = fit_scene(scene())
+    with pytest.raises(PackError, match="another scene"):
+        write_fitted(tmp_path / "a.sundae", other, codecs)
+    assert not list(tmp_path.iterdir())
+
+
+def test_fewer_bits_of_the_head_are_fewer_bytes(tmp_path: Path) -> None:
+    big = {"a.weight": torch.randn(64, 64, 3, 3, generator=torch.Generator().manual_seed(0))}
+    whole = Scene(scene().field, big)
+    sizes = {}
+    for bits in (8, 6, 4):
+        report = write_scene(tmp_path / "a.sundae", whole, PackConfig(head_bits=bits))
+        sizes[bits] = report.sections["head/weights"]
+        weight, found = big["a.weight"], read_scene(tmp_path / "a.sundae").head["a.weight"]
+        step = weight.flatten(1).abs().amax(dim=1) / (2 ** (bits - 1) - 1)
+        assert ((found - weight).abs().flatten(1).amax(dim=1) <= step / 2 * (1 + 1e-5)).all()
+    assert sizes[6] < 0.8 * sizes[8]
+    assert sizes[4] < 0.7 * sizes[6]
+
+
+@pytest.mark.gpu
+def test_rounding_is_the_same_on_a_gpu() -> None:
+    fitted, codecs = fit_scene(scene(), PackConfig(feature_bits=5))
+    cuda = torch.device("cuda")
+    here, there = codecs.rounded(fitted.field), codecs.to(cuda).rounded(_moved(fitted.field, cuda))
+    for name in codecs.field:
+        if name == "features_rest":  # sums of products in another order: a few roundings to float32
+            assert torch.allclose(here[name], there[name].cpu(), rtol=0, atol=1e-5)
+        else:
+            assert torch.equal(here[name], there[name].cpu()), name
+    head = codecs.to(cuda).rounded_head(_moved(fitted.head, cuda))
+    for name, value in codecs.rounded_head(fitted.head).items():
+        assert torch.equal(value, head[name].cpu()), name
+
+
+def _moved(tensors: dict[str, Tensor], device: torch.device) -> dict[str, Tensor]:
+    return {name: value.to(device) for name, value in tensors.items()}
