@@ -26,7 +26,7 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
     Raises:
         SundaeError: it failed; the message shows the end of its output.
     """
-    # Safe path: `python -m` would look in the current folder first, where an unfinished sundae_ns may lie.
+    # Safe path: `python -m` would look in the current folder first, where another sundae_ns may lie.
     environment = {**os.environ, "COLUMNS": "160", "PYTHONSAFEPATH": "1"}
     last: deque[str] = deque(maxlen=_TAIL)
     with open(log, "w", encoding="utf-8") as file:
