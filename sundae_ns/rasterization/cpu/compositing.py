@@ -28,10 +28,10 @@ from sundae_ns.rasterization.cpu.lanes import (
     magnitude,
     spread,
     store,
-    totals,
+    store_totals,
     zeros,
 )
-from sundae_ns.rasterization.cpu.parallel import as_array, compiled, share
+from sundae_ns.rasterization.cpu.parallel import as_array, compiled, compiled_into, share
 from sundae_ns.rasterization.cpu.tiles import HALF_XX, HALF_YY, OPACITY, XY, Lists, U, V
 from sundae_ns.rasterization.tiles import MIN_ALPHA, TILE
 
@@ -39,8 +39,9 @@ _PIXELS = TILE * TILE
 _LOOK = 8  # list entries between two looks at whether a tile is opaque
 _FAINTEST = 20.0  # exponents end here, far beyond log(255)
 _WORTH_A_THREAD = 8  # tiles
-_MOMENTS = WIDTH  # of a primitive in a tile, behind its channels: six, and two absolute gradients
-_WORTH_A_THREAD_TO_SUM = 20_000  # primitives
+_ABREAST = 8  # channels whose gradients are summed together
+_MOMENTS = 8  # of a primitive in a tile, behind its channels: six, and two absolute gradients
+_WORTH_A_THREAD_TO_SUM = 5_000  # primitives
 
 
 def composite(
@@ -70,8 +71,8 @@ class _Composite(torch.autograd.Function):
         height: int,
         absgrad: bool,
     ) -> tuple[Tensor, Tensor]:
-        image = colors.new_zeros(height, width, colors.shape[1])
-        alpha = colors.new_zeros(height, width, 1)
+        image = np.zeros((height, width, colors.shape[1]), lists.table.dtype)
+        alpha = np.zeros((height, width, 1), lists.table.dtype)
         tiles = lists.columns * lists.rows
         left = np.empty((tiles, _PIXELS), lists.table.dtype)
         last = np.empty((tiles, _PIXELS), np.int32)
@@ -80,15 +81,15 @@ class _Composite(torch.autograd.Function):
             len(lists.busiest),
             *lists.for_blending(),
             as_array(colors),
-            as_array(image),
-            as_array(alpha),
+            image,
+            alpha,
             left,
             last,
             at_least=_WORTH_A_THREAD,
         )
         ctx.save_for_backward(means2d, conics, opacities, colors)
         ctx.lists, ctx.left, ctx.last, ctx.absgrad = lists, left, last, absgrad
-        return image, alpha
+        return torch.from_numpy(image), torch.from_numpy(alpha)
 
     @staticmethod
     @once_differentiable
@@ -97,7 +98,7 @@ class _Composite(torch.autograd.Function):
         lists: Lists = ctx.lists
         want_geometry, want_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
         absgrad = ctx.absgrad and want_geometry
-        padded = -(-colors.shape[1] // WIDTH) * WIDTH
+        padded = -(-colors.shape[1] // _ABREAST) * _ABREAST
         parts = np.empty((len(lists.slots), padded + _MOMENTS), lists.table.dtype)
         share(
             _blend_backward,
@@ -115,8 +116,8 @@ class _Composite(torch.autograd.Function):
             parts,
             at_least=_WORTH_A_THREAD,
         )
-        outputs = [torch.zeros_like(value, memory_format=torch.contiguous_format) for value in ctx.saved_tensors]
-        absolute = torch.zeros_like(outputs[0]) if absgrad else outputs[0].new_zeros(0, 0, 0)
+        outputs = [np.zeros(value.shape, lists.table.dtype) for value in ctx.saved_tensors]
+        absolute = np.zeros(means2d.shape if absgrad else (0, 0, 0), lists.table.dtype)
         share(
             _sum_slots,
             len(lists.ids),
@@ -124,19 +125,30 @@ class _Composite(torch.autograd.Function):
             lists.first_slots,
             lists.table,
             parts,
-            *(as_array(value) for value in (*outputs, absolute)),
+            *outputs,
+            absolute,
             at_least=_WORTH_A_THREAD_TO_SUM,
         )
         if ctx.absgrad:
-            means2d.absgrad = absolute if absgrad else torch.zeros_like(outputs[0])
-        geometry = outputs[:3] if want_geometry else (None, None, None)
-        return *geometry, outputs[3] if want_colors else None, None, None, None, None
+            means2d.absgrad = torch.from_numpy(absolute) if absgrad else torch.zeros_like(means2d)
+        wanted = (want_geometry, want_geometry, want_geometry, want_colors)
+        grads = (torch.from_numpy(output) if want else None for output, want in zip(outputs, wanted))
+        return *grads, None, None, None, None
+
+
+@compiled_into
+def _uncapped_alphas(dx: Any, dy: Any, half_xx: Any, xy: Any, half_yy: Any, opacity: Any) -> Any:
+    exponents = fused(fused(dx, half_xx, dy * xy), dx, dy * dy * half_yy)
+    return decay(least(exponents, _FAINTEST)) * opacity
 
 
 @compiled
-def _uncapped_alphas(across: Any, dy: Any, half_xx: Any, xy: Any, half_yy: Any, opacity: Any) -> Any:
-    exponents = fused(fused(half_xx, across, xy * dy), across, half_yy * dy * dy)
-    return decay(least(exponents, _FAINTEST)) * opacity
+def _pixel_centres(like: Any) -> Any:
+    """Coordinates of the pixels of a tile: x ``[P]`` and y ``[P]``."""
+    across, down = np.empty(_PIXELS, like.dtype), np.empty(_PIXELS, like.dtype)
+    for p in range(_PIXELS):
+        across[p], down[p] = p % TILE + 0.5, p // TILE + 0.5
+    return across, down
 
 
 @compiled
@@ -158,9 +170,10 @@ def _blend(
 ) -> None:
     number = table.dtype.type
     height, width, channels = image.shape
-    centres = np.arange(TILE).astype(table.dtype) + number(0.5)
-    places = load(centres, 0)
-    summed, blended = np.empty(_PIXELS, table.dtype), np.empty((TILE, channels, TILE), table.dtype)
+    across, down = _pixel_centres(table)
+    x = load(across, 0)
+    # Channels of as many pixels as there are lanes stand together.
+    summed, blended = np.empty(_PIXELS, table.dtype), np.empty((_PIXELS // WIDTH, channels, WIDTH), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
@@ -176,46 +189,43 @@ def _blend(
         for entry in range(start, starts[tile + 1]):
             rank = ranks[entry]
             color = channels * ids[rank]
-            across = places - (table[rank, U] - number(left))
-            v = table[rank, V] - number(top)
+            dx, v = x - (table[rank, U] - number(left)), table[rank, V] - number(top)
             half_xx, xy, half_yy = table[rank, HALF_XX], table[rank, XY], table[rank, HALF_YY]
             opacity = table[rank, OPACITY]
             place = entry - start + 1
-            for y in range(spans[entry, 0], spans[entry, 1]):
-                row = y * TILE
-                alphas = least(_uncapped_alphas(across, centres[y] - v, half_xx, xy, half_yy, opacity), MAX_ALPHA)
-                counts = alphas >= MIN_ALPHA
-                if not anywhere(counts):
-                    continue
-                before = load(through, row)
+            for step in range(spans[entry, 0], spans[entry, 1]):
+                p = step * WIDTH
+                alphas = least(_uncapped_alphas(dx, load(down, p) - v, half_xx, xy, half_yy, opacity), MAX_ALPHA)
+                before = load(through, p)
                 behind = before * (1.0 - alphas)
+                counts = alphas >= MIN_ALPHA
                 taken = both(counts, behind > MIN_TRANSMITTANCE)
-                ended = choose(counts, 0.0 - magnitude(before), before)
-                store(through, row, choose(taken, behind, ended))
+                store(through, p, choose(taken, behind, choose(counts, 0.0 - magnitude(before), before)))
                 if not anywhere(taken):
                     continue
                 weights = choose(taken, alphas * before, 0.0)
-                store(blended_last, row, choose(taken, place, load(blended_last, row)))
-                store(summed, row, load(summed, row) + weights)
+                store(blended_last, p, choose(taken, place, load(blended_last, p)))
+                store(summed, p, load(summed, p) + weights)
                 for c in range(channels):
-                    at = row * channels + c * TILE
+                    at = p * channels + c * WIDTH
                     store(blended, at, fused(weights, spread(colors, color + c), load(blended, at)))
             if place % _LOOK == 0 and not _light(through):
                 break
         for p in range(_PIXELS):
             through[p] = abs(through[p])
         for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
+            for x_of_pixel in range(min(TILE, width - left)):
+                p = y * TILE + x_of_pixel
                 for c in range(channels):
-                    image[top + y, left + x, c] = blended[y, c, x]
-                alpha_image[top + y, left + x, 0] = summed[y * TILE + x]
+                    image[top + y, left + x_of_pixel, c] = blended[p // WIDTH, c, p % WIDTH]
+                alpha_image[top + y, left + x_of_pixel, 0] = summed[p]
 
 
-@compiled
+@compiled_into
 def _light(through: Any) -> bool:
     """Whether any pixel of a tile has not ended."""
     light = False
-    for p in range(0, _PIXELS, TILE):
+    for p in range(0, _PIXELS, WIDTH):
         light = light or anywhere(load(through, p) > 0.0)
     return light
 
@@ -246,10 +256,10 @@ def _blend_backward(
     number = table.dtype.type
     height, width, channels = grad_image.shape
     padded = parts.shape[1] - _MOMENTS
-    centres = np.arange(TILE).astype(table.dtype) + number(0.5)
-    places, none = load(centres, 0), zeros(table)
+    across, down = _pixel_centres(table)
+    x, none = load(across, 0), zeros(table)
     through, behind = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
-    weights, grads = np.empty(_PIXELS, table.dtype), np.zeros((TILE, padded, TILE), table.dtype)
+    weights, grads = np.empty(_PIXELS, table.dtype), np.zeros((_PIXELS // WIDTH, padded, WIDTH), table.dtype)
     alpha_grads = np.zeros(_PIXELS, table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
@@ -259,71 +269,78 @@ def _blend_backward(
         blended_last = last[tile]
         # Pixels outside of the image keep what the tile before left there: nothing was blended in them.
         for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
+            for x_of_pixel in range(min(TILE, width - left)):
+                p = y * TILE + x_of_pixel
                 for c in range(channels):
-                    grads[y, c, x] = grad_image[top + y, left + x, c]
-                alpha_grads[y * TILE + x] = grad_alpha[top + y, left + x, 0]
-        deepest = blended_last.max()
-        start = starts[tile]
+                    grads[p // WIDTH, c, p % WIDTH] = grad_image[top + y, left + x_of_pixel, c]
+                alpha_grads[p] = grad_alpha[top + y, left + x_of_pixel, 0]
+        start, deepest = starts[tile], blended_last.max()
         for entry in range(start + deepest, starts[tile + 1]):
             parts[slots[entry]] = 0
         for place in range(deepest, 0, -1):
             entry = start + place - 1
             rank = ranks[entry]
             color = channels * ids[rank]
-            across = places - (table[rank, U] - number(left))
-            v = table[rank, V] - number(top)
+            dx, v = x - (table[rank, U] - number(left)), table[rank, V] - number(top)
             half_xx, xy, half_yy = table[rank, HALF_XX], table[rank, XY], table[rank, HALF_YY]
             opacity = table[rank, OPACITY]
-            first, beyond = spans[entry, 0], spans[entry, 1]
             m = mx = my = mxx = mxy = myy = absolute_x = absolute_y = none
-            for y in range(first, beyond):
-                row, dy = y * TILE, centres[y] - v
-                uncapped = _uncapped_alphas(across, dy, half_xx, xy, half_yy, opacity)
+            for step in range(spans[entry, 0], spans[entry, 1]):
+                p = step * WIDTH
+                dy = load(down, p) - v
+                uncapped = _uncapped_alphas(dx, dy, half_xx, xy, half_yy, opacity)
                 alphas = least(uncapped, MAX_ALPHA)
-                taken = both(alphas >= MIN_ALPHA, load(blended_last, row) >= place)
+                taken = both(alphas >= MIN_ALPHA, load(blended_last, p) >= place)
                 inverse = 1.0 / (1.0 - alphas)
-                before = load(through, row) * inverse
+                before = load(through, p) * inverse
                 weight = choose(taken, alphas * before, 0.0)
-                store(weights, row, weight)
+                store(weights, p, weight)
                 if not anywhere(taken):
                     continue
-                store(through, row, choose(taken, before, load(through, row)))
+                store(through, p, choose(taken, before, load(through, p)))
                 if want_geometry:
-                    pull = load(alpha_grads, row)  # becomes <g, c>
-                    for c in range(channels):
-                        pull = fused(load(grads, row * padded + c * TILE), spread(colors, color + c), pull)
-                    gain = weight * pull
-                    light = load(behind, row)
-                    store(behind, row, light + gain)
+                    gain = weight * (load(alpha_grads, p) + _product(grads, p * padded, colors, color, channels))
+                    light = load(behind, p)
+                    store(behind, p, light + gain)
                     pull = choose(both(taken, uncapped < MAX_ALPHA), gain - alphas * inverse * light, 0.0)
-                    pull_x = pull * across
-                    m, mx, mxx = m + pull, mx + pull_x, fused(pull_x, across, mxx)
-                    my, myy, mxy = fused(pull, dy, my), fused(pull, dy * dy, myy), fused(pull_x, dy, mxy)
+                    pull_x, pull_y = pull * dx, pull * dy
+                    m, mx, my = m + pull, mx + pull_x, my + pull_y
+                    mxx, mxy, myy = fused(pull_x, dx, mxx), fused(pull_x, dy, mxy), fused(pull_y, dy, myy)
                     if absgrad:
-                        slope_x = fused(across, number(2) * half_xx, xy * dy)
-                        slope_y = fused(across, xy, number(2) * half_yy * dy)
+                        slope_x = fused(dx, number(2) * half_xx, dy * xy)
+                        slope_y = fused(dx, xy, dy * (number(2) * half_yy))
                         absolute_x = absolute_x + magnitude(pull * slope_x)
                         absolute_y = absolute_y + magnitude(pull * slope_y)
             part = slots[entry] * parts.shape[1]
             if want_colors:
-                for c in range(0, padded, TILE):
-                    store(parts, part + c, _weighed(weights, grads, first, beyond, c))
-            store(parts, part + padded, totals(m, mx, my, mxx, mxy, myy, absolute_x, absolute_y))
+                for c in range(0, padded, _ABREAST):
+                    _weigh(weights, grads, spans[entry, 0], spans[entry, 1], c, parts, part + c)
+            store_totals(parts, part + padded, m, mx, my, mxx, mxy, myy, absolute_x, absolute_y)
 
 
-@compiled
-def _weighed(weights: Any, grads: Any, first: int, beyond: int, c: int) -> Any:
-    """Sums over some rows of pixels, of the weights times the gradients of eight channels."""
-    a = b = d = e = f = g = h = i = zeros(weights)
-    for y in range(first, beyond):
-        weight = load(weights, y * TILE)
-        at = (y * grads.shape[1] + c) * TILE
-        a, b = fused(weight, load(grads, at), a), fused(weight, load(grads, at + TILE), b)
-        d, e = fused(weight, load(grads, at + 2 * TILE), d), fused(weight, load(grads, at + 3 * TILE), e)
-        f, g = fused(weight, load(grads, at + 4 * TILE), f), fused(weight, load(grads, at + 5 * TILE), g)
-        h, i = fused(weight, load(grads, at + 6 * TILE), h), fused(weight, load(grads, at + 7 * TILE), i)
-    return totals(a, b, d, e, f, g, h, i)
+@compiled_into
+def _product(grads: Any, at: int, colors: Any, color: int, channels: int) -> Any:
+    """<g, c> of some pixels; in two sums, since either waits for itself."""
+    even = odd = zeros(grads)
+    for c in range(0, channels, 2):
+        even = fused(load(grads, at + c * WIDTH), spread(colors, color + c), even)
+        if c + 1 < channels:
+            odd = fused(load(grads, at + c * WIDTH + WIDTH), spread(colors, color + c + 1), odd)
+    return even + odd
+
+
+@compiled_into
+def _weigh(weights: Any, grads: Any, first: int, beyond: int, channel: int, parts: Any, part: int) -> None:
+    """Write the sums over some pixels of a tile, of the weights times the gradients of eight channels."""
+    a = b = c = d = e = f = g = h = zeros(weights)
+    for step in range(first, beyond):
+        weight = load(weights, step * WIDTH)
+        at = (step * grads.shape[1] + channel) * WIDTH
+        a, b = fused(weight, load(grads, at), a), fused(weight, load(grads, at + WIDTH), b)
+        c, d = fused(weight, load(grads, at + 2 * WIDTH), c), fused(weight, load(grads, at + 3 * WIDTH), d)
+        e, f = fused(weight, load(grads, at + 4 * WIDTH), e), fused(weight, load(grads, at + 5 * WIDTH), f)
+        g, h = fused(weight, load(grads, at + 6 * WIDTH), g), fused(weight, load(grads, at + 7 * WIDTH), h)
+    store_totals(parts, part, a, b, c, d, e, f, g, h)
 
 
 @compiled

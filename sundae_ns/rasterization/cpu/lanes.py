@@ -1,10 +1,10 @@
-"""Eight numbers side by side: what a processor computes at once, as a type that compiled loops hold in variables.
+"""Sixteen numbers side by side: what a processor computes at once, as a type that compiled loops hold in variables.
 
-LLVM finds such rows by itself in simple loops only, and not in sums, whose order it must not change. Here they are written down:
-a row of eight pixels is one value, every sum has its order, and a product is rounded unless :func:`fused` is asked for. So no
-number depends on how many lanes a processor has.
+LLVM finds such rows by itself in simple loops only, and not in sums, whose order it must not change. Here they are written
+down: sixteen pixels are one value, every sum has its order, and a product is rounded unless :func:`fused` is asked for. So
+what comes out of them does not depend on how many numbers a processor has room for.
 
-    alphas = opacity * decay(exponents)
+    alphas = decay(exponents) * opacity
     weights = choose(alphas >= MIN_ALPHA, alphas * through, 0.0)
 
 Operators and functions take lanes, or a number that stands in all of them.
@@ -23,14 +23,15 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 from numba.np import arrayobj
 
-WIDTH = 8
-"""Lanes: two registers of SSE or NEON, one of AVX, half of one of AVX-512, in float32."""
+WIDTH = 16
+"""Lanes: in float32 one register of AVX-512, two of AVX, four of SSE or NEON. More registers than one are worth having
+too, since what has to wait is done beside the other half."""
 
 _WORD = ir.IntType(32)
 
 
 class Lanes(types.Type):
-    """Numba's type of eight numbers, or of eight truths, whose number is ``boolean``."""
+    """Numba's type of sixteen numbers, or of sixteen truths, whose number is ``boolean``."""
 
     def __init__(self, number: types.Type) -> None:
         self.number = number
@@ -62,12 +63,12 @@ def _spread(context: Any, builder: Any, value: Any, kind: Any, lanes: Lanes) -> 
 
 
 def _shuffled(builder: Any, a: Any, b: Any, places: Sequence[int]) -> Any:
-    """Lanes of ``a``, numbered from 0, and of ``b``, numbered from 8."""
+    """Lanes of ``a``, numbered from 0, and of ``b``, numbered from 16."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_WORD, len(places)), list(places)))
 
 
 def _lane_by_lane(operands: Sequence[Any], write: Callable[..., Any], result: Lanes | None = None) -> Any:
-    """What an intrinsic returns: its signature, and code that ``write(builder, *lanes)`` adds. None without lanes of numbers."""
+    """What an intrinsic returns: signature, and code that ``write(builder, *lanes)`` adds. None without lanes of numbers."""
     lanes = next((kind for kind in operands if isinstance(kind, Lanes) and kind != TRUTHS), None)
     if lanes is None:
         return None
@@ -174,7 +175,7 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, place: Any) -> A
 
 @_intrinsic
 def load(typing: Any, array: Any, place: Any) -> Any:
-    """Eight numbers of a C-contiguous array, from ``place`` on in the order of memory. Bounds are not checked."""
+    """Sixteen numbers of a C-contiguous array, from ``place`` on in the order of memory. Bounds are not checked."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_address(context, builder, array, *arguments), align=array.dtype.bitwidth // 8)
@@ -196,7 +197,7 @@ def spread(typing: Any, array: Any, place: Any) -> Any:
 
 @_intrinsic
 def store(typing: Any, array: Any, place: Any, values: Any) -> Any:
-    """Write what :func:`load` reads; a number is written eight times."""
+    """Write what :func:`load` reads; a number is written sixteen times."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         lanes = _spread(context, builder, arguments[2], values, Lanes(array.dtype))
@@ -218,35 +219,30 @@ def zeros(typing: Any, array: Any) -> Any:
 
 
 @_intrinsic
-def total(typing: Any, a: Any) -> Any:
-    """The sum of the lanes: of halves, quarters and pairs."""
+def store_totals(
+    typing: Any, array: Any, place: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any
+) -> Any:
+    """Write the sums of eight lanes side by side: of each its halves are added, then neighbours, pairs and quadruples."""
+    rows = (a, b, c, d, e, f, g, h)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        (rest,) = arguments
-        for half in (4, 2, 1):
-            low, high = (_shuffled(builder, rest, rest, range(first, first + half)) for first in (0, half))
-            rest = builder.fadd(low, high)
-        return builder.extract_element(rest, ir.Constant(_WORD, 0))
-
-    return a.number(a), generate
-
-
-@_intrinsic
-def totals(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    """The sums of eight lanes as lanes: neighbours are added, then pairs, then halves."""
-
-    def write(builder: Any, *rows: Any) -> Any:
+        sums = [
+            builder.fadd(_shuffled(builder, row, row, range(8)), _shuffled(builder, row, row, range(8, 16)))
+            for row in arguments[2:]
+        ]
         for size in (1, 2, 4):
-            # Blocks of `size` lanes of one row stand beside those of the next, the first of two on the left of the sum.
-            first = [row * WIDTH + block + i for block in range(0, WIDTH, 2 * size) for row in (0, 1) for i in range(size)]
+            # Blocks of `size` numbers of one row stand beside those of the next.
+            first = [row * 8 + block + i for block in range(0, 8, 2 * size) for row in (0, 1) for i in range(size)]
             second = [place + size for place in first]
-            rows = tuple(
+            sums = [
                 builder.fadd(_shuffled(builder, a, b, first), _shuffled(builder, a, b, second))
-                for a, b in zip(rows[::2], rows[1::2])
-            )
-        return rows[0]
+                for a, b in zip(sums[::2], sums[1::2])
+            ]
+        data = _address(context, builder, array, *arguments[:2])
+        builder.store(sums[0], builder.bitcast(data, sums[0].type.as_pointer()), align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
 
-    return _lane_by_lane((a, b, c, d, e, f, g, h), write)
+    return types.void(array, types.intp, *rows), generate
 
 
 @_intrinsic
@@ -271,9 +267,12 @@ def decay(typing: Any, x: Any) -> Any:
         n = builder.fsub(shifted, large)
         r = _call(builder, "fma", n, constant(high), x)
         r = _call(builder, "fma", n, constant(low), r)
-        value = constant((-1) ** (terms - 1) / factorial(terms - 1))
-        for k in range(terms - 2, -1, -1):
-            value = _call(builder, "fma", value, r, constant((-1) ** k / factorial(k)))
+        square = builder.fmul(r, r)
+        even, odd = (constant((-1) ** k / factorial(k)) for k in (terms - 2, terms - 1))
+        for k in range(terms - 4, -1, -2):
+            even = _call(builder, "fma", even, square, constant((-1) ** k / factorial(k)))
+            odd = _call(builder, "fma", odd, square, constant((-1) ** (k + 1) / factorial(k + 1)))
+        value = _call(builder, "fma", odd, r, even)
         bits = ir.VectorType(ir.IntType(32 if single else 64), WIDTH)
         power = builder.shl(builder.bitcast(shifted, bits), ir.Constant(bits, [mantissa] * WIDTH))
         return builder.bitcast(builder.add(builder.bitcast(value, bits), power), x.type)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sundae_ns.rasterization.cpu.lanes import WIDTH
 from sundae_ns.rasterization.cpu.parallel import as_array, compiled, share
 from sundae_ns.rasterization.projection import Projection
 from sundae_ns.rasterization.tiles import BIN, MIN_ALPHA, ROUNDING, TILE
@@ -22,7 +23,10 @@ from sundae_ns.rasterization.tiles import BIN, MIN_ALPHA, ROUNDING, TILE
 U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, HALF_WIDTH, HALF_HEIGHT = range(9)
 """Columns of the table: centre, conic, opacity, the largest exponent that counts, and how far from the centre it occurs."""
 
-_WORTH_A_THREAD = 10_000  # primitives: below a millisecond, waking a thread costs more than it saves
+STEP = WIDTH // TILE
+"""Rows of pixels of a tile that are blended in one step."""
+
+_WORTH_A_THREAD = 2_500  # primitives: below a tenth of a millisecond, waking a thread costs more than it saves
 _DIGIT = 11  # bits that one pass of the sort looks at
 
 
@@ -38,7 +42,7 @@ class Lists:
     starts: Any  # [T + 1], int64: the list of a tile begins here
     ranks: Any  # [L], int32: in the order of the lists
     slots: Any  # [L], int32: in the order of the lists
-    spans: Any  # [L, 2], uint8, in the order of the lists: the first row of pixels that is touched, and the first that is not
+    spans: Any  # [L, 2], uint8, in the order of the lists: the steps of a tile that are touched, from one to before another
     busiest: Any  # [B], int32: tiles with a list, the longest first
 
     def for_blending(self) -> tuple[Any, ...]:
@@ -144,9 +148,7 @@ def _measure(
 
 
 @compiled
-def _find_bands(
-    begin: int, end: int, table: Any, boxes: Any, first_bands: Any, bands: Any, counts: Any
-) -> None:
+def _find_bands(begin: int, end: int, table: Any, boxes: Any, first_bands: Any, bands: Any, counts: Any) -> None:
     """Write the rows of pixels that a rank touches in each column of tiles, and at rank + 1 the number of tiles."""
     for rank in range(begin, end):
         first_row, end_row = boxes[rank, 1] * TILE, boxes[rank, 3] * TILE
@@ -172,8 +174,8 @@ def _tiles_of(first: int, beyond: int) -> int:
 def _touched(table: Any, rank: int, left: int) -> tuple[float, float]:
     """The lowest and the highest place, in rows of pixels, of exponents that count within a column of tiles.
 
-    They are those inside of an ellipse, from ``slope dx - rise`` to ``slope dx + rise`` at ``dx`` from its centre. Where its top
-    is outside of the column, the highest place is on the edge that is nearer to it; the bottom lies opposite.
+    They are those inside of an ellipse, from ``slope dx - rise`` to ``slope dx + rise`` at ``dx`` from its centre. Where
+    its top is outside of the column, the highest place is on the edge that is nearer to it; the bottom lies opposite.
     """
     xx, xy, yy = float(table[rank, HALF_XX]), float(table[rank, XY]), float(table[rank, HALF_YY])
     half_width, half_height = float(table[rank, HALF_WIDTH]), float(table[rank, HALF_HEIGHT])
@@ -218,7 +220,8 @@ def _sort_by_tile(
                 tile = row * columns + column
                 place = ends[tile]
                 ranks[place], slots[place] = rank, slot
-                spans[place, 0], spans[place, 1] = max(first - row * TILE, 0), min(beyond - row * TILE, TILE)
+                spans[place, 0] = max(first - row * TILE, 0) // STEP
+                spans[place, 1] = (min(beyond - row * TILE, TILE) + STEP - 1) // STEP
                 ends[tile] += 1
                 slot += 1
                 row += 1
