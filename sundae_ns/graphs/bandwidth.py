@@ -83,16 +83,20 @@ def _robust_sigma(distances: Tensor) -> float:
 
 
 def kth_smallest(values: Tensor, k: int) -> float:
-    """The value with ``k`` values before it in ascending order, of values that are not negative, ``inf`` among them.
-
-    On a GPU it is found bit by bit, by counting: the bits of such numbers, read as an integer, rise with the number. It
-    takes one byte a value beside the values, where a sort or a selection on a GPU takes more than the values themselves
-    or runs on one of its many processors. On a CPU see :func:`_kth_smallest_on_cpu`.
-    """
+    """The value with ``k`` values before it in ascending order, of values that are not negative, ``inf`` among them."""
     if values.dtype not in (torch.float32, torch.float64):
         values = values.float()
     if values.device.type == "cpu":
-        return _kth_smallest_on_cpu(np.ascontiguousarray(values.numpy()).reshape(-1), k)
+        return select_near_sample(np.ascontiguousarray(values.numpy()).reshape(-1), k)
+    return select_by_bits(values, k)
+
+
+def select_by_bits(values: Tensor, k: int) -> float:
+    """As :func:`kth_smallest`, of float32 or float64, by counting, which a GPU is good at.
+
+    The bits of such numbers, read as an integer, rise with the number. Bit by bit it takes one byte a value beside the
+    values, where a sort or a selection takes more than the values themselves or runs on one of many processors.
+    """
     integer, highest = (torch.int32, 30) if values.dtype == torch.float32 else (torch.int64, 62)
     bits = values.view(integer)
     found = torch.zeros((), dtype=integer, device=values.device)
@@ -102,10 +106,11 @@ def kth_smallest(values: Tensor, k: int) -> float:
     return float(found.view(values.dtype))
 
 
-def _kth_smallest_on_cpu(values: NDArray[np.floating], k: int) -> float:
-    """As there: between two numbers that a sample puts around it there are few values, and those alone are put in order.
+def select_near_sample(values: NDArray[np.floating], k: int) -> float:
+    """As :func:`kth_smallest`, of ``[M]``, on all threads of a CPU.
 
-    All threads look for them. Were the sample misleading, all values would be put in order; chance has no part in the result.
+    A sample says between which two numbers the value should be; few others are, and those alone are put in order. Where the
+    sample misleads, all values are put in order: chance has no part in the result.
     """
     low, high = -np.inf, np.inf
     if len(values) > SAMPLED:
