@@ -247,7 +247,7 @@ def store_totals(
 
 @_intrinsic
 def decay(typing: Any, x: Any) -> Any:
-    """exp(-x) of lanes between 0 and 80, within one unit in the last place.
+    """exp(-x) of lanes between 0 and 80, within one and a half units in the last place.
 
     2^n exp(-r) with n the integer next to -x / log(2), and Taylor's series for -r, which is at most log(2) / 2.
     """
