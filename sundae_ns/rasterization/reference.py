@@ -70,7 +70,7 @@ def assemble(image: Tensor, alpha: Tensor, means2d: Tensor, radii: Tensor, chann
     """
     height, width, depth = image.shape
     return Rasterization(
-        colors=image[..., :channels],
+        colors=image[..., :channels] if depth > channels else image,
         depth=image[..., channels:] / alpha.clamp(min=_SMALLEST_ALPHA) if depth > channels else None,
         alpha=alpha,
         radii=radii,

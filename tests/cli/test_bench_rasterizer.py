@@ -51,7 +51,8 @@ def test_a_row_for_every_case(bench: Callable[..., Rows]) -> None:
 def test_errors_are_seen() -> None:
     case = Case("cpu", "cpu", "float64", 30, 16, 16, 2, 2.0, 0, torch.get_num_threads())
     backend = select_backend("reference", "cpu")
-    exact = render(case, *draw_view(case), torch.ones(16, 16, 3, dtype=torch.float64), backend)
+    pulls = torch.ones(16, 16, 2, dtype=torch.float64), torch.ones(16, 16, 1, dtype=torch.float64)
+    exact = render(case, *draw_view(case), pulls, backend)
     assert measure(case, exact, 1)["gradient_error"] > 0.1  # of another loss
     assert measure(case, exact, 1)["max_error"] < 1e-12
     exact["picture"][3, 4, 1] += 0.25

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -18,7 +20,9 @@ from sundae_ns.graphs import (
     laplacian,
     radius_neighbors,
 )
-from sundae_ns.graphs.bandwidth import kth_smallest
+from sundae_ns.graphs.bandwidth import kth_smallest, select_by_bits
+
+bandwidth_module = importlib.import_module("sundae_ns.graphs.bandwidth")  # its name is also that of a function
 
 
 def cloud(n: int = 120, seed: int = 0) -> torch.Tensor:
@@ -78,11 +82,30 @@ def test_overrides_replace_the_rule() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_median_by_counting_is_the_median(dtype: torch.dtype) -> None:
+@pytest.mark.parametrize(
+    ("select", "sampled"),
+    [(select_by_bits, 0), (kth_smallest, 2**16), (kth_smallest, 256), (kth_smallest, 1)],
+    ids=["by bits", "all in order", "near a sample", "near a sample of one"],
+)
+def test_selection_is_what_sorting_gives(
+    dtype: torch.dtype, select: Callable, sampled: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bandwidth_module, "SAMPLED", sampled)
+    monkeypatch.setattr(bandwidth_module, "CHUNK", 100)
     values = torch.cat([cloud(300).abs().flatten(), torch.zeros(40), torch.tensor([1e-40, 1e-30, 1e30, torch.inf])])
     values = values[torch.randperm(len(values))].to(dtype)
     ordered = values.sort().values.tolist()
     for k in (0, 30, 40, 41, 42, 500, len(values) - 2, len(values) - 1):
+        assert select(values, k) == ordered[k]
+
+
+def test_a_sample_that_misleads_does_no_harm(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every value that the sample sees is 1, and not one of the others is."""
+    monkeypatch.setattr(bandwidth_module, "SAMPLED", 64)
+    values = torch.arange(10_000.0)
+    values[torch.from_numpy(np.random.default_rng(0).integers(10_000, size=64))] = 1.0
+    ordered = values.sort().values.tolist()
+    for k in (0, 5000, 9999):
         assert kth_smallest(values, k) == ordered[k]
 
 

@@ -413,7 +413,7 @@ if child == 0:
     torch.set_num_threads(2)
     from sundae_ns.rasterization.cpu import parallel
     parallel.torch.get_num_threads = lambda: 2  # torch's own pool does not survive a fork, and is not asked here
-    from sundae_ns.rasterization.cpu.tiles import _cells, _sort_by_cell
+    from sundae_ns.rasterization.cpu.tiles import _sort_by_tile
     import numpy as np
     done = np.zeros(1 << 16)
     parallel.share(lambda begin, end: done[begin:end].fill(1), 1 << 16)

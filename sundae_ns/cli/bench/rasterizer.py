@@ -129,16 +129,16 @@ def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
         repeats: timed runs, fewer where they take longer than ``WORTH_IT`` seconds together.
     """
     backend = select_backend(_name(case.rasterizer), case.device)
-    pull = _pull(case).to(case.device, DTYPES[case.dtype])
+    pulls = _pulls(case, DTYPES[case.dtype], case.device)
     scene, camera = (
         {key: value.to(case.device, DTYPES[case.dtype]) for key, value in part.items()} for part in draw_view(case)
     )
-    found = render(case, scene, camera, pull, backend)
+    found = render(case, scene, camera, pulls, backend)
     errors = {key: (found[key].cpu().double() - exact[key]) for key in exact}
     gradients = {
         key: float(errors[key].norm()) / max(float(exact[key].norm()), 1e-30) for key in errors if key in scene
     }
-    picture = errors["picture"].abs()
+    picture = torch.cat([errors["picture"], errors["alpha"]], dim=-1).abs()
     del found, errors
 
     def forward() -> None:
@@ -146,7 +146,7 @@ def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
             _picture(case, scene, camera, backend)
 
     forward_ms, forward_cpu_ms, _ = _median_ms(forward, repeats, case.device)
-    both = _median_ms(lambda: render(case, scene, camera, pull, backend), repeats, case.device)
+    both = _median_ms(lambda: render(case, scene, camera, pulls, backend), repeats, case.device)
     return {
         "forward_ms": _rounded(forward_ms),
         "forward_backward_ms": _rounded(both[0]),
@@ -162,12 +162,16 @@ def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
     }
 
 
-def render(case: Case, scene: Drawn, camera: Drawn, pull: Tensor, backend: Backend) -> Drawn:
-    """The picture with alpha behind the channels ``[H, W, C + 1]``, and the gradients of its product with ``pull``."""
+def render(case: Case, scene: Drawn, camera: Drawn, pulls: tuple[Tensor, Tensor], backend: Backend) -> Drawn:
+    """Picture ``[H, W, C]``, alpha ``[H, W, 1]``, and the gradients of what their products with the pulls add up to.
+
+    Nothing of torch's stands between rasteriser and gradients: it would be timed, and its threads would go on waiting on the
+    cores that the way back needs.
+    """
     leaves = {key: value.detach().requires_grad_() for key, value in scene.items()}
-    picture = _picture(case, leaves, camera, backend)
-    gradients = torch.autograd.grad(picture, list(leaves.values()), pull)
-    return {"picture": picture.detach(), **dict(zip(leaves, gradients))}
+    picture, alpha = _picture(case, leaves, camera, backend)
+    gradients = torch.autograd.grad((picture, alpha), list(leaves.values()), pulls)
+    return {"picture": picture.detach(), "alpha": alpha.detach(), **dict(zip(leaves, gradients))}
 
 
 class _Oracle:
@@ -180,12 +184,12 @@ class _Oracle:
     def __call__(self, case: Case) -> Drawn:
         view = (case.primitives, case.width, case.height, case.channels, case.pixels, case.seed)
         if view != self._view:
-            self._exact = render(case, *draw_view(case), _pull(case), select_backend("reference", "cpu"))
+            self._exact = render(case, *draw_view(case), _pulls(case), select_backend("reference", "cpu"))
             self._view = view
         return self._exact
 
 
-def _picture(case: Case, scene: Drawn, camera: Drawn, backend: Backend) -> Tensor:
+def _picture(case: Case, scene: Drawn, camera: Drawn, backend: Backend) -> tuple[Tensor, Tensor]:
     view = rasterize(
         scene["means"],
         scene["quats"],
@@ -198,13 +202,14 @@ def _picture(case: Case, scene: Drawn, camera: Drawn, backend: Backend) -> Tenso
         case.height,
         backend=backend,
     )
-    return torch.cat([view.colors, view.alpha], dim=-1)
+    return view.colors, view.alpha
 
 
-def _pull(case: Case) -> Tensor:
-    """What the loss pulls at each value of the picture: fixed random numbers, of float32."""
+def _pulls(case: Case, dtype: torch.dtype = torch.float64, device: str = "cpu") -> tuple[Tensor, Tensor]:
+    """What the loss pulls at each value of the picture and of alpha: fixed random numbers, of float32."""
     generator = torch.Generator().manual_seed(case.seed + 1)
-    return torch.randn(case.height, case.width, case.channels + 1, generator=generator).double()
+    pull = torch.randn(case.height, case.width, case.channels + 1, generator=generator).to(device, dtype)
+    return pull[..., :-1].contiguous(), pull[..., -1:].contiguous()
 
 
 def _backends(names: Sequence[BackendName]) -> Iterator[tuple[str, str]]:

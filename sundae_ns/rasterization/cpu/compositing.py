@@ -8,19 +8,30 @@ blended in a pixel, it knows from the number of the last one.
 
 from __future__ import annotations
 
-from math import exp
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
-from llvmlite import ir
-from numba.core import types
-from numba.extending import intrinsic, overload
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sundae_ns.rasterization.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
-from sundae_ns.rasterization.cpu.parallel import as_array, compiled, compiled_for_simd, share
+from sundae_ns.rasterization.cpu.lanes import (
+    WIDTH,
+    anywhere,
+    both,
+    choose,
+    decay,
+    fused,
+    least,
+    load,
+    magnitude,
+    spread,
+    store,
+    store_totals,
+    zeros,
+)
+from sundae_ns.rasterization.cpu.parallel import as_array, compiled, compiled_into, share
 from sundae_ns.rasterization.cpu.tiles import HALF_XX, HALF_YY, OPACITY, XY, Lists, U, V
 from sundae_ns.rasterization.tiles import MIN_ALPHA, TILE
 
@@ -28,9 +39,9 @@ _PIXELS = TILE * TILE
 _LOOK = 8  # list entries between two looks at whether a tile is opaque
 _FAINTEST = 20.0  # exponents end here, far beyond log(255)
 _WORTH_A_THREAD = 8  # tiles
-_ABREAST = 4  # channels that a loop over pixels takes together
-_MOMENTS = 6  # of a primitive in a tile, behind its channels
-_WORTH_A_THREAD_TO_SUM = 20_000  # primitives
+_ABREAST = 8  # channels whose gradients are summed together
+_MOMENTS = 8  # of a primitive in a tile, behind its channels: six, and two absolute gradients
+_WORTH_A_THREAD_TO_SUM = 5_000  # primitives
 
 
 def composite(
@@ -60,32 +71,25 @@ class _Composite(torch.autograd.Function):
         height: int,
         absgrad: bool,
     ) -> tuple[Tensor, Tensor]:
-        image = colors.new_zeros(height, width, colors.shape[1])
-        alpha = colors.new_zeros(height, width, 1)
+        image = np.zeros((height, width, colors.shape[1]), lists.table.dtype)
+        alpha = np.zeros((height, width, 1), lists.table.dtype)
         tiles = lists.columns * lists.rows
-        packed = np.zeros((len(lists.ids), -(-colors.shape[1] // _ABREAST) * _ABREAST), lists.table.dtype)
-        packed[:, : colors.shape[1]] = as_array(colors)[lists.ids]
         left = np.empty((tiles, _PIXELS), lists.table.dtype)
         last = np.empty((tiles, _PIXELS), np.int32)
         share(
             _blend,
             len(lists.busiest),
-            lists.busiest,
-            lists.starts,
-            lists.ranks,
-            lists.table,
-            packed,
-            lists.columns,
-            as_array(image),
-            as_array(alpha),
+            *lists.for_blending(),
+            as_array(colors),
+            image,
+            alpha,
             left,
             last,
             at_least=_WORTH_A_THREAD,
         )
         ctx.save_for_backward(means2d, conics, opacities, colors)
-        ctx.packed = packed
         ctx.lists, ctx.left, ctx.last, ctx.absgrad = lists, left, last, absgrad
-        return image, alpha
+        return torch.from_numpy(image), torch.from_numpy(alpha)
 
     @staticmethod
     @once_differentiable
@@ -94,18 +98,14 @@ class _Composite(torch.autograd.Function):
         lists: Lists = ctx.lists
         want_geometry, want_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
         absgrad = ctx.absgrad and want_geometry
-        # A tile that became opaque leaves the slots of its later entries alone.
-        parts = np.zeros((len(lists.slots), ctx.packed.shape[1] + _MOMENTS + 2 * absgrad), lists.table.dtype)
+        padded = -(-colors.shape[1] // _ABREAST) * _ABREAST
+        parts = np.empty((len(lists.slots), padded + _MOMENTS), lists.table.dtype)
         share(
             _blend_backward,
             len(lists.busiest),
-            lists.busiest,
-            lists.starts,
-            lists.ranks,
+            *lists.for_blending(),
+            as_array(colors),
             lists.slots,
-            lists.table,
-            ctx.packed,
-            lists.columns,
             ctx.left,
             ctx.last,
             as_array(grad_image),
@@ -116,8 +116,8 @@ class _Composite(torch.autograd.Function):
             parts,
             at_least=_WORTH_A_THREAD,
         )
-        outputs = [torch.zeros_like(value, memory_format=torch.contiguous_format) for value in ctx.saved_tensors]
-        absolute = torch.zeros_like(outputs[0]) if absgrad else outputs[0].new_zeros(0, 0, 0)
+        outputs = [np.zeros(value.shape, lists.table.dtype) for value in ctx.saved_tensors]
+        absolute = np.zeros(means2d.shape if absgrad else (0, 0, 0), lists.table.dtype)
         share(
             _sum_slots,
             len(lists.ids),
@@ -125,163 +125,124 @@ class _Composite(torch.autograd.Function):
             lists.first_slots,
             lists.table,
             parts,
-            *(as_array(value) for value in (*outputs, absolute)),
+            *outputs,
+            absolute,
             at_least=_WORTH_A_THREAD_TO_SUM,
         )
         if ctx.absgrad:
-            means2d.absgrad = absolute if absgrad else torch.zeros_like(outputs[0])
-        geometry = outputs[:3] if want_geometry else (None, None, None)
-        return *geometry, outputs[3] if want_colors else None, None, None, None, None
+            means2d.absgrad = torch.from_numpy(absolute) if absgrad else torch.zeros_like(means2d)
+        wanted = (want_geometry, want_geometry, want_geometry, want_colors)
+        grads = (torch.from_numpy(output) if want else None for output, want in zip(outputs, wanted))
+        return *grads, None, None, None, None
 
 
-@cast(Any, intrinsic)
-def _fused(typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """a * b + c, rounded once: so that the way back computes the very alphas of the way there."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.fma(*arguments)
-
-    return a(a, a, a), generate
-
-
-@cast(Any, intrinsic)
-def _power_of_two(typing: Any, exponent: Any) -> Any:
-    """2 to the power of an int32, float32: its bits are the exponent, shifted."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        word = ir.IntType(32)
-        bits = builder.shl(builder.add(arguments[0], word(127)), word(23))
-        return builder.bitcast(bits, ir.FloatType())
-
-    return types.float32(types.int32), generate
-
-
-def _exp(x: Any) -> Any:
-    """exp(x) for x in [-20, 0]: in float32 without a call, so that it runs in SIMD lanes, within one unit in the last place."""
-    raise NotImplementedError
-
-
-@overload(_exp)
-def _exp_by_type(x: Any) -> Any:
-    def double(x: Any) -> Any:
-        return exp(x)
-
-    def single(x: Any) -> Any:
-        number = np.float32
-        whole = _fused(x, number(1.4426950408889634), number(12582912.0)) - number(12582912.0)  # rounds x / log(2)
-        # log(2) in two parts, of which the first has so few bits that its product is exact.
-        rest = _fused(whole, number(-0.693359375), x)
-        rest = _fused(whole, number(2.12194440e-4), rest)
-        # Taylor's series; |rest| is at most log(2) / 2.
-        value = number(1 / 5040)
-        value = _fused(value, rest, number(1 / 720))
-        value = _fused(value, rest, number(1 / 120))
-        value = _fused(value, rest, number(1 / 24))
-        value = _fused(value, rest, number(1 / 6))
-        value = _fused(value, rest, number(0.5))
-        value = _fused(value, rest, number(1.0))
-        value = _fused(value, rest, number(1.0))
-        return value * _power_of_two(np.int32(whole))
-
-    return single if x == types.float32 else double
+@compiled_into
+def _uncapped_alphas(dx: Any, dy: Any, half_xx: Any, xy: Any, half_yy: Any, opacity: Any) -> Any:
+    exponents = fused(fused(dx, half_xx, dy * xy), dx, dy * dy * half_yy)
+    return decay(least(exponents, _FAINTEST)) * opacity
 
 
 @compiled
-def _uncapped_alpha(dx: Any, dy: Any, half_xx: Any, xy: Any, half_yy: Any, opacity: Any, faintest: Any) -> Any:
-    exponent = _fused(_fused(half_xx, dx, xy * dy), dx, half_yy * dy * dy)
-    return opacity * _exp(-min(exponent, faintest))
+def _pixel_centres(like: Any) -> Any:
+    """Coordinates of the pixels of a tile: x ``[P]`` and y ``[P]``."""
+    across, down = np.empty(_PIXELS, like.dtype), np.empty(_PIXELS, like.dtype)
+    for p in range(_PIXELS):
+        across[p], down[p] = p % TILE + 0.5, p // TILE + 0.5
+    return across, down
 
 
-@compiled_for_simd
+@compiled
 def _blend(
     begin: int,
     end: int,
+    columns: int,
     tiles: Any,
     starts: Any,
     ranks: Any,
+    spans: Any,
+    ids: Any,
     table: Any,
     colors: Any,
-    columns: int,
     image: Any,
     alpha_image: Any,
     left_over: Any,
     last: Any,
 ) -> None:
     number = table.dtype.type
-    zero, one, faintest = number(0), number(1), number(_FAINTEST)
-    least, most, enough = number(MIN_ALPHA), number(MAX_ALPHA), number(MIN_TRANSMITTANCE)
     height, width, channels = image.shape
-    across, down = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
-    for p in range(_PIXELS):
-        across[p], down[p] = number(p % TILE + 0.5), number(p // TILE + 0.5)
-    through, weights = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
-    summed, blended = np.empty(_PIXELS, table.dtype), np.empty((colors.shape[1], _PIXELS), table.dtype)
+    across, down = _pixel_centres(table)
+    x = load(across, 0)
+    # Channels of as many pixels as there are lanes stand together.
+    summed, blended = np.empty(_PIXELS, table.dtype), np.empty((_PIXELS // WIDTH, channels, WIDTH), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        rest, blended_last = left_over[tile], last[tile]
+        # Light that comes through a pixel; negative once it has ended, and outside of the image.
+        through, blended_last = left_over[tile], last[tile]
         for p in range(_PIXELS):
             inside = left + p % TILE < width and top + p // TILE < height
-            through[p] = one if inside else zero
-            rest[p], blended_last[p], summed[p] = one, 0, zero
-        blended[:] = zero
+            through[p] = number(1) if inside else number(-1)
+        blended_last[:] = 0
+        summed[:] = 0
+        blended[:] = 0
         start = starts[tile]
         for entry in range(start, starts[tile + 1]):
             rank = ranks[entry]
-            u, v = table[rank, U] - number(left), table[rank, V] - number(top)
+            color = channels * ids[rank]
+            dx, v = x - (table[rank, U] - number(left)), table[rank, V] - number(top)
             half_xx, xy, half_yy = table[rank, HALF_XX], table[rank, XY], table[rank, HALF_YY]
             opacity = table[rank, OPACITY]
-            place = np.int32(entry - start + 1)
-            total = zero
-            for p in range(_PIXELS):
-                alpha = _uncapped_alpha(across[p] - u, down[p] - v, half_xx, xy, half_yy, opacity, faintest)
-                alpha = min(alpha, most)
-                before = through[p]
-                behind = before * (one - alpha)
-                counts = alpha >= least
-                goes_on = behind > enough
-                taken = counts and goes_on
-                weight = alpha * before if taken else zero
-                # A pixel that has ended is left no light at all.
-                through[p] = (behind if goes_on else zero) if counts else before
-                rest[p] = behind if taken else rest[p]
-                blended_last[p] = place if taken else blended_last[p]
-                weights[p] = weight
-                summed[p] += weight
-                total += weight
-            if total > zero:
-                for c in range(0, len(blended), _ABREAST):
-                    c0, c1, c2, c3 = colors[rank, c], colors[rank, c + 1], colors[rank, c + 2], colors[rank, c + 3]
-                    for p in range(_PIXELS):
-                        weight = weights[p]
-                        blended[c, p] += c0 * weight
-                        blended[c + 1, p] += c1 * weight
-                        blended[c + 2, p] += c2 * weight
-                        blended[c + 3, p] += c3 * weight
-            if place % _LOOK == 0:
-                light = zero
-                for p in range(_PIXELS):
-                    light += through[p]
-                if light == zero:
-                    break
-        for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
+            place = entry - start + 1
+            for step in range(spans[entry, 0], spans[entry, 1]):
+                p = step * WIDTH
+                alphas = least(_uncapped_alphas(dx, load(down, p) - v, half_xx, xy, half_yy, opacity), MAX_ALPHA)
+                before = load(through, p)
+                behind = before * (1.0 - alphas)
+                counts = alphas >= MIN_ALPHA
+                taken = both(counts, behind > MIN_TRANSMITTANCE)
+                store(through, p, choose(taken, behind, choose(counts, 0.0 - magnitude(before), before)))
+                if not anywhere(taken):
+                    continue
+                weights = choose(taken, alphas * before, 0.0)
+                store(blended_last, p, choose(taken, place, load(blended_last, p)))
+                store(summed, p, load(summed, p) + weights)
                 for c in range(channels):
-                    image[top + y, left + x, c] = blended[c, y * TILE + x]
-                alpha_image[top + y, left + x, 0] = summed[y * TILE + x]
+                    at = p * channels + c * WIDTH
+                    store(blended, at, fused(weights, spread(colors, color + c), load(blended, at)))
+            if place % _LOOK == 0 and not _light(through):
+                break
+        for p in range(_PIXELS):
+            through[p] = abs(through[p])
+        for y in range(min(TILE, height - top)):
+            for x_of_pixel in range(min(TILE, width - left)):
+                p = y * TILE + x_of_pixel
+                for c in range(channels):
+                    image[top + y, left + x_of_pixel, c] = blended[p // WIDTH, c, p % WIDTH]
+                alpha_image[top + y, left + x_of_pixel, 0] = summed[p]
 
 
-@compiled_for_simd
+@compiled_into
+def _light(through: Any) -> bool:
+    """Whether any pixel of a tile has not ended."""
+    light = False
+    for p in range(0, _PIXELS, WIDTH):
+        light = light or anywhere(load(through, p) > 0.0)
+    return light
+
+
+@compiled
 def _blend_backward(
     begin: int,
     end: int,
+    columns: int,
     tiles: Any,
     starts: Any,
     ranks: Any,
-    slots: Any,
+    spans: Any,
+    ids: Any,
     table: Any,
     colors: Any,
-    columns: int,
+    slots: Any,
     left_over: Any,
     last: Any,
     grad_image: Any,
@@ -293,94 +254,93 @@ def _blend_backward(
 ) -> None:
     """Write, for every slot, the gradient of the channels, the moments of dL/de, and the absolute gradient of the centre."""
     number = table.dtype.type
-    zero, one, faintest = number(0), number(1), number(_FAINTEST)
-    least, most = number(MIN_ALPHA), number(MAX_ALPHA)
     height, width, channels = grad_image.shape
-    across, down = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
-    for p in range(_PIXELS):
-        across[p], down[p] = number(p % TILE + 0.5), number(p // TILE + 0.5)
-    through, weights = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
-    behind, pulls = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
-    grads, alpha_grads = np.zeros((colors.shape[1], _PIXELS), table.dtype), np.zeros(_PIXELS, table.dtype)
+    padded = parts.shape[1] - _MOMENTS
+    across, down = _pixel_centres(table)
+    x, none = load(across, 0), zeros(table)
+    through, behind = np.empty(_PIXELS, table.dtype), np.empty(_PIXELS, table.dtype)
+    weights, grads = np.empty(_PIXELS, table.dtype), np.zeros((_PIXELS // WIDTH, padded, WIDTH), table.dtype)
+    alpha_grads = np.zeros(_PIXELS, table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        through[:] = left_over[tile]
+        behind[:] = 0
         blended_last = last[tile]
-        deepest = 0
-        for p in range(_PIXELS):
-            through[p], behind[p] = left_over[tile, p], zero
-            deepest = max(deepest, blended_last[p])
         # Pixels outside of the image keep what the tile before left there: nothing was blended in them.
         for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
+            for x_of_pixel in range(min(TILE, width - left)):
+                p = y * TILE + x_of_pixel
                 for c in range(channels):
-                    grads[c, y * TILE + x] = grad_image[top + y, left + x, c]
-                alpha_grads[y * TILE + x] = grad_alpha[top + y, left + x, 0]
+                    grads[p // WIDTH, c, p % WIDTH] = grad_image[top + y, left + x_of_pixel, c]
+                alpha_grads[p] = grad_alpha[top + y, left + x_of_pixel, 0]
+        start, deepest = starts[tile], blended_last.max()
+        for entry in range(start + deepest, starts[tile + 1]):
+            parts[slots[entry]] = 0
         for place in range(deepest, 0, -1):
-            entry = starts[tile] + place - 1
-            rank, slot = ranks[entry], slots[entry]
-            u, v = table[rank, U] - number(left), table[rank, V] - number(top)
+            entry = start + place - 1
+            rank = ranks[entry]
+            color = channels * ids[rank]
+            dx, v = x - (table[rank, U] - number(left)), table[rank, V] - number(top)
             half_xx, xy, half_yy = table[rank, HALF_XX], table[rank, XY], table[rank, HALF_YY]
             opacity = table[rank, OPACITY]
-            number_here = np.int32(place)
-            if want_geometry:
-                for p in range(_PIXELS):
-                    pulls[p] = alpha_grads[p]
-                for c in range(0, len(grads), _ABREAST):
-                    c0, c1, c2, c3 = colors[rank, c], colors[rank, c + 1], colors[rank, c + 2], colors[rank, c + 3]
-                    for p in range(_PIXELS):  # becomes <g, c>
-                        pulls[p] += (
-                            c0 * grads[c, p] + c1 * grads[c + 1, p] + c2 * grads[c + 2, p] + c3 * grads[c + 3, p]
-                        )
-            m = mx = my = mxx = mxy = myy = zero
-            total = zero
-            for p in range(_PIXELS):
-                dx, dy = across[p] - u, down[p] - v
-                uncapped = _uncapped_alpha(dx, dy, half_xx, xy, half_yy, opacity, faintest)
-                alpha = min(uncapped, most)
-                taken = alpha >= least and number_here <= blended_last[p]
-                inverse = one / (one - alpha)
-                before = through[p] * inverse
-                weight = alpha * before if taken else zero
-                through[p] = before if taken else through[p]
-                weights[p] = weight
-                total += weight
-                gain = weight * pulls[p]
-                pull = gain - alpha * inverse * behind[p]
-                behind[p] += gain
-                pull = pull if taken and uncapped < most else zero
-                pulls[p] = pull
-                m += pull
-                mx += pull * dx
-                my += pull * dy
-                mxx += pull * dx * dx
-                mxy += pull * dx * dy
-                myy += pull * dy * dy
-            if not total > zero:
-                continue
+            m = mx = my = mxx = mxy = myy = absolute_x = absolute_y = none
+            for step in range(spans[entry, 0], spans[entry, 1]):
+                p = step * WIDTH
+                dy = load(down, p) - v
+                uncapped = _uncapped_alphas(dx, dy, half_xx, xy, half_yy, opacity)
+                alphas = least(uncapped, MAX_ALPHA)
+                taken = both(alphas >= MIN_ALPHA, load(blended_last, p) >= place)
+                inverse = 1.0 / (1.0 - alphas)
+                before = load(through, p) * inverse
+                weight = choose(taken, alphas * before, 0.0)
+                store(weights, p, weight)
+                if not anywhere(taken):
+                    continue
+                store(through, p, choose(taken, before, load(through, p)))
+                if want_geometry:
+                    gain = weight * (load(alpha_grads, p) + _product(grads, p * padded, colors, color, channels))
+                    light = load(behind, p)
+                    store(behind, p, light + gain)
+                    pull = choose(both(taken, uncapped < MAX_ALPHA), gain - alphas * inverse * light, 0.0)
+                    pull_x, pull_y = pull * dx, pull * dy
+                    m, mx, my = m + pull, mx + pull_x, my + pull_y
+                    mxx, mxy, myy = fused(pull_x, dx, mxx), fused(pull_x, dy, mxy), fused(pull_y, dy, myy)
+                    if absgrad:
+                        slope_x = fused(dx, number(2) * half_xx, dy * xy)
+                        slope_y = fused(dx, xy, dy * (number(2) * half_yy))
+                        absolute_x = absolute_x + magnitude(pull * slope_x)
+                        absolute_y = absolute_y + magnitude(pull * slope_y)
+            part = slots[entry] * parts.shape[1]
             if want_colors:
-                for c in range(0, len(grads), _ABREAST):
-                    g0 = g1 = g2 = g3 = zero
-                    for p in range(_PIXELS):
-                        weight = weights[p]
-                        g0 += weight * grads[c, p]
-                        g1 += weight * grads[c + 1, p]
-                        g2 += weight * grads[c + 2, p]
-                        g3 += weight * grads[c + 3, p]
-                    parts[slot, c], parts[slot, c + 1], parts[slot, c + 2], parts[slot, c + 3] = g0, g1, g2, g3
-            if want_geometry:
-                moments = parts[slot, len(grads) :]
-                moments[0], moments[1], moments[2] = m, mx, my
-                moments[3], moments[4], moments[5] = mxx, mxy, myy
-            if absgrad:
-                xx, yy = number(2) * half_xx, number(2) * half_yy
-                absolute_x = absolute_y = zero
-                for p in range(_PIXELS):
-                    dx, dy = across[p] - u, down[p] - v
-                    absolute_x += abs(pulls[p] * (xx * dx + xy * dy))
-                    absolute_y += abs(pulls[p] * (xy * dx + yy * dy))
-                parts[slot, len(grads) + _MOMENTS] = absolute_x
-                parts[slot, len(grads) + _MOMENTS + 1] = absolute_y
+                for c in range(0, padded, _ABREAST):
+                    _weigh(weights, grads, spans[entry, 0], spans[entry, 1], c, parts, part + c)
+            store_totals(parts, part + padded, m, mx, my, mxx, mxy, myy, absolute_x, absolute_y)
+
+
+@compiled_into
+def _product(grads: Any, at: int, colors: Any, color: int, channels: int) -> Any:
+    """<g, c> of some pixels; in two sums, since either waits for itself."""
+    even = odd = zeros(grads)
+    for c in range(0, channels, 2):
+        even = fused(load(grads, at + c * WIDTH), spread(colors, color + c), even)
+        if c + 1 < channels:
+            odd = fused(load(grads, at + c * WIDTH + WIDTH), spread(colors, color + c + 1), odd)
+    return even + odd
+
+
+@compiled_into
+def _weigh(weights: Any, grads: Any, first: int, beyond: int, channel: int, parts: Any, part: int) -> None:
+    """Write the sums over some pixels of a tile, of the weights times the gradients of eight channels."""
+    a = b = c = d = e = f = g = h = zeros(weights)
+    for step in range(first, beyond):
+        weight = load(weights, step * WIDTH)
+        at = (step * grads.shape[1] + channel) * WIDTH
+        a, b = fused(weight, load(grads, at), a), fused(weight, load(grads, at + WIDTH), b)
+        c, d = fused(weight, load(grads, at + 2 * WIDTH), c), fused(weight, load(grads, at + 3 * WIDTH), d)
+        e, f = fused(weight, load(grads, at + 4 * WIDTH), e), fused(weight, load(grads, at + 5 * WIDTH), f)
+        g, h = fused(weight, load(grads, at + 6 * WIDTH), g), fused(weight, load(grads, at + 7 * WIDTH), h)
+    store_totals(parts, part, a, b, c, d, e, f, g, h)
 
 
 @compiled
@@ -398,7 +358,7 @@ def _sum_slots(
     absolute: Any,
 ) -> None:
     """Add up the slots of each primitive, in float64, and turn moments into gradients."""
-    channels, width = parts.shape[1] - _MOMENTS - (2 if len(absolute) > 0 else 0), parts.shape[1]
+    channels, width = parts.shape[1] - _MOMENTS, parts.shape[1]
     sums = np.empty(width)
     for rank in range(begin, end):
         i = ids[rank]
@@ -416,5 +376,5 @@ def _sum_slots(
         grad_conics[i, 2] = -0.5 * sums[channels + 5]
         grad_opacities[i] = sums[channels] / table[rank, OPACITY]
         if len(absolute) > 0:
-            absolute[0, i, 0] = sums[channels + _MOMENTS]
-            absolute[0, i, 1] = sums[channels + _MOMENTS + 1]
+            absolute[0, i, 0] = sums[channels + 6]
+            absolute[0, i, 1] = sums[channels + 7]

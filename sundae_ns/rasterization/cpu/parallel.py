@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
+from pathlib import Path
 from threading import Timer
 from typing import Any
 
@@ -26,32 +27,31 @@ from torch import Tensor
 _SHARES = 8  # of each thread: enough for an even load, few enough that handing them out costs nothing
 _PATIENCE = 1.0  # seconds that a loop may compile before a line says so; reading it from disk takes milliseconds
 
+_SOURCES = "".join(path.read_text() for path in sorted(Path(__file__).parent.glob("*.py")))
+"""Of this package: loops call functions of its other modules, and numba looks only at the file of a loop itself."""
+
 _ready: set[tuple[Any, ...]] = set()  # loops that were called, and the types that they were called with
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile at the first call for its types; later processes read the machine code from disk.
 
-    numba keeps it beside the module, or in the user's cache folder, and compiles anew when the module's file changes.
-    Functions of other modules must not be called from a compiled one: when they change, the code on disk would not.
+    numba keeps it beside the module, or in the user's cache folder, and compiles anew when this package's files change.
     """
-    return _compile(function, relaxed=False)
+    return _compile(function)
 
 
-def compiled_for_simd(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As :func:`compiled`; sums may be taken in any order, products fused with them. NaN and infinity keep their meaning."""
-    return _compile(function, relaxed=True)
+def compiled_into(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As :func:`compiled`, for a piece of a loop: it becomes part of its callers, in which lanes then stay in registers."""
+    return _compile(function, forceinline=True)
 
 
-def _compile(function: Callable[..., Any], relaxed: bool) -> Callable[..., Any]:
-    options: dict[str, Any] = {
-        "nogil": True,
-        "error_model": "numpy",  # x / 0 as in torch; raising would keep loops from being vectorised
-        "fastmath": {"reassoc", "contract", "nsz"} if relaxed else False,
-    }
+def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    # x / 0 is what it is in torch: raising would cost a branch.
+    options |= {"nogil": True, "error_model": "numpy"}
     # Constants are compiled in, and may come from other modules: part of the name, they choose the file.
     numbers = sorted((k, v) for k, v in function.__globals__.items() if isinstance(v, (int, float)))
-    function.__qualname__ += "_" + hashlib.sha256(repr(numbers).encode()).hexdigest()[:8]
+    function.__qualname__ += "_" + hashlib.sha256(f"{numbers} {_SOURCES}".encode()).hexdigest()[:8]
     try:
         return njit(cache=True, **options)(function)
     except RuntimeError:  # neither the package's folder nor the user's can be written to
@@ -121,5 +121,8 @@ if hasattr(os, "register_at_fork"):
 
 
 def as_array(tensor: Tensor) -> Any:
-    """The memory of a tensor as a C-contiguous numpy array; another layout would be compiled anew."""
-    return tensor.detach().contiguous().numpy()
+    """The memory of a tensor as a C-contiguous numpy array; another layout would be compiled anew.
+
+    numpy makes the copy, where there has to be one: after torch's, its threads keep waiting on the cores that ours need.
+    """
+    return np.ascontiguousarray(tensor.detach().numpy())

@@ -17,7 +17,7 @@ from sundae_ns.rasterization.cpu.parallel import as_array, compiled, share
 from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN, MAX_RADIUS, Projection
 from sundae_ns.rasterization.projection import project as project_with_autograd
 
-_WORTH_A_THREAD = 10_000  # primitives: below a millisecond, waking a thread costs more than it saves
+_WORTH_A_THREAD = 2_500  # primitives: below a tenth of a millisecond, waking a thread costs more than it saves
 _SHORTEST = 1e-12  # quaternions that are shorter are divided by this, as torch's normalize() does
 
 
@@ -38,10 +38,11 @@ def project(
     """
     if torch.is_grad_enabled() and (viewmat.requires_grad or K.requires_grad):
         return project_with_autograd(means, quats, scales, viewmat, K, width, height, near_plane, far_plane)
-    lens = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], dtype=np.float64)
+    lens = as_array(K)[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float64)
     size = np.array([width, height], dtype=np.float64)
     # As torch compares a tensor with a number: in the tensor's dtype.
-    planes = torch.tensor([near_plane, far_plane], dtype=means.dtype).double().numpy()
+    planes = np.array([near_plane, far_plane], np.float32 if means.dtype == torch.float32 else np.float64)
+    planes = planes.astype(np.float64)
     outputs = _Project.apply(means, quats, scales, viewmat, (lens, size, planes))
     means2d, conics, depths, compensations, covars2d, radii = outputs
     return Projection(means2d, covars2d, conics, depths, compensations, radii)

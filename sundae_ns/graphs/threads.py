@@ -1,0 +1,33 @@
+"""Parts of an array, several at a time: numpy and scipy let go of the interpreter's lock while they compute."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
+
+
+def for_each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """What ``work`` makes of each part, in their order, on as many threads as there are cores.
+
+    No part may write where another one reads or writes.
+    """
+    threads = min(_cores(), len(parts))
+    if threads <= 1:
+        return [work(part) for part in parts]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(work, parts))
+
+
+def slices(count: int, size: int) -> list[slice]:
+    """``range(count)`` in slices of at most ``size``."""
+    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
