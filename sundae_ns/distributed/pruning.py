@@ -54,6 +54,8 @@ class GlobalPruning:
         state["peak"] = max(state["peak"], before)
         if not self.policy.due(state, step, before):
             return None
+        for value in params.values():
+            value.grad = None  # surgery would drop it, but only after the ranks have made room for the whole field
         states = [] if strategy_state is None else [strategy_state]
         finite = finite_mask(params)
         dropped = before - sum(count for (count,) in shards.numbers(int(finite.sum())))
@@ -100,7 +102,8 @@ def _decide(
     policy: PruningPolicy, field: Mapping[str, Any], state: Mapping[str, Any], step: int, sums: Tensor | None
 ) -> tuple[Any, dict[str, Any], Tensor]:
     """What the policy makes of a whole field: outcome for all ranks, the field after it, and the rows that stayed."""
-    params: dict[str, Any] = {name: Parameter(value.clone(), requires_grad=False) for name, value in field.items()}
+    # Surgery makes new tensors of what stays, so the field remains as it was without a copy.
+    params: dict[str, Any] = {name: Parameter(value, requires_grad=False) for name, value in field.items()}
     rows = torch.arange(num_primitives(params), device=params["means"].device)
     # Surgery slices every per-primitive tensor of the state, so this one comes out as the rows that stayed.
     counted: dict[str, Any] = {**state, "rows": rows}
