@@ -54,8 +54,8 @@ class GlobalPruning:
         state["peak"] = max(state["peak"], before)
         if not self.policy.due(state, step, before):
             return None
-        for value in params.values():
-            value.grad = None  # surgery would drop it, but only after the ranks have made room for the whole field
+        for held in params.values():
+            held.grad = None  # surgery would drop it, but only after the ranks have made room for the whole field
         states = [] if strategy_state is None else [strategy_state]
         finite = finite_mask(params)
         dropped = before - sum(count for (count,) in shards.numbers(int(finite.sum())))
