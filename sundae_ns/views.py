@@ -9,6 +9,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.compensation import Window
+from sundae_ns.rasterization.projection import camera_center
 
 
 class View(NamedTuple):
@@ -27,7 +28,7 @@ class View(NamedTuple):
     @property
     def center(self) -> Tensor:
         """Where the camera stands ``[3]``."""
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+        return camera_center(self.viewmat)
 
     def zoomed(self, factor: float) -> View:
         """The camera that sees the same in a picture whose sides are ``factor`` times as long."""

@@ -8,7 +8,8 @@ from fractions import Fraction
 from typing import Any
 
 from sundae_ns.distributed.batches import scaled_group
-from sundae_ns.distributed.shards import Shards, bounds, per_primitive
+from sundae_ns.distributed.shards import Shards, bounds
+from sundae_ns.gaussians.surgery import per_primitive
 
 _FIELD = "_model.gauss_params."
 _EXTRA = "_model._extra_state"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -20,8 +21,8 @@ from torch.optim import Optimizer
 
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.parameters import num_primitives
-from sundae_ns.gaussians.surgery import check_wiring
-from sundae_ns.rasterization.reference import per_axis
+from sundae_ns.gaussians.surgery import check_wiring, per_primitive, replace_parameter
+from sundae_ns.rasterization.reference import largest_axis, per_axis
 from sundae_ns.rasterization.sharded import (
     Route,
     exchange,
@@ -156,19 +157,15 @@ class Shards:
 
         for name, old in list(params.items()):
             new = Parameter(moved(old.detach()), requires_grad=old.requires_grad)
-            if name in optimizers:
-                optimizer = optimizers[name]
-                moments = optimizer.state.pop(old, None)
-                if moments is not None:
-                    optimizer.state[new] = {
-                        key: moved(value) if key != "step" and isinstance(value, Tensor) else value
-                        for key, value in moments.items()
-                    }
-                optimizer.param_groups[0]["params"] = [new]
-            params[name] = new
+            held = optimizers[name].state.get(old, {}) if name in optimizers else {}
+            moments = {
+                key: moved(value) if key != "step" and isinstance(value, Tensor) else value
+                for key, value in held.items()
+            }
+            replace_parameter(params, optimizers, name, new, moments)
         for state in states:
             state.update({key: moved(value) for key, value in state.items() if per_primitive(value, n)})
-        self.counts = [end - start for start, end in zip(*_pairs(bounds(sum(kept), self.ranks)))]
+        self.counts = [end - start for start, end in pairwise(bounds(sum(kept), self.ranks))]
 
     # ---------------------------------------------------------------------------------------------------- rendering
 
@@ -216,8 +213,7 @@ class Shards:
         def found() -> Tensor:
             centres = info["means2d"]
             gradients = (centres.absgrad if absgrad else centres.grad)[0]
-            radii = info["radii"][0]
-            radii = (radii if radii.dim() == 1 else radii.amax(dim=-1)).to(gradients.dtype)
+            radii = largest_axis(info["radii"][0]).to(gradients.dtype)
             width, height = info["width"], info["height"]
             halves = gradients.new_tensor([width / 2, height / 2])
             return torch.cat([gradients * halves, (radii * (2 / max(width, height)))[:, None]], dim=1)
@@ -304,12 +300,3 @@ class Shards:
         dist.all_reduce(ends, dist.ReduceOp.MIN)
         low, high = ends.tolist()
         model.trained_focal = None if math.isinf(low) else (low, -high)
-
-
-def _pairs(ends: list[int]) -> tuple[list[int], list[int]]:
-    return ends[:-1], ends[1:]
-
-
-def per_primitive(value: Any, n: int) -> bool:
-    """Whether a value has a row for each of ``n`` primitives."""
-    return isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] == n

@@ -18,6 +18,8 @@ from torch.nn import Parameter
 from torch.nn.functional import normalize
 from torch.optim import Optimizer
 
+from sundae_ns.gaussians.surgery import replace_parameter
+
 MAX_COPIES = 51
 """Copies beyond these are counted as these: the sum alternates, and its terms grow."""
 
@@ -100,16 +102,12 @@ def grow(
     for name, value in list(params.items()):
         new = Parameter(torch.cat([value.data, value.data[sources]]), requires_grad=value.requires_grad)
         optimizer = optimizers.get(name)
-        if optimizer is not None:
-            longer = {
-                key: torch.cat([moment, torch.zeros_like(moment[sources])])
-                for key, moment in _per_row(optimizer, value).items()
-            }
-            state = optimizer.state.pop(value, None)
-            if state is not None:
-                optimizer.state[new] = {**state, **longer}
-            optimizer.param_groups[0]["params"] = [new]
-        params[name] = new
+        held = {} if optimizer is None else optimizer.state.get(value, {})
+        longer = {
+            key: torch.cat([moment, torch.zeros_like(moment[sources])])
+            for key, moment in _per_row(optimizer, value).items()
+        }
+        replace_parameter(params, optimizers, name, new, {**held, **longer})
 
 
 @torch.no_grad()

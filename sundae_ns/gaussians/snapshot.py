@@ -9,6 +9,8 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
+from sundae_ns.gaussians.surgery import replace_parameter
+
 Snapshot = dict[str, dict[str, Tensor]]
 """For each parameter its ``value`` and the tensors of its optimizer's state, all on the CPU."""
 
@@ -72,12 +74,8 @@ def _replace(
     moments: Mapping[str, Tensor],
 ) -> None:
     optimizer = optimizers.get(name)
-    if optimizer is not None:
-        optimizer.state.pop(params[name], None)
-        optimizer.param_groups[0]["params"] = [new]
-        if moments:
-            optimizer.state[new] = _placed(moments, new, optimizer)
-    params[name] = new
+    placed = None if optimizer is None else _placed(moments, new, optimizer)
+    replace_parameter(params, optimizers, name, new, placed)
 
 
 def _placed(moments: Mapping[str, Tensor], parameter: Tensor, optimizer: Optimizer) -> dict[str, Tensor]:

@@ -35,6 +35,36 @@ def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimize
             )
 
 
+def per_primitive(value: Any, n: int) -> bool:
+    """Whether a value is a tensor with a row for each of ``n`` primitives."""
+    return isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] == n
+
+
+def replace_parameter(
+    params: MutableMapping[str, Parameter],
+    optimizers: Mapping[str, Optimizer],
+    name: str,
+    new: Parameter,
+    state: Mapping[str, Any] | None,
+) -> None:
+    """Put another parameter in the place of one, in the field and in its optimizer.
+
+    Args:
+        params: the field.
+        optimizers: by parameter name, of one parameter each; there may be none of this name.
+        name: whose place.
+        new: the parameter.
+        state: what its optimizer is to hold for it; None or empty lets the optimizer begin anew.
+    """
+    optimizer = optimizers.get(name)
+    if optimizer is not None:
+        optimizer.state.pop(params[name], None)
+        if state:
+            optimizer.state[new] = dict(state)
+        optimizer.param_groups[0]["params"] = [new]
+    params[name] = new
+
+
 @torch.no_grad()
 def keep(
     params: MutableMapping[str, Parameter],
@@ -72,21 +102,12 @@ def keep(
         name: Parameter(_slice(value.detach(), mask), requires_grad=value.requires_grad)
         for name, value in params.items()
     }
-    new_moments = {
-        name: _sliced_entries(optimizers[name].state[params[name]], mask, skip="step")
-        for name in new_params
-        if name in optimizers and params[name] in optimizers[name].state
-    }
+    held = {name: optimizers[name].state.get(params[name], {}) for name in new_params if name in optimizers}
+    new_held = {name: {**state, **_sliced_entries(state, mask, skip="step")} for name, state in held.items()}
     new_state = _sliced_entries(state, mask)
 
     for name, new in new_params.items():
-        if name in optimizers:
-            optimizer = optimizers[name]
-            moments = optimizer.state.pop(params[name], None)
-            if moments is not None:
-                optimizer.state[new] = {**moments, **new_moments[name]}
-            optimizer.param_groups[0]["params"] = [new]
-        params[name] = new
+        replace_parameter(params, optimizers, name, new, new_held.get(name))
     state.update(new_state)
 
 
@@ -103,8 +124,4 @@ def _slice(value: Tensor, mask: Tensor) -> Tensor:
 def _sliced_entries(entries: Mapping[str, Any], mask: Tensor, skip: str | None = None) -> dict[str, Tensor]:
     """The per-primitive tensors of a mapping, sliced; the mapping itself is not changed."""
     n = mask.shape[0]
-    return {
-        name: _slice(value, mask)
-        for name, value in entries.items()
-        if name != skip and isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] == n
-    }
+    return {name: _slice(value, mask) for name, value in entries.items() if name != skip and per_primitive(value, n)}

@@ -21,7 +21,7 @@ from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, num_primitives
 from sundae_ns.gaussians.relocation import grow
 from sundae_ns.gaussians.rewriting import rewrite
-from sundae_ns.gaussians.surgery import check_wiring, keep, keep_state
+from sundae_ns.gaussians.surgery import check_wiring, keep, keep_state, per_primitive
 from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.decision import decide
 from sundae_ns.pruning.report import PruneReport
@@ -231,7 +231,7 @@ class ContinuousPruning(PruningPolicy):
         if step >= self.config.stop and lacking > 0:
             grow(params, optimizers, lacking, LEAST_OPACITY)
             if strategy_state is not None:
-                stale = [k for k, v in strategy_state.items() if isinstance(v, Tensor) and v.shape[:1] == (n,)]
+                stale = [k for k, v in strategy_state.items() if per_primitive(v, n)]
                 strategy_state.update(dict.fromkeys(stale))
             state["peak"] = max(state["peak"], n + lacking)
         return report

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
-from sundae_ns.rasterization.reference import ReferenceBackend
+from sundae_ns.rasterization.reference import ReferenceBackend, largest_axis
 from sundae_ns.rasterization.types import Rasterization
 
 _CHANNELS_PER_PASS = 32
@@ -81,12 +81,11 @@ class GsplatBackend:
             # Each pass overwrites absgrad with that of its own channels, so with absgrad there must be one pass only.
             channel_chunk=max(_CHANNELS_PER_PASS, channels + 1) if absgrad else _CHANNELS_PER_PASS,
         )
-        radii = info["radii"][0]
         return Rasterization(
             colors=rendered[0, ..., :channels],
             depth=rendered[0, ..., channels:] if render_depth else None,
             alpha=alpha[0],
-            radii=radii if radii.dim() == 1 else radii.amax(dim=-1),  # [N, 2] from gsplat 1.5
+            radii=largest_axis(info["radii"][0]),
             info=info,
         )
 

@@ -32,6 +32,11 @@ class Projection:
     radii: Tensor  # [N], int32
 
 
+def camera_center(viewmat: Tensor) -> Tensor:
+    """Where a camera stands ``[3]``, from its world-to-camera transform ``[4, 4]``."""
+    return -viewmat[:3, :3].T @ viewmat[:3, 3]
+
+
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations ``[N, 3, 3]`` of wxyz quaternions ``[N, 4]`` of any length; all-zero ones give the identity."""
     w, x, y, z = normalize(quats, dim=-1).unbind(-1)

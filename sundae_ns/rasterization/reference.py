@@ -83,6 +83,11 @@ def per_axis(radii: Tensor) -> Tensor:
     return radii[:, None].expand(-1, 2) if _radii_per_axis() else radii
 
 
+def largest_axis(radii: Tensor) -> Tensor:
+    """Radii as any installed gsplat gives them, ``[N]`` or ``[N, 2]``, as one a primitive ``[N]``."""
+    return radii if radii.dim() == 1 else radii.amax(dim=-1)
+
+
 def _strategy_info(means2d: Tensor, radii: Tensor, width: int, height: int) -> dict[str, Any]:
     return {
         "means2d": means2d,

@@ -15,7 +15,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN
+from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN, camera_center
 
 
 class Cameras(NamedTuple):
@@ -58,8 +58,7 @@ def frustum_bounds(viewmat: Tensor, K: Tensor, width: int, height: int, near_pla
 @torch.no_grad()
 def gather_cameras(viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float) -> Cameras:
     """The cameras of all ranks by rank, detached. Collective. Arguments are this rank's; see :func:`frustum_bounds`."""
-    center = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    own = torch.cat([center, frustum_bounds(viewmat, K, width, height, near_plane).flatten()])
+    own = torch.cat([camera_center(viewmat), frustum_bounds(viewmat, K, width, height, near_plane).flatten()])
     every = own.new_empty(dist.get_world_size() * len(own))
     dist.all_gather_into_tensor(every, own)
     every = every.view(-1, len(own))
