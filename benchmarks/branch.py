@@ -254,7 +254,9 @@ def main() -> None:
                 torch._foreach_mul_(group["params"], 1 - group["lr"] * options.weight_decay)
 
         after_each_step(trainer, decay)
+    started = run.now()
     trainer.train()
+    seconds = run.now() - started
     if averaged is not None:
         averaged.take()
     trainer.pipeline.eval()
@@ -264,6 +266,7 @@ def main() -> None:
         "steps": options.steps,
         "seed": options.seed,
         "primitives": trainer.pipeline.model.num_points,
+        "train_s": seconds,
         **run.evaluate(trainer.pipeline),
         **training_views(trainer.pipeline),
         "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",

@@ -52,8 +52,9 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--steps", type=int, help="length of the run, in place of the method's own")
     parser.add_argument("--out", type=Path, default=Path("outputs/benchmarks"))
     parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--save", action="store_true", help="keep the final checkpoint")
+    parser.add_argument("--save", action="store_true", help="keep the final checkpoint, and config.yml for other tools")
     parser.add_argument("--save-pruned", action="store_true", help="keep the checkpoint right after the prune")
+    parser.add_argument("--save-warm", action="store_true", help="keep the checkpoint right before the prune")
     own, extra = sys.argv[1:], []
     if "--" in own:
         cut = own.index("--")
@@ -95,6 +96,13 @@ class CountPrimitives:
         return self._step(step)
 
 
+def now() -> float:
+    """Seconds on the clock, once the device has done what it was given."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
 @torch.no_grad()
 def evaluate(pipeline: Any) -> dict[str, float]:
     """Mean PSNR and SSIM over all test views, of the picture and of its base colours."""
@@ -130,20 +138,21 @@ def main() -> None:
     trainer.setup()
     save, wanted = trainer.save_checkpoint, set()
     if options.save_pruned:
-        trainer.config.steps_per_save = config.pipeline.model.pruning.prune_at
         wanted.add(config.pipeline.model.pruning.prune_at)
+    if options.save_warm:
+        wanted.add(config.pipeline.model.pruning.prune_at - 1)
+    if wanted:
+        config.steps_per_save, config.save_only_latest_checkpoint = 1, False  # the line below picks
     if options.save:
         wanted.add(config.max_num_iterations - 1)
+        config.save_config()
     trainer.save_checkpoint = lambda step: save(step) if step in wanted else None
     counts = CountPrimitives(trainer)
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
-        torch.cuda.synchronize()
-    started = time.perf_counter()
+    started = now()
     trainer.train()
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    train_s = time.perf_counter() - started
+    train_s = now() - started
     peak = torch.cuda.max_memory_allocated() / 2**20 if torch.cuda.is_available() else 0.0
 
     pipeline, model = trainer.pipeline, trainer.pipeline.model
