@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 import urllib.request
@@ -59,8 +60,11 @@ def call(tmp_path_factory: pytest.TempPathFactory) -> Call:
 
     def run(*arguments: object, **variables: str) -> subprocess.CompletedProcess[str]:
         words = [str(word) for word in arguments]
+        # Beside the interpreter, or where a package was put that the interpreter only knows of.
+        command = shutil.which(words[0], path=path)
+        assert command is not None, f"{words[0]} is not installed"
         result = subprocess.run(
-            [str(commands / words[0]), *words[1:]],
+            [command, *words[1:]],
             capture_output=True,
             text=True,
             env={**environment, **variables},
