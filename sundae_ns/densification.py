@@ -23,24 +23,27 @@ if TYPE_CHECKING:
     from sundae_ns.model import SundaeModelConfig
 
 
-def limit_growth(state: MutableMapping[str, Any], room: int, threshold: float, radius: float | None) -> None:
-    """Let at most ``room`` primitives grow: those with the highest gradients keep their statistics, others lose theirs.
+def limit_growth(
+    state: MutableMapping[str, Any], small: Tensor, room: int, threshold: float, radius: float | None
+) -> None:
+    """Let at most ``room`` primitives be added: those with the highest gradients grow, others lose their statistics.
 
     Args:
         state: of gsplat's strategy, with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used.
-        room: how many may be duplicated or split; each adds one.
+        small: those that a high gradient duplicates; it splits the others, bool ``[N]``.
+        room: how many may be added: one by each that is duplicated or split, two by one that is both.
         threshold: mean gradient above which a primitive grows.
         radius: share of the picture above which it is split, None where it is not looked at.
     """
     gradients = state["grad2d"] / state["count"].clamp_min(1)
-    growing = gradients > threshold
+    high = gradients > threshold
+    wide = torch.zeros_like(high)
     if radius is not None and state.get("radii") is not None:
-        growing |= state["radii"] > radius
-    candidates = growing.nonzero().squeeze(1)
-    if len(candidates) <= room:
-        return
-    order = gradients[candidates].argsort(descending=True, stable=True)
-    left_out = candidates[order[max(room, 0) :]]
+        wide = state["radii"] > radius
+    added = (high & small).long() + ((high & ~small) | wide).long()
+    candidates = added.nonzero().squeeze(1)
+    candidates = candidates[gradients[candidates].argsort(descending=True, stable=True)]
+    left_out = candidates[added[candidates].cumsum(0) > room]
     state["grad2d"][left_out] = 0
     if radius is not None and state.get("radii") is not None:
         state["radii"][left_out] = state["radii"][left_out].clamp_max(radius)
@@ -61,7 +64,8 @@ class CappedStrategy(DefaultStrategy):
     def _grow_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> tuple[int, int]:
         if self.cap is not None:
             radius = self.grow_scale2d if step < self.refine_scale2d_stop_iter else None
-            limit_growth(state, self.cap - len(params["means"]), self.grow_grad2d, radius)
+            small = params["scales"].exp().amax(dim=-1) <= self.grow_scale3d * state["scene_scale"]
+            limit_growth(state, small, self.cap - len(params["means"]), self.grow_grad2d, radius)
         grown = super()._grow_gs(params, optimizers, state, step)
         state["peak"] = max(state.get("peak", 0), len(params["means"]))
         return grown
