@@ -274,6 +274,7 @@ def test_training_on_a_gpu_is_that_of_the_layers(mode: str) -> None:
     layers = make(mode=mode, size="compact", num_features=13, fused=False).cuda()
     quick = make(mode=mode, size="compact", num_features=13).cuda()
     sizes = [(33, 40), (48, 64), (33, 40), (31, 30), (16, 16), (24, 56), (16, 16), (8, 8)]
+    norms = []
     for seed, (height, width) in enumerate(sizes):
         with torch.no_grad():
             for parameter in exact.parameters():
@@ -283,10 +284,13 @@ def test_training_on_a_gpu_is_that_of_the_layers(mode: str) -> None:
         pictures = tuple(picture.cuda() for picture in splatted(height, width, 13, seed=seed))
         to_out = torch.randn(height, width, 3, device="cuda")
         results = (of_layers(head, pictures, to_out) for head in (quick, layers, exact))
-        for found, by_layers, expected in zip(*results, strict=True):
-            # bf16 rounds on both sides, at different places; where it turns an activation's sign, small pictures differ by
-            # several percent.
-            error, allowed = (float((result - expected).norm()) for result in (found, by_layers))
-            assert error <= 4 * allowed + 1e-2 * float(expected.norm())
+        by_result = [[found - whole, rounded - whole, whole] for found, rounded, whole in zip(*results, strict=True)]
+        norms.append(torch.tensor([[float(value.norm()) for value in values] for values in by_result]))
         assert quick._can_fuse
+    # bf16 rounds on both sides, at different places. Where that turns an activation's sign, one small picture differs by
+    # several percent; all of them together by no more than the layers do themselves, four times over.
+    together = torch.stack(norms).square().sum(dim=0).sqrt()
+    for table, slack in [*((each, 0.1) for each in norms), (together, 0.01)]:
+        error, allowed, whole = table.unbind(1)
+        assert (error <= 4 * allowed + slack * whole).all(), (error, allowed, whole)
     assert len(quick._training._recorded) == fused.MAX_SIZES

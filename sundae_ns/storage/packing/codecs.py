@@ -1,8 +1,7 @@
 """How each attribute of a scene is rounded: grids, bases, books and steps, fitted once, then used to write and to train.
 
 A codec has two sides. ``encode`` makes what is stored of an attribute; ``rounded`` makes the values that a reader will decode
-from it, without the detour, on the device of its argument. They are the same to the bit where arithmetic is (see ``rounded`` of
-``transform`` and ``codebooks``).
+from it, without the detour, on the device of its argument. On a CPU they are the same to the bit.
 """
 
 from __future__ import annotations

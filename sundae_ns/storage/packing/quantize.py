@@ -74,7 +74,7 @@ def at_levels(levels: Tensor, low: Tensor, step: Tensor) -> Tensor:
 
 
 def rounded(values: Tensor, grid: Grid) -> Tensor:
-    """What :func:`dequantize` makes of :func:`quantize`, to the bit, on any device: float32 ``[N, C]``."""
+    """What :func:`dequantize` makes of :func:`quantize`: float32 ``[N, C]``; to the bit on a CPU."""
     found, outside = levels(values, grid)
     return torch.where(outside, values, at_levels(found, grid.low, grid.step))
 
@@ -203,7 +203,7 @@ def rotation_levels(quats: Tensor, bits: int) -> tuple[Tensor, Tensor]:
     scale = q.abs().amax(dim=1, keepdim=True)
     q = torch.where(scale > 0, q / torch.where(scale > 0, scale, 1.0), q.new_tensor([1.0, 0.0, 0.0, 0.0]))
     largest = q.abs().argmax(dim=1)
-    # Sums are written out, so that they do not depend on the device or on the number of rows.
+    # Sums are written out, so that they do not depend on the number of rows.
     w, x, y, z = q.T
     length = (w * w + x * x + y * y + z * z).sqrt()
     sign = torch.where(q.gather(1, largest[:, None])[:, 0] < 0, -1.0, 1.0)
@@ -234,7 +234,7 @@ def _unit(three: Tensor, largest: Tensor) -> Tensor:
 
 
 def rounded_rotations(quats: Tensor, bits: int) -> Tensor:
-    """What :func:`dequantize_rotations` makes of :func:`quantize_rotations`, to the bit, on any device: ``[N, 4]``."""
+    """What :func:`dequantize_rotations` makes of :func:`quantize_rotations`: ``[N, 4]``; to the bit on a CPU."""
     found, largest = rotation_levels(quats, bits)
     return _unit(_component(found, bits), largest)
 
@@ -274,7 +274,7 @@ def weights_at(levels: Tensor, step: Tensor) -> Tensor:
 
 
 def rounded_weights(weight: Tensor, step: Tensor, bits: int) -> Tensor:
-    """What :func:`dequantize_weights` makes of :func:`quantize_weights`, to the bit, on any device: ``[O, ...]``."""
+    """What :func:`dequantize_weights` makes of :func:`quantize_weights`: ``[O, ...]``; to the bit on a CPU."""
     return weights_at(weight_levels(weight, step, bits), step)
 
 
