@@ -22,7 +22,7 @@ from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, response
 from sundae_ns.run_folder import find_config, read_config, training_cameras
 from sundae_ns.storage import replacing, write_point_cloud, write_text
-from sundae_ns.storage.atomic import storage_error
+from sundae_ns.storage.atomic import writing
 
 RULES = ("high", "low", "combined")
 QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
@@ -159,10 +159,8 @@ def run_bands(
         replace(config, keep_ratio=keep_ratio).validate()
     ratios = sorted(set(keep_ratios))
     run = source.parent if source.name == "config.yml" else source
-    try:
+    with writing(f"cannot write {out}"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(f"cannot write {out}", error) or error from error
 
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Reading the field", total=3 + len(ratios))

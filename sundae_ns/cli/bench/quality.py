@@ -29,7 +29,7 @@ from sundae_ns.cli.bench.shards import parse_shard
 from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.evaluation.document import table
-from sundae_ns.storage.atomic import storage_error, write_text
+from sundae_ns.storage.atomic import write_text, writing
 
 SAID = "sundae: "
 """How a line begins in which a job says why it ends."""
@@ -165,10 +165,8 @@ def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
 
 def _describe(job: Job, out: Path) -> None:
     folder = job_folder(out, job.key)
-    try:
+    with writing(f"cannot make {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(f"cannot make {folder}", error) or error from error
     write_text(folder / "job.json", json.dumps(asdict(job)) + "\n")
 
 
