@@ -17,8 +17,10 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
+from sundae_ns.cli.bench.figures import significant
 from sundae_ns.cli.bench.shards import parse_shard
 from sundae_ns.errors import BackendError, ConfigError, DataError
+from sundae_ns.evaluation.timing import now
 from sundae_ns.rasterization import Backend, BackendName, rasterize, select_backend
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -61,7 +63,13 @@ def run_rasterizer(
     output: Path | None,
     json: bool,
 ) -> int:
-    """Measure and print; options are those of the command."""
+    """Measure and print; options are those of the command.
+
+    Raises:
+        BackendError: a rasteriser that was asked for does not run here.
+        ConfigError: an option cannot work.
+        DataError: a line of the output file is no JSON.
+    """
     if not counts or min(counts) < 1 or min(size) < 1 or channels < 1 or repeats < 1 or not pixels > 0:
         raise ConfigError("nothing to measure: primitives, size, channels, pixels and repeats must be at least 1")
     index, parts = parse_shard(shard)
@@ -148,15 +156,15 @@ def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
     forward_ms, forward_cpu_ms, _ = _median_ms(forward, repeats, case.device)
     both = _median_ms(lambda: render(case, scene, camera, pulls, backend), repeats, case.device)
     return {
-        "forward_ms": _rounded(forward_ms),
-        "forward_backward_ms": _rounded(both[0]),
-        "forward_cpu_ms": _rounded(forward_cpu_ms),
-        "forward_backward_cpu_ms": _rounded(both[1]),
+        "forward_ms": significant(forward_ms),
+        "forward_backward_ms": significant(both[0]),
+        "forward_cpu_ms": significant(forward_cpu_ms),
+        "forward_backward_cpu_ms": significant(both[1]),
         "repeats": both[2],
-        "max_error": _rounded(float(picture.max())),
-        "mean_error": _rounded(float(picture.mean())),
-        "gradient_error": _rounded(max(gradients.values())),
-        **{f"gradient_error_{key}": _rounded(value) for key, value in gradients.items()},
+        "max_error": significant(float(picture.max())),
+        "mean_error": significant(float(picture.mean())),
+        "gradient_error": significant(max(gradients.values())),
+        **{f"gradient_error_{key}": significant(value) for key, value in gradients.items()},
         "device_name": torch.cuda.get_device_name() if case.device == "cuda" else f"CPU, {case.threads} threads",
         "torch": torch.__version__,
     }
@@ -240,17 +248,11 @@ def _median_ms(function: Callable[[], object], repeats: int, device: str) -> tup
     times: list[float] = []
     busy: list[float] = []
     while len(times) < repeats and sum(times) < WORTH_IT:
-        started, computed = _now(device), time.process_time()
+        started, computed = now(device), time.process_time()
         function()
-        times.append(_now(device) - started)
+        times.append(now(device) - started)
         busy.append(time.process_time() - computed)
     return 1e3 * statistics.median(times), 1e3 * statistics.median(busy), len(times)
-
-
-def _now(device: str) -> float:
-    if device == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter()
 
 
 def _read(output: Path | None) -> Iterator[dict[str, Any]]:
@@ -283,7 +285,3 @@ def _table(rows: Sequence[dict[str, Any]], title: str) -> Table:
         errors = (f"{row[key]:.1e}" for key in ("max_error", "mean_error", "gradient_error"))
         table.add_row(f"{row['primitives']:,}", name, row["dtype"], *times, *errors)
     return table
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.4g}")
