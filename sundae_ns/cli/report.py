@@ -152,8 +152,7 @@ def _error_maps(path: Path, opened: Opened, measured: Measured) -> None:
     order = sorted(range(len(values)), key=values.__getitem__)
     rows = []
     for name, index in (("worst", order[0]), ("median", order[len(order) // 2])):
-        row = pictures_of(opened, index)
-        rows.append(type(row)(row.truth, row.base, row.compensated, title=f"{name}: view {index}"))
+        rows.append(replace(pictures_of(opened, index), title=f"{name}: view {index}"))
     save_comparison(path, rows)
 
 
