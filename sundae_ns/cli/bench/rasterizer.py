@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from rich.console import Console
@@ -30,11 +30,20 @@ WORTH_IT = 20.0
 """Seconds after which no further repeat is begun."""
 
 
+CANDIDATES: tuple[tuple[BackendName, str], ...] = (
+    ("gsplat", "cuda"),
+    ("reference", "cuda"),
+    ("cpu", "cpu"),
+    ("reference", "cpu"),
+)
+"""Rasterisers and their devices, of which all that run here are measured by default."""
+
+
 @dataclass(frozen=True)
 class Case:
     """What is measured: the fields that tell one row from another."""
 
-    rasterizer: str
+    rasterizer: BackendName
     device: str
     dtype: str
     primitives: int
@@ -47,6 +56,7 @@ class Case:
 
 
 Drawn = dict[str, Tensor]
+"""Tensors by name: primitives after activation, a camera, or what came out for them."""
 
 
 def run_rasterizer(
@@ -136,7 +146,7 @@ def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
         exact: from :func:`render` by the reference in float64.
         repeats: timed runs, fewer where they take longer than ``WORTH_IT`` seconds together.
     """
-    backend = select_backend(_name(case.rasterizer), case.device)
+    backend = select_backend(case.rasterizer, case.device)
     pulls = _pulls(case, DTYPES[case.dtype], case.device)
     scene, camera = (
         {key: value.to(case.device, DTYPES[case.dtype]) for key, value in part.items()} for part in draw_view(case)
@@ -220,26 +230,22 @@ def _pulls(case: Case, dtype: torch.dtype = torch.float64, device: str = "cpu") 
     return pull[..., :-1].contiguous(), pull[..., -1:].contiguous()
 
 
-def _backends(names: Sequence[BackendName]) -> Iterator[tuple[str, str]]:
+def _backends(names: Sequence[BackendName]) -> Iterator[tuple[BackendName, str]]:
     """Rasterisers and their devices: those that were named, or by default all that run here."""
     if names:
         for name in names:
             device = "cuda" if name == "gsplat" else "cpu"
-            yield select_backend(name, device).name, device
+            yield cast(BackendName, select_backend(name, device).name), device  # not auto
         return
-    for default, device in (("gsplat", "cuda"), ("reference", "cuda"), ("cpu", "cpu"), ("reference", "cpu")):
+    for name, device in CANDIDATES:
         if device == "cuda" and not torch.cuda.is_available():
             continue
         try:
-            select_backend(_name(default), device)
+            select_backend(name, device)
         except BackendError as error:
-            print(f"without {default}: {error}", file=sys.stderr)
+            print(f"without {name}: {error}", file=sys.stderr)
             continue
-        yield default, device
-
-
-def _name(name: str) -> BackendName:
-    return name  # type: ignore[return-value]
+        yield name, device
 
 
 def _median_ms(function: Callable[[], object], repeats: int, device: str) -> tuple[float, float, int]:
