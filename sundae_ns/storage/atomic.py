@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from sundae_ns.errors import StorageError, SundaeError
+from sundae_ns.errors import StorageError
 
 _MENDS = {
     errno.ENOSPC: "the disk is full; make room",
@@ -46,9 +46,7 @@ def writing(what: str) -> Iterator[None]:
     """
     try:
         yield
-    except SundaeError:
-        raise
-    except OSError as error:
+    except OSError as error:  # ours, which have no number, pass too
         ours = storage_error(what, error)
         if ours is None:
             raise
