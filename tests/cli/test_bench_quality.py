@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
+import shlex
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tyro
 from rich.console import Console
 
 from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
@@ -82,6 +84,26 @@ def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[i
     console = Console(file=text, width=200, force_terminal=False)
     code = run_quality(QualityOptions(capture, out, **options), runner=runner, console=console)
     return code, text.getvalue()
+
+
+# --------------------------------------------------------------------------------------------------------------- options
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        QualityOptions(Path("a b"), Path("out")),
+        QualityOptions(Path("a"), Path("o"), arms=("random",), warmup_steps=7, steps_scale=0.5, downscale=4),
+        PaperOptions(Path("a b"), Path("out")),
+        PaperOptions(Path("a"), Path("o"), scenes=("garden", "room"), seed=1, finetune_steps=9, method="sundae-tiny"),
+    ],
+)
+def test_a_page_names_the_command_of_the_whole(options: QualityOptions | PaperOptions) -> None:
+    part = replace(options, shard="2/3", jobs=True)
+    assert part.command() == options.command()
+    words = shlex.split(part.command())
+    assert words[:3] == ["sundae", "bench", "quality" if isinstance(options, QualityOptions) else "paper"]
+    assert tyro.cli(type(options), args=words[3:]) == options
 
 
 # ----------------------------------------------------------------------------------------------------------------- plans
