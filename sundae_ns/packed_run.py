@@ -30,12 +30,12 @@ from torch import Tensor
 from sundae_ns import checkpoint
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
-from sundae_ns.errors import CheckpointError, PackError, StorageError
+from sundae_ns.errors import CheckpointError, PackError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rendering import degree_in_use
 from sundae_ns.run_config import load_config
-from sundae_ns.storage.atomic import storage_error, write_text
+from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.packing import Scene
 
 TIMESTAMP = "unpacked"
@@ -246,7 +246,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
         manager.dataparser, manager.camera_res_scale_factor = _capture(scene.meta.get("capture"))
         config.data = data.resolve()
     manager.data = config.data
-    try:
+    with writing(f"cannot write to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         if data is None:
             config.data.mkdir(exist_ok=True)
@@ -254,10 +254,6 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
         frame = scene.meta.get("frame")
         if _is_frame(frame):
             write_text(folder / _FRAME_FILE, json.dumps(frame, indent=4))
-    except OSError as error:
-        if isinstance(error, StorageError):
-            raise
-        raise storage_error(f"cannot write to {folder}", error) or error from error
     state = {f"_model.{name}": value for name, value in model.state_dict().items()}
     checkpoint.save(
         {"step": model.step, "pipeline": state}, config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"

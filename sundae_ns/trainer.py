@@ -5,8 +5,6 @@ The module path and the class names are written into every run's ``config.yml``:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +19,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from sundae_ns import checkpoint, distributed
 from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, StorageError, SundaeError, out_of_memory
-from sundae_ns.storage.atomic import storage_error, write_text
+from sundae_ns.storage.atomic import write_text, writing
 
 
 @dataclass
@@ -49,20 +47,6 @@ class SundaeTrainerConfig(TrainerConfig):
         write_text(path, yaml.dump(self))
 
 
-@contextmanager
-def _named(what: str) -> Iterator[None]:
-    """Turn an error of the file system that a user can mend into one of ours."""
-    try:
-        yield
-    except SundaeError:
-        raise
-    except OSError as error:
-        ours = storage_error(what, error)
-        if ours is None:
-            raise
-        raise ours from error
-
-
 class SundaeTrainer(Trainer):
     """Saves atomically, resumes from the newest whole checkpoint, and takes random numbers up where they were left."""
 
@@ -84,7 +68,7 @@ class SundaeTrainer(Trainer):
         super().__init__(config, local_rank, world_size=1)
         self.ranks = world_size
         if world_size > 1:
-            with _named(f"cannot make the run's folder {self.base_dir}"):
+            with writing(f"cannot make the run's folder {self.base_dir}"):
                 self.base_dir.mkdir(parents=True, exist_ok=True)  # nerfstudio's own way fails where two make it at once
 
     def setup_optimizers(self) -> Optimizers:
@@ -114,7 +98,7 @@ class SundaeTrainer(Trainer):
             MemoryExhaustedError: the GPU's memory is full.
         """
         try:
-            with _named(f"cannot write to the run's folder {self.base_dir}"):
+            with writing(f"cannot write to the run's folder {self.base_dir}"):
                 super().train()
         except torch.cuda.OutOfMemoryError as error:
             raise out_of_memory(error, getattr(self.pipeline.model, "num_points", 0)) from error

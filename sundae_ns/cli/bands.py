@@ -22,9 +22,10 @@ from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, response
 from sundae_ns.run_folder import find_config, read_config, training_cameras
 from sundae_ns.storage import replacing, write_point_cloud, write_text
-from sundae_ns.storage.atomic import storage_error
+from sundae_ns.storage.atomic import writing
 
-RULES = ("high", "low", "combined")
+RULES = {"high": "high-pass", "low": "low-pass", "combined": "combined"}
+"""Captions of the rules, by their names."""
 QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
 SIDE = 720
 """Longer side of a panel that shows a camera's view, pixels."""
@@ -49,7 +50,7 @@ def base_colors(params: Mapping[str, Tensor], *, logits: bool) -> Tensor:
 def band_masks(
     params: Mapping[str, Tensor], config: PruningConfig, graph: NeighborGraph, keep_ratio: float
 ) -> dict[str, Tensor]:
-    """Which primitives each rule keeps, bool ``[N]`` by the names of ``RULES``.
+    """Which primitives each rule keeps, bool ``[N]`` by the names of :data:`RULES`.
 
     The paper takes both ends of one ranking, that of the high-pass response: what responds most passes the high-pass
     filter, what responds least the low-pass filter, and the combined rule takes ``gamma`` of the first.
@@ -159,10 +160,8 @@ def run_bands(
         replace(config, keep_ratio=keep_ratio).validate()
     ratios = sorted(set(keep_ratios))
     run = source.parent if source.name == "config.yml" else source
-    try:
+    with writing(f"cannot write {out}"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(f"cannot write {out}", error) or error from error
 
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Reading the field", total=3 + len(ratios))
@@ -206,7 +205,7 @@ def run_bands(
                 cloud(f"{name}-{keep_ratio:g}.ply", mask)
             everything = torch.ones_like(masks["high"])
             sets = {f"all: {len(everything):,}": everything}
-            sets |= {f"{_CAPTIONS[name]}: {int(mask.sum()):,}": mask for name, mask in masks.items()}
+            sets |= {f"{RULES[name]}: {int(mask.sum()):,}": mask for name, mask in masks.items()}
             title = f"{keep_ratio:g} of the primitives' centres; signal: {config.signal}; {looked.partition(',')[0]}"
             picture(f"bands-{keep_ratio:g}.png", points_sheet(looks, colors, sets, title=title))
             next_is(f"Kept {keep_ratio:g}")
@@ -236,6 +235,3 @@ def run_bands(
         console.print(f"keep {figure['keep_ratio']:g}: {kept:,} each; the combined rule keeps {ends}", highlight=False)
     console.print(f"wrote bands.json and {len(files)} files to {out}", highlight=False)
     return 0
-
-
-_CAPTIONS = {"high": "high-pass", "low": "low-pass", "combined": "combined"}

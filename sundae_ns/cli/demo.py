@@ -7,6 +7,7 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import torch
 from PIL import Image
 from rich.console import Console
@@ -28,8 +29,7 @@ def _command(name: str) -> str:
 
 
 def _picture(path: Path) -> torch.Tensor:
-    import numpy as np
-
+    """Pixels ``[H, W, 3]``, float32 in [0, 1]."""
     with Image.open(path) as image:
         return torch.from_numpy(np.asarray(image.convert("RGB"), dtype=np.float32) / 255)
 
@@ -84,14 +84,9 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         run_logged(train, out / "train.log", show)
         progress.update(training, completed=100)
         progress.add_task("ns-eval", total=None)
-        evaluate = [
-            _command("ns-eval"),
-            "--load-config",
-            str(run / "config.yml"),
-            "--output-path",
-            str(out / "eval.json"),
-        ]
-        run_logged([*evaluate, "--render-output-path", str(out / "renders")], out / "eval.log")
+        evaluate = [_command("ns-eval"), "--load-config", str(run / "config.yml")]
+        evaluate += ["--output-path", str(out / "eval.json"), "--render-output-path", str(out / "renders")]
+        run_logged(evaluate, out / "eval.log")
         progress.add_task("Timing frames", total=None)
 
         # nerfstudio is chatty while it imports and loads.

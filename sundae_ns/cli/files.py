@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 
-def _check_folder(out: Path) -> None:
+def check_folder(out: Path) -> None:
+    """Raise ``StorageError`` unless the folder of a file to write is there."""
     from sundae_ns.errors import StorageError
 
     if not out.parent.is_dir():
@@ -36,7 +37,7 @@ def export(
     from sundae_ns.storage.viewers import check_format, write_for_viewers
 
     check_format(out)
-    _check_folder(out)
+    check_folder(out)
     found = read_scene(scene) if scene.suffix == ".sundae" else scene_of_run(scene, max_cameras=0)
     stated = found.meta.get("model")
     model = stated if isinstance(stated, dict) else {}
@@ -85,7 +86,7 @@ def prune(
 
     if out.suffix.lower() != ".ply":
         raise ConfigError(f"{out} is not named .ply, the one format that is written; rename it")
-    _check_folder(out)
+    check_folder(out)
     config = PruningConfig(keep_ratio=keep, score=score, selection=selection, signal=signal, gamma=gamma, seed=seed)
     config.validate()
     field = read_ply(source)

@@ -10,6 +10,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from sundae_ns.cli.files import check_folder
+
 
 def pack(
     run: Annotated[Path, tyro.conf.Positional],
@@ -59,17 +61,14 @@ def pack(
     from rich.console import Console
     from rich.progress import Progress
 
-    from sundae_ns.errors import ConfigError, StorageError
+    from sundae_ns.errors import ConfigError
     from sundae_ns.packed_run import scene_of_run
     from sundae_ns.storage.packing import FINETUNED, PackConfig, fit_scene, write_fitted
 
     if finetune < 0:
         raise ConfigError(f"finetune is {finetune}; give the number of steps, or 0 for none")
-    given = {
-        "harmonics_step": harmonics_step,
-        "feature_bits": feature_bits,
-        "head_bits": head_bits,
-    }
+    # What a fine-tune has other defaults for.
+    given = {"harmonics_step": harmonics_step, "feature_bits": feature_bits, "head_bits": head_bits}
     fixed = {
         "position_bits": position_bits,
         "block": block,
@@ -86,8 +85,7 @@ def pack(
     chosen = {name: value for name, value in given.items() if value is not None}
     config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, **fixed})  # type: ignore[arg-type]
     config.validate()
-    if not out.parent.is_dir():
-        raise StorageError(f"{out.parent} is no folder; make it first, or choose another")
+    check_folder(out)
     # The bar keeps its place to write to where what nerfstudio prints is held back.
     with Progress(console=Console(file=sys.stdout), transient=True) as progress:
         task = progress.add_task("Reading the run", total=2 + finetune)

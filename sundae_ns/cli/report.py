@@ -24,7 +24,7 @@ from sundae_ns.evaluation.plots import colors_of, plot_costs, plot_curves, plot_
 from sundae_ns.evaluation.published import Printed, printed_of
 from sundae_ns.measure import measure_scene, pictures_of
 from sundae_ns.opening import Opened, open_scene
-from sundae_ns.storage.atomic import storage_error, write_text
+from sundae_ns.storage.atomic import write_text, writing
 
 PNG_WIDTH = 400
 """Widest pictures, pixels, whose error maps are written without loss; larger ones would take many megabytes."""
@@ -53,10 +53,8 @@ def run_report(
     if warmup < 0 or repeats < 0:
         raise ConfigError(f"{warmup} warm-up renderings and {repeats} timed ones; give at least 0 of each")
     console = console or Console()
-    try:
+    with writing(f"cannot make {out}"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(f"cannot make {out}", error) or error from error
     words = ["sundae", "report", *map(str, paths), "-o", str(out), "--lpips-net", lpips_net]
     words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
     command = shlex.join(words)
@@ -154,8 +152,7 @@ def _error_maps(path: Path, opened: Opened, measured: Measured) -> None:
     order = sorted(range(len(values)), key=values.__getitem__)
     rows = []
     for name, index in (("worst", order[0]), ("median", order[len(order) // 2])):
-        row = pictures_of(opened, index)
-        rows.append(type(row)(row.truth, row.base, row.compensated, title=f"{name}: view {index}"))
+        rows.append(replace(pictures_of(opened, index), title=f"{name}: view {index}"))
     save_comparison(path, rows)
 
 

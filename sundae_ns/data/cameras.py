@@ -1,4 +1,4 @@
-"""Pinhole cameras in nerfstudio's convention, on an orbit around the scene.
+"""Pinhole cameras in nerfstudio's convention, on an orbit around a scene or before a wall.
 
 World: z up. Camera: OpenGL axes (x right, y up, looking along -z). Pixels: x right, y down, centres at +0.5.
 """
@@ -10,6 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sundae_ns.data.shapes import Array
+
+GOLDEN = (5**0.5 - 1) / 2
+"""Golden ratio less 1: its multiples, modulo 1, fill [0, 1) evenly however many there are."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,11 @@ def look_at(eye: Array, target: Array) -> Array:
     return matrix
 
 
+def _focal_length(width: int, height: int, field_of_view: float) -> float:
+    """In pixels; the field of view is in degrees, across the shorter side."""
+    return float(0.5 * min(width, height) / np.tan(np.radians(field_of_view) / 2))
+
+
 def orbit(
     count: int, *, width: int, height: int, rng: np.random.Generator, field_of_view: float = 50.0
 ) -> list[Camera]:
@@ -53,17 +61,16 @@ def orbit(
         rng: source of the small jitter.
         field_of_view: degrees, across the shorter side.
     """
-    golden = (5**0.5 - 1) / 2
-    focal = 0.5 * min(width, height) / np.tan(np.radians(field_of_view) / 2)
+    focal = _focal_length(width, height, field_of_view)
     cameras = []
     for i in range(count):
         azimuth = 2 * np.pi * (i + rng.uniform(-0.2, 0.2)) / count
-        elevation = np.radians(12 + 36 * ((i * golden) % 1.0))
+        elevation = np.radians(12 + 36 * ((i * GOLDEN) % 1.0))
         distance = 4.0 + rng.uniform(-0.4, 0.4)
         around = np.array([np.cos(azimuth), np.sin(azimuth)]) * np.cos(elevation)
         eye = distance * np.array([*around, np.sin(elevation)]) + [0, 0, 0.3]
         target = np.array([0, 0, 0.35]) + rng.uniform(-0.12, 0.12, 3)
-        cameras.append(Camera(look_at(eye, target), float(focal), width, height))
+        cameras.append(Camera(look_at(eye, target), focal, width, height))
     return cameras
 
 
@@ -81,14 +88,13 @@ def facing(
         rng: source of the small jitter.
         field_of_view: degrees, across the shorter side.
     """
-    golden = (5**0.5 - 1) / 2
-    focal = 0.5 * min(width, height) / np.tan(np.radians(field_of_view) / 2)
+    focal = _focal_length(width, height, field_of_view)
     cameras = []
     for i in range(count):
-        across, up = 2 * ((i + 0.5) / count) - 1, 2 * ((i * golden) % 1.0) - 1
+        across, up = 2 * ((i + 0.5) / count) - 1, 2 * ((i * GOLDEN) % 1.0) - 1
         eye = np.array([2.6 * across, -3.2 + rng.uniform(-0.3, 0.3), 1.4 * up])
         target = np.array([0.3 * across, 0.0, 0.2 * up]) + rng.uniform(-0.1, 0.1, 3) * [1, 0, 1]
-        cameras.append(Camera(look_at(eye, target), float(focal), width, height))
+        cameras.append(Camera(look_at(eye, target), focal, width, height))
     return cameras
 
 

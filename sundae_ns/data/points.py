@@ -91,18 +91,18 @@ def sparse_points(
     """
     wrong = round(count * outliers)
     wanted = count - wrong
-    found, colours, have = [], [], 0
+    found, colors, have = [], [], 0
     while have < wanted:
         points, owner, distance = _surface_points(scene, cameras, pictures, max(2 * (wanted - have), 64), rng)
-        views, colour = observe(scene, cameras, points, owner)
+        views, color = observe(scene, cameras, points, owner)
         good = views >= MIN_VIEWS
         jitter = rng.normal(size=points.shape) * (noise * distance)[:, None]
         found.append((points + jitter)[good])
-        colours.append(colour[good])
+        colors.append(color[good])
         have += int(good.sum())
     # The pixels came camera by camera: shuffle before cutting, or the last cameras would lose theirs.
     order = rng.permutation(have)[:wanted]
-    xyz, rgb = np.concatenate(found)[order], np.concatenate(colours)[order]
+    xyz, rgb = np.concatenate(found)[order], np.concatenate(colors)[order]
     stray = rng.uniform([-3, -3, -0.5], [3, 3, 2.5], size=(wrong, 3))
     stray_rgb = rng.uniform(size=(wrong, 3))
     xyz, rgb = np.concatenate([xyz, stray]), np.concatenate([rgb, stray_rgb])

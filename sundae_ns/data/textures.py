@@ -14,7 +14,7 @@ import numpy as np
 from sundae_ns.data.shapes import Array
 
 Texture = Callable[[Array], Array]
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 
 def _scramble(h: np.ndarray) -> np.ndarray:
@@ -30,10 +30,15 @@ def _lattice(cell: np.ndarray, axis: int) -> np.ndarray:
     return cell.astype(np.int64).astype(np.uint32) * np.uint32(primes[axis])
 
 
+def _salt(seed: int) -> np.uint32:
+    """Bits of a seed, spread over 32 (Knuth's multiplicative hash)."""
+    return np.uint32(seed * 2654435761 % 2**32)
+
+
 def cell_random(cells: np.ndarray, seed: int) -> Array:
     """One number in [0, 1) for each integer cell ``[M, 3]``: ``[M]`` float32, the same for the same cell and seed."""
     h = _lattice(cells[:, 0], 0) ^ _lattice(cells[:, 1], 1) ^ _lattice(cells[:, 2], 2)
-    return _scramble(h ^ np.uint32(seed * 2654435761 % 2**32)).astype(np.float32) * np.float32(2**-32)
+    return _scramble(h ^ _salt(seed)).astype(np.float32) * np.float32(2**-32)
 
 
 def value_noise(points: Array, seed: int) -> Array:
@@ -41,7 +46,7 @@ def value_noise(points: Array, seed: int) -> Array:
     base = np.floor(points)
     frac = (points - base).astype(np.float32)
     weight = frac * frac * (3 - 2 * frac)
-    salt = np.uint32(seed * 2654435761 % 2**32)
+    salt = _salt(seed)
     keys = [[_lattice(base[:, axis] + corner, axis) for corner in (0, 1)] for axis in range(3)]
     total = np.zeros(len(points), np.float32)
     for i in (0, 1):
@@ -62,7 +67,7 @@ def fractal_noise(points: Array, seed: int, octaves: int) -> Array:
     return total / (2 - 0.5 ** (octaves - 1))
 
 
-def mix(a: Colour | Array, b: Colour | Array, weight: Array) -> Array:
+def mix(a: Color | Array, b: Color | Array, weight: Array) -> Array:
     """Blend two colours (one, or one a point) by a weight ``[M]``, clipped to [0, 1]: ``[M, 3]``."""
     w = np.clip(weight, 0, 1).astype(np.float32)[:, None]
     return np.asarray(a, np.float32) * (1 - w) + np.asarray(b, np.float32) * w
@@ -78,8 +83,8 @@ def _ramp(x: Array, low: float, high: float) -> Array:
 class Gradient:
     """Two colours from the bottom to the top: the smooth one."""
 
-    low: Colour
-    high: Colour
+    low: Color
+    high: Color
     half_height: float
 
     def __call__(self, points: Array) -> Array:
@@ -91,8 +96,8 @@ class Gradient:
 class Checker:
     """A 3D checkerboard of cubes of side ``size``, with a little variation from cube to cube."""
 
-    dark: Colour
-    light: Colour
+    dark: Color
+    light: Color
     size: float
     seed: int
 
@@ -108,8 +113,8 @@ class Checker:
 class Marble:
     """Veins: stripes across x that noise bends."""
 
-    body: Colour
-    vein: Colour
+    body: Color
+    vein: Color
     scale: float
     seed: int
 
@@ -124,8 +129,8 @@ class Marble:
 class Speckle:
     """Fine coloured grains on a plain ground."""
 
-    ground: Colour
-    grains: Sequence[Colour]
+    ground: Color
+    grains: Sequence[Color]
     scale: float
     seed: int
 
@@ -142,22 +147,22 @@ class Speckle:
 class Spiral:
     """Stripes that wind about the z axis ``turns`` times in one unit of height."""
 
-    colours: Sequence[Colour]
+    colors: Sequence[Color]
     turns: float
 
     def __call__(self, points: Array) -> Array:
         """Colours ``[M, 3]`` of points ``[M, 3]``."""
         angle = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)
         stripe = (2 * angle + self.turns * points[:, 2]) % 1.0
-        return np.asarray(self.colours, np.float32)[(stripe * len(self.colours)).astype(np.int64) % len(self.colours)]
+        return np.asarray(self.colors, np.float32)[(stripe * len(self.colors)).astype(np.int64) % len(self.colors)]
 
 
 @dataclass(frozen=True)
 class Wood:
     """Growth rings about a slanted axis, with fine grain along it."""
 
-    light: Colour
-    dark: Colour
+    light: Color
+    dark: Color
     rings: float
     seed: int
 
@@ -174,9 +179,9 @@ class Wood:
 class Tiles:
     """The floor: a fine mosaic in a ring, large plain tiles inside and out."""
 
-    plain: Colour
-    grout: Colour
-    mosaic: Sequence[Colour]
+    plain: Color
+    grout: Color
+    mosaic: Sequence[Color]
     inner: float
     outer: float
     seed: int
@@ -185,11 +190,11 @@ class Tiles:
         """Colours ``[M, 3]`` of points ``[M, 3]``."""
         radius = np.hypot(points[:, 0], points[:, 1])
         fine = (radius > self.inner) & (radius < self.outer)
-        colours = self._tiled(points, size=0.7, joint=0.03, palette=(self.plain,), variation=0.10)
-        colours[fine] = self._tiled(points[fine], size=0.14, joint=0.07, palette=self.mosaic, variation=0.30)
-        return colours
+        colors = self._tiled(points, size=0.7, joint=0.03, palette=(self.plain,), variation=0.10)
+        colors[fine] = self._tiled(points[fine], size=0.14, joint=0.07, palette=self.mosaic, variation=0.30)
+        return colors
 
-    def _tiled(self, points: Array, size: float, joint: float, palette: Sequence[Colour], variation: float) -> Array:
+    def _tiled(self, points: Array, size: float, joint: float, palette: Sequence[Color], variation: float) -> Array:
         grid = points[:, :2] / size
         cells = np.floor(grid).astype(np.int64)
         cells = np.concatenate([cells, np.zeros_like(cells[:, :1])], axis=1)
@@ -224,8 +229,8 @@ class Landscape:
 class Plaster:
     """A painted wall: two tones that pass into each other over about ``size`` units, and no fine detail."""
 
-    low: Colour
-    high: Colour
+    low: Color
+    high: Color
     size: float
     seed: int
 

@@ -101,7 +101,7 @@ def shade(scene: Scene, points: Array, directions: Array, owner: Array) -> Array
     Returns:
         RGB ``[M, 3]`` in [0, 1], float32.
     """
-    colours = np.zeros((len(points), 3), np.float32)
+    colors = np.zeros((len(points), 3), np.float32)
     for index, body in enumerate(scene.bodies):
         mine = np.flatnonzero(owner == index)
         if len(mine) == 0:
@@ -109,7 +109,7 @@ def shade(scene: Scene, points: Array, directions: Array, owner: Array) -> Array
         local = _to_local(body, points[mine])
         albedo = body.texture(local)
         if body.luminous:
-            colours[mine] = albedo
+            colors[mine] = albedo
             continue
         normals = body.shape.normal(local) @ body.rotation.T.astype(local.dtype)
         facing = normals @ scene.light.astype(normals.dtype)
@@ -121,8 +121,8 @@ def shade(scene: Scene, points: Array, directions: Array, owner: Array) -> Array
         lit[lit] = ~_in_shadow(scene, points[mine[lit]] + 10 * EPSILON * normals[lit])
         # Light from the sky: half of it is lost by a surface that looks down.
         sky = scene.ambient * (0.75 + 0.25 * normals[:, 2])
-        colours[mine] = albedo * (sky + scene.diffuse * facing * lit)[:, None] + (highlight * lit)[:, None]
-    return np.clip(colours, 0, 1)
+        colors[mine] = albedo * (sky + scene.diffuse * facing * lit)[:, None] + (highlight * lit)[:, None]
+    return np.clip(colors, 0, 1)
 
 
 def render(scene: Scene, camera: Camera, *, samples: int = 2) -> Array:
@@ -137,7 +137,7 @@ def render(scene: Scene, camera: Camera, *, samples: int = 2) -> Array:
         origins, directions = pixel_rays(camera, x.ravel(), y.ravel())
         distance, owner = first_hits(scene, origins, directions)
         reach = np.where(owner >= 0, distance, 0)[:, None]
-        colours = shade(scene, origins + reach * directions, directions, owner)
-        block = colours.reshape(bottom - top, samples, camera.width, samples, 3)
+        colors = shade(scene, origins + reach * directions, directions, owner)
+        block = colors.reshape(bottom - top, samples, camera.width, samples, 3)
         picture[top:bottom] = block.mean(axis=(1, 3))
     return picture

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,8 @@ def read_curves(folder: Path) -> Curves | None:
     return curves if curves else None
 
 
-def _curve(events: list) -> Curve:  # type: ignore[type-arg]
+def _curve(events: Sequence[Any]) -> Curve:
+    """A curve of tensorboard's events, each with ``step``, ``value`` and ``wall_time``."""
     # A resumed run repeats the steps after its checkpoint; the later record of a step counts.
     by_step = {event.step: event.value for event in sorted(events, key=lambda event: event.wall_time)}
     steps = sorted(by_step)

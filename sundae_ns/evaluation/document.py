@@ -8,6 +8,8 @@ from sundae_ns.evaluation.flip import VARIANT
 from sundae_ns.evaluation.measured import MEGABYTE, Configuration, Measured
 from sundae_ns.evaluation.published import NOTE, Printed
 
+METRICS = (("psnr", 2), ("ssim", 4), ("flip", 4), ("lpips", 4))
+"""Metrics of a table, in the order of its columns, with their decimals."""
 _NONE = "-"
 
 
@@ -29,11 +31,8 @@ def _line(run: Measured, configuration: Configuration) -> list[str]:
         number(run.primitives, 0),
         number(configuration.bytes / MEGABYTE, 2),
         number(configuration.ms, 2),
-        *(number(configuration.mean(metric), digits) for metric, digits in _METRICS),
+        *(number(configuration.mean(metric), digits) for metric, digits in METRICS),
     ]
-
-
-_METRICS = (("psnr", 2), ("ssim", 4), ("flip", 4), ("lpips", 4))
 
 
 def document(

@@ -150,7 +150,16 @@ def plot_costs(path: Path, runs: Sequence[Measured], colors: Mapping[str, Any], 
 
 
 def plot_gain(path: Path, runs: Sequence[Measured], colors: Mapping[str, Any]) -> bool:
-    """What the head adds to PSNR and SSIM against the milliseconds it adds; false, and no file, where no run has one."""
+    """What the head adds to PSNR and SSIM against the milliseconds it adds.
+
+    Args:
+        path: the file to write.
+        runs: all of one scene.
+        colors: from :func:`colors_of`.
+
+    Returns:
+        Whether there was something to plot; without a timed run with a head there is no file.
+    """
     compensated = [run for run in runs if run.has_head and run.full.ms is not None and run.bare.ms is not None]
     if not compensated:
         return False
@@ -174,7 +183,13 @@ def plot_gain(path: Path, runs: Sequence[Measured], colors: Mapping[str, Any]) -
 
 
 def plot_views(path: Path, runs: Sequence[Measured], colors: Mapping[str, Any]) -> None:
-    """PSNR of every test view, of all runs of one scene: solid with the head, dashed without."""
+    """PSNR of every test view: solid with the head, dashed without.
+
+    Args:
+        path: the file to write.
+        runs: all of one scene.
+        colors: from :func:`colors_of`.
+    """
     count = max(len(run.full.views) for run in runs)
     figure, panels = _figure(1, 1, width=min(7 + 0.12 * count, 16), height=3.8)
     panel = panels[0, 0]

@@ -23,11 +23,14 @@ class Timing:
     repeats: int
 
 
-def _wait(device: torch.device) -> None:
+def now(device: torch.device | str) -> float:
+    """Seconds by the host's wall clock, from any start, read once the device has done what was asked of it."""
+    device = torch.device(device)
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     elif device.type == "mps":
         torch.mps.synchronize()
+    return time.perf_counter()
 
 
 def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: int = 5, repeats: int = 20) -> Timing:
@@ -47,14 +50,11 @@ def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: i
     """
     if warmup < 0 or repeats < 1:
         raise ConfigError(f"{warmup} warm-up calls and {repeats} timed ones; give at least 0 and 1.")
-    device = torch.device(device)
     for _ in range(warmup):
         fn()
     times = []
     for _ in range(repeats):
-        _wait(device)
-        start = time.perf_counter()
+        start = now(device)
         fn()
-        _wait(device)
-        times.append(1e3 * (time.perf_counter() - start))
+        times.append(1e3 * (now(device) - start))
     return Timing(float(np.median(times)), min(times), float(np.quantile(times, 0.9, method="higher")), repeats)

@@ -35,6 +35,25 @@ def storage_error(what: str, error: OSError) -> StorageError | None:
 
 
 @contextmanager
+def writing(what: str) -> Iterator[None]:
+    """Turn an error of the file system that a user can mend into one of ours; others pass.
+
+    Args:
+        what: what fails then, without a full stop: ``"cannot make runs/a"``.
+
+    Raises:
+        StorageError: the disk is full, or may not be written to.
+    """
+    try:
+        yield
+    except OSError as error:  # ours, which have no number, pass too
+        ours = storage_error(what, error)
+        if ours is None:
+            raise
+        raise ours from error
+
+
+@contextmanager
 def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     """Yield a path to write to; after the block it is flushed to disk and takes the place of ``path`` in one step.
 
@@ -50,15 +69,11 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     """
     partial = partial or path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
-        yield partial
-        _flush(partial)
-        partial.replace(path)
-        _flush(path.parent)
-    except OSError as error:
-        ours = storage_error(f"cannot write {path}", error)
-        if ours is None:
-            raise
-        raise ours from error
+        with writing(f"cannot write {path}"):
+            yield partial
+            _flush(partial)
+            partial.replace(path)
+            _flush(path.parent)
     finally:
         with suppress(OSError):
             partial.unlink()

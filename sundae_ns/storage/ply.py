@@ -30,6 +30,10 @@ _COLUMNS = {
 }
 _NORMALS = ("nx", "ny", "nz")
 _MAX_SH_DEGREE = 4
+_SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
+_SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
+MAX_HEADER = 1 << 16
+"""Bytes of a file in which its header must end."""
 
 
 def _rest_columns(count: int) -> tuple[str, ...]:
@@ -97,15 +101,10 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
         data.write(str(partial))
 
 
-_SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
-_SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
-_MAX_HEADER = 1 << 16
-
-
 def _damage(path: Path) -> str | None:
     """Why a file cannot hold what its header states, or None; the parser allocates by what is stated."""
     with path.open("rb") as file:
-        header, found, _ = file.read(_MAX_HEADER).partition(b"end_header")
+        header, found, _ = file.read(MAX_HEADER).partition(b"end_header")
     lines = [line.split() for line in header.splitlines()]
     if not found or lines[0] != [b"ply"]:
         return "it has no header of a .ply"

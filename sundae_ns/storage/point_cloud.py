@@ -12,9 +12,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.ply import load_ply, stack_columns
-
-_MAX_HEADER = 1 << 16
+from sundae_ns.storage.ply import MAX_HEADER, load_ply, stack_columns
 
 MODEL_FRAME = "Coordinates: nerfstudio model"
 """Header comment of files whose primitives are in the coordinates of nerfstudio's model, not of the capture."""
@@ -81,7 +79,7 @@ def is_nerfstudio_ply(path: Path) -> bool:
     """
     try:
         with Path(path).open("rb") as file:
-            header = file.read(_MAX_HEADER).partition(b"end_header")[0]
+            header = file.read(MAX_HEADER).partition(b"end_header")[0]
     except OSError:
         return False
     comments = [line[len(b"comment ") :].strip() for line in header.splitlines() if line.startswith(b"comment ")]

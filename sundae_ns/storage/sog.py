@@ -31,12 +31,12 @@ from sundae_ns.storage.spz import checked
 
 MAX_PALETTE = 1 << 16
 """Rows of harmonics that two bytes can name."""
-_ROW_ENTRIES = 64
-_ENTRIES = 256
-_COARSE = 256
-_ROUNDS = 30
-_LEVELS = 65535
-_FIRST_MODE = 252
+_ROW_ENTRIES = 64  # rows of the palette in a row of its picture
+_ENTRIES = 256  # numbers that a byte can name
+_COARSE = 256  # cells that share out the rows of a large palette
+_ROUNDS = 30  # of Lloyd's, for numbers on a line
+_LEVELS = 65535  # highest level of a position, of two bytes
+_FIRST_MODE = 252  # alpha of a rotation whose first component is left out; the others follow
 
 
 def write_sog(

@@ -27,10 +27,10 @@ MAX_SH_DEGREE = 3
 HARMONICS_STEP = 1 / 64
 """Costs 0.03 dB where the finest step costs 0.01 and the one twice as coarse 0.12; see docs/packing.md."""
 _VERSION = 3  # one gzip stream; more programs read it than version 4
-_HEADER_FLAGS = 14
-_ANTIALIASED = 0x1
-_LARGEST = (1 << 23) - 1
-_MOST_BITS = 24
+_HEADER_FLAGS = 14  # byte of the header
+_ANTIALIASED = 0x1  # one of these flags
+_LARGEST = (1 << 23) - 1  # coordinate in steps, of 24 bits with a sign
+_MOST_BITS = 24  # binary places of a coordinate
 _FEWEST_BITS = 8
 
 

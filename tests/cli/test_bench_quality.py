@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
+import shlex
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+import tyro
 from rich.console import Console
 
+from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
 from sundae_ns.cli.bench.plan import ARMS, Job, Schedule, done_file, jobs_of_shard, parser_of, plan_scene, schedule_of
 from sundae_ns.cli.bench.quality import run_paper, run_quality
 from sundae_ns.cli.bench.recipes import RECIPES, find_scene
@@ -77,27 +80,30 @@ def capture(tmp_path: Path) -> Path:
 
 def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[int, str]:
     text = StringIO()
-    options: dict[str, Any] = {
-        "arms": ("sundae", "random-no-head", "mcmc", "splatfacto"),
-        "keep_ratios": (0.01, 0.1),
-        "seeds": (42, 43, 44),
-        "repeat_at": (0.1,),
-        "method": "sundae",
-        "warmup_steps": None,
-        "finetune_steps": None,
-        "steps_scale": 1.0,
-        "downscale": 1,
-        "shard": "1/1",
-        "jobs": False,
-    }
-    code = run_quality(
-        capture,
-        out,
-        **{**options, **changed},
-        runner=runner,
-        console=Console(file=text, width=200, force_terminal=False),
-    )
+    options: dict[str, Any] = {"arms": ("sundae", "random-no-head", "mcmc", "splatfacto"), **changed}
+    console = Console(file=text, width=200, force_terminal=False)
+    code = run_quality(QualityOptions(capture, out, **options), runner=runner, console=console)
     return code, text.getvalue()
+
+
+# --------------------------------------------------------------------------------------------------------------- options
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        QualityOptions(Path("a b"), Path("out")),
+        QualityOptions(Path("a"), Path("o"), arms=("random",), warmup_steps=7, steps_scale=0.5, downscale=4),
+        PaperOptions(Path("a b"), Path("out")),
+        PaperOptions(Path("a"), Path("o"), scenes=("garden", "room"), seed=1, finetune_steps=9, method="sundae-tiny"),
+    ],
+)
+def test_a_page_names_the_command_of_the_whole(options: QualityOptions | PaperOptions) -> None:
+    part = replace(options, shard="2/3", jobs=True)
+    assert part.command() == options.command()
+    words = shlex.split(part.command())
+    assert words[:3] == ["sundae", "bench", "quality" if isinstance(options, QualityOptions) else "paper"]
+    assert tyro.cli(type(options), args=words[3:]) == options
 
 
 # ----------------------------------------------------------------------------------------------------------------- plans
@@ -297,20 +303,9 @@ def archives(tmp_path: Path) -> Path:
 
 def paper(root: Path, out: Path, runner: Runner, **changed: Any) -> tuple[int, str]:
     text = StringIO()
-    options: dict[str, Any] = {
-        "scenes": (),
-        "arms": ("sundae", "splatfacto"),
-        "keep_ratios": (0.01, 0.1, 0.3, 0.5),
-        "seed": 42,
-        "method": "sundae",
-        "warmup_steps": None,
-        "finetune_steps": None,
-        "steps_scale": 1.0,
-        "shard": "1/1",
-        "jobs": False,
-    }
+    options: dict[str, Any] = {"arms": ("sundae", "splatfacto"), **changed}
     console = Console(file=text, width=200, force_terminal=False)
-    return run_paper(root, out, **{**options, **changed}, runner=runner, console=console), text.getvalue()
+    return run_paper(PaperOptions(root, out, **options), runner=runner, console=console), text.getvalue()
 
 
 def cells_of(page: str, first: str) -> list[str]:

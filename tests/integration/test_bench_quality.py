@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from sundae_ns.cli import main
 from sundae_ns.cli.bench.job import perform
+from sundae_ns.cli.bench.options import PaperOptions
 from sundae_ns.cli.bench.plan import Job, parser_of, plan_scene, schedule_of
 from sundae_ns.cli.bench.quality import run_paper
 from sundae_ns.evaluation import read_rows
@@ -106,21 +107,16 @@ def published(scene: Path, out: Path, *, factor: int) -> None:
 def test_a_scene_as_it_is_published(tiny: Any, tmp_path: Path) -> None:
     published(tiny.scene, tmp_path / "360_v2" / "bicycle", factor=4)
     published(tiny.scene, tmp_path / "360_v2" / "counter", factor=2)
-    code = run_paper(
+    options = PaperOptions(
         tmp_path,
         tmp_path / "out",
-        scenes=(),
         arms=("sundae",),
         keep_ratios=(0.5,),
-        seed=42,
         method="sundae-tiny",
         warmup_steps=WARMUP,
         finetune_steps=FINETUNE,
-        steps_scale=1.0,
-        shard="1/1",
-        jobs=False,
-        runner=in_process,
     )
+    code = run_paper(options, runner=in_process)
     assert code == 0
     rows = [row for row in read_rows(tmp_path / "out" / "results.csv") if row.variant == "sundae"]
     meta = json.loads((tiny.scene / "transforms.json").read_text())

@@ -350,3 +350,8 @@ def test_a_target_may_be_the_cap() -> None:
 @pytest.mark.parametrize("budget", [{}, {"max_psnr_drop": 0.5}, {"max_bytes": 100}, {"max_primitives": 1}])
 def test_one_budget_is_enough(budget: dict[str, object]) -> None:
     PruningConfig(mode="auto", stop=20000, **budget).validate()  # type: ignore[arg-type]
+
+
+def test_the_share_is_that_of_what_the_cap_leaves() -> None:
+    config = PruningConfig(mode="continuous", max_primitives=30)
+    assert (config.share(60), config.share(10), PruningConfig(keep_ratio=0.2).share(60)) == (0.5, 1.0, 0.2)

@@ -16,6 +16,7 @@ import torch
 from sundae_ns.errors import StorageError
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import replacing, write_ply, write_text
+from sundae_ns.storage.atomic import writing
 
 
 @contextmanager
@@ -92,3 +93,13 @@ def test_what_the_system_says_becomes_one_line(
 def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         write_text(tmp_path / "nowhere" / "a.txt", "new")
+
+
+def test_only_what_a_user_can_mend_becomes_an_error_of_ours() -> None:
+    with pytest.raises(StorageError, match="^cannot make a: the disk is full; make room$"), writing("cannot make a"):
+        raise OSError(errno.ENOSPC, "no space")
+    ours, theirs = StorageError("cannot write b: denied"), OSError(errno.EMFILE, "too many open files")
+    for error in (ours, theirs):
+        with pytest.raises(OSError, match=str(error.args[-1])) as caught, writing("cannot make a"):
+            raise error
+        assert caught.value is error

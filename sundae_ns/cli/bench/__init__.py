@@ -7,9 +7,11 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sundae_ns.cli.bench.plan import ARMS
+from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
 
 app = tyro.extras.SubcommandApp()
+INLINE = tyro.conf.arg(name="")
+"""Shows the fields of a dataclass as options of the command itself."""
 
 
 @app.command
@@ -53,109 +55,26 @@ def graph(
 
 
 @app.command
-def quality(
-    scene: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    arms: tuple[str, ...] = ARMS,
-    keep_ratios: tuple[float, ...] = (0.01, 0.1),
-    seeds: tuple[int, ...] = (42, 43, 44),
-    repeat_at: tuple[float, ...] = (0.1,),
-    method: str = "sundae",
-    warmup_steps: int | None = None,
-    finetune_steps: int | None = None,
-    steps_scale: float = 1.0,
-    downscale: int = 1,
-    shard: str = "1/1",
-    jobs: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
-) -> int:
+def quality(options: Annotated[QualityOptions, INLINE]) -> int:
     """Warm up once a seed, branch, fine-tune and evaluate; peers in the same run. Stopped, the same command goes on.
 
     Every finished job is a file of one line in OUT/done. Parts of a plan (--shard) may run side by side, in one folder or
     in several whose results.jsonl are concatenated into one.
-
-    Args:
-        scene: folder of a capture: COLMAP layout (sparse/0, images), or with a transforms.json.
-        out: folder for jobs, results and tables; what is finished in it is not done again.
-        arms: what to compare: sundae, band, contribution, random, each also with -no-head; mcmc, splatfacto, splatfacto-7k.
-        keep_ratios: shares of the warm-up's primitives.
-        seeds: the first for everything, the others for what is at --repeat-at.
-        repeat_at: shares that all seeds are run for.
-        method: method of ours whose options the jobs have.
-        warmup_steps: length of the warm-up instead of the method's own.
-        finetune_steps: length of the fine-tuning instead of the method's own.
-        steps_scale: factor on all lengths, for a trial.
-        downscale: take the pictures of images_2, images_4 ... (COLMAP layout).
-        shard: i/n does the i-th of n parts.
-        jobs: list the jobs, and which are done, and do nothing.
     """
     from sundae_ns.cli.bench.quality import run_quality
 
-    return run_quality(
-        scene,
-        out,
-        arms=arms,
-        keep_ratios=keep_ratios,
-        seeds=seeds,
-        repeat_at=repeat_at,
-        method=method,
-        warmup_steps=warmup_steps,
-        finetune_steps=finetune_steps,
-        steps_scale=steps_scale,
-        downscale=downscale,
-        shard=shard,
-        jobs=jobs,
-    )
+    return run_quality(options)
 
 
 @app.command
-def paper(
-    root: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    scenes: tuple[str, ...] = (),
-    arms: tuple[str, ...] = ("sundae", "sundae-no-head", "splatfacto"),
-    keep_ratios: tuple[float, ...] = (0.01, 0.1, 0.3, 0.5),
-    seed: int = 42,
-    method: str = "sundae",
-    warmup_steps: int | None = None,
-    finetune_steps: int | None = None,
-    steps_scale: float = 1.0,
-    shard: str = "1/1",
-    jobs: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False,
-) -> int:
+def paper(options: Annotated[PaperOptions, INLINE]) -> int:
     """Measure the paper's eleven scenes at its keep ratios, into one table beside its own figures.
 
     Pictures are those that papers measure on: images_4 outdoors and images_2 indoors of Mip-NeRF 360, every eighth for test.
-
-    Args:
-        root: folder with the archives as they unpack: 360_v2, tandt and db, or the scenes themselves.
-        out: folder for jobs, results and tables; what is finished in it is not done again.
-        scenes: some of the eleven; all that are there by default.
-        arms: as in bench quality.
-        keep_ratios: shares of the warm-up's primitives.
-        seed: of everything.
-        method: method of ours whose options the jobs have.
-        warmup_steps: length of the warm-up instead of the method's own.
-        finetune_steps: length of the fine-tuning instead of the method's own.
-        steps_scale: factor on all lengths, for a trial.
-        shard: i/n does the i-th of n parts.
-        jobs: list the jobs, and which are done, and do nothing.
     """
     from sundae_ns.cli.bench.quality import run_paper
 
-    return run_paper(
-        root,
-        out,
-        scenes=scenes,
-        arms=arms,
-        keep_ratios=keep_ratios,
-        seed=seed,
-        method=method,
-        warmup_steps=warmup_steps,
-        finetune_steps=finetune_steps,
-        steps_scale=steps_scale,
-        shard=shard,
-        jobs=jobs,
-    )
+    return run_paper(options)
 
 
 @app.command

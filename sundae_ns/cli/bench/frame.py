@@ -28,7 +28,14 @@ def run_frame(
     repeats: int,
     json: bool,
 ) -> int:
-    """Measure and print; options are those of the command."""
+    """Measure and print; options are those of the command.
+
+    Raises:
+        BackendError: a CPU was asked for another precision than fp32.
+        CheckpointError: the run cannot be opened.
+        ConfigError: an option cannot work.
+        DataError: the capture is gone or has no test views.
+    """
     if repeats < 1 or (views is not None and views < 1):
         raise ConfigError(f"{repeats} timed runs of {views} views measure nothing: use at least 1 of each")
     with redirect_stdout(sys.stderr):  # what nerfstudio says while it loads is no figure

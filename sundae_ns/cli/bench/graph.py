@@ -13,8 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sundae_ns.cli.bench.figures import significant
 from sundae_ns.cli.bench.points import Distribution, draw
 from sundae_ns.errors import BackendError, ConfigError
+from sundae_ns.evaluation.timing import now
 from sundae_ns.filters import high_pass
 from sundae_ns.graphs import NeighborGraph, build_graph
 
@@ -34,7 +36,13 @@ def run_graph(
     seed: int,
     json: bool,
 ) -> int:
-    """Measure and print; options are those of the command."""
+    """Measure and print; options are those of the command.
+
+    Raises:
+        BackendError: there is no CUDA device, or memory cannot be measured here.
+        CheckpointError: the field cannot be read.
+        ConfigError: an option cannot work.
+    """
     if repeats < 1:
         raise ConfigError(f"{repeats} timed runs measure nothing: use at least 1")
     if device == "cuda" and not torch.cuda.is_available():
@@ -73,16 +81,19 @@ def measure(positions: Tensor, neighbors: int, device: str, repeats: int, refere
         device: where to measure.
         repeats: timed runs, after one that is not timed.
         reference: whether to run cKDTree.
+
+    Raises:
+        BackendError: memory cannot be measured here.
     """
     placed = positions.to(device)
     stages: dict[str, float] = {}
 
     def run() -> tuple[NeighborGraph, Tensor]:
-        started = _now(device)
+        started = now(device)
         found = build_graph(placed, num_neighbors=neighbors)
-        built = _now(device)
+        built = now(device)
         response = high_pass(found, placed)
-        stages.update(graph=built - started, response=_now(device) - built)
+        stages.update(graph=built - started, response=now(device) - built)
         return found, response
 
     run()
@@ -94,19 +105,19 @@ def measure(positions: Tensor, neighbors: int, device: str, repeats: int, refere
         responses.append(stages["response"])
     (found, response), peak = _with_peak(run, device)
     result: dict[str, Any] = {
-        "seconds": _rounded(statistics.median(times)),
-        "graph_seconds": _rounded(statistics.median(graphs)),
-        "response_seconds": _rounded(statistics.median(responses)),
+        "seconds": significant(statistics.median(times)),
+        "graph_seconds": significant(statistics.median(graphs)),
+        "response_seconds": significant(statistics.median(responses)),
         "reference_seconds": None,
         "speedup": None,
         "index_mismatches": None,
-        "response_rel_error": float(f"{_response_error(placed, neighbors, response):.3g}"),
+        "response_rel_error": significant(_response_error(placed, neighbors, response), 3),
         "peak_mib": round(peak / 2**20, 1),
     }
     if reference:
         seconds, distances = _reference(positions, neighbors)
-        result["reference_seconds"] = _rounded(seconds)
-        result["speedup"] = _rounded(seconds / statistics.median(times))
+        result["reference_seconds"] = significant(seconds)
+        result["speedup"] = significant(seconds / statistics.median(times))
         result["index_mismatches"] = count_mismatches(positions, found.indices.cpu(), distances)
     return result
 
@@ -155,12 +166,6 @@ def _response_error(placed: Tensor, neighbors: int, response: Tensor) -> float:
     return float((response.double() - exact)[known].norm()) / norm if norm > 0 else 0.0
 
 
-def _now(device: str) -> float:
-    if device == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter()
-
-
 def _with_peak(run: Callable[[], Any], device: str) -> tuple[Any, int]:
     """What a run gives, and the most memory that it took beside what was there before, in bytes."""
     if device == "cuda":
@@ -183,7 +188,3 @@ def _with_peak(run: Callable[[], Any], device: str) -> tuple[Any, int]:
 def _resident(status: Path, name: str) -> int:
     line = next(line for line in status.read_text().splitlines() if line.startswith(f"{name}:"))
     return 1024 * int(line.split()[1])
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.4g}")

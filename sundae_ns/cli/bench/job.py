@@ -32,6 +32,7 @@ from sundae_ns.opening import open_scene
 from sundae_ns.storage.atomic import write_text
 
 NEVER = 10**9
+"""A step that no training reaches."""
 
 
 def read_result(path: Path) -> dict[str, Any] | None:
@@ -210,7 +211,7 @@ def _forget() -> None:
 
 
 def read_job(path: Path) -> Job:
-    """Description of a job, from its file."""
+    """Description of a job, from the ``job.json`` that ``bench.quality`` writes into its folder."""
     plain = json.loads(path.read_text(encoding="utf-8"))
     return Job(**{**plain, "options": tuple(plain["options"]), "parser": tuple(plain["parser"])})
 

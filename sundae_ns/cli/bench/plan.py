@@ -104,13 +104,17 @@ def schedule_of(method: str, *, warmup: int | None, finetune: int | None, scale:
 
 
 def parser_of(data: Path, downscale: int = 1) -> tuple[str, ...]:
-    """Data parser for the layout of a capture's folder; every eighth picture for test, as papers measure.
+    """Data parser for the layout of a capture's folder, and its options; every eighth picture for test, as papers measure.
 
     Args:
         data: with ``sparse/0`` and ``images`` (COLMAP), or with a ``transforms.json`` (its own split).
         downscale: takes pictures and cameras smaller by this, from ``images_2``, ``images_4`` ... (COLMAP alone).
 
+    Returns:
+        Words of the command line; none for the method's own parser.
+
     Raises:
+        ConfigError: smaller pictures of a capture that is not in COLMAP layout.
         DataError: neither layout, or no such pictures.
     """
     if (data / "sparse" / "0").is_dir():
@@ -156,7 +160,7 @@ def plan_scene(
         ConfigError: an arm, share or seed that cannot be.
     """
     _check(arms, keep_ratios, seeds, repeat_at)
-    # A shared key for all that is the same whatever the arm.
+    # The same for all jobs on this capture.
     where = {"scene": scene, "data": str(data), "parser": tuple(parser)}
     total = schedule.warmup + schedule.finetune
     jobs: list[Job] = []

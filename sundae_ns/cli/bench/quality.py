@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -13,14 +12,24 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
-from sundae_ns.cli.bench.plan import Job, done_file, job_folder, jobs_of_shard, parser_of, plan_scene, schedule_of
+from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
+from sundae_ns.cli.bench.plan import (
+    Job,
+    Schedule,
+    done_file,
+    job_folder,
+    jobs_of_shard,
+    parser_of,
+    plan_scene,
+    schedule_of,
+)
 from sundae_ns.cli.bench.recipes import plan_paper
 from sundae_ns.cli.bench.results import Result, paper_page, quality_page, read_results, write_results
 from sundae_ns.cli.bench.shards import parse_shard
 from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.evaluation.document import table
-from sundae_ns.storage.atomic import storage_error, write_text
+from sundae_ns.storage.atomic import write_text, writing
 
 SAID = "sundae: "
 """How a line begins in which a job says why it ends."""
@@ -33,107 +42,60 @@ Runner = Callable[[Job, Path, OnPercent], None]
 """Does one job, and leaves its result in ``done/``."""
 
 
-def run_quality(
-    scene: Path,
-    out: Path,
-    *,
-    arms: Sequence[str],
-    keep_ratios: Sequence[float],
-    seeds: Sequence[int],
-    repeat_at: Sequence[float],
-    method: str,
-    warmup_steps: int | None,
-    finetune_steps: int | None,
-    steps_scale: float,
-    downscale: int,
-    shard: str,
-    jobs: bool,
-    runner: Runner | None = None,
-    console: Console | None = None,
-) -> int:
-    """Compare arms on one capture; options are those of the command.
+def run_quality(options: QualityOptions, *, runner: Runner | None = None, console: Console | None = None) -> int:
+    """Compare arms on one capture; the exit code.
+
+    Args:
+        options: those of the command.
+        runner: does a job; by default in a process of its own (:func:`spawn`).
+        console: to report to.
 
     Raises:
         ConfigError: an option cannot work, or the folder holds results of other jobs of the same names.
         DataError: there is no such capture.
         StorageError: the folder cannot be written to.
     """
-    console, part = console or Console(), parse_shard(shard)
-    schedule = schedule_of(method, warmup=warmup_steps, finetune=finetune_steps, scale=steps_scale)
-    data = scene.resolve()
+    console, part, schedule = console or Console(), parse_shard(options.shard), _schedule(options)
+    data = options.scene.resolve()
     plan = plan_scene(
         data.name,
         data,
-        parser_of(data, downscale),
+        parser_of(data, options.downscale),
         schedule,
-        arms=arms,
-        keep_ratios=keep_ratios,
-        seeds=seeds,
-        repeat_at=repeat_at,
+        arms=options.arms,
+        keep_ratios=options.keep_ratios,
+        seeds=options.seeds,
+        repeat_at=options.repeat_at,
     )
-    command = _command(
-        ["sundae", "bench", "quality", str(scene), "-o", str(out)],
-        arms=arms,
-        keep_ratios=keep_ratios,
-        seeds=seeds,
-        repeat_at=repeat_at,
-        method=method,
-        warmup_steps=warmup_steps,
-        finetune_steps=finetune_steps,
-        steps_scale=steps_scale,
-        downscale=downscale,
-    )
-    return _list_or_do(plan, part, out, lambda results: quality_page(results, command), jobs, runner, console)
+    own = jobs_of_shard(plan, *part)
+    return _list_or_do(own, options, lambda results: quality_page(results, options.command()), runner, console)
 
 
-def run_paper(
-    root: Path,
-    out: Path,
-    *,
-    scenes: Sequence[str],
-    arms: Sequence[str],
-    keep_ratios: Sequence[float],
-    seed: int,
-    method: str,
-    warmup_steps: int | None,
-    finetune_steps: int | None,
-    steps_scale: float,
-    shard: str,
-    jobs: bool,
-    runner: Runner | None = None,
-    console: Console | None = None,
-) -> int:
-    """Measure the paper's scenes; options are those of the command.
+def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: Console | None = None) -> int:
+    """Measure the paper's scenes; the exit code. Arguments are as in :func:`run_quality`.
 
     Raises:
         ConfigError, DataError, StorageError: as in :func:`run_quality`.
     """
-    console, part = console or Console(), parse_shard(shard)
-    schedule = schedule_of(method, warmup=warmup_steps, finetune=finetune_steps, scale=steps_scale)
-    plan, missing = plan_paper(root.resolve(), schedule, scenes=scenes, arms=arms, keep_ratios=keep_ratios, seed=seed)
+    console, part, schedule = console or Console(), parse_shard(options.shard), _schedule(options)
+    plan, missing = plan_paper(
+        options.root.resolve(),
+        schedule,
+        scenes=options.scenes,
+        arms=options.arms,
+        keep_ratios=options.keep_ratios,
+        seed=options.seed,
+    )
     if missing:
         console.print(f"[yellow]Not there, and left out: {', '.join(missing)}", highlight=False)
-    command = _command(
-        ["sundae", "bench", "paper", str(root), "-o", str(out)],
-        scenes=scenes,
-        arms=arms,
-        keep_ratios=keep_ratios,
-        seed=seed,
-        method=method,
-        warmup_steps=warmup_steps,
-        finetune_steps=finetune_steps,
-        steps_scale=steps_scale,
+    own = jobs_of_shard(plan, *part)
+    return _list_or_do(own, options, lambda results: paper_page(results, missing, options.command()), runner, console)
+
+
+def _schedule(options: QualityOptions | PaperOptions) -> Schedule:
+    return schedule_of(
+        options.method, warmup=options.warmup_steps, finetune=options.finetune_steps, scale=options.steps_scale
     )
-    return _list_or_do(plan, part, out, lambda results: paper_page(results, missing, command), jobs, runner, console)
-
-
-def _command(words: list[str], **options: object) -> str:
-    """The command that a page names: that of the whole, whichever part of it was done here."""
-    for name, value in options.items():
-        values = [value] if isinstance(value, str) or not isinstance(value, Sequence) else list(value)
-        if values and values != [None]:
-            words += [f"--{name.replace('_', '-')}", *map(str, values)]
-    return shlex.join(words)
 
 
 def show_jobs(jobs: Sequence[Job], out: Path, console: Console) -> None:
@@ -203,10 +165,8 @@ def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
 
 def _describe(job: Job, out: Path) -> None:
     folder = job_folder(out, job.key)
-    try:
+    with writing(f"cannot make {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise storage_error(f"cannot make {folder}", error) or error from error
     write_text(folder / "job.json", json.dumps(asdict(job)) + "\n")
 
 
@@ -226,21 +186,19 @@ def _check_same(job: Job, result: Result, out: Path) -> None:
 
 
 def _list_or_do(
-    plan: Sequence[Job],
-    part: tuple[int, int],
-    out: Path,
+    jobs: Sequence[Job],
+    options: QualityOptions | PaperOptions,
     page: Callable[[Sequence[Result]], str],
-    only_list: bool,
     runner: Runner | None,
     console: Console,
 ) -> int:
-    """List this shard's part of a plan, or do it and write the tables; the exit code."""
-    own = jobs_of_shard(plan, *part)
-    if only_list:
-        show_jobs(own, out, console)
+    """List the jobs of this shard, or do them and write the tables; the exit code."""
+    out = options.out
+    if options.jobs:
+        show_jobs(jobs, out, console)
         return 0
     try:
-        failed = run_jobs(own, out, runner or spawn, console)
+        failed = run_jobs(jobs, out, runner or spawn, console)
     except KeyboardInterrupt:
         console.print("stopped; the same command goes on from here", highlight=False)
         return STOPPED

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from rich.console import Console
@@ -17,8 +17,10 @@ from rich.progress import track
 from rich.table import Table
 from torch import Tensor
 
+from sundae_ns.cli.bench.figures import significant
 from sundae_ns.cli.bench.shards import parse_shard
 from sundae_ns.errors import BackendError, ConfigError, DataError
+from sundae_ns.evaluation.timing import now
 from sundae_ns.rasterization import Backend, BackendName, rasterize, select_backend
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
@@ -28,11 +30,20 @@ WORTH_IT = 20.0
 """Seconds after which no further repeat is begun."""
 
 
+CANDIDATES: tuple[tuple[BackendName, str], ...] = (
+    ("gsplat", "cuda"),
+    ("reference", "cuda"),
+    ("cpu", "cpu"),
+    ("reference", "cpu"),
+)
+"""Rasterisers and their devices, of which all that run here are measured by default."""
+
+
 @dataclass(frozen=True)
 class Case:
     """What is measured: the fields that tell one row from another."""
 
-    rasterizer: str
+    rasterizer: BackendName
     device: str
     dtype: str
     primitives: int
@@ -45,6 +56,7 @@ class Case:
 
 
 Drawn = dict[str, Tensor]
+"""Tensors by name: primitives after activation, a camera, or what came out for them."""
 
 
 def run_rasterizer(
@@ -61,7 +73,13 @@ def run_rasterizer(
     output: Path | None,
     json: bool,
 ) -> int:
-    """Measure and print; options are those of the command."""
+    """Measure and print; options are those of the command.
+
+    Raises:
+        BackendError: a rasteriser that was asked for does not run here.
+        ConfigError: an option cannot work.
+        DataError: a line of the output file is no JSON.
+    """
     if not counts or min(counts) < 1 or min(size) < 1 or channels < 1 or repeats < 1 or not pixels > 0:
         raise ConfigError("nothing to measure: primitives, size, channels, pixels and repeats must be at least 1")
     index, parts = parse_shard(shard)
@@ -128,7 +146,7 @@ def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
         exact: from :func:`render` by the reference in float64.
         repeats: timed runs, fewer where they take longer than ``WORTH_IT`` seconds together.
     """
-    backend = select_backend(_name(case.rasterizer), case.device)
+    backend = select_backend(case.rasterizer, case.device)
     pulls = _pulls(case, DTYPES[case.dtype], case.device)
     scene, camera = (
         {key: value.to(case.device, DTYPES[case.dtype]) for key, value in part.items()} for part in draw_view(case)
@@ -148,15 +166,15 @@ def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
     forward_ms, forward_cpu_ms, _ = _median_ms(forward, repeats, case.device)
     both = _median_ms(lambda: render(case, scene, camera, pulls, backend), repeats, case.device)
     return {
-        "forward_ms": _rounded(forward_ms),
-        "forward_backward_ms": _rounded(both[0]),
-        "forward_cpu_ms": _rounded(forward_cpu_ms),
-        "forward_backward_cpu_ms": _rounded(both[1]),
+        "forward_ms": significant(forward_ms),
+        "forward_backward_ms": significant(both[0]),
+        "forward_cpu_ms": significant(forward_cpu_ms),
+        "forward_backward_cpu_ms": significant(both[1]),
         "repeats": both[2],
-        "max_error": _rounded(float(picture.max())),
-        "mean_error": _rounded(float(picture.mean())),
-        "gradient_error": _rounded(max(gradients.values())),
-        **{f"gradient_error_{key}": _rounded(value) for key, value in gradients.items()},
+        "max_error": significant(float(picture.max())),
+        "mean_error": significant(float(picture.mean())),
+        "gradient_error": significant(max(gradients.values())),
+        **{f"gradient_error_{key}": significant(value) for key, value in gradients.items()},
         "device_name": torch.cuda.get_device_name() if case.device == "cuda" else f"CPU, {case.threads} threads",
         "torch": torch.__version__,
     }
@@ -212,26 +230,22 @@ def _pulls(case: Case, dtype: torch.dtype = torch.float64, device: str = "cpu") 
     return pull[..., :-1].contiguous(), pull[..., -1:].contiguous()
 
 
-def _backends(names: Sequence[BackendName]) -> Iterator[tuple[str, str]]:
+def _backends(names: Sequence[BackendName]) -> Iterator[tuple[BackendName, str]]:
     """Rasterisers and their devices: those that were named, or by default all that run here."""
     if names:
         for name in names:
             device = "cuda" if name == "gsplat" else "cpu"
-            yield select_backend(name, device).name, device
+            yield cast(BackendName, select_backend(name, device).name), device  # not auto
         return
-    for default, device in (("gsplat", "cuda"), ("reference", "cuda"), ("cpu", "cpu"), ("reference", "cpu")):
+    for name, device in CANDIDATES:
         if device == "cuda" and not torch.cuda.is_available():
             continue
         try:
-            select_backend(_name(default), device)
+            select_backend(name, device)
         except BackendError as error:
-            print(f"without {default}: {error}", file=sys.stderr)
+            print(f"without {name}: {error}", file=sys.stderr)
             continue
-        yield default, device
-
-
-def _name(name: str) -> BackendName:
-    return name  # type: ignore[return-value]
+        yield name, device
 
 
 def _median_ms(function: Callable[[], object], repeats: int, device: str) -> tuple[float, float, int]:
@@ -240,17 +254,11 @@ def _median_ms(function: Callable[[], object], repeats: int, device: str) -> tup
     times: list[float] = []
     busy: list[float] = []
     while len(times) < repeats and sum(times) < WORTH_IT:
-        started, computed = _now(device), time.process_time()
+        started, computed = now(device), time.process_time()
         function()
-        times.append(_now(device) - started)
+        times.append(now(device) - started)
         busy.append(time.process_time() - computed)
     return 1e3 * statistics.median(times), 1e3 * statistics.median(busy), len(times)
-
-
-def _now(device: str) -> float:
-    if device == "cuda":
-        torch.cuda.synchronize()
-    return time.perf_counter()
 
 
 def _read(output: Path | None) -> Iterator[dict[str, Any]]:
@@ -283,7 +291,3 @@ def _table(rows: Sequence[dict[str, Any]], title: str) -> Table:
         errors = (f"{row[key]:.1e}" for key in ("max_error", "mean_error", "gradient_error"))
         table.add_row(f"{row['primitives']:,}", name, row["dtype"], *times, *errors)
     return table
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.4g}")

@@ -13,12 +13,13 @@ from typing import Any
 from sundae_ns.cli.bench.plan import ARMS
 from sundae_ns.errors import DataError
 from sundae_ns.evaluation import COLUMNS
-from sundae_ns.evaluation.document import number, table
+from sundae_ns.evaluation.document import METRICS, number, table
 from sundae_ns.evaluation.measured import HEAD_OFF, MEGABYTE
 from sundae_ns.evaluation.published import DATASETS, MEMBERS, NOTE, SCENES
 from sundae_ns.storage.atomic import write_text
 
 Result = Mapping[str, Any]
+"""What a job leaves in ``done/``: its description as ``job``, its figures as ``measured``."""
 
 
 def read_results(out: Path) -> list[Result]:
@@ -40,7 +41,11 @@ def read_results(out: Path) -> list[Result]:
 
 
 def write_results(out: Path, results: Sequence[Result], page: str) -> None:
-    """Write ``results.jsonl``, ``results.csv`` with the columns of runs.csv, and ``table.md``."""
+    """Write ``results.jsonl``, ``results.csv`` with the columns of runs.csv, and ``table.md``.
+
+    Raises:
+        StorageError: the folder cannot be written to.
+    """
     buffer = StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -51,16 +56,17 @@ def write_results(out: Path, results: Sequence[Result], page: str) -> None:
 
 
 def _cells(result: Result) -> list[Any]:
+    """A row of runs.csv: as ``Measured.row``, of a result that was read from a file."""
     measured = result["measured"]
     full, bare = measured["configurations"][0], measured["configurations"][-1]
-    special = {
+    renamed = {
         **{name: full["mean"][name] for name in ("psnr", "ssim", "lpips")},
         **{f"{name}_base": bare["mean"][name] for name in ("psnr", "ssim")},
         "ms_frame": full["ms"],
         "ms_splat": bare["ms"],
         "lpips_net": measured["lpips_net"] if full["mean"]["lpips"] is not None else "",
     }
-    return [special.get(name, measured.get(name)) for name in COLUMNS]
+    return [renamed.get(name, measured.get(name)) for name in COLUMNS]
 
 
 def _group(results: Sequence[Result]) -> dict[tuple[str, str, float | None], list[Result]]:
@@ -113,10 +119,7 @@ def quality_page(results: Sequence[Result], command: str) -> str:
                     [
                         *(arm, head, _percent(ratio), str(len(own))),
                         spread([r["measured"]["primitives"] for r in own], 0),
-                        *(
-                            spread([c["mean"][metric] for c in chosen], digits)
-                            for metric, digits in (("psnr", 2), ("ssim", 4), ("flip", 4), ("lpips", 4))
-                        ),
+                        *(spread([c["mean"][metric] for c in chosen], digits) for metric, digits in METRICS),
                         spread([c["bytes"] / MEGABYTE for c in chosen], 1),
                         spread([c["ms"] for c in chosen], 2),
                         spread([r["measured"]["train_s"] for r in own], 0) if place == 0 else "",
@@ -138,10 +141,9 @@ def paper_page(results: Sequence[Result], missing: Sequence[str], command: str) 
         "Measured: means over the test views, with the head where there is one. A mean over a data set stands only where",
         "all of its scenes are measured; the paper's 3DGS rows of Mip-NeRF 360 are means over nine scenes, not seven.",
     ]
-    for metric, digits in (("psnr", 2), ("ssim", 4)):
-        name = {"psnr": "PSNR, dB", "ssim": "SSIM"}[metric]
+    shares = [0.01, 0.1, 0.3, 0.5]
+    for metric, name, digits in (("psnr", "PSNR, dB", 2), ("ssim", "SSIM", 4)):
         heads = ["scene", *(f"{arm} {_percent(ratio)}".rstrip() for arm, ratio in arms)]
-        shares = [0.01, 0.1, 0.3, 0.5]
         heads += [f"*paper {share:.0%}*" for share in shares]
         rows = []
         for dataset, members in MEMBERS.items():

@@ -20,9 +20,9 @@ ROWS_AN_ENTRY = 16
 """Fields with fewer rows for each entry get smaller books, which would else take more bytes than they save."""
 EXACT = 0.001
 """Share of rows, those that the books fit worst, that are stored as they are; it bounds the error of all others."""
-_SAMPLE = 1 << 16
-_ROUNDS = 8
-_CHUNK = 1 << 14
+_SAMPLE = 1 << 16  # rows that books are found by
+_ROUNDS = 8  # of Lloyd's
+_CHUNK = 1 << 14  # rows that are compared with all centres at once
 
 
 class Codebooks(NamedTuple):

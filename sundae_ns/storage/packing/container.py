@@ -143,6 +143,7 @@ def write(
         Bytes of the file.
 
     Raises:
+        PackError: the header is longer than a reader takes.
         StorageError: no room or no right to write.
     """
     named = {name: np.asarray(array) for name, array in arrays.items()}

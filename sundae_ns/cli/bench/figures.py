@@ -1,0 +1,8 @@
+"""Figures as benchmarks print them."""
+
+from __future__ import annotations
+
+
+def significant(value: float, digits: int = 4) -> float:
+    """A number rounded to so many significant digits."""
+    return float(f"{value:.{digits}g}")

@@ -1,0 +1,85 @@
+"""Prunes between steps of training: the count, the optimizers, and that training goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+
+from sundae_ns.model import SundaeModel
+
+Build = Callable[..., SundaeModel]
+TrainingOf = Callable[[SundaeModel], Any]
+
+N = 60
+"""Primitives of a model that is built without a count."""
+
+
+@pytest.mark.parametrize("score", ["detail-contribution", "response-contribution", "opacity"])
+def test_prune_keeps_the_count_and_training_goes_on(
+    build: Build, training_of: TrainingOf, score: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training = training_of(build(pruning={"score": score}, background_color="black"))
+    losses = [training.step(step) for step in range(3)]
+    assert training.model.num_points == N
+    training.step(3)
+    assert training.model.num_points == N // 2
+    assert training.live()
+    assert "kept 30 of 60" in " ".join(capsys.readouterr().out.split())
+    before = training.model.means.detach().clone()
+    losses += [training.step(step) for step in range(4, 20)]
+    assert training.model.num_points == N // 2
+    assert training.live()
+    assert (training.model.means.detach() - before).abs().max() > 0
+    assert losses[-1]["main_loss"] < losses[3]["main_loss"] - 0.01
+    assert "base_loss" in losses[-1]
+    assert "base_loss" not in losses[0]
+
+
+def test_primitives_that_are_not_finite_are_dropped_and_counted(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training = training_of(build())
+    training.step(0)
+    training.step(1)
+    with torch.no_grad():
+        training.model.gauss_params["means"][[3, 5]] = torch.nan
+        training.model.gauss_params["scales"][7, 1] = torch.inf
+        training.model.gauss_params["features"][9, 0] = torch.nan
+    # A step on a broken field would spread the damage; the prune itself is what is tested.
+    training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 3)
+    training.callbacks[-1].run_callback_at_location(3, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+    assert training.model.num_points == round(0.5 * (N - 4))
+    assert all(torch.isfinite(value).all() for value in training.model.gauss_params.values())
+    assert training.live()
+    out = " ".join(capsys.readouterr().out.split())
+    assert "dropped 4 primitives that were not finite" in out
+    assert training.step(4)["main_loss"].isfinite()
+
+
+@pytest.mark.parametrize("options", [{"mode": "off"}, {"keep_ratio": 1.0}])
+def test_nothing_goes_unless_asked_for(build: Build, training_of: TrainingOf, options: dict[str, Any]) -> None:
+    training = training_of(build(pruning=options))
+    for step in range(6):
+        training.step(step)
+    assert training.model.num_points == N
+
+
+@pytest.mark.parametrize("redistribution", ["merge", "grow"])
+def test_rounds_prune_to_the_count_and_the_head_waits_for_the_last(
+    build: Build, training_of: TrainingOf, redistribution: str
+) -> None:
+    options = {"rounds": 3, "round_every": 2, "keep_ratio": 0.4, "redistribution": redistribution, "num_neighbors": 5}
+    training = training_of(build(pruning={**options, "selection": "systematic", "edges": "appearance"}))
+    counts, active = [], []
+    for step in range(11):
+        training.step(step)
+        counts.append(training.model.num_points)
+        active.append(training.model.head_active)
+        assert training.live()
+    assert counts == [60] * 3 + [44] * 2 + [33] * 2 + [24] * 4
+    assert active == [False] * 8 + [True] * 3
+    assert all(torch.isfinite(value).all() for value in training.model.gauss_params.values())

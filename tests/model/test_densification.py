@@ -1,0 +1,85 @@
+"""Continuous pruning while the field grows."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from torch import Tensor
+
+from sundae_ns.model import SundaeModel
+
+Build = Callable[..., SundaeModel]
+TrainingOf = Callable[[SundaeModel], Any]
+
+N = 60
+"""Primitives of a model that is built without a count."""
+
+
+@pytest.mark.parametrize("head_start", [None, 2])
+def test_continuous_pruning_and_densification_share_a_field(
+    build: Build, training_of: TrainingOf, head_start: int | None
+) -> None:
+    model = build(
+        head={"start_at": head_start},
+        pruning={
+            "mode": "continuous",
+            "start": 4,
+            "stop": 12,
+            "every": 4,
+            "target_primitives": 40,
+            "max_primitives": 70,
+        },
+        warmup_length=0,
+        refine_every=3,
+        reset_alpha_every=100,
+        densify_grad_thresh=1e-9,
+        stop_split_at=14,
+    )
+    model.strategy.pause_refine_after_reset = 0
+    training = training_of(model)
+    counts = []
+    for step in range(15):
+        training.step(step)
+        counts.append(model.num_points)
+        if step > 3:
+            assert training.live()
+        assert all(
+            len(value) == model.num_points
+            for value in model.strategy_state.values()
+            if isinstance(value, Tensor) and value.ndim
+        )
+    assert [counts[step] for step in (4, 8, 12)] == [40, 40, 40]
+    assert max(counts) > 40
+    # The cap holds at every step, and between growing and culling; densification ends with the last prune.
+    assert 40 < model.pruning_state["peak"] <= 70
+    assert counts[12:] == [40, 40, 40]
+    assert model.head_active
+
+
+def test_continuous_pruning_merges_and_leaves_adam_in_order(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+) -> None:
+    densified = {"warmup_length": 0, "refine_every": 3, "reset_alpha_every": 100, "stop_split_at": 9}
+    model = build(
+        pruning={"mode": "continuous", "start": 4, "stop": 10, "every": 4},
+        densify_grad_thresh=1e-9,
+        **densified,
+    )
+    model.strategy.pause_refine_after_reset = 0
+    training = training_of(model)
+    for step in range(13):
+        training.step(step)
+        assert training.live() or step < 4
+        assert all(value.isfinite().all() for value in model.gauss_params.values())
+        if model.pruning_state["pruned_at"] == step:
+            scales = model.gauss_params["scales"]
+            direction = training.optimizers.optimizers["scales"].state[scales]["exp_avg"]
+            # What was merged starts without one, and what stayed as it is keeps its own.
+            assert 0 < int((direction == 0).all(dim=1).sum()) < model.num_points
+    counts = [tuple(map(int, pair)) for pair in re.findall(r"kept (\d+) of (\d+)", capsys.readouterr().out)]
+    assert len(counts) == 2
+    assert all(after == round(before / 2) for after, before in counts)
+    assert counts[0][1] > N

@@ -1,0 +1,138 @@
+"""The field that a model starts with: sparse points, random ones, or a finished field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sundae_ns.datamanager import DATASET_FRAME
+from sundae_ns.errors import CheckpointError
+from sundae_ns.model import SundaeModel
+from sundae_ns.storage import similarity, write_ply
+
+Build = Callable[..., SundaeModel]
+Points = Callable[[], tuple[Tensor, Tensor]]
+MakeCamera = Callable[..., Cameras]
+TrainingOf = Callable[[SundaeModel], Any]
+
+N = 60
+"""Primitives of a model that is built without a count."""
+
+
+@pytest.mark.parametrize("seed_points", [None, (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))])
+def test_without_a_sparse_cloud_points_are_random(
+    build: Build, seed_points: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = build(seed_points=seed_points, num_random=40, random_scale=2.0)
+    assert model.num_points == 40
+    assert model.means.abs().max() <= 1
+    assert "no sparse point cloud" in " ".join(capsys.readouterr().out.split())
+
+
+def test_random_points_on_request_need_no_warning(build: Build, capsys: pytest.CaptureFixture[str]) -> None:
+    model = build(random_init=True, num_random=40)
+    assert model.num_points == 40
+    assert "Warning" not in capsys.readouterr().out
+
+
+def test_a_cloud_above_the_cap_is_cut_before_the_first_step(build: Build, capsys: pytest.CaptureFixture[str]) -> None:
+    model = build(pruning={"mode": "continuous", "max_primitives": 25})
+    assert model.num_points == 25
+    assert "starting from 25 of them" in " ".join(capsys.readouterr().out.split())
+
+
+def _ply(build: Build, path: Path, degree: int = 1, **options: Any) -> dict[str, Tensor]:
+    params = {name: value.detach() for name, value in build(sh_degree=degree).gauss_params.items()}
+    params["features_rest"] = torch.randn_like(params["features_rest"])
+    write_ply(path, params, **options)
+    return params
+
+
+def _frame() -> tuple[Tensor, float]:
+    turn = torch.tensor([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return torch.cat([turn, torch.tensor([[0.1], [0.2], [0.3]])], dim=1), 0.5
+
+
+def test_a_ply_of_the_capture_is_moved_into_the_model(build: Build, tmp_path: Path) -> None:
+    params = _ply(build, tmp_path / "a.ply")
+    model = build(warm_start=tmp_path / "a.ply", metadata={DATASET_FRAME: _frame()})
+    expected = similarity(params, *_frame())
+    for name in ("means", "scales", "quats", "features_rest", "opacities"):
+        torch.testing.assert_close(model.gauss_params[name].detach(), expected[name])
+    assert model.gauss_params["features"].shape == (N, 5)
+    as_is = build(warm_start=tmp_path / "a.ply", warm_start_frame="model")
+    torch.testing.assert_close(as_is.means.detach(), params["means"])
+
+
+def test_a_ply_of_the_capture_needs_to_know_the_way(build: Build, training_of: TrainingOf, tmp_path: Path) -> None:
+    _ply(build, tmp_path / "a.ply")
+    with pytest.raises(CheckpointError, match="warm-start-frame model") as caught:
+        training_of(build(warm_start=tmp_path / "a.ply"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_finished_run_opens_without_what_it_started_from(
+    build: Build, training_of: TrainingOf, tmp_path: Path
+) -> None:
+    """Training without the warm start is refused in one line; loading the run's checkpoint needs it no more."""
+    _ply(build, tmp_path / "a.ply")
+    state = build(warm_start=tmp_path / "a.ply", warm_start_frame="model").state_dict()
+    (tmp_path / "a.ply").unlink()
+    orphan = build(warm_start=tmp_path / "a.ply", warm_start_frame="model")
+    with pytest.raises(CheckpointError, match="does not exist"):
+        training_of(orphan)
+    orphan.load_state_dict(state)
+    assert torch.equal(orphan.means, state["gauss_params.means"])
+    training_of(orphan)
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_colours_are_those_of_the_cloud_and_of_the_warm_start(
+    build: Build, points: Points, camera: MakeCamera, tmp_path: Path, degree: int
+) -> None:
+    xyz, rgb = points()
+    model = build(sh_degree=degree, seed_points=(xyz, rgb))
+    shown = model._colors(model.gaussians, model.view_of(camera()).center).detach()
+    torch.testing.assert_close(shown, rgb / 255, rtol=0, atol=2e-3)
+    torch.save(
+        {"pipeline": {f"_model.{k}": v for k, v in model.state_dict().items()}}, tmp_path / "step-000000001.ckpt"
+    )
+    for wanted in (0, 1):
+        warm = build(sh_degree=wanted, warm_start=tmp_path / "step-000000001.ckpt")
+        again = warm._colors(warm.gaussians, warm.view_of(camera()).center).detach()
+        torch.testing.assert_close(again, shown, rtol=0, atol=2e-3)
+
+
+def test_a_warm_start_trains_at_full_resolution(build: Build, tmp_path: Path) -> None:
+    _ply(build, tmp_path / "a.ply")
+    options = {"num_downscales": 2, "resolution_schedule": 3000}
+    cold, warm = build(**options), build(warm_start=tmp_path / "a.ply", warm_start_frame="model", **options)
+    assert cold.train()._get_downscale_factor() == 4
+    assert warm.train()._get_downscale_factor() == 1
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_a_warm_start_of_another_sh_degree(build: Build, tmp_path: Path, degree: int) -> None:
+    params = _ply(build, tmp_path / "a.ply", degree=degree)
+    model = build(warm_start=tmp_path / "a.ply", warm_start_frame="model", sh_degree=1)
+    rest = model.gauss_params["features_rest"].detach()
+    assert rest.shape == (N, 3, 3)
+    shared = min(3, params["features_rest"].shape[1])
+    assert torch.equal(rest[:, :shared], params["features_rest"][:, :shared])
+    assert not rest[:, shared:].any()
+
+
+def test_a_warm_start_prunes_at_its_first_step(build: Build, training_of: TrainingOf, tmp_path: Path) -> None:
+    _ply(build, tmp_path / "a.ply")
+    training = training_of(build(warm_start=tmp_path / "a.ply", warm_start_frame="model", pruning={"prune_at": 15000}))
+    training.step(0)
+    assert training.model.num_points == N // 2
+    assert training.live()
+    assert "base_loss" in training.step(1)
+    assert training.model.num_points == N // 2

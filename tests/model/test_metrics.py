@@ -1,0 +1,52 @@
+"""Metrics of the model's pictures, and that LPIPS costs nothing until it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+import torchmetrics.image
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sundae_ns.model import SundaeModel
+
+Build = Callable[..., SundaeModel]
+Perturb = Callable[[SundaeModel], SundaeModel]
+MakeCamera = Callable[..., Cameras]
+MakeBatch = Callable[..., dict[str, Tensor]]
+
+
+def test_metrics_with_and_without_the_head(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = perturb(build()).eval()
+    monkeypatch.setattr(model.lpips, "download", False)
+    monkeypatch.setattr("sundae_ns.evaluation.lpips.lpips_weights_available", lambda _: False)
+    with torch.no_grad():
+        outputs = model.get_outputs_for_camera(camera())
+    metrics, images = model.get_image_metrics_and_images(outputs, batch())
+    assert set(metrics) == {"gaussian_count", "psnr", "ssim", "psnr_base", "ssim_base"}
+    assert all(type(value) is float for value in metrics.values())
+    truth = batch()["image"].float() / 255
+    for suffix, name in (("", "rgb"), ("_base", "base_rgb")):
+        mse = ((outputs[name] - truth) ** 2).mean()
+        assert metrics["psnr" + suffix] == pytest.approx(float(-10 * mse.log10()), abs=1e-4)
+    assert metrics["psnr"] != metrics["psnr_base"]
+    assert images["img"].shape == (32, 80, 3)
+    # A picture with alpha is composited over the background that it was rendered with.
+    assert torch.isfinite(torch.tensor(model.get_image_metrics_and_images(outputs, batch(channels=4))[0]["psnr"]))
+
+
+def test_lpips_is_not_built_and_not_saved(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("LPIPS was built")
+
+    monkeypatch.setattr(torchmetrics.image.LearnedPerceptualImagePatchSimilarity, "__init__", refuse)
+    model = build()
+    assert not [name for name in model.state_dict() if "lpips" in name]
+    assert not [name for name, _ in model.named_modules() if "lpips" in name]
+    # The field, the head and nerfstudio's empty marker of the device; nothing else costs bytes.
+    known = ("gauss_params.", "head.", "device_indicator_param", "_extra_state", "ssim.", "camera_optimizer.")
+    assert not [name for name in model.state_dict() if not name.startswith(known)]

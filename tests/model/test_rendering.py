@@ -1,0 +1,183 @@
+"""Pictures of the model: every output, with the head and without, crops, other scales, and a device without room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.utils import colormaps
+from torch import Tensor
+
+from sundae_ns.compensation import resize
+from sundae_ns.errors import MemoryExhaustedError
+from sundae_ns.model import SundaeModel
+
+Build = Callable[..., SundaeModel]
+Perturb = Callable[[SundaeModel], SundaeModel]
+MakeCamera = Callable[..., Cameras]
+TrainingOf = Callable[[SundaeModel], Any]
+
+N = 60
+"""Primitives of a model that is built without a count."""
+VIEWER_KEYS = {"rgb": 3, "base_rgb": 3, "depth": 1, "accumulation": 1, "features": 3, "response": 1, "background": 3}
+
+
+@pytest.mark.parametrize("size", [(30, 30), (31, 47), (97, 33)])
+@pytest.mark.parametrize("mode", ["residual", "features", "off"])
+@torch.no_grad()
+def test_every_output_can_be_shown(
+    build: Build, perturb: Perturb, camera: MakeCamera, mode: str, size: tuple[int, int]
+) -> None:
+    model = perturb(build(head={"mode": mode})).eval()
+    outputs = model.get_outputs_for_camera(camera(*size))
+    assert {name: value.shape for name, value in outputs.items()} == {
+        name: (size[1], size[0], channels) for name, channels in VIEWER_KEYS.items()
+    }
+    for name, value in outputs.items():
+        assert value.dtype == torch.float32, name
+        assert torch.isfinite(value).all(), name
+        shown = colormaps.apply_colormap(value, colormaps.ColormapOptions(normalize=name == "depth"))
+        assert shown.shape == (size[1], size[0], 3)
+    for name in ("rgb", "base_rgb", "accumulation", "features", "response"):
+        assert ((outputs[name] >= 0) & (outputs[name] <= 1)).all(), name
+    assert outputs["response"].max() > 0
+    assert (outputs["features"].std() > 0) == (mode != "off")
+
+
+@torch.no_grad()
+def test_a_crop_without_primitives_has_the_same_keys(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = perturb(build()).eval()
+    whole = model.get_outputs_for_camera(camera())
+    far = OrientedBox.from_params((50.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    empty = model.get_outputs_for_camera(camera(), obb_box=far)
+    assert list(empty) == list(whole)
+    assert {name: value.shape for name, value in empty.items()} == {n: v.shape for n, v in whole.items()}
+    assert torch.equal(empty["rgb"], empty["background"])
+    assert not empty["accumulation"].any()
+    half = OrientedBox.from_params((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), (2.0, 9.0, 9.0))
+    cropped = model.get_outputs_for_camera(camera(), obb_box=half)
+    assert 0 < cropped["accumulation"].sum() < whole["accumulation"].sum()
+    assert torch.equal(model.get_outputs_for_camera(camera())["rgb"], whole["rgb"])
+
+
+@torch.no_grad()
+def test_without_the_head_the_picture_is_the_base_exactly(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = perturb(build()).eval()
+    on = model.get_outputs_for_camera(camera())
+    assert (on["rgb"] - on["base_rgb"]).abs().max() > 1e-3
+    off, _ = model.render(model.gaussians, model.view_of(camera()), on["background"], compensate=False)
+    assert torch.equal(off["rgb"], off["base_rgb"])
+    # With features in the same pass the sums are taken in another order.
+    torch.testing.assert_close(off["base_rgb"], on["base_rgb"], atol=1e-6, rtol=0)
+    model.step = 3
+    before = model.get_outputs_for_camera(camera())
+    assert torch.equal(before["rgb"], before["base_rgb"])
+
+
+@torch.no_grad()
+def test_residual_head_starts_at_the_base_and_features_head_does_not_need_it(build: Build, camera: MakeCamera) -> None:
+    residual, features = build(), build(head={"mode": "features"})
+    residual.step = features.step = 10
+    outputs = residual.eval().get_outputs_for_camera(camera())
+    torch.testing.assert_close(outputs["rgb"], outputs["base_rgb"])
+    first = features.eval().get_outputs_for_camera(camera())
+    features.gauss_params["features_dc"].data.zero_()
+    second = features.get_outputs_for_camera(camera())
+    assert not torch.equal(first["base_rgb"], second["base_rgb"])
+    assert torch.equal(first["rgb"], second["rgb"])
+
+
+@torch.no_grad()
+def test_viewer_may_switch_modes_between_frames(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = perturb(build()).eval()
+    expected = model.get_outputs_for_camera(camera())["rgb"]
+    model.train()
+    model.get_outputs(camera())
+    model.eval()
+    assert torch.equal(model.get_outputs_for_camera(camera())["rgb"], expected)
+
+
+@torch.no_grad()
+def test_background_shows_where_nothing_is(build: Build, camera: MakeCamera) -> None:
+    model = build().eval()
+    model.set_background(torch.tensor([0.2, 0.4, 0.6]))
+    model.gauss_params["means"].data += 100.0
+    outputs = model.get_outputs_for_camera(camera())
+    torch.testing.assert_close(outputs["rgb"], torch.tensor([0.2, 0.4, 0.6]).expand(32, 40, 3))
+
+
+def at_focal(camera: MakeCamera, factor: float) -> Cameras:
+    """The test camera, its picture magnified."""
+    small = camera()
+    sides = {"width": round(40 * factor), "height": round(32 * factor)}
+    center = {"cx": 20.0 * factor, "cy": 16.0 * factor}
+    return Cameras(small.camera_to_worlds, fx=30.0 * factor, fy=30.0 * factor, **center, **sides)
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_other_scales_get_the_correction_of_the_trained_one(
+    build: Build, perturb: Perturb, camera: MakeCamera, mode: Any
+) -> None:
+    model = perturb(build(head={"mode": mode}, background_color="black")).eval()
+    model.trained_focal = (30.0, 30.0)
+    own = model.get_outputs(camera())
+    correction = own["rgb"] - own["base_rgb"]
+    assert correction.abs().max() > 1e-3
+    double = model.get_outputs(at_focal(camera, 2))
+    expected = (double["base_rgb"] + resize(correction, 64, 80)).clamp(0, 1)
+    torch.testing.assert_close(double["rgb"], expected, atol=1e-5, rtol=0)
+    # Within the tolerance the head sees the picture itself.
+    near = model.get_outputs(at_focal(camera, 1.1))
+    model.trained_focal = None
+    assert torch.equal(near["rgb"], model.get_outputs(at_focal(camera, 1.1))["rgb"])
+
+
+def test_thumbnails_are_base_colours(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = perturb(build(background_color="black")).eval()
+    model.trained_focal = (300.0, 300.0)
+    outputs = model.get_outputs(camera())
+    assert torch.equal(outputs["rgb"], outputs["base_rgb"])
+
+
+def test_the_head_remembers_its_scale(build: Build, training_of: TrainingOf) -> None:
+    training = training_of(build(background_color="black"))
+    for step in range(4):
+        training.step(step)
+    assert training.model.trained_focal is None  # the head took no part so far
+    training.step(4)
+    assert training.model.trained_focal == (30.0, 30.0)
+    other = build(background_color="black")
+    other.load_state_dict(training.model.state_dict())
+    assert other.trained_focal == (30.0, 30.0)
+
+
+class FullBackend:
+    """A rasteriser on a device without room."""
+
+    name = "full"
+
+    def rasterize(self, *_: Any, **__: Any) -> Any:
+        raise torch.cuda.OutOfMemoryError(
+            "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 79.10 GiB of which 1 MiB is free."
+        )
+
+    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
+        return torch.zeros_like(directions)
+
+
+@pytest.mark.parametrize("training", [True, False], ids=["training", "rendering"])
+def test_full_memory_says_how_much_and_what_to_try(build: Build, camera: MakeCamera, training: bool) -> None:
+    model = build().train(training)
+    model._backend = FullBackend()  # type: ignore[assignment]
+    with pytest.raises(
+        MemoryExhaustedError, match=rf"2\.50 GiB more were asked for, with {N} primitives; try"
+    ) as caught:
+        model.get_outputs_for_camera(camera())
+    text = str(caught.value)
+    assert "\n" not in text
+    for option in ("cache-images cpu", "camera-res-scale-factor", f"max-primitives {N // 2}"):
+        assert option in text
