@@ -17,6 +17,7 @@ from nerfstudio.cameras.camera_paths import get_interpolated_camera_path
 from nerfstudio.cameras.cameras import Cameras
 from rich.progress import track
 
+from sundae_ns.compensation import PHASES
 from sundae_ns.evaluation import Frame, change
 from sundae_ns.opening import load_run
 
@@ -28,10 +29,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--load-config", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=30, help="frames from one test camera to the next")
+    parser.add_argument(
+        "--phases", type=int, choices=PHASES, help="how often the head runs a frame; default: the run's"
+    )
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     run = load_run(options.load_config)
     model, cameras = run.model, run.cameras
+    if options.phases is not None and model.head is not None:
+        model.head.config.phases = options.phases
     first = cameras[0]
     stations = Cameras(
         torch.cat([camera.camera_to_worlds for camera in cameras]).cpu(),
@@ -54,6 +60,8 @@ def main() -> None:
                     values.append(found.mean)
             before[name] = frame
     figures = {
+        "phases": 0 if model.head is None else model.head.config.phases,
+        "steps": options.steps,
         "frames": len(path),
         "pairs": len(changes["rgb"]),
         "change_with_head": mean(changes["rgb"]),

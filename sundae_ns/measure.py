@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sundae_ns.compensation import resize
+from sundae_ns.compensation import over_phases, resize
 from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.evaluation import (
     HEAD_OFF,
@@ -87,7 +88,9 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
                 times.append(milliseconds(partial(show, camera)))
         if model.head is not None and model.head_active:
             pictures, splat = model.render(model.gaussians, model.view_of(camera), background)
-            heads.append(milliseconds(partial(model.head, pictures["base_rgb"], splat.colors, splat.alpha)))
+            heads.append(
+                milliseconds(partial(over_phases, model.head, pictures["base_rgb"], splat.colors, splat.alpha))
+            )
     return FrameTimes(median(frames), median(splats), median(heads) if heads else 0.0)
 
 
@@ -105,6 +108,8 @@ class FrameFigures:
     """Size of the first picture, pixels."""
     precision: str
     """Arithmetic of the head."""
+    phases: int
+    """How often the head ran for a frame."""
     views: int
     ms_frame: float
     ms_splat: float
@@ -117,18 +122,25 @@ class FrameFigures:
 
 @torch.no_grad()
 def frame_figures(
-    run: Opened, *, factor: float = 1.0, precision: str | None = None, warmup: int = 3, repeats: int = 5
+    run: Opened,
+    *,
+    factor: float = 1.0,
+    precision: str | None = None,
+    phases: int | None = None,
+    warmup: int = 3,
+    repeats: int = 5,
 ) -> FrameFigures:
-    """Time the frames of a run at a size and a precision, and compare these very frames with the truth resized alike.
+    """Time the frames of a run at a size, and compare these very frames with the truth resized alike.
 
     Args:
         run: a finished run.
         factor: on the pictures' sides.
         precision: of the head, one of ``PRECISIONS``; by default the run's own, and fp32 on a CPU.
+        phases: how often the head runs for a frame, one of ``PHASES``; by default the run's own.
         warmup, repeats: as for :func:`frame_times`.
 
     Raises:
-        ConfigError: the factor is not above zero.
+        ConfigError: the factor is not above zero, or phases are not of :data:`PHASES`.
         BackendError: half precision is asked for on a CPU.
     """
     model = run.model
@@ -138,10 +150,11 @@ def frame_figures(
     precision = precision or ("fp32" if on_cpu or model.head is None else model.head.config.precision)
     if on_cpu and precision != "fp32":
         raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
+    phases = phases or (1 if model.head is None else model.head.config.phases)
     cameras = [copy.deepcopy(camera) for camera in run.cameras]
     for camera in cameras:
         camera.rescale_output_resolution(factor, scale_rounding_mode="ceil")
-    with _precision(model, precision):
+    with _head_as(model, precision=precision, phases=phases):
         times = frame_times(model, cameras, warmup=warmup, repeats=repeats)
         errors = dict.fromkeys(("psnr", "ssim", "psnr_base", "ssim_base"), 0.0)
         for camera, truth in zip(cameras, run.truths, strict=True):
@@ -155,6 +168,7 @@ def frame_figures(
         width=int(cameras[0].width),
         height=int(cameras[0].height),
         precision=precision,
+        phases=phases,
         views=len(cameras),
         ms_frame=times.frame,
         ms_splat=times.splat,
@@ -164,12 +178,14 @@ def frame_figures(
 
 
 @contextmanager
-def _precision(model: SundaeModel, precision: str) -> Iterator[None]:
+def _head_as(model: SundaeModel, **changes: Any) -> Iterator[None]:
     if model.head is None:
         yield
         return
     before = model.head.config
-    model.head.config = replace(before, precision=precision)  # type: ignore[arg-type]
+    changed = replace(before, **changes)
+    changed.validate()
+    model.head.config = changed
     try:
         yield
     finally:

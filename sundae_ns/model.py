@@ -6,7 +6,7 @@ The module path and the class names are written into every run's ``config.yml``:
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -19,7 +19,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
-from nerfstudio.viewer.viewer_elements import ViewerCheckbox
+from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerDropdown
 from pytorch_msssim import SSIM
 from rich.progress import track
 from torch import Tensor
@@ -27,7 +27,7 @@ from torch import Tensor
 from sundae_ns import checkpoint
 from sundae_ns.after_step import finish, prune_if_due
 from sundae_ns.budget import Budget
-from sundae_ns.compensation import CompensationHead, HeadConfig, Window, training_window
+from sundae_ns.compensation import PHASES, CompensationHead, HeadConfig, Window, training_window
 from sundae_ns.datamanager import NO_PICTURES, SundaeDatamanager
 from sundae_ns.densification import CappedStrategy, make_strategy
 from sundae_ns.distributed import Arrived, GlobalPruning, Shards
@@ -147,6 +147,13 @@ class SundaeModel(SplatfactoModel):
             torch.tensor([0.1490, 0.1647, 0.2157]) if random_background else get_color(config.background_color)
         )
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
+        self.phases: ViewerDropdown[str] = ViewerDropdown(
+            "Runs of the head",
+            str(config.head.phases),
+            [str(count) for count in PHASES],
+            hint="Mean over so many places of its grid of pixels: slower, and flickers less",
+            cb_hook=self._set_phases,
+        )
         self.compensated = True
         """Whether pictures that nobody looks at in a viewer get the head's correction."""
         self.preview = Preview()
@@ -300,6 +307,10 @@ class SundaeModel(SplatfactoModel):
             arrivals=None if shards is None else self.arrivals,
             follow=None if shards is None or not densifying else partial(shards.follow, absgrad=absgrad),
         )
+
+    def _set_phases(self, chosen: ViewerDropdown[str]) -> None:
+        if self.head is not None:
+            self.head.config = replace(self.head.config, phases=int(chosen.value))  # type: ignore[arg-type]
 
     def _colors(self, params: Mapping[str, Tensor], center: Tensor) -> Tensor:
         return colors_of(params, center, self._style)

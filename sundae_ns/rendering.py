@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from sundae_ns.compensation import CompensationHead, plan, resize
+from sundae_ns.compensation import CompensationHead, over_phases, plan, resize
 from sundae_ns.distributed import Arrived
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.parameters import sh_degree
@@ -127,7 +127,8 @@ def render(
     if head is not None:
         zoom, weight = (1.0, 1.0) if style.training else plan(view.focal, style.trained_focal)
         if zoom == 1.0:
-            rgb = head(base, splatted.colors, splatted.alpha)
+            seen = (base, splatted.colors, splatted.alpha)
+            rgb = head(*seen) if style.training else over_phases(head, *seen)
         elif weight > 0:
             at_scale, _ = render(field, view.zoomed(zoom), background, style, depth=False)
             correction = at_scale["rgb"] - at_scale["base_rgb"]

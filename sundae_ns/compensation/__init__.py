@@ -1,8 +1,20 @@
 """Neural compensation: the U-Net that makes up, in image space, for what pruning lost. Floor 1."""
 
 from sundae_ns.compensation.head import CompensationHead, HeadConfig
+from sundae_ns.compensation.phases import PHASES, over_phases
 from sundae_ns.compensation.scale import ScalePlan, plan, resize
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.compensation.window import Window, training_window
 
-__all__ = ["CompensationHead", "HeadConfig", "ScalePlan", "UNet", "Window", "plan", "resize", "training_window"]
+__all__ = [
+    "PHASES",
+    "CompensationHead",
+    "HeadConfig",
+    "ScalePlan",
+    "UNet",
+    "Window",
+    "over_phases",
+    "plan",
+    "resize",
+    "training_window",
+]

@@ -47,6 +47,9 @@ class HeadConfig:
     max_train_pixels: int = 2**22
     """Train on a random window of at most this many pixels where pictures are larger, once the head takes part; 0 for
     whole pictures."""
+    phases: Literal[1, 2, 4] = 1
+    """Pictures that are only looked at: mean over so many places of the head's grid of pixels. More take as many times the
+    head's time, and flicker less as a camera moves."""
     precision: Literal["fp32", "bf16", "fp16"] = "bf16"
     """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is meant for inference: it trains unscaled."""
     fused: bool = True
@@ -65,6 +68,8 @@ class HeadConfig:
             )
         if self.pixel_unshuffle < 1:
             raise ConfigError(f"head.pixel-unshuffle is {self.pixel_unshuffle}; give 1, 2 or 4")
+        if self.phases not in (1, 2, 4):
+            raise ConfigError(f"head.phases is {self.phases}; give 1, 2 or 4")
         if self.max_train_pixels < 0:
             raise ConfigError(f"head.max-train-pixels is {self.max_train_pixels}; give 0 for whole pictures, or more")
 

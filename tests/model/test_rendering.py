@@ -181,3 +181,24 @@ def test_full_memory_says_how_much_and_what_to_try(build: Build, camera: MakeCam
     assert "\n" not in text
     for option in ("cache-images cpu", "camera-res-scale-factor", f"max-primitives {N // 2}"):
         assert option in text
+
+
+@torch.no_grad()
+def test_the_head_runs_as_often_as_the_viewer_asks_and_once_in_training(
+    build: Build, perturb: Perturb, camera: MakeCamera
+) -> None:
+    model = perturb(build(head={"pixel_unshuffle": 2}))
+    background = torch.zeros(3)
+
+    def pictures() -> tuple[torch.Tensor, torch.Tensor]:
+        shown, _ = model.eval().render(model.gaussians, model.view_of(camera()), background)
+        trained, _ = model.train().render(model.gaussians, model.view_of(camera()), background)
+        return shown["rgb"], trained["rgb"]
+
+    shown, trained = pictures()
+    model.phases.value = "4"
+    model._set_phases(model.phases)
+    steadied, trained_too = pictures()
+    assert torch.equal(trained, trained_too)
+    assert (steadied - shown).abs().max() > 1e-4
+    assert (steadied - shown).abs().mean() < 0.05

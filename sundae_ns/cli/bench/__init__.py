@@ -82,6 +82,7 @@ def frame(
     load_config: Path,
     factors: tuple[float, ...] = (1.0,),
     precisions: tuple[Literal["fp32", "bf16", "fp16"], ...] = (),
+    phases: tuple[Literal[1, 2, 4], ...] = (),
     views: int | None = None,
     repeats: int = 5,
     json: bool = False,
@@ -92,13 +93,16 @@ def frame(
         load_config: the run's config.yml.
         factors: sizes to show, as factors on the pictures' sides; the truth is resized alike.
         precisions: arithmetic of the head; by default all three on CUDA, and fp32 on a CPU, which knows no other.
+        phases: how often the head runs for a frame, over as many places of its grid; by default as the run says.
         views: measure on the first so many test views; by default on all.
         repeats: timed runs of each view, of which the median counts.
         json: print one line of JSON for each size and precision, instead of a table.
     """
     from sundae_ns.cli.bench.frame import run_frame
 
-    return run_frame(load_config, factors=factors, precisions=precisions, views=views, repeats=repeats, json=json)
+    return run_frame(
+        load_config, factors=factors, precisions=precisions, phases=phases, views=views, repeats=repeats, json=json
+    )
 
 
 @app.command

@@ -24,6 +24,7 @@ def run_frame(
     *,
     factors: Sequence[float],
     precisions: Sequence[str],
+    phases: Sequence[int],
     views: int | None,
     repeats: int,
     json: bool,
@@ -44,10 +45,10 @@ def run_frame(
     device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
     every = ("fp32", "bf16", "fp16") if device != "cpu" and run.model.head is not None else (None,)
     wanted: Sequence[str | None] = precisions or every
-    jobs = [(factor, precision) for factor in factors for precision in wanted]
+    jobs = [(factor, precision, count) for factor in factors for precision in wanted for count in phases or (None,)]
     found: list[FrameFigures] = []
-    for factor, precision in track(jobs, description="Frames", transient=True, console=Console(stderr=True)):
-        found.append(frame_figures(run, factor=factor, precision=precision, repeats=repeats))
+    for factor, precision, count in track(jobs, description="Frames", transient=True, console=Console(stderr=True)):
+        found.append(frame_figures(run, factor=factor, precision=precision, phases=count, repeats=repeats))
         if json:
             line = {"config": str(load_config), "device": device, "primitives": run.model.num_points}
             rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(found[-1]).items()}
@@ -59,10 +60,10 @@ def run_frame(
 
 def _table(figures: Sequence[FrameFigures], title: str) -> Table:
     table = Table(title=title, caption="frame, splat and head in ms; off: without the head")
-    for column in ("size", "head in", "frame", "splat", "head", "PSNR", "SSIM", "PSNR off", "SSIM off"):
+    for column in ("size", "head in", "runs", "frame", "splat", "head", "PSNR", "SSIM", "PSNR off", "SSIM off"):
         table.add_column(column, justify="right", no_wrap=True)
     for f in figures:
         times = (f"{value:.2f}" for value in (f.ms_frame, f.ms_splat, f.ms_head))
         errors = (f"{f.psnr:.2f}", f"{f.ssim:.4f}", f"{f.psnr_base:.2f}", f"{f.ssim_base:.4f}")
-        table.add_row(f"{f.width}x{f.height}", f.precision, *times, *errors)
+        table.add_row(f"{f.width}x{f.height}", f.precision, str(f.phases), *times, *errors)
     return table
