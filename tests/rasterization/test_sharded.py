@@ -33,7 +33,7 @@ def test_all_that_is_drawn_may_be_seen(
     drawn = project(means, quats, scales, torch.eye(4), K, width, height, NEAR, FAR).radii > 0
     away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
     bounds = torch.stack([frustum_bounds(pose, K, width, height, NEAR) for pose in (away, torch.eye(4))])
-    unseen, seen = may_be_seen(means, scales, bounds)
+    unseen, seen = may_be_seen(means, scales.log(), bounds)
     assert not (drawn & unseen).any()  # each camera for itself
     assert drawn.any()
     assert not (drawn & ~seen).any()
@@ -45,7 +45,7 @@ def test_what_is_not_a_number_is_not_seen() -> None:
     means = torch.tensor([[0.0, 0.0, 2.0], [torch.nan, 0.0, 2.0], [0.0, 0.0, torch.nan], [0.0, 0.0, 0.0]])
     scales = torch.full((4, 3), 0.1)
     drawn = project(means, torch.ones(4, 4), scales, torch.eye(4), torch.eye(3), 10, 10, NEAR, FAR).radii > 0
-    (seen,) = may_be_seen(means, scales, frustum_bounds(torch.eye(4), torch.eye(3), 10, 10, NEAR)[None])
+    (seen,) = may_be_seen(means, scales.log(), frustum_bounds(torch.eye(4), torch.eye(3), 10, 10, NEAR)[None])
     assert drawn.tolist()[0]
     assert not (drawn & ~seen).any()
     assert not seen[2:].any()
