@@ -30,11 +30,12 @@ from torch.nn import Parameter
 from sundae_ns import checkpoint, distributed
 from sundae_ns.data import write_scene
 from sundae_ns.densification import CappedStrategy
-from sundae_ns.distributed import GlobalPruning, Shards
+from sundae_ns.distributed import Course, GlobalPruning, Look, Shards, Timetable, slack_of_step
 from sundae_ns.errors import ConfigError, RankError, rank_ended
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.pruning import PruningConfig, make_policy
 from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
+from sundae_ns.rasterization.sharded import Cameras, Slack, camera_row, cameras_of, may_be_seen
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 from sundae_ns.views import View
 
@@ -156,12 +157,143 @@ def check_that_nothing_stays(shards: Shards) -> None:
     splat = draw(arrived, arrived["colors"], view)
     splat.info["means2d"].retain_grad()
     shards.follow(splat.info, arrived.route, absgrad=True)
+    timetable: Any = Views(shards.rank)
+    shards.plan_ahead(params, timetable, Look(1, 1, 0), Slack(0.1, 0.1))  # and it stays until then
     loss_of(splat, shards.rank).backward()
     shards.statistics(splat.info)
     route = weakref.ref(arrived.route)
     del arrived, splat
     gc.collect()
     assert route() is None
+    assert shards.ahead is not None
+    shards.forget_plan()
+
+
+class Views:
+    """A timetable in float64: two views, which the ranks take in turns, at half of the size where a look says so."""
+
+    def __init__(self, rank: int) -> None:
+        self.rank = rank
+
+    def of(self, look: Look, rank: int) -> View:
+        view = a_view((look.step + rank) % RANKS).zoomed(1 / look.downscale)
+        aside = torch.zeros(4, 4, dtype=torch.float64)
+        aside[0, 3] = 1.2 * ((look.step + rank) % RANKS)  # so that each sees what the other does not
+        return view._replace(viewmat=view.viewmat + aside)
+
+    def view(self, look: Look) -> View:
+        return self.of(look, self.rank)
+
+    def cameras(self, look: Look) -> Cameras:
+        views = [self.of(look, rank) for rank in range(RANKS)]
+        return cameras_of(torch.stack([camera_row(v.viewmat, v.K, v.width, v.height, 0.01) for v in views]))
+
+
+def check_planning_ahead(shards: Shards) -> None:
+    """Steps that were planned ahead do what steps that plan at their start do, and what one process does."""
+    start, end = distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2]
+    views: Any = Views(shards.rank)
+    small = {**a_field(), "scales": a_field()["scales"] - 2}
+    looks = [Look(step, 1, 0) for step in range(4)]
+
+    def optimizers_of(params: dict[str, Parameter]) -> dict[str, torch.optim.Optimizer]:
+        # Rates at which the field leaves its place within three steps.
+        return {name: torch.optim.Adam([value], lr=0.1, betas=(0.8, 0.9), eps=1e-8) for name, value in params.items()}
+
+    found = {}
+    for ahead in (True, False):
+        params = shard_of(small, start, end)
+        shards.recount(params)
+        optimizers, pictures, missed = optimizers_of(params), [], 0
+        for look in looks[:-1]:
+            assert (shards.ahead is not None) == (ahead and look.step > 0)
+            cameras, route = shards.course(params, views, look)
+            assert shards.ahead is None
+            view = views.view(look)
+            arrived = shards.arrivals(
+                params, view, colors_of, near_plane=0.01, features=True, course=Course(cameras, route)
+            )
+            splat = draw(arrived, arrived["colors"], view)
+            pictures.append(splat.colors.detach())
+            if ahead:
+                slack = slack_of_step(optimizers)
+                assert slack is not None
+                shards.plan_ahead(params, views, looks[look.step + 1], slack)
+                bounds = views.cameras(looks[look.step + 1]).bounds
+                before = may_be_seen(params["means"], params["scales"], bounds)
+            loss_of(splat, view.width).backward()
+            for optimizer in optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad()
+            if ahead:
+                missed += int((may_be_seen(params["means"], params["scales"], bounds) & ~before).sum())
+        # Without allowing for the steps, something would have been left out.
+        every = [count for (count,) in shards.numbers(missed)]
+        assert not ahead or sum(every) > 0, every
+        found[ahead] = pictures, {name: value.detach() for name, value in params.items()}
+        shards.forget_plan()
+
+    whole = shard_of(small, 0, 90)
+    optimizers = optimizers_of(whole)
+    alone = []
+    for look in looks[:-1]:
+        drawn = [draw(whole, colors_of(whole, v.center), v) for v in (views.of(look, r) for r in range(RANKS))]
+        alone.append(drawn[shards.rank].colors.detach())
+        losses = [loss_of(splat, views.of(look, rank).width) for rank, splat in enumerate(drawn)]
+        (sum(losses) / RANKS).backward()  # type: ignore[union-attr]
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+    for ours, theirs, expected in zip(found[True][0], found[False][0], alone):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-12)
+        torch.testing.assert_close(ours, expected, rtol=0, atol=1e-9)
+    for name in NAMES:
+        torch.testing.assert_close(found[True][1][name], found[False][1][name], rtol=0, atol=1e-12)
+        torch.testing.assert_close(found[True][1][name], whole[name].detach()[start:end], rtol=0, atol=1e-9)
+
+
+def check_that_plans_are_forgotten(shards: Shards) -> None:
+    """A field that has changed, or pictures of another size, are planned for anew, on all ranks; silence is an error."""
+    params = shard_of(a_field(), *distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2])
+    views: Any = Views(shards.rank)
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
+
+    def planned() -> bool:
+        return shards.ahead is not None
+
+    def plan() -> None:
+        shards.plan_ahead(params, views, Look(1, 1, 0), Slack(0.0, 0.0))
+        assert planned()
+
+    shards.recount(params)
+    plan()
+    # Pictures of another size, and other windows: what is seen then is what is planned then.
+    for look in (Look(1, 2, 0), Look(1, 1, 400), Look(2, 1, 0)):
+        plan()
+        assert shards.ahead is not None
+        unused = shards.ahead.plan
+        unused.seen.fill_(False)
+        _, route = shards.course(params, views, look)
+        assert len(route.ids) > 0
+        assert not planned()
+    plan()
+    shards.recount(params)
+    assert not planned()
+    for mask in (None, torch.rand(len(params["means"])) > 0.2):
+        plan()
+        shards.level(params, optimizers, [], mask)
+        assert not planned()
+    # Another tensor, other data in the same one, and other values in the same data.
+    old = params["scales"]
+    for change in (
+        lambda: params.update(scales=Parameter(old.detach().clone())),
+        lambda: setattr(params["scales"], "data", params["scales"].detach().clone()),
+        lambda: [params["scales"].detach().mul_(0.5), params["scales"].detach().mul_(2)],
+    ):
+        plan()
+        change()
+        with pytest.raises(AssertionError, match="has changed since"):
+            shards.course(params, views, Look(1, 1, 0))
 
 
 def check_looking_away(shards: Shards) -> None:
@@ -207,11 +339,11 @@ def check_an_empty_shard(shards: Shards) -> None:
 class Tripling:
     """A strategy that grows the shard of rank 1 alone, and puts a mark on what it has counted."""
 
-    refine_every = 10
+    refine_every, grows = 10, True
 
     def step_post_backward(self, params: Any, optimizers: Any, state: Any, step: int, info: Any) -> None:
         assert len(info["statistics"].norms) > 0
-        if dist.get_rank() != 1:
+        if dist.get_rank() != 1 or not self.grows:
             return
         for name in list(params):
             params[name] = Parameter(params[name].detach().repeat_interleave(3, dim=0))
@@ -241,7 +373,14 @@ def check_drift(shards: Shards) -> None:
         optimizers=optimizers,
         schedule_step=20,
     )
+    planned: Any = object()
+    shards.ahead, model.schedule_step = planned, 19
+    model.strategy.grows = False
     shards.densify(model)
+    assert shards.ahead is planned
+    model.schedule_step, model.strategy.grows = 20, True
+    shards.densify(model)
+    assert shards.ahead is None
     assert shards.counts == [75, 75]
     assert model.strategy_state["peak"] == 60 + 90 + 5
     every = torch.cat([torch.arange(60), torch.arange(60, 90).repeat_interleave(3)])
@@ -376,6 +515,7 @@ def configured(folder: Path, name: str) -> SundaeTrainerConfig:
     model.rasterizer = "reference"
     model.pruning.prune_at, model.pruning.keep_ratio = PRUNE_AT, KEEP
     model.warmup_length, model.refine_every, model.stop_split_at = 4, 6, PRUNE_AT
+    model.num_downscales, model.resolution_schedule = 1, 4
     model.densify_grad_thresh, model.reset_alpha_every, model.sh_degree_interval = 0.003, 100, 8
     return config
 
@@ -409,7 +549,19 @@ def train(config: SundaeTrainerConfig, rank: int, ranks: int) -> SundaeTrainer:
 
 def check_training(shards: Shards, folder: Path) -> None:
     """A run of two ranks; afterwards both have the same head, and no shard is far from the mean."""
+    anew = []
+    course = Shards.course
+
+    def noted(self: Shards, params: Any, timetable: Timetable, look: Look) -> Course:
+        if self.ahead is None or self.ahead.look != look:
+            anew.append(look.step)
+        return course(self, params, timetable, look)
+
+    Shards.course = noted  # type: ignore[method-assign]
     trainer = train(configured(folder, "train"), shards.rank, RANKS)
+    Shards.course = course  # type: ignore[method-assign]
+    # The first step, those after a round of growing, and the one after the prune; resolution rises at step 2.
+    assert anew == [0, *range(1, PRUNE_AT // RANKS + 1, 3), PRUNE_AT // RANKS + 1]
     model: Any = trainer.pipeline.model
     weights = torch.cat([value.detach().flatten() for value in model.head.parameters()])
     every = [torch.empty_like(weights) for _ in range(RANKS)]
@@ -429,6 +581,8 @@ def check_frozen(shards: Shards, folder: Path) -> None:
 CHECKS: tuple[Callable[..., None], ...] = (
     check_drawing,
     check_that_nothing_stays,
+    check_planning_ahead,
+    check_that_plans_are_forgotten,
     check_looking_away,
     check_levelling,
     check_an_empty_shard,

@@ -1,0 +1,93 @@
+"""What a step can know of the next one: which views it draws, and how far Adam moves at most."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+import torch.distributed as dist
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nerfstudio.cameras.cameras import Cameras
+from torch.nn import Parameter
+
+from sundae_ns.compensation import training_window
+from sundae_ns.distributed import Look, Timetable, longest_step, slack_of_step
+from sundae_ns.rasterization.sharded import camera_row
+from sundae_ns.views import view_of
+
+RATE = 0.01
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    ranks=st.sampled_from([1, 2, 4, 16]),
+    growth=st.floats(0.5, 2.0),
+    sparsity=st.sampled_from([0.0, 0.5, 0.95]),
+)
+def test_no_step_of_adam_is_longer(seed: int, ranks: int, growth: float, sparsity: float) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    value = Parameter(torch.zeros(200, dtype=torch.float64))
+    optimizer = torch.optim.Adam([value], lr=RATE, betas=(0.9**ranks, 0.999**ranks), eps=1e-15)
+    most = longest_step(optimizer)
+    for step in range(30):
+        gradient = torch.randn(200, generator=generator, dtype=torch.float64) * growth**step
+        value.grad = gradient * (torch.rand(200, generator=generator) >= sparsity)
+        before = value.detach().clone()
+        optimizer.step()
+        assert (value.detach() - before).abs().max() <= most
+        optimizer.state[value]["exp_avg"][step::50] = 0  # as where a primitive is merged or split
+        optimizer.state[value]["exp_avg_sq"][step::100] = 0 if step % 3 else 1.0
+
+
+@pytest.mark.parametrize("betas", [(0.9, 0.999), (0.81, 0.998001), (0.5, 0.5)])
+def test_gradients_that_grow_come_near(betas: tuple[float, float]) -> None:
+    """So nothing shorter would do; the rate by itself is far too short."""
+    value = Parameter(torch.zeros((), dtype=torch.float64))
+    optimizer = torch.optim.Adam([value], lr=RATE, betas=betas, eps=0.0)
+    before = 0.0
+    for step in range(-6000, 1):  # until the corrections of the moments' bias are gone
+        value.grad = torch.tensor((betas[1] / betas[0]) ** max(step, -200), dtype=torch.float64)
+        before = value.item()
+        optimizer.step()
+    assert 0.97 * longest_step(optimizer) < abs(value.item() - before) <= longest_step(optimizer)
+
+
+def test_other_optimizers_are_not_planned_for() -> None:
+    value = Parameter(torch.zeros(3))
+    others = (
+        torch.optim.AdamW([value]),
+        torch.optim.SGD([value]),
+        torch.optim.Adam([value], betas=(0.9, 0.5)),
+    )
+    assert all(math.isinf(longest_step(other)) for other in others)
+    adam = torch.optim.Adam([value], lr=RATE)
+    assert slack_of_step({"means": others[0], "scales": adam}) is None
+    slack = slack_of_step({"means": adam, "scales": torch.optim.Adam([value], lr=2 * RATE)})
+    assert slack is not None
+    assert slack.scales == pytest.approx(2 * slack.means)
+
+
+def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dist, "get_rank", lambda: 1)
+    monkeypatch.setattr(dist, "get_world_size", lambda: 3)
+    poses = torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(0))
+    sides = torch.tensor([[64], [48], [64], [32], [80]])
+    cameras = Cameras(poses, 50.0, 40.0, 33.0, 20.0, width=sides, height=sides - 10)
+    timetable = Timetable(cameras, lambda picture: (2 * picture) % 5, "cpu", 0.02)
+    for look in (Look(0, 1, 0), Look(1, 1, 0), Look(1, 2, 0), Look(2, 1, 1024), Look(3, 1, 1024)):
+        pictures = [(2 * (3 * look.step + rank)) % 5 for rank in range(3)]
+        assert timetable.pictures(look.step) == pictures
+        views = [view_of(cameras[i : i + 1], "cpu", downscale=look.downscale) for i in pictures]
+        own, expected = timetable.view(look), views[1]
+        assert (own.width, own.height, own.focal) == (expected.width, expected.height, expected.focal)
+        assert torch.equal(own.viewmat, expected.viewmat)
+        assert torch.equal(own.K, expected.K)
+        known = timetable.cameras(look)
+        for rank, view in enumerate(views):
+            window = training_window(view.width, view.height, look.window_pixels, seed=look.step)
+            seen = view if window is None else view.cut(window)
+            row = camera_row(seen.viewmat, seen.K, seen.width, seen.height, 0.02)
+            assert torch.equal(torch.cat([known.centers[rank], known.bounds[rank].flatten()]), row)
