@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,10 +13,15 @@ import torch.distributed as dist
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nerfstudio.cameras.cameras import Cameras
+from pytorch_msssim import SSIM
+from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.compensation import training_window
-from sundae_ns.distributed import Look, Timetable, longest_step, slack_of_step
+from sundae_ns.densification import CappedStrategy
+from sundae_ns.distributed import Look, Shards, Timetable, longest_step, slack_of_step
+from sundae_ns.losses import picture_loss
+from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
 from sundae_ns.rasterization.sharded import camera_row
 from sundae_ns.views import view_of
 
@@ -91,3 +99,85 @@ def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPa
             seen = view if window is None else view.cut(window)
             row = camera_row(seen.viewmat, seen.K, seen.width, seen.height, 0.02)
             assert torch.equal(torch.cat([known.centers[rank], known.bounds[rank].flatten()]), row)
+
+
+@pytest.mark.gpu
+def test_a_step_waits_for_the_gpu_only_where_it_splats(tmp_path: Path) -> None:
+    """torch raises where it would wait; one GPU alone, so that any machine with one can tell."""
+    learn(tmp_path, "cuda", "nccl", partial(torch.cuda.set_sync_debug_mode, "error"))
+
+
+def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None]) -> None:
+    """Three steps of a rank by itself; from the second on, its exchange has been planned ahead."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = {
+        "means": (3,),
+        "quats": (4,),
+        "scales": (3,),
+        "opacities": (1,),
+        "features_dc": (3,),
+        "features_rest": (3, 3),
+    }
+    params = {
+        name: Parameter(torch.randn(500, *shape, generator=generator).mul(0.5).to(device))
+        for name, shape in shapes.items()
+    }
+    params["scales"].data -= 3
+    optimizers = {name: torch.optim.Adam([value], fused=True) for name, value in params.items()}
+    pose = torch.eye(4)[None, :3].clone()
+    pose[0, 2, 3] = 3.0
+    cameras = Cameras(pose, 60.0, 60.0, 32.0, 24.0, width=64, height=48)
+    backend = select_backend("auto", device)
+    strategy, ssim, target = CappedStrategy(absgrad=True), SSIM(data_range=1.0), torch.rand(48, 64, 3).to(device)
+    state = strategy.initialize_state()
+    dist.init_process_group(group, init_method=f"file://{folder / 'meeting'}", rank=0, world_size=1)
+    try:
+        shards, timetable = Shards(device), Timetable(cameras, lambda picture: 0, device, 0.01)
+        shards.recount(params)
+
+        def colors_of(field: Mapping[str, Tensor], centers: Tensor) -> Tensor:
+            coeffs = torch.cat([field["features_dc"][:, None], field["features_rest"]], dim=1)
+            return spherical_harmonics(1, field["means"] - centers, coeffs, backend=backend) + 0.5
+
+        for step in range(3):
+            look = Look(step, 1, 0)
+            assert (shards.ahead is not None) == (step > 0)
+            view = timetable.view(look)
+            if step > 0:  # in the first one kernels load, constants are made, and the ranks meet
+                forbid_waits()
+            course = shards.course(params, timetable, look)
+            arrived = shards.arrivals(params, view, colors_of, near_plane=0.01, features=False, course=course)
+            allow_waits()
+            splat = rasterize(
+                arrived["means"],
+                arrived["quats"],
+                arrived["scales"].exp(),
+                arrived["opacities"].sigmoid()[:, 0],
+                arrived["colors"],
+                *view[:4],
+                absgrad=True,
+                backend=backend,
+            )
+            if step > 0:
+                forbid_waits()
+            splat.info["means2d"].retain_grad()
+            shards.follow(splat.info, arrived.route, absgrad=True)
+            slack = slack_of_step(optimizers)
+            assert slack is not None
+            shards.plan_ahead(params, timetable, Look(step + 1, 1, 0), slack)
+            picture_loss(splat.colors, target, ssim, 0.2).backward()  # type: ignore[no-untyped-call]
+            strategy._update_state(params, state, {"statistics": shards.statistics(splat.info)})
+            for optimizer in optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad()
+            allow_waits()
+        assert state["grad2d"].sum() > 0
+        assert state["count"].max() == 3
+    finally:
+        allow_waits()
+        dist.destroy_process_group()
+
+
+def allow_waits() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.set_sync_debug_mode("default")
