@@ -354,7 +354,7 @@ class SundaeModel(SplatfactoModel):
         background = self._get_background_color()
         if self.training:
             look = self._look(self.step)
-            view = self.view_of(camera, look.downscale) if self.timetable is None else self._scheduled(camera, look)
+            view = self.view_of(camera, look.downscale) if self.timetable is None else self.timetable.view(look, camera)
             self._remember_focal(view)
             window = training_window(view.width, view.height, look.window_pixels, seed=look.step)
             view = view if window is None else view.cut(window)
@@ -421,20 +421,12 @@ class SundaeModel(SplatfactoModel):
         windows = self.head_active and not self.densifying
         return Look(step, self._downscale_at(step), self.config.head.max_train_pixels if windows else 0)
 
-    def _scheduled(self, camera: Cameras, look: Look) -> View:
-        """The view that this rank is to draw, from the table of all: making one anew would wait for the GPU."""
-        assert self.timetable is not None
-        assert self.shards is not None
-        expected = self.timetable.pictures(look.step)[self.shards.rank]
-        assert (camera.metadata or {}).get("cam_idx") == expected, "ranks train on the pictures of the timetable alone"
-        return self.timetable.view(look)
-
     def _on_course(self, view: View, look: Look) -> Arrived:
         """What a view of the timetable needs from all ranks. Collective."""
         assert self.timetable is not None
         assert self.shards is not None
-        course = self.shards.course(self.gaussians, self.timetable, look)
-        return self.arrivals(self.gaussians, view, features=self.head_active, course=course)
+        field, course = self.gaussians, self.shards.course(self.gaussians, self.timetable, look)
+        return self.arrivals(field, view, features=self.head_active, course=course)
 
     def _plan_ahead(self) -> None:
         """Plan the exchange of the next step, while the GPU is busy with this one. Collective."""

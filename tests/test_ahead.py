@@ -78,6 +78,12 @@ def test_other_optimizers_are_not_planned_for() -> None:
     assert slack.scales == pytest.approx(2 * slack.means)
 
 
+def served(cameras: Cameras, index: int) -> Cameras:
+    camera = cameras[index : index + 1]
+    camera.metadata = {"cam_idx": index}
+    return camera
+
+
 def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dist, "get_rank", lambda: 1)
     monkeypatch.setattr(dist, "get_world_size", lambda: 3)
@@ -89,7 +95,7 @@ def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPa
         pictures = [(2 * (3 * look.step + rank)) % 5 for rank in range(3)]
         assert timetable.pictures(look.step) == pictures
         views = [view_of(cameras[i : i + 1], "cpu", downscale=look.downscale) for i in pictures]
-        own, expected = timetable.view(look), views[1]
+        own, expected = timetable.view(look, served(cameras, pictures[1])), views[1]
         assert (own.width, own.height, own.focal) == (expected.width, expected.height, expected.focal)
         assert torch.equal(own.viewmat, expected.viewmat)
         assert torch.equal(own.K, expected.K)
@@ -99,6 +105,8 @@ def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPa
             seen = view if window is None else view.cut(window)
             row = camera_row(seen.viewmat, seen.K, seen.width, seen.height, 0.02)
             assert torch.equal(torch.cat([known.centers[rank], known.bounds[rank].flatten()]), row)
+    with pytest.raises(AssertionError, match="timetable"):
+        timetable.view(Look(0, 1, 0), served(cameras, timetable.pictures(0)[0]))
 
 
 @pytest.mark.gpu
@@ -142,7 +150,7 @@ def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None
         for step in range(3):
             look = Look(step, 1, 0)
             assert (shards.ahead is not None) == (step > 0)
-            view = timetable.view(look)
+            view = timetable.view(look, served(cameras, 0))
             if step > 0:  # in the first one kernels load, constants are made, and the ranks meet
                 forbid_waits()
             course = shards.course(params, timetable, look)

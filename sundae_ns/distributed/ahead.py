@@ -61,9 +61,16 @@ class Timetable:
         """Indices of the views of a step, by rank."""
         return [self._order(step * self.ranks + rank) for rank in range(self.ranks)]
 
-    def view(self, look: Look) -> View:
-        """What this rank draws: the whole picture, of which it may take a window."""
-        return self._at(look.downscale).views[self.pictures(look.step)[self.rank]]
+    def view(self, look: Look, camera: Capture) -> View:
+        """What this rank draws, the whole picture, from a table of all: to make it anew would wait for the GPU.
+
+        Args:
+            look: at this step.
+            camera: what the datamanager serves at this step.
+        """
+        picture = self.pictures(look.step)[self.rank]
+        assert (camera.metadata or {}).get("cam_idx") == picture, "ranks train on the views of the timetable alone"
+        return self._at(look.downscale).views[picture]
 
     def cameras(self, look: Look) -> Cameras:
         """The cameras of all ranks, by rank; one launch, and no collective."""
