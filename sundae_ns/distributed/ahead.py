@@ -88,6 +88,7 @@ class Timetable:
         return camera_row(view.viewmat, view.K, view.width, view.height, self._near_plane)
 
     def _at(self, downscale: int) -> _Table:
+        # Not before the first look: the datamanager corrects cameras in place where it straightens pictures.
         if self._table is None or self._table.downscale != downscale:
             cameras = (self._cameras[i : i + 1] for i in range(len(self._cameras)))
             views = [view_of(camera, "cpu", downscale=downscale) for camera in cameras]
