@@ -38,14 +38,13 @@ class Shown:
     timed: bool = True
     """Whether the run had the machine for itself, so that its times say something."""
     packed: str = ""
-    """Name in pack.jsonl, where a line for the packed run is to follow."""
+    """Name in pack.jsonl, where lines for the packed run are to follow."""
 
 
 SHOWN = (
-    Shown("bonsai", "splatfacto", "default", "5e4bc58", "splatfacto"),
-    Shown("bonsai", "sundae", "default", "5e4bc58", "sundae"),
-    Shown("bonsai", "sundae", "no-head-branch", "5e4bc58", "the same field, no head", timed=False),
-    Shown("bonsai", "sundae", "band-positions", "2e7bd23", "the paper's band rule (H200, older head)"),
+    Shown("bonsai", "splatfacto", "default", "4f32371", "splatfacto"),
+    Shown("bonsai", "sundae", "default", "8b20125", "sundae", packed="bonsai-default-42"),
+    Shown("bonsai", "sundae", "band-positions", "2e7bd23", "the paper's band rule (an older head)"),
     Shown("fox", "splatfacto", "default", "5e4bc58", "splatfacto"),
     Shown("fox", "sundae", "default", "ef71d9f", "sundae", packed="fox, 30,000 steps"),
     Shown("fox", "sundae", "no-head-branch", "ef71d9f", "the same field, no head", timed=False),
@@ -72,18 +71,21 @@ def readme_table(rows: list[RunRow]) -> str:
             ]
         )
         if shown.packed:
-            lines.append(packed_line(shown.packed))
+            lines += packed_lines(shown.packed)
     heads = ["scene", "method", "primitives", "PSNR", "SSIM", "PSNR, head off", "MB", "ms a frame", "training"]
     return "\n".join(table(heads, lines))
 
 
-def packed_line(run: str) -> list[str]:
-    """README's line of a run packed with the default options, whose last measurement counts."""
+def packed_lines(run: str) -> list[list[str]]:
+    """README's lines of a run packed with the default options, as it is and fine-tuned; the last measurements count."""
     measured = [json.loads(line) for line in PACKS.read_text(encoding="utf-8").splitlines()]
-    *_, found = (line for line in measured if line["run"] == run and not line["set"])
-    quality = (number(found["psnr_packed"], 2), "", number(found["psnr_packed_base"], 2))
-    size = number(found["bytes"] / MB, 1)
-    return ["", "the same, packed", number(found["primitives"], 0), *quality, size, "", ""]
+    last = {line.get("finetune_steps", 0): line for line in measured if line["run"] == run and not line["set"]}
+    lines = []
+    for steps, found in sorted(last.items()):
+        label = "the same, packed" + (f" with --finetune {steps}" if steps else "")
+        quality = (number(found["psnr_packed"], 2), "", number(found["psnr_packed_base"], 2))
+        lines.append(["", label, number(found["primitives"], 0), *quality, number(found["bytes"] / MB, 1), "", ""])
+    return lines
 
 
 def with_table(text: str, rows: list[RunRow]) -> str:
