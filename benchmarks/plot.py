@@ -16,11 +16,16 @@ FIGURE = ROOT / "docs" / "figures" / "runs.png"
 AXES = (("bytes_total", 1e6, "MB, primitives and head in fp32"), ("ms_frame", 1.0, "ms a frame, head included"))
 
 
+def ran_beside_others(variant: str) -> bool:
+    """Whether runs of this kind shared their GPU: their times say nothing."""
+    return variant.endswith("-branch") or variant.startswith("budget-")
+
+
 def main() -> None:
     with open(RUNS, newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["ms_frame"]]
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    figure, panels = plt.subplots(len(scenes), 2, figsize=(11, 4.2 * len(scenes)), layout="constrained")
+    figure, panels = plt.subplots(len(scenes), 2, figsize=(13, 4.2 * len(scenes)), layout="constrained")
     labels = sorted({(row["method"], row["variant"]) for row in rows})
     colors = {label: plt.get_cmap("tab20")(i % 20) for i, label in enumerate(labels)}
     # One filling a machine: times compare within a filling only.
@@ -35,8 +40,7 @@ def main() -> None:
                         for row in own
                         if (row["method"], row["variant"]) == label
                         and (row["gpu"] == newest) == here
-                        # Branches ran side by side: their times say nothing.
-                        and not (column == "ms_frame" and row["variant"].endswith("-branch"))
+                        and not (column == "ms_frame" and ran_beside_others(row["variant"]))
                     ]
                     if not runs:
                         continue
@@ -57,7 +61,8 @@ def main() -> None:
             panel.set_ylabel("test PSNR, dB")
             panel.set_title(f"{scene}, {own[0]['resolution']} px")
             panel.grid(alpha=0.3)
-        line[0].legend(fontsize=7, loc="center right")
+        handles, names = line[0].get_legend_handles_labels()
+        line[1].legend(handles, names, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     FIGURE.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(FIGURE, dpi=110)
     print(f"wrote {FIGURE}")
