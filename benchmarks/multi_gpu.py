@@ -63,6 +63,7 @@ class Clock:
         every = max(trainer.config.max_num_iterations // looks, 1) if looks else 0
         self.looks = {every * (i + 1) for i in range(looks)}
         self.curve: dict[int, float] = {}
+        self.heads_apart: dict[int, float] = {}
         self.seconds, self.pictures = 0.0, 0
         self.started: float | None = None
 
@@ -95,6 +96,8 @@ class Clock:
         pipeline = self.trainer.pipeline
         if self.ranks > 1:
             self.trainer.shards.agree_on_focal(pipeline.model)
+            head = pipeline.model.head
+            self.heads_apart[step * self.ranks] = self.trainer.shards.apart(() if head is None else head.parameters())
         pipeline.eval()
         quality = run.evaluate(pipeline)
         pipeline.train()
@@ -202,6 +205,7 @@ def record(
         "seconds": clock.seconds,
         "pictures_per_s": clock.pictures / clock.seconds,
         "psnr_after_pictures": clock.curve,
+        "heads_apart": clock.heads_apart,
         "peak_mib": memory,
         "commit": run.commit(),
         "command": ours,

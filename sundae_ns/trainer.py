@@ -113,6 +113,7 @@ class SundaeTrainer(Trainer):
         """
         if self.shards is not None:
             self.shards.agree_on_focal(self.pipeline.model)
+            self._compare_heads(self.shards)
         own = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
@@ -132,6 +133,15 @@ class SundaeTrainer(Trainer):
             for other in self.checkpoint_dir.glob("*.ckpt"):
                 if other != path:
                     other.unlink(missing_ok=True)
+
+    def _compare_heads(self, shards: distributed.Shards) -> None:
+        head = self.pipeline.model.head
+        apart = 0.0 if head is None else shards.apart(head.parameters())
+        if apart != 0 and shards.rank == 0:
+            CONSOLE.print(
+                f"[yellow]Warning: the heads of the ranks differ by up to {apart:.2g}, which is an error of ours; the first "
+                "rank's is saved, and to resume from it makes them alike again"
+            )
 
     def _load_checkpoint(self) -> None:
         path = self._source()

@@ -352,6 +352,11 @@ def check_averages(shards: Shards) -> None:
     distributed.average_gradients(values)
     assert all((value.grad == 1.5).all() for value in values[:2])  # type: ignore[union-attr]
     assert shards.announce({"rank": shards.rank}) == {"rank": 0}
+    assert shards.apart(values) == 0
+    with torch.no_grad():
+        values[1][1, 0] -= 0.25 * shards.rank
+    assert shards.apart(values) == 0.25
+    assert shards.apart([]) == 0
 
 
 # ----------------------------------------------------------------------------------------------------------- training

@@ -293,6 +293,21 @@ class Shards:
                 sums[ids] += added
         return sums
 
+    @torch.no_grad()
+    def apart(self, copies: Iterable[Tensor]) -> float:
+        """Most that any number differs by of which all ranks should have the same; 0 without any. Collective.
+
+        Args:
+            copies: tensors of this rank, of the same shapes on all.
+        """
+        numbers = [copy.detach().flatten() for copy in copies]
+        if not numbers:
+            return 0.0
+        own = torch.cat(numbers)
+        ends = torch.stack([own, -own])
+        dist.all_reduce(ends, dist.ReduceOp.MAX)
+        return float(ends.sum(dim=0).max())
+
     def agree_on_focal(self, model: SundaeModel) -> None:
         """Let all ranks know the focal lengths of the pictures that any has trained the head on. Collective."""
         low, high = model.trained_focal or (math.inf, -math.inf)
