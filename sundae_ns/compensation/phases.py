@@ -1,8 +1,7 @@
 """Pictures that hang less on where the camera's pixels lie.
 
 A U-Net that folds and pools pixels makes something else of a picture that is moved by one pixel, which shows as flicker when
-the camera moves. The mean over moved pictures, each moved back, does so less: it is what a network of twice the resolution
-at its folds would be bound to.
+the camera moves. The mean over pictures that were moved, each moved back, hangs less on where they lay.
 """
 
 from __future__ import annotations
