@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -49,6 +49,17 @@ def limit_growth(
         state["radii"][left_out] = state["radii"][left_out].clamp_max(radius)
 
 
+class Statistics(NamedTuple):
+    """What a backward pass has said about primitives in the views of several ranks; one may be in several rows."""
+
+    ids: Tensor
+    """Which primitive ``[S]``."""
+    norms: Tensor
+    """Length of the gradient of its centre, in units of half the picture; 0 where it is not drawn ``[S]``."""
+    radii: Tensor
+    """Its radius as a share of the picture's longer side; 0 where it is not drawn ``[S]``."""
+
+
 @dataclass
 class CappedStrategy(DefaultStrategy):
     """gsplat's densification, with an exact cap: where more would grow, those with the highest gradients do."""
@@ -59,6 +70,22 @@ class CappedStrategy(DefaultStrategy):
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """gsplat's state, and the peak."""
         return {**super().initialize_state(scene_scale), "peak": 0}
+
+    @torch.no_grad()
+    def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
+        """gsplat's; ``statistics`` of several ranks are added as they are, rows of zeros too, which waits for no GPU."""
+        found: Statistics | None = info.get("statistics")
+        if found is None:
+            super()._update_state(params, state, info, packed=packed)
+            return
+        for name in ("grad2d", "count", "radii"):
+            if name in state and state[name] is None:
+                state[name] = torch.zeros(len(params["means"]), device=found.norms.device)
+        norms, radii = found.norms.to(state["grad2d"]), found.radii.to(state["grad2d"])
+        state["grad2d"].index_add_(0, found.ids, norms)
+        state["count"].index_add_(0, found.ids, (radii > 0).to(state["count"]))
+        if "radii" in state:
+            state["radii"].scatter_reduce_(0, found.ids, radii, "amax")
 
     @torch.no_grad()
     def _grow_gs(self, params: Any, optimizers: Any, state: dict[str, Any], step: int) -> tuple[int, int]:

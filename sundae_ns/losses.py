@@ -23,6 +23,7 @@ def picture_loss(picture: Tensor, target: Tensor, ssim: SSIM, weight: float) -> 
     l1 = (picture - target).abs().mean()
     if weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
         return l1
+    ssim.win = ssim.win.to(target.device)  # once: it would be copied there, and waited for, each time
     # Contiguous planes: on the interleaved colours of a large picture the same convolutions take much longer.
     planes = (image.permute(2, 0, 1)[None].contiguous() for image in (target, picture))
     return (1 - weight) * l1 + weight * (1 - ssim(*planes))

@@ -27,10 +27,10 @@ from torch import Tensor
 from sundae_ns import checkpoint
 from sundae_ns.after_step import finish, prune_if_due
 from sundae_ns.budget import Budget
-from sundae_ns.compensation import PHASES, CompensationHead, HeadConfig, Window, training_window
+from sundae_ns.compensation import PHASES, CompensationHead, HeadConfig, training_window
 from sundae_ns.datamanager import NO_PICTURES, SundaeDatamanager
 from sundae_ns.densification import CappedStrategy, make_strategy
-from sundae_ns.distributed import Arrived, GlobalPruning, Shards
+from sundae_ns.distributed import Arrived, Course, GlobalPruning, Look, Shards, Timetable, slack_of_step
 from sundae_ns.errors import ConfigError, DataError, out_of_memory
 from sundae_ns.evaluation import LazyOutputs, Lpips, psnr, ssim
 from sundae_ns.initial_field import initial_field
@@ -134,6 +134,8 @@ class SundaeModel(SplatfactoModel):
         self.policy: PruningPolicy | GlobalPruning = make_policy(config.pruning)
         self.shards: Shards | None = None
         """The ranks that hold the field together; None where one process holds it all."""
+        self.timetable: Timetable | None = None
+        """Which views the ranks draw in training."""
         self.budget = Budget(config.pruning, config.head) if config.pruning.mode == "auto" else None
         self.pruning_state: dict[str, Any] = self.policy.initialize_state()
         self.strategy_state: dict[str, Any] = self.strategy.initialize_state(scene_scale=1.0)
@@ -212,19 +214,23 @@ class SundaeModel(SplatfactoModel):
         """Primitives of the whole field; ``num_points`` are those that this process holds."""
         return self.num_points if self.shards is None else self.shards.total
 
-    def share(self, shards: Shards) -> None:
-        """Be one of the ranks that hold the field together, each its block of primitives."""
+    def share(self, shards: Shards, datamanager: SundaeDatamanager) -> None:
+        """Be one of the ranks that hold the field together, each its block of primitives, and draw views in their order."""
         self.shards = shards
+        cameras = datamanager.train_dataset.cameras
+        self.timetable = Timetable(cameras, datamanager.view_of_step, self.device, NEAR_PLANE)
         self.policy = GlobalPruning(make_policy(self.config.pruning), shards)
         if isinstance(self.strategy, CappedStrategy):
             # Opacities are reset, and then each picture is seen once before anything grows or goes.
             pictures = -(-self.num_train_data // shards.ranks)
             self.strategy.pause_refine_after_reset = pictures + self.config.refine_every
 
-    def arrivals(self, params: Mapping[str, Tensor], view: View, *, features: bool = False) -> Arrived:
+    def arrivals(
+        self, params: Mapping[str, Tensor], view: View, *, features: bool = False, course: Course | None = None
+    ) -> Arrived:
         """What this process needs to draw its view, from all ranks; each has to ask, see :mod:`sundae_ns.distributed`."""
         assert self.shards is not None
-        return self.shards.arrivals(params, view, self._colors, near_plane=NEAR_PLANE, features=features)
+        return self.shards.arrivals(params, view, self._colors, near_plane=NEAR_PLANE, features=features, course=course)
 
     def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """One group per parameter of the field, features included."""
@@ -356,16 +362,17 @@ class SundaeModel(SplatfactoModel):
             beside the first two are made when they are asked for. In training, pictures may be of a ``window`` alone,
             then given beside them.
         """
-        view = self.view_of(camera, self._get_downscale_factor())
         background = self._get_background_color()
         if self.training:
+            look = self._look(self.step)
+            view = self.view_of(camera, look.downscale) if self.timetable is None else self.timetable.view(look, camera)
             self._remember_focal(view)
-            window = self._training_window(view)
+            window = training_window(view.width, view.height, look.window_pixels, seed=look.step)
             view = view if window is None else view.cut(window)
-            outputs, splat = self.render(
-                self.gaussians, view, background, depth=self.config.output_depth_during_training
-            )
+            field = self.gaussians if self.shards is None else self._on_course(view, look)
+            outputs, splat = self.render(field, view, background, depth=self.config.output_depth_during_training)
             self.info = splat.info
+            self._plan_ahead()
             if self.densifying:
                 self.strategy.step_pre_backward(
                     self.gauss_params, self.optimizers, self.strategy_state, self.schedule_step, self.info
@@ -373,6 +380,7 @@ class SundaeModel(SplatfactoModel):
             outputs.pop("feature_image")
             return {**outputs, "background": background, "window": window}
 
+        view = self.view_of(camera, self._get_downscale_factor())
         mask = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
         preview = self.preview.decision(self)
         if preview is not None:
@@ -405,19 +413,39 @@ class SundaeModel(SplatfactoModel):
     # ----------------------------------------------------------------------------------------------------- training
 
     def _get_downscale_factor(self) -> int:
+        return self._downscale_at(self.step) if self.training else 1
+
+    def _downscale_at(self, step: int) -> int:
         """Splatfacto's rising resolution; a warm start has risen."""
-        return 1 if self.config.warm_start is not None else super()._get_downscale_factor()
+        if self.config.warm_start is not None:
+            return 1
+        return int(2 ** max(self.config.num_downscales - step // self.config.resolution_schedule, 0))
 
     def _remember_focal(self, view: View) -> None:
         if self.head_active and self._get_downscale_factor() == 1:
             low, high = self.trained_focal or (view.focal, view.focal)
             self.trained_focal = (min(low, view.focal), max(high, view.focal))
 
-    def _training_window(self, view: View) -> Window | None:
+    def _look(self, step: int) -> Look:
+        """How pictures are looked at in a step of training; at a later one, as far as it is known now."""
         # Densification takes its statistics from whole pictures.
-        if not self.head_active or self.densifying:
-            return None
-        return training_window(view.width, view.height, self.config.head.max_train_pixels, seed=self.step)
+        windows = self.head_active and not self.densifying
+        return Look(step, self._downscale_at(step), self.config.head.max_train_pixels if windows else 0)
+
+    def _on_course(self, view: View, look: Look) -> Arrived:
+        """What a view of the timetable needs from all ranks. Collective."""
+        assert self.timetable is not None
+        assert self.shards is not None
+        field, course = self.gaussians, self.shards.course(self.gaussians, self.timetable, look)
+        return self.arrivals(field, view, features=self.head_active, course=course)
+
+    def _plan_ahead(self) -> None:
+        """Plan the exchange of the next step, while the GPU is busy with this one. Collective."""
+        if self.shards is None or self.timetable is None:
+            return
+        slack = slack_of_step(self.optimizers)
+        if slack is not None:
+            self.shards.plan_ahead(self.gaussians, self.timetable, self._look(self.step + 1), slack)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

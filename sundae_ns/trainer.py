@@ -77,10 +77,10 @@ class SundaeTrainer(Trainer):
             return super().setup_optimizers()
         model, datamanager = self.pipeline.model, cast(SundaeDatamanager, self.pipeline.datamanager)
         self.shards = distributed.take_shard(model, self.config.machine.seed)
-        model.share(self.shards)
+        model.share(self.shards, datamanager)
         datamanager.place = (self.shards.rank, self.ranks)
         optimizers = distributed.SharedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
-        distributed.scale_rates(optimizers, self.ranks)
+        distributed.scale_rates(optimizers, model.gauss_params, self.ranks)
         return optimizers
 
     def eval_iteration(self, step: int) -> None:

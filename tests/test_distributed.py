@@ -29,11 +29,13 @@ from torch.nn import Parameter
 
 from sundae_ns import checkpoint, distributed
 from sundae_ns.data import write_scene
-from sundae_ns.distributed import GlobalPruning, Shards
+from sundae_ns.densification import CappedStrategy
+from sundae_ns.distributed import Course, GlobalPruning, Look, Shards, Timetable, slack_of_step
 from sundae_ns.errors import ConfigError, RankError, rank_ended
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.pruning import PruningConfig, make_policy
 from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
+from sundae_ns.rasterization.sharded import Cameras, Slack, camera_row, cameras_of, may_be_seen
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 from sundae_ns.views import View
 
@@ -114,7 +116,8 @@ def check_drawing(shards: Shards) -> None:
     splat.info["means2d"].retain_grad()
     shards.follow(splat.info, arrived.route, absgrad=True)
     loss_of(splat, shards.rank).backward()
-    info = shards.statistics(splat.info)
+    state = {"grad2d": None, "count": None, "radii": None}
+    CappedStrategy(absgrad=True)._update_state(params, state, {"statistics": shards.statistics(splat.info)})
 
     whole = shard_of(a_field(), 0, 90)
     one = [draw(whole, colors_of(whole, a_view(rank).center), a_view(rank)) for rank in range(RANKS)]
@@ -140,14 +143,9 @@ def check_drawing(shards: Shards) -> None:
         norms += (splats.info["means2d"].absgrad[0] * halves * RANKS).norm(dim=-1) * (splats.radii > 0)
         counts += splats.radii > 0
         radii = radii.maximum(splats.radii.double() / max(seen_from.width, seen_from.height))
-    ids = info["gaussian_ids"]
-    found = torch.zeros(end - start).double().index_add_(0, ids, info["means2d"].absgrad.norm(dim=-1))
-    torch.testing.assert_close(found, norms[start:end], rtol=1e-10, atol=1e-12)
-    assert torch.equal(torch.bincount(ids, minlength=end - start).double(), counts[start:end])
-    largest = torch.zeros(end - start).double()
-    of_row = info["radii"] if info["radii"].dim() == 1 else info["radii"][:, 0]
-    largest[ids] = of_row / max(info["width"], info["height"])
-    torch.testing.assert_close(largest, radii[start:end])
+    torch.testing.assert_close(state["grad2d"], norms[start:end].float(), rtol=1e-6, atol=1e-8)
+    assert torch.equal(state["count"], counts[start:end].float())
+    torch.testing.assert_close(state["radii"], radii[start:end].float())
 
 
 def check_that_nothing_stays(shards: Shards) -> None:
@@ -159,12 +157,143 @@ def check_that_nothing_stays(shards: Shards) -> None:
     splat = draw(arrived, arrived["colors"], view)
     splat.info["means2d"].retain_grad()
     shards.follow(splat.info, arrived.route, absgrad=True)
+    timetable: Any = Views(shards.rank)
+    shards.plan_ahead(params, timetable, Look(1, 1, 0), Slack(0.1, 0.1))  # and it stays until then
     loss_of(splat, shards.rank).backward()
     shards.statistics(splat.info)
     route = weakref.ref(arrived.route)
     del arrived, splat
     gc.collect()
     assert route() is None
+    assert shards.ahead is not None
+    shards.forget_plan()
+
+
+class Views:
+    """A timetable in float64: two views, which the ranks take in turns, at half of the size where a look says so."""
+
+    def __init__(self, rank: int) -> None:
+        self.rank = rank
+
+    def of(self, look: Look, rank: int) -> View:
+        view = a_view((look.step + rank) % RANKS).zoomed(1 / look.downscale)
+        aside = torch.zeros(4, 4, dtype=torch.float64)
+        aside[0, 3] = 1.2 * ((look.step + rank) % RANKS)  # so that each sees what the other does not
+        return view._replace(viewmat=view.viewmat + aside)
+
+    def view(self, look: Look) -> View:
+        return self.of(look, self.rank)
+
+    def cameras(self, look: Look) -> Cameras:
+        views = [self.of(look, rank) for rank in range(RANKS)]
+        return cameras_of(torch.stack([camera_row(v.viewmat, v.K, v.width, v.height, 0.01) for v in views]))
+
+
+def check_planning_ahead(shards: Shards) -> None:
+    """Steps that were planned ahead do what steps that plan at their start do, and what one process does."""
+    start, end = distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2]
+    views: Any = Views(shards.rank)
+    small = {**a_field(), "scales": a_field()["scales"] - 2}
+    looks = [Look(step, 1, 0) for step in range(4)]
+
+    def optimizers_of(params: dict[str, Parameter]) -> dict[str, torch.optim.Optimizer]:
+        # Rates at which the field leaves its place within three steps.
+        return {name: torch.optim.Adam([value], lr=0.1, betas=(0.8, 0.9), eps=1e-8) for name, value in params.items()}
+
+    found = {}
+    for ahead in (True, False):
+        params = shard_of(small, start, end)
+        shards.recount(params)
+        optimizers, pictures, missed = optimizers_of(params), [], 0
+        for look in looks[:-1]:
+            assert (shards.ahead is not None) == (ahead and look.step > 0)
+            cameras, route = shards.course(params, views, look)
+            assert shards.ahead is None
+            view = views.view(look)
+            arrived = shards.arrivals(
+                params, view, colors_of, near_plane=0.01, features=True, course=Course(cameras, route)
+            )
+            splat = draw(arrived, arrived["colors"], view)
+            pictures.append(splat.colors.detach())
+            if ahead:
+                slack = slack_of_step(optimizers)
+                assert slack is not None
+                shards.plan_ahead(params, views, looks[look.step + 1], slack)
+                bounds = views.cameras(looks[look.step + 1]).bounds
+                before = may_be_seen(params["means"], params["scales"], bounds)
+            loss_of(splat, view.width).backward()
+            for optimizer in optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad()
+            if ahead:
+                missed += int((may_be_seen(params["means"], params["scales"], bounds) & ~before).sum())
+        # Without allowing for the steps, something would have been left out.
+        every = [count for (count,) in shards.numbers(missed)]
+        assert not ahead or sum(every) > 0, every
+        found[ahead] = pictures, {name: value.detach() for name, value in params.items()}
+        shards.forget_plan()
+
+    whole = shard_of(small, 0, 90)
+    optimizers = optimizers_of(whole)
+    alone = []
+    for look in looks[:-1]:
+        drawn = [draw(whole, colors_of(whole, v.center), v) for v in (views.of(look, r) for r in range(RANKS))]
+        alone.append(drawn[shards.rank].colors.detach())
+        losses = [loss_of(splat, views.of(look, rank).width) for rank, splat in enumerate(drawn)]
+        (sum(losses) / RANKS).backward()  # type: ignore[union-attr]
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+    for ours, theirs, expected in zip(found[True][0], found[False][0], alone):
+        torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-12)
+        torch.testing.assert_close(ours, expected, rtol=0, atol=1e-9)
+    for name in NAMES:
+        torch.testing.assert_close(found[True][1][name], found[False][1][name], rtol=0, atol=1e-12)
+        torch.testing.assert_close(found[True][1][name], whole[name].detach()[start:end], rtol=0, atol=1e-9)
+
+
+def check_that_plans_are_forgotten(shards: Shards) -> None:
+    """A field that has changed, or pictures of another size, are planned for anew, on all ranks; silence is an error."""
+    params = shard_of(a_field(), *distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2])
+    views: Any = Views(shards.rank)
+    optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
+
+    def planned() -> bool:
+        return shards.ahead is not None
+
+    def plan() -> None:
+        shards.plan_ahead(params, views, Look(1, 1, 0), Slack(0.0, 0.0))
+        assert planned()
+
+    shards.recount(params)
+    plan()
+    # Pictures of another size, and another step.
+    for look in (Look(1, 2, 0), Look(2, 1, 0)):
+        plan()
+        cameras, route = shards.course(params, views, look)
+        assert not planned()
+        expected = views.cameras(look)
+        assert torch.equal(cameras.centers, expected.centers)
+        assert torch.equal(cameras.bounds, expected.bounds)
+        seen = may_be_seen(params["means"], params["scales"], expected.bounds)
+        assert torch.equal(torch.stack([route.cameras, route.ids], dim=1), seen.nonzero())
+    plan()
+    shards.recount(params)
+    assert not planned()
+    for mask in (None, torch.rand(len(params["means"])) > 0.2):
+        plan()
+        shards.level(params, optimizers, [], mask)
+        assert not planned()
+    # Another parameter, other data in the same one, and other values in the same data.
+    for change in (
+        lambda: params.update(scales=Parameter(params["scales"].data)),
+        lambda: setattr(params["scales"], "data", params["scales"].detach().clone()),
+        lambda: [params["scales"].detach().mul_(0.5), params["scales"].detach().mul_(2)],
+    ):
+        plan()
+        change()
+        with pytest.raises(AssertionError, match="has changed since"):
+            shards.course(params, views, Look(1, 1, 0))
 
 
 def check_looking_away(shards: Shards) -> None:
@@ -210,12 +339,11 @@ def check_an_empty_shard(shards: Shards) -> None:
 class Tripling:
     """A strategy that grows the shard of rank 1 alone, and puts a mark on what it has counted."""
 
-    refine_every = 10
+    refine_every, grows = 10, True
 
-    def step_post_backward(self, params: Any, optimizers: Any, state: Any, step: int, info: Any, packed: bool) -> None:
-        assert packed
-        assert info["means2d"].absgrad is not None
-        if dist.get_rank() != 1:
+    def step_post_backward(self, params: Any, optimizers: Any, state: Any, step: int, info: Any) -> None:
+        assert len(info["statistics"].norms) > 0
+        if dist.get_rank() != 1 or not self.grows:
             return
         for name in list(params):
             params[name] = Parameter(params[name].detach().repeat_interleave(3, dim=0))
@@ -245,7 +373,14 @@ def check_drift(shards: Shards) -> None:
         optimizers=optimizers,
         schedule_step=20,
     )
+    planned: Any = object()
+    shards.ahead, model.schedule_step = planned, 19
+    model.strategy.grows = False
     shards.densify(model)
+    assert shards.ahead is planned
+    model.schedule_step, model.strategy.grows = 20, True
+    shards.densify(model)
+    assert shards.ahead is None
     assert shards.counts == [75, 75]
     assert model.strategy_state["peak"] == 60 + 90 + 5
     every = torch.cat([torch.arange(60), torch.arange(60, 90).repeat_interleave(3)])
@@ -385,6 +520,7 @@ def configured(folder: Path, name: str) -> SundaeTrainerConfig:
     model.rasterizer = "reference"
     model.pruning.prune_at, model.pruning.keep_ratio = PRUNE_AT, KEEP
     model.warmup_length, model.refine_every, model.stop_split_at = 4, 6, PRUNE_AT
+    model.num_downscales, model.resolution_schedule = 1, 4
     model.densify_grad_thresh, model.reset_alpha_every, model.sh_degree_interval = 0.003, 100, 8
     return config
 
@@ -418,7 +554,19 @@ def train(config: SundaeTrainerConfig, rank: int, ranks: int) -> SundaeTrainer:
 
 def check_training(shards: Shards, folder: Path) -> None:
     """A run of two ranks; afterwards both have the same head, and no shard is far from the mean."""
+    anew = []
+    course = Shards.course
+
+    def noted(self: Shards, params: Any, timetable: Timetable, look: Look) -> Course:
+        if self.ahead is None or self.ahead.look != look:
+            anew.append(look.step)
+        return course(self, params, timetable, look)
+
+    Shards.course = noted  # type: ignore[method-assign]
     trainer = train(configured(folder, "train"), shards.rank, RANKS)
+    Shards.course = course  # type: ignore[method-assign]
+    # The first step, those after a round of growing, and the one after the prune; resolution rises at step 2.
+    assert anew == [0, *range(1, PRUNE_AT // RANKS + 1, 3), PRUNE_AT // RANKS + 1]
     model: Any = trainer.pipeline.model
     weights = torch.cat([value.detach().flatten() for value in model.head.parameters()])
     every = [torch.empty_like(weights) for _ in range(RANKS)]
@@ -429,6 +577,11 @@ def check_training(shards: Shards, folder: Path) -> None:
     group = trainer.optimizers.optimizers["opacities"].param_groups[0]
     assert group["lr"] == pytest.approx(0.05 * RANKS**0.5)
     assert group["betas"] == pytest.approx((0.9**RANKS, 0.999**RANKS))
+    head = trainer.optimizers.optimizers["compensation"].param_groups[0]
+    assert (head["initial_lr"], head["betas"]) == (
+        sundae_tiny.config.optimizers["compensation"]["optimizer"].lr,
+        (0.9, 0.999),
+    )
 
 
 def check_frozen(shards: Shards, folder: Path) -> None:
@@ -438,6 +591,8 @@ def check_frozen(shards: Shards, folder: Path) -> None:
 CHECKS: tuple[Callable[..., None], ...] = (
     check_drawing,
     check_that_nothing_stays,
+    check_planning_ahead,
+    check_that_plans_are_forgotten,
     check_looking_away,
     check_levelling,
     check_an_empty_shard,
@@ -588,6 +743,8 @@ def test_a_checkpoint_loads_on_another_number_of_ranks(folder: Path, ranks: int)
     group, whole = (x["optimizers"]["means"]["param_groups"][0] for x in (parts[0], loaded))
     assert group["lr"] == pytest.approx(whole["lr"] * ranks**0.5)
     assert group["betas"] == pytest.approx([beta**ranks for beta in whole["betas"]])
+    assert parts[0]["optimizers"]["compensation"] == loaded["optimizers"]["compensation"]
+    assert parts[0]["schedulers"]["compensation"]["base_lrs"] == loaded["schedulers"]["compensation"]["base_lrs"]
     assert parts[0]["step"] == (SAVED_AT + 1) // ranks - 1
     assert parts[0]["schedulers"]["means"]["last_epoch"] == round((SAVED_AT + 1) / ranks)
 

@@ -42,15 +42,23 @@ def average_gradients(params: Iterable[Tensor]) -> None:
     torch._foreach_copy_(gradients, flat.split([len(gradient) for gradient in gradients]))
 
 
-def scale_rates(optimizers: Optimizers, ranks: int) -> None:
+def scale_rates(optimizers: Optimizers, names: Iterable[str], ranks: int) -> None:
     """Adapt Adam to batches of ``ranks`` pictures: rates by the square root, both betas to that power.
 
-    Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024.
+    Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024. It is a rule for primitives, each of
+    which few pictures see. A head with all weights in every picture bursts at twice its rate (``docs/distributed.md``).
+
+    Args:
+        optimizers: by name of the group.
+        names: the groups to adapt, parameters of the field.
+        ranks: pictures of a step.
     """
-    for optimizer in optimizers.optimizers.values():
-        for group in optimizer.param_groups:
-            group.update(scaled_group(group, ranks))
-    for scheduler in optimizers.schedulers.values():
+    field = set(names)
+    for group in (
+        group for key in field & optimizers.optimizers.keys() for group in optimizers.optimizers[key].param_groups
+    ):
+        group.update(scaled_group(group, ranks))
+    for scheduler in (optimizers.schedulers[key] for key in field & optimizers.schedulers.keys()):
         for name in ("base_lrs", "_last_lr"):
             setattr(scheduler, name, [rate * ranks**0.5 for rate in getattr(scheduler, name)])
 

@@ -82,11 +82,14 @@ def _map_state(
                 key: {kind: value if kind == "step" else change(value) for kind, value in entries.items()}
                 for key, entries in moments.items()
             }
-        groups = [{**group, **scaled_group(group, float(factor))} for group in held["param_groups"]]
+        groups = held["param_groups"]
+        if name in field:
+            groups = [{**group, **scaled_group(group, float(factor))} for group in groups]
         optimizers[name] = {"state": moments, "param_groups": groups}
     schedulers = {}
     for name, held in state.get("schedulers", {}).items():
-        rates = {key: [rate * float(factor) ** 0.5 for rate in held[key]] for key in ("base_lrs", "_last_lr")}
+        growth = float(factor) ** 0.5 if name in field else 1.0
+        rates = {key: [rate * growth for rate in held[key]] for key in ("base_lrs", "_last_lr")}
         decays = []
         for decay in held["lr_lambdas"]:
             spans = {key: round(decay[key] / factor) for key in ("max_steps", "warmup_steps")}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 import torch.distributed as dist
@@ -19,17 +19,21 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
+from sundae_ns.densification import Statistics
+from sundae_ns.distributed.ahead import Ahead, Look, Timetable, stamped
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.parameters import num_primitives
 from sundae_ns.gaussians.surgery import check_wiring, per_primitive, replace_parameter
-from sundae_ns.rasterization.reference import largest_axis, per_axis
+from sundae_ns.rasterization.reference import largest_axis
 from sundae_ns.rasterization.sharded import (
+    Cameras,
     Route,
+    Slack,
     exchange,
     gather_cameras,
     give_back,
     may_be_seen,
-    plan_route,
+    plan_exchange,
     swap,
 )
 
@@ -73,6 +77,19 @@ class Arrived(dict[str, Tensor]):
     route: Route
 
 
+class Course(NamedTuple):
+    """One exchange: who looks, and what goes where."""
+
+    cameras: Cameras
+    route: Route
+
+
+def _course_now(params: Mapping[str, Tensor], cameras: Cameras) -> Course:
+    with torch.no_grad():
+        seen = may_be_seen(params["means"], params["scales"], cameras.bounds)
+    return Course(cameras, plan_exchange(seen).route())
+
+
 class Shards:
     """This rank's place among the ranks, and how many primitives each holds.
 
@@ -85,6 +102,8 @@ class Shards:
         self.device = torch.device(device)
         self.counts = [0] * self.ranks
         """Primitives of each rank."""
+        self.ahead: Ahead | None = None
+        """The exchange of the next step, once this one has planned it."""
 
     @property
     def total(self) -> int:
@@ -100,6 +119,7 @@ class Shards:
 
     def recount(self, params: Mapping[str, Tensor]) -> None:
         """Let every rank know what each holds. Collective."""
+        self.forget_plan()
         self.counts = [count for (count,) in self.numbers(num_primitives(params))]
 
     def announce(self, thing: Any) -> Any:
@@ -147,6 +167,7 @@ class Shards:
             states: running states; their tensors of N_r rows move too.
             mask: True for primitives that stay, bool ``[N_r]``; None for all.
         """
+        self.forget_plan()
         check_wiring(params, optimizers)
         n = num_primitives(params)
         kept = [count for (count,) in self.numbers(n if mask is None else int(mask.sum()))]
@@ -169,6 +190,35 @@ class Shards:
 
     # ---------------------------------------------------------------------------------------------------- rendering
 
+    def forget_plan(self) -> None:
+        """Let the next step plan its own exchange: whoever changes the field calls this, on all ranks alike."""
+        self.ahead = None
+
+    @torch.no_grad()
+    def plan_ahead(self, params: Mapping[str, Tensor], timetable: Timetable, look: Look, slack: Slack) -> None:
+        """Plan the exchange of a step to come, for whatever the field becomes within the slack; wait for nothing. Collective.
+
+        Args:
+            params: this rank's primitives as they are.
+            timetable: of the ranks' views.
+            look: at the step to come.
+            slack: from :func:`sundae_ns.distributed.ahead.slack_of_step`.
+        """
+        cameras = timetable.cameras(look)
+        plan = plan_exchange(may_be_seen(params["means"], params["scales"], cameras.bounds, slack))
+        self.ahead = Ahead(look, cameras, plan, stamped(params))
+
+    @torch.no_grad()
+    def course(self, params: Mapping[str, Tensor], timetable: Timetable, look: Look) -> Course:
+        """The exchange of this step: the one that was planned for it, or a new one. Collective.
+
+        All ranks do the same: plans are made and forgotten in collectives, and a look is a function of the step.
+        """
+        planned, self.ahead = self.ahead, None
+        if planned is not None and planned.look == look:
+            return Course(planned.cameras, planned.route(params))
+        return _course_now(params, timetable.cameras(look))
+
     def arrivals(
         self,
         params: Mapping[str, Tensor],
@@ -177,6 +227,7 @@ class Shards:
         *,
         near_plane: float,
         features: bool,
+        course: Course | None = None,
     ) -> Arrived:
         """The primitives of all ranks that this rank's view may see; differentiable. Collective.
 
@@ -186,14 +237,15 @@ class Shards:
             colors_of: colours ``[S, 3]`` of primitives with centres and harmonics, as seen from places ``[S, 3]``.
             near_plane: as the rasteriser gets it.
             features: whether features come along.
+            course: what is to be exchanged; None for the ranks to tell each other of their views.
         """
         names = [*_GEOMETRY, FEATURES] if features else list(_GEOMETRY)
-        cameras = gather_cameras(view.viewmat, view.K, view.width, view.height, near_plane)
-        with torch.no_grad():
-            route = plan_route(may_be_seen(params["means"], params["scales"].exp(), cameras.bounds))
+        if course is None:
+            course = _course_now(params, gather_cameras(view.viewmat, view.K, view.width, view.height, near_plane))
+        cameras, route = course
         # Picked for all cameras at once: the way back then fills one gradient per parameter, not one per camera.
         going = {name: params[name].index_select(0, route.ids) for name in [*names, *_COLORS]}
-        centers = torch.cat([center.expand(count, 3) for center, count in zip(cameras.centers, route.sent)])
+        centers = cameras.centers.index_select(0, route.cameras)
         rows = torch.cat([*(going[name] for name in names), colors_of(going, centers)], dim=1)
         columns = [params[name].shape[1] for name in names]
         pieces = exchange(rows, route).split([*columns, 3], dim=1)
@@ -211,60 +263,40 @@ class Shards:
         """
 
         def found() -> Tensor:
-            centres = info["means2d"]
+            centres, width, height = info["means2d"], info["width"], info["height"]
             gradients = (centres.absgrad if absgrad else centres.grad)[0]
-            radii = largest_axis(info["radii"][0]).to(gradients.dtype)
-            width, height = info["width"], info["height"]
-            halves = gradients.new_tensor([width / 2, height / 2])
-            return torch.cat([gradients * halves, (radii * (2 / max(width, height)))[:, None]], dim=1)
+            # By numbers, not by a tensor of them, which would be copied to the GPU, and waited for.
+            norms = torch.hypot(gradients[:, 0] * (width / 2), gradients[:, 1] * (height / 2))
+            return torch.stack([norms, (largest_axis(info["radii"][0]) / max(width, height)).to(norms)], dim=1)
 
         route.ask = found
         info["route"] = route
 
-    @torch.no_grad()
-    def statistics(self, info: Mapping[str, Any]) -> dict[str, Any]:
-        """What gsplat's strategy reads after a backward pass, about this rank's primitives in all views.
+    @staticmethod
+    def statistics(info: Mapping[str, Any]) -> Statistics:
+        """What densification reads after a backward pass, about this rank's primitives in all views.
 
         Args:
             info: of this rank's view, which :meth:`follow` has followed.
-
-        Returns:
-            ``info`` of a packed rasterisation, in units of half the picture: its width and height are 2.
         """
         route: Route = info["route"]
         assert route.told is not None
-        found = route.told
-        seen = (found[:, 2] > 0).nonzero()[:, 0]  # once: each search for them waits for the GPU
-        ids, found = route.ids[seen], found[seen]
-        # The strategy writes radii row by row: of a primitive in several views, each row gets the largest.
-        largest = found.new_zeros(self.counts[self.rank]).scatter_reduce_(0, ids, found[:, 2], "amax")
-        packed = found[:, :2].clone()
-        packed.grad = found[:, :2].clone()
-        packed.absgrad = packed.grad  # type: ignore[attr-defined]
-        return {
-            "width": 2,
-            "height": 2,
-            "n_cameras": 1,
-            "radii": per_axis(largest[ids]),
-            "gaussian_ids": ids,
-            "means2d": packed,
-        }
+        return Statistics(route.ids, *route.told.unbind(dim=1))
 
     def densify(self, model: SundaeModel) -> None:
         """Densify every shard by itself, and level the shards when they have drifted apart. Collective."""
         strategy, state = model.strategy, model.strategy_state
         peak, state["peak"] = state["peak"], 0
-        info = self.statistics(model.info)
         params = model.gaussians
         strategy.step_post_backward(
             params=model.gauss_params,
             optimizers=model.optimizers,
             state=state,
             step=model.schedule_step,
-            info=info,
-            packed=True,
+            info={"statistics": self.statistics(model.info)},
         )
         if model.schedule_step % strategy.refine_every == 0:
+            self.forget_plan()  # the only steps at which primitives come and go
             numbers = self.numbers(num_primitives(params), max(state["peak"], num_primitives(params)))
             self.counts = [count for count, _ in numbers]
             peak = max(peak, sum(most for _, most in numbers))

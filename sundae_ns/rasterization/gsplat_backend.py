@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
+from sundae_ns.rasterization.constants import constant
 from sundae_ns.rasterization.reference import ReferenceBackend, largest_axis
 from sundae_ns.rasterization.types import Rasterization
 
@@ -113,4 +114,4 @@ def _check_kernels_take(tensor: Tensor) -> None:
 def _without_zeros(quats: Tensor) -> Tensor:
     """Replace all-zero quaternions by the identity; the kernels would divide by their length."""
     is_zero = (quats == 0).all(dim=-1, keepdim=True)
-    return torch.where(is_zero, quats.new_tensor([1.0, 0.0, 0.0, 0.0]), quats)
+    return torch.where(is_zero, constant((1.0, 0.0, 0.0, 0.0), quats.dtype, quats.device), quats)

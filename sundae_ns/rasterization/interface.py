@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError
+from sundae_ns.rasterization.constants import constant
 from sundae_ns.rasterization.types import Backend, Rasterization
 
 MAX_SH_DEGREE = 4
@@ -108,7 +109,8 @@ def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, back
     _check_alike("directions", directions, coeffs=coeffs)
     # Replaced before any backend normalises: the CUDA kernel would return NaN for a camera inside a primitive's centre.
     is_zero = (directions == 0).all(dim=-1, keepdim=True)
-    directions = torch.where(is_zero, directions.new_tensor([0.0, 0.0, 1.0]), directions)
+    ahead = constant((0.0, 0.0, 1.0), directions.dtype, directions.device)
+    directions = torch.where(is_zero, ahead, directions)
     return backend.spherical_harmonics(degree, directions, coeffs)
 
 

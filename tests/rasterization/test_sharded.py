@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from torch import Tensor
 
 from sundae_ns.rasterization.projection import project
-from sundae_ns.rasterization.sharded import frustum_bounds, may_be_seen
+from sundae_ns.rasterization.sharded import UNMOVED, Slack, frustum_bounds, may_be_seen
 
 NEAR, FAR = 0.01, 1e10
 
@@ -33,7 +35,7 @@ def test_all_that_is_drawn_may_be_seen(
     drawn = project(means, quats, scales, torch.eye(4), K, width, height, NEAR, FAR).radii > 0
     away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
     bounds = torch.stack([frustum_bounds(pose, K, width, height, NEAR) for pose in (away, torch.eye(4))])
-    unseen, seen = may_be_seen(means, scales, bounds)
+    unseen, seen = may_be_seen(means, scales.log(), bounds)
     assert not (drawn & unseen).any()  # each camera for itself
     assert drawn.any()
     assert not (drawn & ~seen).any()
@@ -41,11 +43,48 @@ def test_all_that_is_drawn_may_be_seen(
     assert seen.sum() < most * drawn.sum()
 
 
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10**6),
+    means_slack=st.sampled_from([0.0, 1e-6, 1e-3, 0.03, 1.0]),
+    scales_slack=st.sampled_from([0.0, 1e-5, 0.01, 0.1, 2.0]),
+    towards=st.booleans(),
+)
+def test_what_is_drawn_after_a_move_may_be_seen_before_it(
+    seed: int, means_slack: float, scales_slack: float, towards: bool
+) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    means, quats, scales = scattered(seed, 2000)
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, generator=generator))
+    pose = torch.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn * turn.det(), torch.randn(3, generator=generator) * 0.3
+    K = torch.tensor([[60.0, 0.0, 20.0], [0.0, 45.0, 30.0], [0.0, 0.0, 1.0]])
+    bounds = frustum_bounds(pose, K, 64, 48, NEAR)[None]
+    seen = may_be_seen(means, scales.log(), bounds, Slack(means_slack, scales_slack))[0]
+    if towards:  # each the furthest that it may go towards one of the five planes, and as large as it may become
+        plane = torch.randint(0, 5, (len(means),), generator=generator)
+        moved = means - means_slack * bounds[0, plane, :3].sign()
+        grown = scales.log() + scales_slack
+    else:
+        moved = means + means_slack * (2 * torch.rand(means.shape, generator=generator) - 1)
+        grown = scales.log() + scales_slack * (2 * torch.rand(scales.shape, generator=generator) - 1)
+    drawn = project(moved, quats, grown.exp(), pose, K, 64, 48, NEAR, FAR).radii > 0
+    assert not (drawn & ~seen).any()
+
+
+def test_slack_adds_what_may_come_into_view_and_not_much_more() -> None:
+    means, _, scales = scattered(3)
+    K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
+    bounds = frustum_bounds(torch.eye(4), K, 64, 48, NEAR)[None]
+    exact, wider = (may_be_seen(means, scales.log(), bounds, slack).sum() for slack in (UNMOVED, Slack(0.002, 0.05)))
+    assert exact < wider < 1.03 * exact
+
+
 def test_what_is_not_a_number_is_not_seen() -> None:
     means = torch.tensor([[0.0, 0.0, 2.0], [torch.nan, 0.0, 2.0], [0.0, 0.0, torch.nan], [0.0, 0.0, 0.0]])
     scales = torch.full((4, 3), 0.1)
     drawn = project(means, torch.ones(4, 4), scales, torch.eye(4), torch.eye(3), 10, 10, NEAR, FAR).radii > 0
-    (seen,) = may_be_seen(means, scales, frustum_bounds(torch.eye(4), torch.eye(3), 10, 10, NEAR)[None])
+    (seen,) = may_be_seen(means, scales.log(), frustum_bounds(torch.eye(4), torch.eye(3), 10, 10, NEAR)[None])
     assert drawn.tolist()[0]
     assert not (drawn & ~seen).any()
     assert not seen[2:].any()
