@@ -27,7 +27,7 @@ def latest(lines: list[dict[str, Any]]) -> dict[str, dict[int, dict[str, Any]]]:
     runs: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
     for line in lines:
         if line["variant"].endswith("planned-ahead"):
-            continue  # a branch that was taken out again, see docs/distributed.md
+            continue  # its head burst, and no run on one GPU stands beside it, see docs/distributed.md
         tiled = line["variant"].startswith("multi-gpu-tiled")
         kind = f"{line['scene']}, {'tiled to ' + format(line['primitives'], ',') if tiled else 'a whole run'}"
         before = runs[kind].get(line["ranks"])
