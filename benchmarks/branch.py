@@ -29,6 +29,7 @@ from sundae_ns import rendering
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.compensation.head import SIZES
 from sundae_ns.evaluation import psnr
+from sundae_ns.evaluation.timing import now
 from sundae_ns.losses import picture_loss
 from sundae_ns.model import SundaeModel
 
@@ -254,9 +255,9 @@ def main() -> None:
                 torch._foreach_mul_(group["params"], 1 - group["lr"] * options.weight_decay)
 
         after_each_step(trainer, decay)
-    started = run.now()
+    started = now(trainer.device)
     trainer.train()
-    seconds = run.now() - started
+    seconds = now(trainer.device) - started
     if averaged is not None:
         averaged.take()
     trainer.pipeline.eval()

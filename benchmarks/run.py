@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 
 from sundae_ns.evaluation import RunRow, append_row, median_ms, psnr, ssim
+from sundae_ns.evaluation.timing import now
 from sundae_ns.measure import frame_times, revision, sizes
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage import Sizes, bytes_of
@@ -96,13 +96,6 @@ class CountPrimitives:
         return self._step(step)
 
 
-def now() -> float:
-    """Seconds on the clock, once the device has done what it was given."""
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
-    return time.perf_counter()
-
-
 @torch.no_grad()
 def evaluate(pipeline: Any) -> dict[str, float]:
     """Mean PSNR and SSIM over all test views, of the picture and of its base colours."""
@@ -150,9 +143,9 @@ def main() -> None:
     counts = CountPrimitives(trainer)
     if torch.cuda.is_available():
         torch.cuda.reset_peak_memory_stats()
-    started = now()
+    started = now(trainer.device)
     trainer.train()
-    train_s = now() - started
+    train_s = now(trainer.device) - started
     peak = torch.cuda.max_memory_allocated() / 2**20 if torch.cuda.is_available() else 0.0
 
     pipeline, model = trainer.pipeline, trainer.pipeline.model

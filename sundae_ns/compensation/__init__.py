@@ -1,7 +1,7 @@
 """Neural compensation: the U-Net that makes up, in image space, for what pruning lost. Floor 1."""
 
-from sundae_ns.compensation.head import CompensationHead, HeadConfig
-from sundae_ns.compensation.phases import PHASES, over_phases
+from sundae_ns.compensation.head import PHASES, CompensationHead, HeadConfig
+from sundae_ns.compensation.phases import over_phases
 from sundae_ns.compensation.scale import ScalePlan, plan, resize
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.compensation.window import Window, training_window

@@ -23,6 +23,13 @@ SIZES: dict[str, tuple[int, int | None]] = {
 }
 """Channels of the finest level, and the most that a coarser one may have. The last three are the paper's."""
 
+PHASES: dict[int, tuple[tuple[int, int], ...]] = {
+    1: ((0, 0),),
+    2: ((0, 0), (1, 1)),
+    4: ((0, 0), (1, 1), (0, 1), (1, 0)),
+}
+"""Rows and columns that a picture is moved by, in halves of the head's fold, by how often the head runs."""
+
 _log = logging.getLogger(__name__)
 
 PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float16}
@@ -68,7 +75,7 @@ class HeadConfig:
             )
         if self.pixel_unshuffle < 1:
             raise ConfigError(f"head.pixel-unshuffle is {self.pixel_unshuffle}; give 1, 2 or 4")
-        if self.phases not in (1, 2, 4):
+        if self.phases not in PHASES:
             raise ConfigError(f"head.phases is {self.phases}; give 1, 2 or 4")
         if self.max_train_pixels < 0:
             raise ConfigError(f"head.max-train-pixels is {self.max_train_pixels}; give 0 for whole pictures, or more")

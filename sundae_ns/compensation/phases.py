@@ -10,14 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from sundae_ns.compensation.head import CompensationHead
-
-PHASES: dict[int, tuple[tuple[int, int], ...]] = {
-    1: ((0, 0),),
-    2: ((0, 0), (1, 1)),
-    4: ((0, 0), (1, 1), (0, 1), (1, 0)),
-}
-"""Rows and columns that a picture is moved by, in halves of the head's fold, by how often the head runs."""
+from sundae_ns.compensation.head import PHASES, CompensationHead
 
 
 def over_phases(head: CompensationHead, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:

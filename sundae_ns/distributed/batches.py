@@ -53,13 +53,11 @@ def scale_rates(optimizers: Optimizers, names: Iterable[str], ranks: int) -> Non
         names: the groups to adapt, parameters of the field.
         ranks: pictures of a step.
     """
-    field = set(names)
-    for group in (
-        group for key in field & optimizers.optimizers.keys() for group in optimizers.optimizers[key].param_groups
-    ):
-        group.update(scaled_group(group, ranks))
-    for scheduler in (optimizers.schedulers[key] for key in field & optimizers.schedulers.keys()):
-        for name in ("base_lrs", "_last_lr"):
+    for key in names:
+        for group in optimizers.optimizers[key].param_groups:
+            group.update(scaled_group(group, ranks))
+        scheduler = optimizers.schedulers.get(key)
+        for name in () if scheduler is None else ("base_lrs", "_last_lr"):
             setattr(scheduler, name, [rate * ranks**0.5 for rate in getattr(scheduler, name)])
 
 

@@ -27,14 +27,14 @@ from sundae_ns.storage.packing.transform import Basis
 
 Floats = NDArray[np.float32]
 Encoded = tuple[dict[str, Any], dict[str, Array]]
-"""What the header says of an attribute, and its sections."""
+"""What the header says of an attribute, and its sections, by what they are of it."""
 Moved = TypeVar("Moved")
 
 
 class Codec(Protocol):
     """How one attribute ``[N, C]`` is stored."""
 
-    def encode(self, name: str, values: Floats) -> Encoded:
+    def encode(self, values: Floats) -> Encoded:
         """What is stored."""
         ...
 
@@ -51,7 +51,7 @@ class UniformCodec:
     differences: bool = False
     """Whether channels 0 and 2 of three are told by how far they are from channel 1, as those of a colour are alike."""
 
-    def encode(self, name: str, values: Floats) -> Encoded:
+    def encode(self, values: Floats) -> Encoded:
         """What is stored."""
         made = quantize.quantize(values, self.grid)
         about = {
@@ -65,7 +65,7 @@ class UniformCodec:
         if self.differences:
             about["differences"] = True
             codes = np.stack([codes[0] - codes[1], codes[1], codes[2] - codes[1]])
-        return about, {f"{name}/codes": codes, f"{name}/places": made.places, f"{name}/exceptions": made.exceptions}
+        return about, {"codes": codes, "places": made.places, "exceptions": made.exceptions}
 
     def rounded(self, values: Tensor) -> Tensor:
         """What will be read."""
@@ -78,11 +78,11 @@ class RotationCodec:
 
     bits: int
 
-    def encode(self, name: str, values: Floats) -> Encoded:
+    def encode(self, values: Floats) -> Encoded:
         """What is stored."""
         made = quantize.quantize_rotations(values, self.bits)
         about = {"codec": "smallest-three", "bits": self.bits, "bound": quantize.rotation_bound(self.bits)}
-        return about, {f"{name}/codes": made.codes, f"{name}/largest": join_crumbs(made.largest)}
+        return about, {"codes": made.codes, "largest": join_crumbs(made.largest)}
 
     def rounded(self, values: Tensor) -> Tensor:
         """What will be read."""
@@ -95,7 +95,7 @@ class TransformCodec:
 
     basis: Basis
 
-    def encode(self, name: str, values: Floats) -> Encoded:
+    def encode(self, values: Floats) -> Encoded:
         """What is stored."""
         made = transform.forward(values, self.basis)
         arrays: dict[str, Array] = {
@@ -105,7 +105,7 @@ class TransformCodec:
             "exact": made.exact,
         }
         about = {"codec": "transform", "step": made.step, "bound": transform.bound(made)}
-        return about, {f"{name}/{part}": array for part, array in arrays.items()}
+        return about, arrays
 
     def rounded(self, values: Tensor) -> Tensor:
         """What will be read."""
@@ -118,7 +118,7 @@ class BooksCodec:
 
     books: Books
 
-    def encode(self, name: str, values: Floats) -> Encoded:
+    def encode(self, values: Floats) -> Encoded:
         """What is stored."""
         made = codebooks.encode(values, self.books)
         arrays: dict[str, Array] = {
@@ -129,7 +129,7 @@ class BooksCodec:
             "exact": made.exact,
         }
         about = {"codec": "codebooks", "width": values.shape[1], "bound": made.bound}
-        return about, {f"{name}/{part}": array for part, array in arrays.items()}
+        return about, arrays
 
     def rounded(self, values: Tensor) -> Tensor:
         """What will be read."""
@@ -158,18 +158,18 @@ class HeadCodec:
         weights = [name for name in names if values[name].ndim > 1]
         none = np.zeros(0, np.float32)
         plain = [values[name].reshape(-1) for name in names if values[name].ndim <= 1]
-        arrays: dict[str, Array] = {"head/plain": np.concatenate([*plain, none])}
+        arrays: dict[str, Array] = {"plain": np.concatenate([*plain, none])}
         if self.bits <= 8:
             steps = [as_array(self.steps[name]) for name in weights]
             codes = [quantize.quantize_weights(values[name], step, self.bits) for name, step in zip(weights, steps)]
-            arrays["head/weights"] = np.concatenate([*(code.reshape(-1) for code in codes), np.zeros(0, np.int8)])
-            arrays["head/steps"] = np.concatenate([*steps, none])
+            arrays["weights"] = np.concatenate([*(code.reshape(-1) for code in codes), np.zeros(0, np.int8)])
+            arrays["steps"] = np.concatenate([*steps, none])
         else:
             largest = max((float(np.abs(values[name]).max(initial=0.0)) for name in weights), default=0.0)
             if largest > np.finfo(np.float16).max:
                 raise PackError(f"the head has a weight of {largest:.3g}, too large for fp16; pack it with int8")
             flat = np.concatenate([*(values[name].reshape(-1) for name in weights), none])
-            arrays["head/weights"] = flat.astype(np.float16)
+            arrays["weights"] = flat.astype(np.float16)
         tensors = [[name, list(values[name].shape)] for name in names]
         return {"codec": "int8" if self.bits <= 8 else "fp16", "tensors": tensors}, arrays
 

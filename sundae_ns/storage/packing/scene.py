@@ -156,12 +156,12 @@ def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
         raise PackError("the codecs were fitted to another scene; fit them again")
     about: dict[str, Any] = {"means": {"codec": "blocks", "bits": config.position_bits, "block": config.block}}
     arrays: dict[str, Array] = {"means/deltas": blocks.deltas, "means/low": blocks.low, "means/high": blocks.high}
-    encoded = {name: codec.encode(name, as_matrix(scene.field[name])) for name, codec in codecs.field.items()}
+    encoded = {name: codec.encode(as_matrix(scene.field[name])) for name, codec in codecs.field.items()}
     if codecs.head is not None:
         encoded["head"] = codecs.head.encode(scene.head)
     for name, (described, made) in encoded.items():
         about[name] = described
-        arrays |= made
+        arrays |= {f"{name}/{part}": array for part, array in made.items()}
     if scene.cameras is not None:
         for name, (dtype, _) in CAMERAS.items():
             arrays[f"cameras/{name}"] = scene.cameras[name].detach().cpu().numpy().astype(dtype)
