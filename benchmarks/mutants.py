@@ -65,7 +65,7 @@ ROOMS = {
     # What ranks say to each other is tried by processes of their own, which import what is on disk.
     "ranks": Room(
         ("distributed/[!_]*.py",),
-        ("test_blocks.py",),
+        ("distributed/test_blocks.py",),
         ("bounds", "moves", "per_primitive", "scaled_group", "state_of_rank", "_map_state", "_decide"),
     ),
 }

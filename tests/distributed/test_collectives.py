@@ -1,21 +1,13 @@
-"""Two processes over gloo hold one field: they draw, learn, prune, save and resume as one process does.
+"""Two processes over gloo hold one field: they draw, plan, level and prune as one process does.
 
-This file is both the tests and, started as a program, a rank. Every program has a limit of time, so that nothing hangs.
+This file has the checks, which ``rank.py`` goes through on each rank, and the tests that see what came of them.
 """
 
 from __future__ import annotations
 
 import gc
-import json
-import os
-import re
-import signal
-import subprocess
-import sys
-import traceback
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,21 +19,18 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.nn import Parameter
 
-from sundae_ns import checkpoint, distributed
-from sundae_ns.data import write_scene
+from sundae_ns import distributed
 from sundae_ns.densification import CappedStrategy
-from sundae_ns.distributed import Course, GlobalPruning, Look, Shards, Timetable, slack_of_step
-from sundae_ns.errors import ConfigError, RankError, rank_ended
-from sundae_ns.method_configs import sundae_tiny
+from sundae_ns.distributed import Course, GlobalPruning, Look, Shards, slack_of_step
+from sundae_ns.errors import ConfigError
 from sundae_ns.pruning import PruningConfig, make_policy
 from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
 from sundae_ns.rasterization.sharded import Cameras, Slack, camera_row, cameras_of, may_be_seen
-from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 from sundae_ns.views import View
 
+RunRanks = Callable[[str, Path], None]
+Passed = Callable[[Path, str], None]
 RANKS = 2
-LIMIT = 600
-"""Seconds that a program may take on a busy machine."""
 REFERENCE = select_backend("reference", "cpu")
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "features")
 
@@ -494,394 +483,35 @@ def check_averages(shards: Shards) -> None:
     assert shards.apart([]) == 0
 
 
-# ----------------------------------------------------------------------------------------------------------- training
-
-
-STEPS, KEEP, PRUNE_AT, SAVE_EVERY = 40, 0.4, 32, 26
-SAVED_AT = SAVE_EVERY + RANKS - 1
-"""Two ranks save after batch 13, which is the last that sees picture 27."""
-
-
-def configured(folder: Path, name: str) -> SundaeTrainerConfig:
-    """A short run on a small scene: it densifies at picture 24, prunes at 32, and then the head takes part."""
-    import copy
-
-    config = copy.deepcopy(sundae_tiny.config)
-    assert isinstance(config, SundaeTrainerConfig)
-    config.machine.device_type = "cpu"
-    config.machine.num_devices = RANKS
-    config.output_dir, config.experiment_name, config.timestamp = folder, name, "now"
-    config.max_num_iterations, config.steps_per_save, config.steps_per_eval_image = STEPS, SAVE_EVERY, 10
-    config.save_only_latest_checkpoint = False
-    config.vis = "tensorboard"
-    config.viewer.quit_on_train_completion = True
-    config.pipeline.datamanager.data = folder / "scene"
-    model: Any = config.pipeline.model
-    model.rasterizer = "reference"
-    model.pruning.prune_at, model.pruning.keep_ratio = PRUNE_AT, KEEP
-    model.warmup_length, model.refine_every, model.stop_split_at = 4, 6, PRUNE_AT
-    model.num_downscales, model.resolution_schedule = 1, 4
-    model.densify_grad_thresh, model.reset_alpha_every, model.sh_degree_interval = 0.003, 100, 8
-    return config
-
-
-def frozen(folder: Path, name: str) -> SundaeTrainerConfig:
-    """One step at rates of 0 from the saved warm-up, and a prune: the field that is pruned is the same for any ranks."""
-    config = configured(folder, name)
-    config.max_num_iterations = 1
-    config.steps_per_eval_image = 1000
-    model: Any = config.pipeline.model
-    model.warm_start = folder / "train" / "sundae-tiny" / "now" / "nerfstudio_models" / f"step-{SAVED_AT:09d}.ckpt"
-    model.evaluate_prune = False
-    for group in config.optimizers.values():
-        group["optimizer"].lr, group["scheduler"] = 0.0, None
-    return config
-
-
-def train(config: SundaeTrainerConfig, rank: int, ranks: int) -> SundaeTrainer:
-    from nerfstudio.utils import profiler, writer
-
-    torch.manual_seed(config.machine.seed + rank)
-    trainer: SundaeTrainer = config.setup(local_rank=rank, world_size=ranks)
-    trainer.setup()
-    trainer.train()
-    writer.EVENT_WRITERS.clear()
-    writer.EVENT_STORAGE.clear()
-    writer.GLOBAL_BUFFER.clear()
-    profiler.PROFILER.clear()
-    return trainer
-
-
-def check_training(shards: Shards, folder: Path) -> None:
-    """A run of two ranks; afterwards both have the same head, and no shard is far from the mean."""
-    anew = []
-    course = Shards.course
-
-    def noted(self: Shards, params: Any, timetable: Timetable, look: Look) -> Course:
-        if self.ahead is None or self.ahead.look != look:
-            anew.append(look.step)
-        return course(self, params, timetable, look)
-
-    Shards.course = noted  # type: ignore[method-assign]
-    trainer = train(configured(folder, "train"), shards.rank, RANKS)
-    Shards.course = course  # type: ignore[method-assign]
-    # The first step, those after a round of growing, and the one after the prune; resolution rises at step 2.
-    assert anew == [0, *range(1, PRUNE_AT // RANKS + 1, 3), PRUNE_AT // RANKS + 1]
-    model: Any = trainer.pipeline.model
-    weights = torch.cat([value.detach().flatten() for value in model.head.parameters()])
-    every = [torch.empty_like(weights) for _ in range(RANKS)]
-    dist.all_gather(every, weights)
-    assert torch.equal(every[0], every[1])
-    assert model.shards.numbers(model.num_points) == [[count] for count in model.shards.counts]
-    assert max(model.shards.counts) <= distributed.DRIFT * model.total_points / RANKS
-    group = trainer.optimizers.optimizers["opacities"].param_groups[0]
-    assert group["lr"] == pytest.approx(0.05 * RANKS**0.5)
-    assert group["betas"] == pytest.approx((0.9**RANKS, 0.999**RANKS))
-    head = trainer.optimizers.optimizers["compensation"].param_groups[0]
-    assert (head["initial_lr"], head["betas"]) == (
-        sundae_tiny.config.optimizers["compensation"]["optimizer"].lr,
-        (0.9, 0.999),
+def checks(_: Path) -> dict[str, Callable[[Shards], None]]:
+    """What each rank goes through, in this order."""
+    plain = (
+        check_drawing,
+        check_that_nothing_stays,
+        check_planning_ahead,
+        check_that_plans_are_forgotten,
+        check_looking_away,
+        check_levelling,
+        check_an_empty_shard,
+        check_drift,
+        check_pruning,
     )
-
-
-def check_frozen(shards: Shards, folder: Path) -> None:
-    train(frozen(folder, "two"), shards.rank, RANKS)
-
-
-CHECKS: tuple[Callable[..., None], ...] = (
-    check_drawing,
-    check_that_nothing_stays,
-    check_planning_ahead,
-    check_that_plans_are_forgotten,
-    check_looking_away,
-    check_levelling,
-    check_an_empty_shard,
-    check_drift,
-    check_pruning,
-    partial(check_pruning, redistribution="none", score="response-contribution", selection="top"),
-    check_refusal,
-    check_averages,
-)
-
-
-@dataclass
-class DyingTrainerConfig(SundaeTrainerConfig):
-    """A run whose rank 1 is killed."""
-
-    _target: type = field(default_factory=lambda: DyingTrainer)
-
-
-class DyingTrainer(SundaeTrainer):
-    """Killed at a step, as by the system where memory is short."""
-
-    def train_iteration(self, step: int) -> Any:
-        if step == (SAVED_AT + 1) // RANKS + 2 and dist.get_rank() == 1:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().train_iteration(step)
-
-
-def main(role: str, folder: Path) -> None:
-    torch.set_num_threads(1)
-    if role == "dies":
-        plain = configured(folder, "dies")
-        config = DyingTrainerConfig(**{k: v for k, v in vars(plain).items() if k != "_target"})
-        config.load_checkpoint = (
-            folder / "train" / "sundae-tiny" / "now" / "nerfstudio_models" / f"step-{SAVED_AT:09d}.ckpt"
-        )
-        try:
-            distributed.launch(config, RANKS)
-        except RankError as error:
-            (folder / "died.txt").write_text(str(error))
-        return
-    rank = int(role)
-    dist.init_process_group("gloo", init_method=f"file://{folder / 'meeting'}", rank=rank, world_size=RANKS)
-    shards = Shards("cpu")
-    said = {}
-    for check in (*CHECKS, partial(check_training, folder=folder), partial(check_frozen, folder=folder)):
-        name = getattr(check, "func", check).__name__ + str(getattr(check, "keywords", {}).get("score", ""))
-        try:
-            check(shards)
-            said[name] = ""
-        except BaseException:
-            said[name] = traceback.format_exc()
-            break  # the other rank may wait for this one
-    (folder / f"rank{rank}.json").write_text(json.dumps(said))
-    if not any(said.values()):
-        dist.barrier()
-        dist.destroy_process_group()
-
-
-if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]))
-
-
-# -------------------------------------------------------------------------------------------------------------- tests
+    by_response = partial(check_pruning, redistribution="none", score="response-contribution", selection="top")
+    return {
+        **{check.__name__: check for check in plain},
+        "check_pruningresponse-contribution": by_response,
+        **{check.__name__: check for check in (check_refusal, check_averages)},
+    }
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: RunRanks) -> Path:
     """Where two ranks have gone through all checks, once for all tests."""
     folder = tmp_path_factory.mktemp("ranks")
-    write_scene(folder / "scene", train_views=7, test_views=2, width=40, height=32, points=150)
-    programs = [subprocess.Popen([sys.executable, __file__, str(rank), str(folder)]) for rank in range(RANKS)]
-    try:
-        for program in programs:
-            program.wait(LIMIT)
-    except subprocess.TimeoutExpired:
-        pass  # what is missing then fails by name
-    finally:
-        for program in programs:
-            program.kill()
-            program.wait()
+    run_ranks(__file__, folder)
     return folder
 
 
-def names_of_checks() -> list[str]:
-    every = [*CHECKS, check_training, check_frozen]
-    return [getattr(c, "func", c).__name__ + str(getattr(c, "keywords", {}).get("score", "")) for c in every]
-
-
-@pytest.mark.parametrize("name", names_of_checks())
-def test_two_ranks(folder: Path, name: str) -> None:
-    for rank in range(RANKS):
-        path = folder / f"rank{rank}.json"
-        assert path.exists(), f"rank {rank} did not come to an end"
-        said = json.loads(path.read_text())
-        assert said.get(name, "not reached") == "", f"rank {rank}: {said.get(name)}"
-
-
-def models(folder: Path, name: str) -> Path:
-    return folder / name / "sundae-tiny" / "now" / "nerfstudio_models"
-
-
-def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
-    (report,) = json.loads((models(folder, "train").parent / "prune.json").read_text())
-    assert report["step"] == PRUNE_AT + RANKS - 1
-    assert report["after"] == round(KEEP * report["before"])
-    assert report["before"] > 150, "densification added nothing"
-    before, after = (
-        checkpoint.load(models(folder, "train") / f"step-{step:09d}.ckpt") for step in (SAVED_AT, STEPS - 1)
-    )
-    assert len(after["pipeline"]["_model.gauss_params.means"]) == report["after"]
-    n = len(before["pipeline"]["_model.gauss_params.means"])
-    assert len(before["pipeline"]["_model._extra_state"]["strategy"]["grad2d"]) == n
-    for name in NAMES[:-1]:
-        (moments,) = before["optimizers"][name]["state"].values()
-        assert len(moments["exp_avg"]) == n
-    group = after["optimizers"]["opacities"]["param_groups"][0]
-    assert group["lr"] == pytest.approx(0.05, rel=1e-12)
-    assert tuple(group["betas"]) == (0.9, 0.999)
-    extra = after["pipeline"]["_model._extra_state"]
-    assert extra["trained_focal"] is not None
-    assert (after["step"], extra["step"], extra["pruning"]["pruned_at"]) == (STEPS - 1, STEPS - 1, report["step"])
-    schedule = after["schedulers"]["means"]
-    assert schedule["last_epoch"] == STEPS
-    assert schedule["base_lrs"] == pytest.approx([1.6e-4])
-    assert schedule["lr_lambdas"][0]["max_steps"] == sundae_tiny.config.optimizers["means"]["scheduler"].max_steps
-    assert schedule["lr_lambdas"][0]["pruned_at"] == report["step"]
-
-
-def test_the_prune_is_that_of_one_process(folder: Path) -> None:
-    """From the same field, views and all: the same primitives stay, with the same values."""
-    one = train(frozen(folder, "one"), 0, 1)
-    two = checkpoint.load(models(folder, "two") / "step-000000001.ckpt")["pipeline"]
-    for name, value in one.pipeline.model.gauss_params.items():
-        # Weights of a view are sums over fewer rows here, so that what a merge makes of them differs by rounding.
-        torch.testing.assert_close(value.detach(), two[f"_model.gauss_params.{name}"], rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("ranks", [1, 3])
-def test_a_checkpoint_loads_on_another_number_of_ranks(folder: Path, ranks: int) -> None:
-    loaded = checkpoint.load(models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt")
-    parts = [distributed.state_of_rank(loaded, rank, ranks, NAMES) for rank in range(ranks)]
-    for key, value in loaded["pipeline"].items():
-        if key.startswith("_model.gauss_params."):
-            assert torch.equal(torch.cat([part["pipeline"][key] for part in parts]), value)
-    counts = loaded["pipeline"]["_model._extra_state"]["strategy"]["count"]
-    theirs = [part["pipeline"]["_model._extra_state"]["strategy"]["count"] for part in parts]
-    assert torch.equal(torch.cat(theirs), counts)
-    group, whole = (x["optimizers"]["means"]["param_groups"][0] for x in (parts[0], loaded))
-    assert group["lr"] == pytest.approx(whole["lr"] * ranks**0.5)
-    assert group["betas"] == pytest.approx([beta**ranks for beta in whole["betas"]])
-    assert parts[0]["optimizers"]["compensation"] == loaded["optimizers"]["compensation"]
-    assert parts[0]["schedulers"]["compensation"]["base_lrs"] == loaded["schedulers"]["compensation"]["base_lrs"]
-    assert parts[0]["step"] == (SAVED_AT + 1) // ranks - 1
-    assert parts[0]["schedulers"]["means"]["last_epoch"] == round((SAVED_AT + 1) / ranks)
-
-
-def test_a_checkpoint_of_another_method_is_left_to_the_loader() -> None:
-    """Which names the method and the option; the ranks' own part of it would fail on the first missing key."""
-    loaded = {"step": 3, "pipeline": {"_model.gauss_params.means": torch.zeros(4, 3)}, "optimizers": {}}
-    assert distributed.state_of_rank(loaded, 1, 2, NAMES) == loaded
-
-
-def test_one_process_goes_on_where_two_have_stopped(folder: Path) -> None:
-    config = configured(folder, "alone")
-    config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
-    config.max_num_iterations = PRUNE_AT - SAVED_AT + 1
-    trainer = train(config, 0, 1)
-    assert trainer.optimizers.optimizers["opacities"].param_groups[0]["lr"] == pytest.approx(0.05)
-    (report,) = json.loads((models(folder, "alone").parent / "prune.json").read_text())
-    assert (report["step"], report["after"]) == (PRUNE_AT, round(KEEP * report["before"]))
-    assert trainer.optimizers.schedulers["means"].last_epoch == trainer.step + 1
-
-
-def test_a_killed_rank_ends_all_with_one_line(folder: Path) -> None:
-    """It resumes on two ranks first, from what two have saved."""
-    subprocess.run([sys.executable, __file__, "dies", str(folder)], timeout=LIMIT, check=True)
-    line = (folder / "died.txt").read_text()
-    assert re.fullmatch(r"rank 1 has ended \(killed by SIGKILL\).*--load-dir.*--machine\.num-devices", line)
-    assert not (models(folder, "dies") / f"step-{SAVED_AT + STEPS:09d}.ckpt").exists()
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_ns_train_on_two_gpus(tmp_path: Path) -> None:
-    """The command of users; the run opens on one GPU as any other."""
-    from nerfstudio.utils.eval_utils import eval_setup
-
-    write_scene(tmp_path / "scene", train_views=12, test_views=3, width=64, height=48, points=300)
-    options = {
-        "machine.num-devices": 2,
-        "data": tmp_path / "scene",
-        "output-dir": tmp_path,
-        "experiment-name": "gpus",
-        "timestamp": "now",
-        "max-num-iterations": 240,
-        "pipeline.model.pruning.prune-at": 120,
-        "pipeline.model.pruning.keep-ratio": KEEP,
-        "pipeline.model.warmup-length": 10,
-        "pipeline.model.refine-every": 30,
-        "viewer.quit-on-train-completion": True,
-    }
-    words = [str(word) for name, value in options.items() for word in (f"--{name}", value)]
-    program = [sys.executable, "-m", "nerfstudio.scripts.train"]
-    subprocess.run([*program, "sundae-tiny", *words], timeout=2 * LIMIT, check=True, cwd=tmp_path)
-    run = tmp_path / "gpus" / "sundae-tiny" / "now"
-    (report,) = json.loads((run / "prune.json").read_text())
-    assert report["after"] == round(KEEP * report["before"])
-    _, pipeline, _, step = eval_setup(run / "config.yml", test_mode="test")
-    assert step == 239
-    assert pipeline.model.num_points == report["after"]
-    # 16 dB is far above a field that has not learned, and far below one that has.
-    assert pipeline.get_average_eval_image_metrics()["psnr"] > 16
-
-
-def test_an_error_of_ours_in_a_rank_is_said_as_it_is() -> None:
-    class Raised(Exception):
-        error_index = 1
-
-    text = "\n\n-- Process 1 terminated with the following error:\nTraceback ...\nsundae_ns.errors.DataError: cause; mend\n"
-    assert str(rank_ended(Raised(text))) == "rank 1: cause; mend"
-    assert "rank 1 has ended (ValueError: odd)" in str(rank_ended(Raised("Traceback ...\nValueError: odd")))
-
-
-def test_nerfstudios_command_ends_with_one_line() -> None:
-    code = """
-import sys
-sys.argv = ["/usr/bin/ns-train"]
-from torch.multiprocessing.spawn import ProcessExitedException
-from sundae_ns.errors import show_in_one_line
-show_in_one_line()
-raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -9, "SIGKILL")
-"""
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT, check=False)
-    assert result.returncode == 1
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("sundae: rank 1 has ended (killed by SIGKILL)")
-
-
-@pytest.mark.parametrize(("total", "ranks"), [(10, 3), (2, 4), (0, 2), (9, 1)])
-def test_blocks_cover_all_rows_and_differ_by_one(total: int, ranks: int) -> None:
-    ends = distributed.bounds(total, ranks)
-    sizes = [b - a for a, b in zip(ends, ends[1:])]
-    assert (ends[0], ends[-1]) == (0, total)
-    assert max(sizes) - min(sizes) <= 1
-
-
-@pytest.mark.parametrize(
-    ("option", "value"), [("warmup", "mcmc"), ("pruning.mode", "auto"), ("camera_optimizer.mode", "SO3xR3")]
-)
-def test_what_several_ranks_cannot_do_is_refused(tmp_path: Path, option: str, value: str) -> None:
-    config = configured(tmp_path, "refused")
-    *owners, name = option.split(".")
-    owner: Any = config.pipeline.model
-    for part in owners:
-        owner = getattr(owner, part)
-    setattr(owner, name, value)
-    with pytest.raises(ConfigError, match="several GPUs"):
-        distributed.check_options(config)
-
-
-def test_more_ranks_than_gpus_are_refused_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = configured(tmp_path, "refused")
-    with pytest.raises(ConfigError, match="needs GPUs.*device-type is cpu"):
-        config.save_config()
-    config.machine.device_type = "cuda"
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(ConfigError, match="is 2 and there are 1 GPUs; give --machine.num-devices 1"):
-        config.save_config()
-    assert not config.get_base_dir().exists()
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    config.save_config()
-    assert (config.get_base_dir() / "config.yml").exists()
-
-
-def test_shorter_runs_see_as_many_pictures(tmp_path: Path) -> None:
-    config = configured(tmp_path, "short")
-    short = distributed.shorten(config, 2)
-    assert (short.max_num_iterations, config.max_num_iterations) == (STEPS // 2, STEPS)
-    assert short.pipeline.model.pruning.prune_at == PRUNE_AT // 2
-    assert short.pipeline.model.refine_every == 3
-    full = config.optimizers["means"]["scheduler"].max_steps
-    assert short.optimizers["means"]["scheduler"].max_steps == full // 2
-
-
-def test_loggers_stay_when_the_viewer_goes() -> None:
-    assert [distributed.without_viewer(vis) for vis in ("viewer", "viewer+wandb", "comet")] == [
-        "tensorboard",
-        "wandb",
-        "comet",
-    ]
+@pytest.mark.parametrize("name", checks(Path()))
+def test_two_ranks(folder: Path, name: str, passed: Passed) -> None:
+    passed(folder, name)

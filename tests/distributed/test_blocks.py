@@ -1,6 +1,6 @@
 """The arithmetic of several ranks, in one process: who holds which rows, and what a checkpoint is for each rank.
 
-``test_distributed.py`` has the ranks talk to each other.
+``test_collectives.py`` has the ranks talk to each other.
 """
 
 from __future__ import annotations
@@ -205,3 +205,11 @@ def test_the_deciding_rank_hands_on_an_error_instead_of_raising_it() -> None:
     error, params, rows = pruning._decide(policy, field, policy.initialize_state(), 2, None)
     assert isinstance(error, ConfigError)
     assert len(rows) == len(params["means"]) == 60
+
+
+@pytest.mark.parametrize(("total", "ranks"), [(10, 3), (2, 4), (0, 2), (9, 1)])
+def test_blocks_cover_all_rows_and_differ_by_one(total: int, ranks: int) -> None:
+    ends = bounds(total, ranks)
+    sizes = [b - a for a, b in zip(ends, ends[1:])]
+    assert (ends[0], ends[-1]) == (0, total)
+    assert max(sizes) - min(sizes) <= 1
