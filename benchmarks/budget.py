@@ -57,7 +57,7 @@ def small_config(steps: int) -> Any:
     for name in TINY:
         setattr(model, name, getattr(tiny.pipeline.model, name))
     model.pruning.prune_at = model.stop_split_at = steps // 2
-    model.pruning.stop = round(steps * 26 / 30)
+    model.pruning.stop = round(steps * model.pruning.stop / sundae_auto.config.max_num_iterations)
     model.pruning.search_every = max(round(steps / 80), 1)
     model.sh_degree_interval = max(steps // 10, 1)  # all bands take part before the warm-up ends
     model.head.size, model.head.pixel_unshuffle, model.head.num_features = "tiny", 1, 5

@@ -141,7 +141,7 @@ sundae_continuous = method(
 sundae_auto = method(
     "sundae-auto",
     "SUNDAE that finds its own budget: as few primitives, bands and network as lose 0.1 dB, or as many as bytes allow.",
-    pruning=PruningConfig(mode="auto", stop=26000),
+    pruning=PruningConfig(mode="auto", stop=28000),
     datamanager={"holdout_every": 8},
 )
 

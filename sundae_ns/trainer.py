@@ -71,6 +71,11 @@ class SundaeTrainer(Trainer):
             with writing(f"cannot make the run's folder {self.base_dir}"):
                 self.base_dir.mkdir(parents=True, exist_ok=True)  # nerfstudio's own way fails where two make it at once
 
+    @property
+    def last_step(self) -> int:
+        """The step at which this training ends."""
+        return self._start_step + self.config.max_num_iterations - 1
+
     def setup_optimizers(self) -> Optimizers:
         """Optimizers of what this process holds, for batches of as many pictures as there are ranks."""
         if self.ranks == 1:

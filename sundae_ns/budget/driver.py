@@ -31,7 +31,7 @@ from sundae_ns.storage import accounting, megabytes
 if TYPE_CHECKING:
     from sundae_ns.model import SundaeModel
 
-MAX_REJECTED = 3
+MAX_REJECTED = 5
 """Cuts that may be taken back, before and after the head has joined."""
 TRIAL_LOOKS = 3
 """Length, in looks, of the training that is compared with other bands."""
@@ -140,7 +140,7 @@ class Budget:
             self._begin(run)
         elif search.phase == "bands" and step - search.cut_at >= TRIAL_LOOKS * config.search_every:
             self._end_trial(run)
-        elif search.phase in ("field", "head") and (step - search.began) % config.search_every == 0:
+        elif search.phase in ("field", "head") and self._look_is_due(run):
             self._look(run)
         else:
             return
@@ -202,13 +202,20 @@ class Budget:
         self.search.begin("field", run.model.num_points)
         self._cut_or_rest(run, run.measure())
 
+    def _look_is_due(self, run: Run) -> bool:
+        search, config, step = self.search, self.config, run.model.schedule_step
+        # A run that ends before the search was meant to may be trained on; else this is the last word on the last cut.
+        time_is_up = search.trying and step >= config.stop and run.steps_left == 0
+        return time_is_up or (step - search.began) % config.search_every == 0
+
     def _look(self, run: Run) -> None:
         search, config, step = self.search, self.config, run.model.schedule_step
         # Half of the time is the head's, if it may join.
         head_to_come = search.phase == "field" and heads.may_pay(run, self._largest)
         deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
+        left = deadline - step if head_to_come else run.steps_left
         value = run.measure()
-        verdict = search.judge(value, step, config.patience)
+        verdict = search.judge(value, step, left, config.patience)
         point = self._look_at(run, value, search.phase, verdict)
         search.curve.append(point)
         CONSOLE.log(
@@ -227,8 +234,8 @@ class Budget:
             value = search.target + search.margin
         # A network that does not help, or that waits for its turn, is not waited for.
         tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
-        over = step + config.patience * config.search_every > deadline or search.looks >= tired * config.patience
-        if over or search.rejected >= MAX_REJECTED:
+        over = step >= deadline or left < config.patience * config.search_every
+        if over or search.looks >= tired * config.patience or search.rejected >= MAX_REJECTED:
             self._end_phase(run)
         else:
             self._cut_or_rest(run, value)
@@ -287,7 +294,11 @@ class Budget:
         search.phase = "done"
         self._accepted = self._fallback = None
         if run.degree > 0:
-            self._flat = flatten(run, run.measure() - FLAT_SHARE * self.config.tolerated_drop)
+            value = run.measure()
+            least = value - FLAT_SHARE * self.config.tolerated_drop
+            if run.steps_left == 0:  # nothing makes up for it any more
+                least = max(least, min(value, search.target))
+            self._flat = flatten(run, least)
             search.zeroed = int(self._flat.sum())
             CONSOLE.log(
                 f"{search.zeroed:,} of {model.num_points:,} primitives look the same from everywhere: "

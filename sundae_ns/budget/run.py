@@ -26,6 +26,7 @@ from sundae_ns.views import View
 
 if TYPE_CHECKING:
     from sundae_ns.model import SundaeModel
+    from sundae_ns.trainer import SundaeTrainer
 
 MAX_VIEWS = 64
 """Training views, evenly chosen, that each scoring looks at: it is repeated at each cut."""
@@ -64,6 +65,14 @@ class Run(NamedTuple):
     def row(self) -> int:
         """Bytes of a primitive without features."""
         return bytes_of({name: value[:1] for name, value in self.params.items() if name != FEATURES}, None)
+
+    @property
+    def steps_left(self) -> int:
+        """Steps of training to come; where no trainer says so, those until the search has to end."""
+        model, trainer = self.model, self.attributes.trainer
+        if trainer is None:
+            return model.config.pruning.stop - model.schedule_step
+        return cast("SundaeTrainer", trainer).last_step - model.step
 
     # ------------------------------------------------------------------------------------------------------- views
 

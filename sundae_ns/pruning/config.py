@@ -96,7 +96,7 @@ class PruningConfig:
     search_every: int = 250
     """Auto: steps from one look at the held-back views to the next."""
     patience: int = 4
-    """Auto: looks after which a cut that has not recovered is taken back."""
+    """Auto: looks after which a cut that has not recovered is taken back, unless half of the gain that it promises would do."""
 
     @property
     def tolerated_drop(self) -> float:

@@ -1,10 +1,11 @@
 """How few primitives a scene needs: cut, let training recover, look at held-back views, go on or step back.
 
 Right after a cut a field is far worse than after some training, and how much worse says little about where it ends. So a
-cut is judged by what training makes of it: it is accepted as soon as the held-back views reach the target again, and
-taken back if they have not after ``patience`` looks, or cannot any more at the rate of the last look (recovery slows
-down, so that this rate is the best to be hoped for). Steps behind an accepted cut are the fine-tuning itself; only those
-behind a cut that is taken back are lost.
+cut is judged by what training makes of it: it is accepted as soon as the held-back views reach the target again. Until then
+it may take what time there is, as long as it is foreseen to get there: recovery is close to a line over the logarithm of
+the steps since the cut, and half of the gain that this promises is counted on. What is not foreseen to recover is taken
+back, and so is what has not when time is up; the field that is gone back to then has reached the target before. Steps
+behind an accepted cut are the fine-tuning itself; only those behind a cut that is taken back are lost.
 
 How deep to cut follows from the cut before: what it cost once recovered, per halving, against the margin that there is.
 Where the margin is too small for a cut worth its while, training goes on until it has grown.
@@ -24,6 +25,9 @@ from sundae_ns.errors import CheckpointError
 
 DEEPEST, SHALLOWEST = 1.0, 0.15
 """Halvings of the deepest cut (a half goes), and of the least that is worth a cut (a tenth goes)."""
+
+TRUST = 0.5
+"""Share of a foreseen gain that is counted on once ``patience`` has ended; before that, all of it."""
 
 _KINDS: dict[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "bool": (bool,)}
 
@@ -64,15 +68,16 @@ class Search:
     """Whether a cut waits for its verdict."""
     looks: int = 0
     """Looks since the last cut, or since the last verdict."""
-    last_psnr: float = math.nan
+    trail: list[list[float]] = field(default_factory=list)
+    """Looks since the last cut: steps of training since then, and PSNR in dB."""
     margin: float = math.nan
     """What the field was above the target before the last cut, dB."""
     slope: float = 0.0
-    """What a halving cost after recovery, dB, by the last verdict."""
+    """What a halving cost after recovery, seen or foreseen, dB, by the last verdict."""
     rejected: int = 0
     """Cuts taken back in this phase."""
     failed: int = 0
-    """Primitives of the last cut taken back in this phase; 0 before."""
+    """Primitives of the last cut of this phase that was taken back; 0 where none was, or where a later one went as far."""
     cuts: int = 0
     """Cuts accepted in this phase."""
     accepted: int = 0
@@ -148,7 +153,7 @@ class Search:
             return None
         halvings = DEEPEST if margin >= self.slope * DEEPEST else margin / self.slope
         if self.failed:
-            # Half the way to what has failed; no nearer to it, and beyond it, in the least steps: training may have gained.
+            # Half the way to what has failed; no nearer to it, in the least steps: training may have gained.
             halvings = min(halvings, max(0.5 * math.log2(self.accepted / self.failed), SHALLOWEST))
         count = max(int(self.accepted * 0.5**halvings), least)
         return count if halvings >= SHALLOWEST and count < self.accepted else None
@@ -156,33 +161,59 @@ class Search:
     def cut(self, psnr: float, count: int, step: int) -> None:
         """A field was cut to ``count`` primitives after this step of the schedule."""
         self.margin, self.tried, self.cut_at, self.trying, self.looks = psnr - self.target, count, step, True, 0
+        self.trail = []
 
-    def judge(self, psnr: float, step: int, patience: int) -> Verdict:
+    def foreseen(self, left: int, trust: float) -> float:
+        """PSNR of the field that is tried after so many steps more, dB.
+
+        The line of least squares through the looks over the logarithm of the steps since the cut; with one look, what it saw.
+
+        Args:
+            left: steps to come.
+            trust: share of a gain that is counted; a loss is counted whole.
+        """
+        ages, values = [math.log2(age) for age, _ in self.trail], [psnr for _, psnr in self.trail]
+        if len(values) == 1:
+            return values[0]
+        age, psnr = sum(ages) / len(ages), sum(values) / len(values)
+        rise = sum((a - age) * (v - psnr) for a, v in zip(ages, values)) / sum((a - age) ** 2 for a in ages)
+        gain = rise * (math.log2(self.trail[-1][0] + left) - ages[-1])
+        return psnr + rise * (ages[-1] - age) + gain * (trust if gain > 0 else 1.0)
+
+    def judge(self, psnr: float, step: int, left: int, patience: int) -> Verdict:
         """Judge the last cut, if it waits for it, by a look at the held-back views.
 
         Args:
             psnr: mean over the views, dB.
             step: of the schedule.
-            patience: looks that a cut may take to recover.
+            left: steps of training that the cut has to recover in.
+            patience: looks for which a cut is given the benefit of the doubt.
         """
         self.looks += 1
-        # The first look has nothing to compare with: what a cut costs is not what training gains.
-        gain = psnr - self.last_psnr if self.looks > 1 else math.inf
-        self.last_psnr = psnr
         if not self.trying:
             return "resting"
-        left, margin = patience - self.looks, psnr - self.target
-        if margin < 0 and left > 0 and margin + gain * left >= 0:
+        self.trail.append([step - self.cut_at, psnr])
+        margin = psnr - self.target
+        if margin < 0 and left > 0 and self._may_recover(left, patience):
             return "waiting"
         self.trying, self.looks = False, 0
+        recovered = margin if margin >= 0 else self.foreseen(max(left, 0), TRUST) - self.target
         # Training gains meanwhile, and a lucky cut does not make the next one cheap.
-        self.slope = max((self.margin - margin) / math.log2(self.accepted / self.tried), self.slope / 2)
+        self.slope = max((self.margin - recovered) / math.log2(self.accepted / self.tried), self.slope / 2)
         if margin >= 0:
             self.accepted, self.cuts = self.tried, self.cuts + 1
+            if self.accepted <= self.failed:
+                self.failed = 0  # training has gained enough meanwhile
             return "accepted"
         self.rejected, self.failed = self.rejected + 1, self.tried
         self.steps_lost += step - self.cut_at
         return "rejected"
+
+    def _may_recover(self, left: int, patience: int) -> bool:
+        if self.looks < patience:
+            # The first look has nothing to compare with: what a cut costs is not what training gains.
+            return self.looks == 1 or self.foreseen(left, trust=1.0) >= self.target
+        return self.foreseen(left, TRUST) >= self.target
 
     def state(self) -> dict[str, Any]:
         """Plain numbers for a checkpoint."""
@@ -203,6 +234,8 @@ class Search:
                 raise ValueError("unknown phase or degree")
             if search.head_size not in ("", *SIZES) or not -1 <= search.num_features <= 1024:
                 raise ValueError("unknown head")
+            if any(len(look) != 2 or not look[0] > 0 or not math.isfinite(sum(look)) for look in search.trail):
+                raise ValueError("a look that nobody took")
             for f in fields(cls):
                 kinds = _KINDS.get(str(f.type))
                 if kinds is not None and not isinstance(getattr(search, f.name), kinds):

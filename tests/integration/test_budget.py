@@ -20,6 +20,7 @@ from torch import Tensor
 
 from sundae_ns import budget
 from sundae_ns.budget import Budget, bytes_of
+from sundae_ns.budget.run import Run as Searched
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.data import write_scene
 from sundae_ns.errors import CheckpointError, ConfigError, DataError
@@ -114,7 +115,7 @@ def test_it_cuts_and_keeps_the_target(done: Run) -> None:
     assert cuts
     for point in cuts:
         assert (point["psnr"] >= found["target"]) == (point["verdict"] == "accepted")
-        assert PRUNE_AT < point["step"] <= STOP
+        assert PRUNE_AT < point["step"] - point["since_cut"] < STOP
     accepted = [point["primitives"] for point in cuts if point["verdict"] == "accepted"]
     assert accepted == sorted(set(accepted), reverse=True)
     assert found["primitives"] == accepted[-1]
@@ -122,6 +123,43 @@ def test_it_cuts_and_keeps_the_target(done: Run) -> None:
     assert (done.folder / "budget.txt").read_text().count("\n") == len(found["curve"])
     (report,) = json.loads((done.folder / "prune.json").read_text())
     assert (report["before"], report["after"], report["peak"]) == (200, found["primitives"], 200)
+
+
+def recovering(at_last: float) -> Callable[[Searched], float]:
+    """PSNR on held-back views: 20 dB of the whole field, and of a cut one what is foreseen to reach 19.5 and does not."""
+
+    def measure(run: Searched) -> float:
+        model = run.model
+        if model.num_points == 200:
+            return 20.0
+        age = model.schedule_step - model.budget.search.cut_at
+        return at_last if run.steps_left == 0 else {4: 18.0, 8: 19.0}.get(age, 19.45)
+
+    return measure
+
+
+@pytest.mark.parametrize(("at_last", "kept"), [(19.49, 200), (19.51, 100)])
+def test_the_last_cut_may_take_until_the_last_step(
+    make: Make, monkeypatch: pytest.MonkeyPatch, at_last: float, kept: int
+) -> None:
+    monkeypatch.setattr(Searched, "measure", recovering(at_last))
+    trainer = make(model_options={"head": HeadConfig(mode="off")})
+    trainer.train()
+    run = Run(trainer)
+    *looks, last, final = run.found["curve"]
+    assert {look["verdict"] for look in looks} == {"waiting"}
+    assert (last["step"], last["primitives"]) == (STEPS - 1, 100)
+    assert last["verdict"] == ("accepted" if kept == 100 else "rejected")
+    assert (final["verdict"], final["primitives"], run.found["phase"]) == ("reached", kept, "done")
+    assert len(run.checkpoint(STEPS - 1)["pipeline"]["_model.gauss_params.means"]) == kept
+
+
+def test_a_run_that_ends_before_its_search_may_be_trained_on(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Searched, "measure", recovering(19.49))
+    trainer = make(model_options={"head": HeadConfig(mode="off")}, stop=STEPS)
+    trainer.train()
+    found = Run(trainer).found
+    assert (found["phase"], found["trying"], found["curve"][-1]["verdict"]) == ("field", True, "missed")
 
 
 def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -18,27 +19,38 @@ def search(accepted: int = 1000, **options: Any) -> Search:
     return made
 
 
-def play(found: Search, recovered: Any, *, patience: int = 4, least: int = 5, looks: int = 200) -> list[int]:
+END = 200
+"""Steps of training, a look each."""
+
+
+def play(found: Search, recovered: Callable[[int], float], *, patience: int = 4, least: int = 5) -> list[int]:
     """Search on a field whose PSNR is a function of its count once it has recovered, half the way a look; cuts made."""
     psnr, count, before, cuts = recovered(found.accepted), found.accepted, found.accepted, []
-    for look in range(looks):
+    for step in range(1, END + 1):
         count = count if found.trying else found.accepted
         psnr += 0.5 * (recovered(count) - psnr)
-        verdict = found.judge(psnr, look, patience)
+        verdict = found.judge(psnr, step, END - step, patience)
         if verdict == "waiting":
             continue
         if verdict == "rejected":
             count, psnr = before, found.target + found.margin
         assert count == found.accepted
-        if found.rejected >= 3:
+        if found.rejected >= 5:
             break
         following = found.next_count(psnr, least)
-        if following is not None:
+        if following is not None and step < END:
             before = count
-            found.cut(psnr, following, look)
+            found.cut(psnr, following, step)
             cuts.append(following)
             count, psnr = following, psnr - 3.0
+    assert not found.trying, "the last look has to say"
     return cuts
+
+
+def verdicts(found: Search, *values: float, left: int = 100, patience: int = 4) -> list[str]:
+    """Of looks at a cut, every 10 steps, with so many steps left after the last of them."""
+    steps = range(found.cut_at + 10, found.cut_at + 10 * len(values) + 1, 10)
+    return [found.judge(psnr, step, left + steps[-1] - step, patience) for psnr, step in zip(values, steps)]
 
 
 @pytest.mark.parametrize("needed", [7, 40, 130, 600, 950])
@@ -47,7 +59,7 @@ def test_finds_about_what_a_scene_needs(needed: int) -> None:
         return 30.0 + 2.0 * math.log2(count / needed)
 
     found = search()
-    play(found, recovered, patience=8)
+    play(found, recovered)
     assert needed <= found.accepted <= 1.3 * needed + 1
     assert recovered(found.accepted) >= found.target
 
@@ -67,27 +79,59 @@ def test_a_field_that_needs_nothing_is_cut_to_the_least() -> None:
     assert found.next_count(40.0, 17) is None
 
 
-def test_a_cut_is_taken_back_once_it_cannot_recover_any_more() -> None:
+def cut_in_half() -> Search:
     found = search()
     found.cut(30.1, 500, step=100)
-    assert found.judge(28.0, 110, patience=5) == "waiting"
-    assert found.judge(28.6, 120, patience=5) == "waiting"  # 3 looks of 0.6 are enough
-    assert found.judge(28.8, 130, patience=5) == "rejected"  # 2 looks of 0.2 are not
-    assert (found.rejected, found.steps_lost, found.accepted) == (1, 30, 1000)
-    assert found.slope == pytest.approx(0.1 + 1.2)
+    return found
 
 
-def test_patience_ends() -> None:
-    found = search()
-    found.cut(30.1, 500, step=0)
-    verdicts = [found.judge(psnr, step, patience=3) for step, psnr in enumerate((20.0, 27.0, 29.9))]
-    assert verdicts == ["waiting", "waiting", "rejected"]
+def test_a_cut_is_accepted_once_it_is_seen_to_reach_the_target() -> None:
+    assert verdicts(cut_in_half(), 29.0, 29.99, 30.0) == ["waiting", "waiting", "accepted"]
+
+
+def test_a_cut_may_take_as_long_as_it_is_foreseen_to_recover() -> None:
+    slowly = [28.0 + 0.5 * math.log2(1 + look) for look in range(15)]
+    assert verdicts(cut_in_half(), *slowly, 30.0, left=1000) == ["waiting"] * 15 + ["accepted"]
+    found = cut_in_half()
+    assert verdicts(found, *slowly, left=1000) == ["waiting"] * 15
+    assert found.judge(29.99, 260, 0, patience=4) == "rejected", "time is up"
+    assert found.steps_lost == 160
+
+
+def test_a_cut_is_taken_back_once_even_the_whole_gain_would_not_do() -> None:
+    found = cut_in_half()
+    assert verdicts(found, 28.0, 29.0, left=15) == ["waiting", "rejected"]  # 1 dB a doubling, and less than one to come
+    assert (found.rejected, found.steps_lost, found.accepted) == (1, 20, 1000)
+    assert found.slope == pytest.approx(0.1 + 1.0 - 0.5 * math.log2(35 / 20)), "by what was foreseen of it"
+    assert verdicts(cut_in_half(), 28.0, 29.0, left=21) == ["waiting", "waiting"]
+
+
+def test_after_some_patience_half_of_the_gain_has_to_do() -> None:
+    values = [28.0, 29.0, 28.0 + math.log2(3)]  # a line: 1 dB a doubling
+    assert verdicts(cut_in_half(), *values, left=20, patience=3) == ["waiting", "waiting", "rejected"]
+    assert verdicts(cut_in_half(), *values, left=20, patience=4) == ["waiting", "waiting", "waiting"]
+    assert verdicts(cut_in_half(), *values, left=30, patience=3) == ["waiting", "waiting", "waiting"]
+
+
+def test_what_is_foreseen_lies_on_a_line_over_the_logarithm_of_the_steps() -> None:
+    found = cut_in_half()
+    verdicts(found, 28.0, 29.0, 28.0 + math.log2(3))
+    assert found.foreseen(0, 1.0) == pytest.approx(28.0 + math.log2(3))
+    assert found.foreseen(30, 1.0) == pytest.approx(29.0 + math.log2(3))
+    assert found.foreseen(30, 0.5) == pytest.approx(28.5 + math.log2(3))
+    falling = cut_in_half()
+    verdicts(falling, 29.0, 28.0)
+    assert falling.foreseen(20, 0.5) == pytest.approx(27.0), "a loss is counted whole"
+
+
+def test_a_picture_that_is_not_a_number_is_no_success() -> None:
+    assert verdicts(cut_in_half(), math.nan) == ["rejected"]
 
 
 def test_what_has_failed_is_come_up_to_from_above() -> None:
     found = search()
     found.cut(30.1, 500, step=0)
-    assert found.judge(29.0, 1, patience=1) == "rejected"
+    assert found.judge(29.0, 1, 0, patience=4) == "rejected"
     assert found.next_count(40.0, 1) == int(1000 * 0.5**0.5)
     found.accepted = 520
     assert found.next_count(40.0, 1) == found.next_count(30.5, 1) == int(520 * 0.5**SHALLOWEST)
@@ -95,18 +139,30 @@ def test_what_has_failed_is_come_up_to_from_above() -> None:
     assert found.next_count(40.0, 1) == 260
 
 
+def test_what_has_failed_is_forgotten_once_a_field_as_small_is_accepted() -> None:
+    found = search()
+    found.cut(30.1, 500, step=0)
+    assert found.judge(29.0, 1, 0, patience=4) == "rejected"
+    found.cut(30.5, 501, step=2)
+    assert (found.judge(30.5, 3, 50, patience=4), found.failed) == ("accepted", 500)
+    found.cut(30.5, 490, step=4)
+    assert (found.judge(30.5, 5, 50, patience=4), found.failed) == ("accepted", 0)
+    found.slope = 0.5
+    assert found.next_count(30.5, 1) == 245, "by what a halving costs alone"
+
+
 def test_how_deep_to_cut_follows_from_what_the_last_cut_cost() -> None:
     found = search()
     assert found.next_count(30.0, 1) == round(1000 * 0.5**DEEPEST)
     found.cut(31.0, 500, step=0)
-    assert found.judge(30.4, 1, patience=4) == "accepted"
+    assert found.judge(30.4, 1, 50, patience=4) == "accepted"
     assert found.slope == pytest.approx(0.6)
     assert found.next_count(30.3, 1) == int(500 * 0.5**0.5)
     assert found.next_count(30.05, 1) is None
     assert search().next_count(29.99, 1) is None, "a field below the target is trained, not cut"
-    assert found.judge(30.05, 2, patience=4) == "resting"
+    assert found.judge(30.05, 2, 50, patience=4) == "resting"
     found.cut(30.3, 353, step=3)
-    assert found.judge(30.3, 4, patience=4) == "accepted"
+    assert found.judge(30.3, 4, 50, patience=4) == "accepted"
     assert found.slope == pytest.approx(0.3), "a lucky cut does not make the next one cheap"
     assert (found.cuts, found.rejected) == (2, 0)
 
@@ -133,6 +189,7 @@ def test_degrees_are_bisected(values: dict[int, float], order: list[int], lowest
 def test_state_goes_through_a_checkpoint() -> None:
     found = search()
     found.cut(30.1, 500, step=100)
+    found.judge(29.0, 110, 50, patience=4)
     found.curve.append(Point(1, "field", 10, 100, 30.0, "waiting", 5))
     assert Search.from_state(found.state()) == found
     assert json.loads(json.dumps(found.state()))["curve"][0]["primitives"] == 10
@@ -149,6 +206,12 @@ def test_state_goes_through_a_checkpoint() -> None:
         {"curve": [{"step": 1}]},
         {"new": 1},
         {"cuts": 0.5},
+        {"trail": [[10, 30.0, 1]]},
+        {"trail": [[0, 30.0]]},
+        {"trail": [[10, math.inf]]},
+        {"trail": [3]},
+        {"trail": 3},
+        {"trail": [["a", "b"]]},
     ],
 )
 def test_a_foreign_state_is_refused(change: dict[str, Any]) -> None:
