@@ -1,6 +1,6 @@
 """Every figure of docs/budget.md: made scenes anywhere, captures on a GPU.
 
-    python benchmarks/budget.py --seeds 0 1 --out benchmarks/results/budget.json     # a plain wall, and the still life
+    python benchmarks/budget.py --seeds 0 1 2 3 --out benchmarks/results/budget.json     # a plain wall, and the still life
     python benchmarks/budget.py --scene bonsai --data DIR                              # rows in results/runs.csv, and a table
     python benchmarks/budget.py --scene bonsai --data DIR --only continuous psnr       # some of them
     python benchmarks/budget.py --scene bonsai --data DIR --dry-run                    # the commands alone
@@ -195,7 +195,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("outputs/budget"))
     parser.add_argument("--kinds", nargs="+", default=["still-life", "wall"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--steps", type=int, default=1000)
+    parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--size", type=int, default=64, help="pixels a side")
     parser.add_argument("--views", type=int, default=32)
     parser.add_argument("--points", type=int, default=1000)

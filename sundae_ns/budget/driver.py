@@ -231,7 +231,7 @@ class Budget:
             return
         if verdict == "rejected":
             self._restore(run, self._accepted)
-            value = search.target + search.margin
+            value = search.aim + search.margin
         # A network that does not help, or that waits for its turn, is not waited for.
         tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
         over = step >= deadline or left < config.patience * config.search_every
@@ -243,7 +243,7 @@ class Budget:
     def _cut_or_rest(self, run: Run, value: float) -> None:
         """Cut on as far as the margin allows; nothing where it allows nothing."""
         config, search = self.config, self.search
-        count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1)
+        count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
         if count is None:
             return
         self._accepted = run.snapshot(head=search.head)

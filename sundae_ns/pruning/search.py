@@ -7,6 +7,9 @@ the steps since the cut, and half of the gain that this promises is counted on. 
 back, and so is what has not when time is up; the field that is gone back to then has reached the target before. Steps
 behind an accepted cut are the fine-tuning itself; only those behind a cut that is taken back are lost.
 
+A field with more primitives than its scene needs may fit what the training views have by chance, and lose the target on
+others while it is trained on. Where one stays below and gains no more, what it has left takes the target's place.
+
 How deep to cut follows from the cut before: what it cost once recovered, per halving, against the margin that there is.
 Where the margin is too small for a cut worth its while, training goes on until it has grown.
 
@@ -28,6 +31,11 @@ DEEPEST, SHALLOWEST = 1.0, 0.15
 
 TRUST = 0.5
 """Share of a foreseen gain that is counted on once ``patience`` has ended; before that, all of it."""
+
+FORMER = {"last_psnr"}
+"""Entries of states that older versions have written, without a use today."""
+REQUIRED = {"phase", "reference", "target", "accepted", "degree", "curve"}
+"""Entries that the states of all versions have; others are as in a new search where they are missing."""
 
 _KINDS: dict[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "bool": (bool,)}
 
@@ -64,6 +72,12 @@ class Search:
     """PSNR that has to be kept, dB."""
     began: int = 0
     """Step of the schedule at which the search began."""
+    lowered: float = math.nan
+    """PSNR that takes the target's place while that is out of reach of the field itself, dB; else not a number."""
+    best: float = math.nan
+    """Highest PSNR of the field since it was last cut or restored, dB."""
+    stuck: int = 0
+    """Looks since then that were no higher."""
     trying: bool = False
     """Whether a cut waits for its verdict."""
     looks: int = 0
@@ -121,6 +135,17 @@ class Search:
         """Start to cut a field that meets the target; what a halving costs is remembered from an earlier phase."""
         self.phase, self.accepted, self.trying = phase, accepted, False
         self.rejected, self.failed, self.cuts, self.looks = 0, 0, 0, 0
+        self.lowered, self.best, self.stuck = math.nan, math.nan, 0
+
+    @property
+    def tolerated(self) -> float:
+        """What may be lost, dB."""
+        return self.reference - self.target
+
+    @property
+    def aim(self) -> float:
+        """PSNR that a cut has to keep, dB."""
+        return self.target if math.isnan(self.lowered) else self.lowered
 
     def next_degree(self, top: int, tolerated: float) -> int | None:
         """The degree to try next, None when the lowest that does is known: bisection, all bands first.
@@ -141,17 +166,20 @@ class Search:
         """The lowest degree among those tried that loses no more than is tolerated."""
         return min(int(name) for name, value in self.degrees.items() if value >= self.degrees[str(top)] - tolerated)
 
-    def next_count(self, psnr: float, least: int) -> int | None:
+    def next_count(self, psnr: float, least: int, patience: int) -> int | None:
         """Primitives after the next cut; None if the margin is too small for one, or there is nothing left to cut.
 
         Args:
             psnr: of the field that would be cut, dB.
             least: fewest primitives.
+            patience: looks without a gain after which the least cut is tried.
         """
-        margin = psnr - self.target
+        margin = psnr - self.aim
         if margin < 0:
             return None
         halvings = DEEPEST if margin >= self.slope * DEEPEST else margin / self.slope
+        if self.stuck >= patience or not math.isnan(self.lowered):
+            halvings = max(halvings, SHALLOWEST)  # to wait longer would change nothing
         if self.failed:
             # Half the way to what has failed; no nearer to it, in the least steps: training may have gained.
             halvings = min(halvings, max(0.5 * math.log2(self.accepted / self.failed), SHALLOWEST))
@@ -160,7 +188,7 @@ class Search:
 
     def cut(self, psnr: float, count: int, step: int) -> None:
         """A field was cut to ``count`` primitives after this step of the schedule."""
-        self.margin, self.tried, self.cut_at, self.trying, self.looks = psnr - self.target, count, step, True, 0
+        self.margin, self.tried, self.cut_at, self.trying, self.looks = psnr - self.aim, count, step, True, 0
         self.trail = []
 
     def foreseen(self, left: int, trust: float) -> float:
@@ -190,14 +218,17 @@ class Search:
             patience: looks for which a cut is given the benefit of the doubt.
         """
         self.looks += 1
+        if psnr >= self.target:
+            self.lowered = math.nan
         if not self.trying:
+            self._rest(psnr, patience)
             return "resting"
         self.trail.append([step - self.cut_at, psnr])
-        margin = psnr - self.target
+        margin = psnr - self.aim
         if margin < 0 and left > 0 and self._may_recover(left, patience):
             return "waiting"
-        self.trying, self.looks = False, 0
-        recovered = margin if margin >= 0 else self.foreseen(max(left, 0), TRUST) - self.target
+        self.trying, self.looks, self.best, self.stuck = False, 0, math.nan, 0
+        recovered = margin if margin >= 0 else self.foreseen(max(left, 0), TRUST) - self.aim
         # Training gains meanwhile, and a lucky cut does not make the next one cheap.
         self.slope = max((self.margin - recovered) / math.log2(self.accepted / self.tried), self.slope / 2)
         if margin >= 0:
@@ -211,9 +242,20 @@ class Search:
 
     def _may_recover(self, left: int, patience: int) -> bool:
         if self.looks < patience:
-            # The first look has nothing to compare with: what a cut costs is not what training gains.
-            return self.looks == 1 or self.foreseen(left, trust=1.0) >= self.target
-        return self.foreseen(left, TRUST) >= self.target
+            # The first look has nothing to compare with: what a cut costs is not what training gains. And looks scatter.
+            return self.looks == 1 or self.foreseen(left, trust=1.0) >= self.aim - self.tolerated
+        return self.foreseen(left, TRUST) >= self.aim
+
+    def _rest(self, psnr: float, patience: int) -> None:
+        if psnr <= self.best:
+            self.stuck += 1
+        else:
+            self.best, self.stuck = psnr, 0
+        # A head that has not proven itself yet goes again, and the field that it joined is at its target.
+        proven = self.phase == "field" or self.cuts > 0
+        if psnr < self.aim and self.stuck >= patience and proven:
+            # Less by half of what may be lost: the field would have gone on losing.
+            self.lowered = psnr - 0.5 * self.tolerated
 
     def state(self) -> dict[str, Any]:
         """Plain numbers for a checkpoint."""
@@ -227,9 +269,10 @@ class Search:
             CheckpointError: it is not what :meth:`state` gives.
         """
         try:
-            if set(state) != {f.name for f in fields(cls)}:
+            known = {name: value for name, value in state.items() if name not in FORMER}
+            if not REQUIRED <= set(known) <= {f.name for f in fields(cls)}:
                 raise ValueError("other entries")
-            search = cls(**{**state, "curve": [Point(**point) for point in state["curve"]]})
+            search = cls(**{**known, "curve": [Point(**point) for point in known["curve"]]})
             if search.phase not in ("before", "bands", "field", "head", "done") or not -1 <= search.degree <= 4:
                 raise ValueError("unknown phase or degree")
             if search.head_size not in ("", *SIZES) or not -1 <= search.num_features <= 1024:
