@@ -195,7 +195,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, default=Path("outputs/budget"))
     parser.add_argument("--kinds", nargs="+", default=["still-life", "wall"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--size", type=int, default=64, help="pixels a side")
     parser.add_argument("--views", type=int, default=32)
     parser.add_argument("--points", type=int, default=1000)
