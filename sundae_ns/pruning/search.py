@@ -11,7 +11,8 @@ A field with more primitives than its scene needs may fit what the training view
 others while it is trained on. Where one stays below and gains no more, what it has left takes the target's place.
 
 How deep to cut follows from the cut before: what it cost once recovered, per halving, against the margin that there is.
-Where the margin is too small for a cut worth its while, training goes on until it has grown.
+Where the margin is too small for a cut worth its while, training goes on until it has grown, or grows no more: then the least
+cut is tried.
 
 This module holds the decisions, as plain numbers; :mod:`sundae_ns.budget` acts on them.
 """
