@@ -231,7 +231,7 @@ class Budget:
             return
         if verdict == "rejected":
             self._restore(run, self._accepted)
-            value = search.aim + search.margin
+            value = search.before_cut
         # A network that does not help, or that waits for its turn, is not waited for.
         tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
         over = step >= deadline or left < config.patience * config.search_every

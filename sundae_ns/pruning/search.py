@@ -148,6 +148,11 @@ class Search:
         """PSNR that a cut has to keep, dB."""
         return self.target if math.isnan(self.lowered) else self.lowered
 
+    @property
+    def before_cut(self) -> float:
+        """PSNR of the field before the last cut, dB."""
+        return self.aim + self.margin
+
     def next_degree(self, top: int, tolerated: float) -> int | None:
         """The degree to try next, None when the lowest that does is known: bisection, all bands first.
 

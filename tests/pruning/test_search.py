@@ -33,7 +33,7 @@ def play(found: Search, recovered: Callable[[int], float], *, patience: int = 4,
         if verdict == "waiting":
             continue
         if verdict == "rejected":
-            count, psnr = before, found.target + found.margin
+            count, psnr = before, found.before_cut
         assert count == found.accepted
         if found.rejected >= 5:
             break
@@ -140,6 +140,7 @@ def test_a_field_that_loses_the_target_by_itself_is_cut_on_by_what_it_has_left()
     found.slope = 1.0
     assert found.next_count(29.82, 1, 3) == int(1000 * 0.5**SHALLOWEST)
     found.cut(29.82, 901, step=100)
+    assert found.before_cut == pytest.approx(29.82)
     assert verdicts(found, 29.7, 29.78) == ["waiting", "accepted"]
     assert found.next_count(30.02, 1, 3) == int(901 * 0.5**0.5), "by its margin, where it has one"
     rest(found, 30.0)
