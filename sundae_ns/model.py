@@ -134,8 +134,6 @@ class SundaeModel(SplatfactoModel):
         self.policy: PruningPolicy | GlobalPruning = make_policy(config.pruning)
         self.shards: Shards | None = None
         """The ranks that hold the field together; None where one process holds it all."""
-        self.timetable: Timetable | None = None
-        """Which views the ranks draw in training."""
         self.budget = Budget(config.pruning, config.head) if config.pruning.mode == "auto" else None
         self.pruning_state: dict[str, Any] = self.policy.initialize_state()
         self.strategy_state: dict[str, Any] = self.strategy.initialize_state(scene_scale=1.0)
@@ -218,7 +216,7 @@ class SundaeModel(SplatfactoModel):
         """Be one of the ranks that hold the field together, each its block of primitives, and draw views in their order."""
         self.shards = shards
         cameras = datamanager.train_dataset.cameras
-        self.timetable = Timetable(cameras, datamanager.view_of_step, self.device, NEAR_PLANE)
+        shards.timetable = Timetable(cameras, datamanager.view_of_step, self.device, NEAR_PLANE)
         self.policy = GlobalPruning(make_policy(self.config.pruning), shards)
         if isinstance(self.strategy, CappedStrategy):
             # Opacities are reset, and then each picture is seen once before anything grows or goes.
@@ -364,15 +362,20 @@ class SundaeModel(SplatfactoModel):
         """
         background = self._get_background_color()
         if self.training:
-            look = self._look(self.step)
-            view = self.view_of(camera, look.downscale) if self.timetable is None else self.timetable.view(look, camera)
+            look, shards = self._look(self.step), self.shards
+            view = self.view_of(camera, look.downscale) if shards is None else shards.timetable.view(look, camera)
             self._remember_focal(view)
             window = training_window(view.width, view.height, look.window_pixels, seed=look.step)
             view = view if window is None else view.cut(window)
-            field = self.gaussians if self.shards is None else self._on_course(view, look)
+            field: Mapping[str, Tensor] = self.gaussians
+            if shards is not None:
+                course = shards.course(self.gaussians, look)
+                field = self.arrivals(self.gaussians, view, features=self.head_active, course=course)
             outputs, splat = self.render(field, view, background, depth=self.config.output_depth_during_training)
             self.info = splat.info
-            self._plan_ahead()
+            if shards is not None:
+                # Now, while the GPU is busy with this step.
+                shards.plan_ahead(self.gaussians, self._look(self.step + 1), slack_of_step(self.optimizers))
             if self.densifying:
                 self.strategy.step_pre_backward(
                     self.gauss_params, self.optimizers, self.strategy_state, self.schedule_step, self.info
@@ -431,21 +434,6 @@ class SundaeModel(SplatfactoModel):
         # Densification takes its statistics from whole pictures.
         windows = self.head_active and not self.densifying
         return Look(step, self._downscale_at(step), self.config.head.max_train_pixels if windows else 0)
-
-    def _on_course(self, view: View, look: Look) -> Arrived:
-        """What a view of the timetable needs from all ranks. Collective."""
-        assert self.timetable is not None
-        assert self.shards is not None
-        field, course = self.gaussians, self.shards.course(self.gaussians, self.timetable, look)
-        return self.arrivals(field, view, features=self.head_active, course=course)
-
-    def _plan_ahead(self) -> None:
-        """Plan the exchange of the next step, while the GPU is busy with this one. Collective."""
-        if self.shards is None or self.timetable is None:
-            return
-        slack = slack_of_step(self.optimizers)
-        if slack is not None:
-            self.shards.plan_ahead(self.gaussians, self.timetable, self._look(self.step + 1), slack)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

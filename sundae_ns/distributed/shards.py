@@ -104,6 +104,8 @@ class Shards:
         """Primitives of each rank."""
         self.ahead: Ahead | None = None
         """The exchange of the next step, once this one has planned it."""
+        self.timetable: Timetable
+        """Which views the ranks draw in training; whoever has the views sets it before the first step."""
 
     @property
     def total(self) -> int:
@@ -195,21 +197,22 @@ class Shards:
         self.ahead = None
 
     @torch.no_grad()
-    def plan_ahead(self, params: Mapping[str, Tensor], timetable: Timetable, look: Look, slack: Slack) -> None:
+    def plan_ahead(self, params: Mapping[str, Tensor], look: Look, slack: Slack | None) -> None:
         """Plan the exchange of a step to come, for whatever the field becomes within the slack; wait for nothing. Collective.
 
         Args:
             params: this rank's primitives as they are.
-            timetable: of the ranks' views.
             look: at the step to come.
-            slack: from :func:`sundae_ns.distributed.ahead.slack_of_step`.
+            slack: from :func:`sundae_ns.distributed.ahead.slack_of_step`; None, the same on all ranks, for no plan.
         """
-        cameras = timetable.cameras(look)
+        if slack is None:
+            return
+        cameras = self.timetable.cameras(look)
         plan = plan_exchange(may_be_seen(params["means"], params["scales"], cameras.bounds, slack))
         self.ahead = Ahead(look, cameras, plan, stamped(params))
 
     @torch.no_grad()
-    def course(self, params: Mapping[str, Tensor], timetable: Timetable, look: Look) -> Course:
+    def course(self, params: Mapping[str, Tensor], look: Look) -> Course:
         """The exchange of this step: the one that was planned for it, or a new one. Collective.
 
         All ranks do the same: plans are made and forgotten in collectives, and a look is a function of the step.
@@ -217,7 +220,7 @@ class Shards:
         planned, self.ahead = self.ahead, None
         if planned is not None and planned.look == look:
             return Course(planned.cameras, planned.route(params))
-        return _course_now(params, timetable.cameras(look))
+        return _course_now(params, self.timetable.cameras(look))
 
     def arrivals(
         self,

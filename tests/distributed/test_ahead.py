@@ -140,7 +140,8 @@ def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None
     state = strategy.initialize_state()
     dist.init_process_group(group, init_method=f"file://{folder / 'meeting'}", rank=0, world_size=1)
     try:
-        shards, timetable = Shards(device), Timetable(cameras, lambda picture: 0, device, 0.01)
+        shards = Shards(device)
+        shards.timetable = Timetable(cameras, lambda picture: 0, device, 0.01)
         shards.recount(params)
 
         def colors_of(field: Mapping[str, Tensor], centers: Tensor) -> Tensor:
@@ -150,10 +151,10 @@ def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None
         for step in range(3):
             look = Look(step, 1, 0)
             assert (shards.ahead is not None) == (step > 0)
-            view = timetable.view(look, served(cameras, 0))
+            view = shards.timetable.view(look, served(cameras, 0))
             if step > 0:  # in the first one kernels load, constants are made, and the ranks meet
                 forbid_waits()
-            course = shards.course(params, timetable, look)
+            course = shards.course(params, look)
             arrived = shards.arrivals(params, view, colors_of, near_plane=0.01, features=False, course=course)
             allow_waits()
             splat = rasterize(
@@ -170,9 +171,7 @@ def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None
                 forbid_waits()
             splat.info["means2d"].retain_grad()
             shards.follow(splat.info, arrived.route, absgrad=True)
-            slack = slack_of_step(optimizers)
-            assert slack is not None
-            shards.plan_ahead(params, timetable, Look(step + 1, 1, 0), slack)
+            shards.plan_ahead(params, Look(step + 1, 1, 0), slack_of_step(optimizers))
             picture_loss(splat.colors, target, ssim, 0.2).backward()  # type: ignore[no-untyped-call]
             strategy._update_state(params, state, {"statistics": shards.statistics(splat.info)})
             for optimizer in optimizers.values():

@@ -146,8 +146,9 @@ def check_that_nothing_stays(shards: Shards) -> None:
     splat = draw(arrived, arrived["colors"], view)
     splat.info["means2d"].retain_grad()
     shards.follow(splat.info, arrived.route, absgrad=True)
-    timetable: Any = Views(shards.rank)
-    shards.plan_ahead(params, timetable, Look(1, 1, 0), Slack(0.1, 0.1))  # and it stays until then
+    views: Any = Views(shards.rank)
+    shards.timetable = views
+    shards.plan_ahead(params, Look(1, 1, 0), Slack(0.1, 0.1))  # and it stays until then
     loss_of(splat, shards.rank).backward()
     shards.statistics(splat.info)
     route = weakref.ref(arrived.route)
@@ -182,6 +183,7 @@ def check_planning_ahead(shards: Shards) -> None:
     """Steps that were planned ahead do what steps that plan at their start do, and what one process does."""
     start, end = distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2]
     views: Any = Views(shards.rank)
+    shards.timetable = views
     small = {**a_field(), "scales": a_field()["scales"] - 2}
     looks = [Look(step, 1, 0) for step in range(4)]
 
@@ -196,7 +198,7 @@ def check_planning_ahead(shards: Shards) -> None:
         optimizers, pictures, missed = optimizers_of(params), [], 0
         for look in looks[:-1]:
             assert (shards.ahead is not None) == (ahead and look.step > 0)
-            cameras, route = shards.course(params, views, look)
+            cameras, route = shards.course(params, look)
             assert shards.ahead is None
             view = views.view(look)
             arrived = shards.arrivals(
@@ -205,9 +207,7 @@ def check_planning_ahead(shards: Shards) -> None:
             splat = draw(arrived, arrived["colors"], view)
             pictures.append(splat.colors.detach())
             if ahead:
-                slack = slack_of_step(optimizers)
-                assert slack is not None
-                shards.plan_ahead(params, views, looks[look.step + 1], slack)
+                shards.plan_ahead(params, looks[look.step + 1], slack_of_step(optimizers))
                 bounds = views.cameras(looks[look.step + 1]).bounds
                 before = may_be_seen(params["means"], params["scales"], bounds)
             loss_of(splat, view.width).backward()
@@ -245,13 +245,14 @@ def check_that_plans_are_forgotten(shards: Shards) -> None:
     """A field that has changed, or pictures of another size, are planned for anew, on all ranks; silence is an error."""
     params = shard_of(a_field(), *distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2])
     views: Any = Views(shards.rank)
+    shards.timetable = views
     optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
 
     def planned() -> bool:
         return shards.ahead is not None
 
     def plan() -> None:
-        shards.plan_ahead(params, views, Look(1, 1, 0), Slack(0.0, 0.0))
+        shards.plan_ahead(params, Look(1, 1, 0), Slack(0.0, 0.0))
         assert planned()
 
     shards.recount(params)
@@ -259,7 +260,7 @@ def check_that_plans_are_forgotten(shards: Shards) -> None:
     # Pictures of another size, and another step.
     for look in (Look(1, 2, 0), Look(2, 1, 0)):
         plan()
-        cameras, route = shards.course(params, views, look)
+        cameras, route = shards.course(params, look)
         assert not planned()
         expected = views.cameras(look)
         assert torch.equal(cameras.centers, expected.centers)
@@ -282,7 +283,7 @@ def check_that_plans_are_forgotten(shards: Shards) -> None:
         plan()
         change()
         with pytest.raises(AssertionError, match="has changed since"):
-            shards.course(params, views, Look(1, 1, 0))
+            shards.course(params, Look(1, 1, 0))
 
 
 def check_looking_away(shards: Shards) -> None:

@@ -24,7 +24,7 @@ import torch.distributed as dist
 
 from sundae_ns import checkpoint, distributed
 from sundae_ns.data import write_scene
-from sundae_ns.distributed import Course, Look, Shards, Timetable
+from sundae_ns.distributed import Course, Look, Shards
 from sundae_ns.errors import ConfigError, RankError, rank_ended
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
@@ -97,10 +97,10 @@ def check_training(shards: Shards, folder: Path) -> None:
     anew = []
     course = Shards.course
 
-    def noted(self: Shards, params: Any, timetable: Timetable, look: Look) -> Course:
+    def noted(self: Shards, params: Any, look: Look) -> Course:
         if self.ahead is None or self.ahead.look != look:
             anew.append(look.step)
-        return course(self, params, timetable, look)
+        return course(self, params, look)
 
     Shards.course = noted  # type: ignore[method-assign]
     trainer = train(configured(folder, "train"), shards.rank, RANKS)
