@@ -26,8 +26,6 @@ def latest(lines: list[dict[str, Any]]) -> dict[str, dict[int, dict[str, Any]]]:
     """The longest run of each kind of field and number of GPUs, the later one of equals; by kind, then number."""
     runs: dict[str, dict[int, dict[str, Any]]] = defaultdict(dict)
     for line in lines:
-        if line["variant"].endswith("planned-ahead"):
-            continue  # its head burst, and no run on one GPU stands beside it, see docs/distributed.md
         tiled = line["variant"].startswith("multi-gpu-tiled")
         kind = f"{line['scene']}, {'tiled to ' + format(line['primitives'], ',') if tiled else 'a whole run'}"
         before = runs[kind].get(line["ranks"])

@@ -18,6 +18,7 @@ import rules
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.lines import Line2D
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 SWEPT = re.compile(r"^(?P<rule>.+) (?P<what>gamma|reach|k) x?(?P<value>[\d.]+)$")
@@ -101,17 +102,20 @@ def sweeps(lines: list[dict[str, Any]], path: Path) -> None:
             curves[found["what"]][label][float(found["value"])].append(line["psnr"])
     if not curves:
         return
-    figure, axes = plt.subplots(1, len(curves), figsize=(4.6 * len(curves), 3.8), layout="constrained", squeeze=False)
+    names = sorted({label for labels in curves.values() for label in labels})
+    colors = {name: plt.get_cmap("tab10")(i) for i, name in enumerate(names)}
+    figure, axes = plt.subplots(1, len(curves), figsize=(4.6 * len(curves), 4.3), layout="constrained", squeeze=False)
     for axis, (what, labels) in zip(axes[0], curves.items(), strict=True):
-        for label, points in labels.items():
+        for label, points in sorted(labels.items()):
             values = sorted(points)
-            axis.plot(values, [mean(points[v]) for v in values], ".-", label=label)
+            axis.plot(values, [mean(points[v]) for v in values], ".-", color=colors[label])
         if what != "gamma":
             axis.set_xscale("log", base=2)
         axis.set_xlabel(TITLES[what])
         axis.set_ylabel("test PSNR, dB")
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=6)
+    lines_of = [Line2D([], [], color=colors[name], marker=".", label=name) for name in names]
+    figure.legend(handles=lines_of, loc="outside lower center", ncols=3, fontsize=8)
     _save(figure, path)
 
 

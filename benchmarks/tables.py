@@ -36,17 +36,20 @@ class Shown:
     commit: str
     label: str
     timed: bool = True
-    """Whether the run had the machine for itself, so that its times say something."""
+    """Whether its times stand beside those of the other rows of the scene."""
     packed: str = ""
     """Name in pack.jsonl, where lines for the packed run are to follow."""
 
 
 SHOWN = (
-    Shown("bonsai", "splatfacto", "default", "4f32371", "splatfacto"),
-    Shown("bonsai", "sundae", "default", "8b20125", "sundae", packed="bonsai-default-42"),
-    Shown("bonsai", "sundae", "band-positions", "2e7bd23", "the paper's band rule (an older head)"),
+    Shown("bonsai", "splatfacto", "peers-splatfacto", "04e59ca", "splatfacto"),
+    Shown("bonsai", "sundae", "peers-sundae", "04e59ca", "**sundae**"),
+    Shown("bonsai", "sundae", "peers-mcmc", "04e59ca", "3DGS-MCMC"),
+    Shown("bonsai", "sundae", "peers-contribution-no-head", "04e59ca", "contribution pruning, as LightGaussian's"),
+    Shown("bonsai", "sundae", "band-positions", "2e7bd23", "the paper's band rule (an older head)", timed=False),
+    Shown("bonsai", "sundae", "default", "8b20125", "another run of sundae", timed=False, packed="bonsai-default-42"),
     Shown("fox", "splatfacto", "default", "5e4bc58", "splatfacto"),
-    Shown("fox", "sundae", "default", "ef71d9f", "sundae", packed="fox, 30,000 steps"),
+    Shown("fox", "sundae", "default", "ef71d9f", "**sundae**", packed="fox, 30,000 steps"),
     Shown("fox", "sundae", "no-head-branch", "ef71d9f", "the same field, no head", timed=False),
 )
 
@@ -67,7 +70,7 @@ def readme_table(rows: list[RunRow]) -> str:
                 *(number(row.psnr, 2), number(row.ssim, 4), number(row.psnr_base, 2)),
                 number(row.bytes_total / MB, 1),
                 number(row.ms_frame, 2) if shown.timed else "",
-                f"{number(row.train_s, 0)} s" if shown.timed else "",
+                f"{number(row.train_s, 0)} s" if shown.timed and row.train_s is not None else "",
             ]
         )
         if shown.packed:
