@@ -146,6 +146,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise DataError(f"{data} cannot be parsed ({reason}); check the capture") from error
         self._order: tuple[int, list[int]] = (-1, [])
+        self._cameras: dict[int, Cameras] = {}
         self.place: tuple[int, int] = (0, 1)
         """Rank of this process, and of how many that train together: each sees another view at a step."""
 
@@ -200,9 +201,15 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     def _view(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         batch = dict(self.cached_train[index])
         batch["image"] = batch["image"].to(self.device, non_blocking=True)  # pinned, where it waits in host memory
-        camera = self.train_dataset.cameras[index : index + 1]
-        camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
-        return camera, batch
+        return self._camera(index), batch
+
+    def _camera(self, index: int) -> Cameras:
+        """A training camera, kept, since nerfstudio takes long to cut one out of many; asked for after its picture was read."""
+        if index not in self._cameras:
+            camera = self.train_dataset.cameras[index : index + 1]
+            camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
+            self._cameras[index] = camera
+        return self._cameras[index]
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         """Camera (on the CPU) and batch of ``step``."""

@@ -52,7 +52,8 @@ class ShownResponse:
 
 
 def late_outputs(
-    pictures: Mapping[str, Tensor],
+    pictures: Mapping[str, Any],
+    drawn: Mapping[str, Tensor],
     field: Mapping[str, Tensor],
     mask: Tensor | None,
     view: View,
@@ -62,8 +63,9 @@ def late_outputs(
     """``depth``, ``features`` (principal components as colours) and ``response`` (of the primitives seen), to be made.
 
     Args:
-        pictures: from :func:`sundae_ns.rendering.render`.
-        field: all primitives; the mapping is kept and has to stay as it is.
+        pictures: from :func:`sundae_ns.rendering.render`; depth may be None, and is splatted when it is looked at.
+        drawn: the primitives that they were made of.
+        field: all primitives. Both mappings are kept and have to stay as they are.
         mask: which of them were drawn, bool ``[N]``; None for all.
         view: the camera.
         style: how the pictures were made.
@@ -71,10 +73,17 @@ def late_outputs(
     """
     alpha = pictures["accumulation"]
     return {
-        "depth": Later(partial(display.fill_depth, pictures["depth"], alpha)),
+        "depth": Later(partial(_depth_image, pictures["depth"], drawn, view, style, alpha)),
         "features": Later(partial(_feature_colors, field, pictures["feature_image"], alpha)),
         "response": Later(partial(_response_image, field, mask, view, style, values)),
     }
+
+
+def _depth_image(depth: Tensor | None, drawn: Mapping[str, Tensor], view: View, style: Style, alpha: Tensor) -> Tensor:
+    if depth is None:
+        depth = splat(drawn, view, drawn["opacities"], style, render_depth=True).depth
+        assert depth is not None
+    return display.fill_depth(depth, alpha)
 
 
 def _feature_colors(field: Mapping[str, Tensor], image: Tensor, alpha: Tensor) -> Tensor:

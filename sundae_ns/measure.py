@@ -43,8 +43,8 @@ class FrameTimes:
     """Milliseconds a frame, device waited for, median over the given cameras."""
 
     frame: float
-    """The whole picture, as nerfstudio's commands ask for it: camera, harmonics, splatting of colours, features and depth,
-    and the head."""
+    """The whole picture, as nerfstudio's commands ask for it: camera, harmonics, splatting of colours and features, and the
+    head."""
     splat: float
     """The same without the head, and so without features."""
     head: float
@@ -87,7 +87,7 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
             with compensation(model, on):
                 times.append(milliseconds(partial(show, camera)))
         if model.head is not None and model.head_active:
-            pictures, splat = model.render(model.gaussians, model.view_of(camera), background)
+            pictures, splat = model.render(model.gaussians, model.view_of(camera), background, depth=False)
             heads.append(
                 milliseconds(partial(over_phases, model.head, pictures["base_rgb"], splat.colors, splat.alpha))
             )

@@ -291,7 +291,9 @@ class SundaeModel(SplatfactoModel):
             camera: nerfstudio camera, camera-to-world with OpenGL axes.
             downscale: divide the resolution by this.
         """
-        pose = self.camera_optimizer.apply_to_camera(camera) if self.training else None
+        optimizer = self.camera_optimizer
+        moved = self.training and optimizer.config.mode != "off"
+        pose = optimizer.apply_to_camera(camera) if moved else None
         return view_of(camera, self.device, pose=pose, downscale=downscale)
 
     @property
@@ -395,10 +397,11 @@ class SundaeModel(SplatfactoModel):
             rows = mask[preview.mask]
             params = {**params, **{k: v[rows] for k, v in preview.values.items()}}
         compensate = preview is None and (self.compensate.value if in_viewer() else self.compensated)
-        pictures, _ = self.render(params, view, background, compensate=compensate)
+        # Depth is left for later, but where other ranks have to take part in it.
+        pictures, _ = self.render(params, view, background, compensate=compensate, depth=self.shards is not None)
         field = dict(self.gaussians)
         values = partial(self._response.values, field, self._response_key, self.config.pruning)
-        pictures.update(late_outputs(pictures, field, mask, view, self._style, values))
+        pictures.update(late_outputs(pictures, dict(params), field, mask, view, self._style, values))
         pictures.pop("feature_image")
         return LazyOutputs({**pictures, "background": background.expand(view.height, view.width, 3)})
 

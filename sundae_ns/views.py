@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -54,19 +55,39 @@ def view_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None 
         pose: camera-to-world, if not the camera's own, ``[..., 3, 4]``; differentiable.
         downscale: divide the resolution by this.
     """
+    *flat, fx, fy, cx, cy, width, height = _numbers(camera)
+    dtype = camera.camera_to_worlds.dtype
+    K = [fx / downscale, 0.0, cx / downscale, 0.0, fy / downscale, cy / downscale, 0.0, 0.0, 1.0]
+    size = (int(width) // downscale, int(height) // downscale)
     if pose is None:
-        # Small sums on single numbers: on a GPU each would cost a launch, and each number read back a wait.
-        camera = camera.to("cpu")
-        pose = camera.camera_to_worlds
-    pose = pose.reshape(-1, 3, 4)[0]
-    rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
-    top = torch.cat([rotation.T, -rotation.T @ pose[:, 3:]], dim=1)
-    viewmat = torch.cat([top, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
-    K = camera.get_intrinsics_matrices().reshape(-1, 3, 3)[0].clone()
-    K[:2] /= downscale
-    size = (int(camera.width.item()) // downscale, int(camera.height.item()) // downscale)
-    focal = (camera.fx + camera.fy).item() / 2 / downscale
-    return View(viewmat.to(device), K.to(device), *size, focal)
+        both = torch.tensor([*_world_to_camera(flat), *K], dtype=dtype).to(device)  # in one piece: one copy to a GPU
+        viewmat, intrinsics = both[:16].view(4, 4), both[16:].view(3, 3)
+    else:
+        pose = pose.reshape(-1, 3, 4)[0]
+        rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])
+        top = torch.cat([rotation.T, -rotation.T @ pose[:, 3:]], dim=1)
+        viewmat = torch.cat([top, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])]).to(device)
+        intrinsics = torch.tensor(K, dtype=dtype).to(device).view(3, 3)
+    return View(viewmat, intrinsics, *size, (fx + fy) / 2 / downscale)
+
+
+def _numbers(camera: Cameras) -> list[float]:
+    """Camera-to-world row by row, focal lengths, centre and size; in one piece, since from a GPU each would be waited for.
+
+    Read by itself, because nerfstudio's methods of cameras build tensors and cameras anew: they took as long as to splat.
+    """
+    parts = (camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    return torch.cat([part.detach().flatten().to(torch.float64) for part in parts]).tolist()  # type: ignore[no-any-return]
+
+
+def _world_to_camera(pose: Sequence[float]) -> list[float]:
+    """World-to-camera, OpenCV axes, from camera-to-world ``3 x 4``, OpenGL axes; both row by row."""
+    x, y, z = pose[3::4]
+    matrix: list[float] = []
+    for axis, sign in enumerate((1.0, -1.0, -1.0)):
+        a, b, c = (sign * value for value in pose[axis::4])
+        matrix += [a, b, c, -(a * x + b * y + c * z)]
+    return [*matrix, 0.0, 0.0, 0.0, 1.0]
 
 
 def cut(image: Tensor, window: Window | None) -> Tensor:

@@ -49,6 +49,32 @@ def test_every_output_can_be_shown(
 
 
 @torch.no_grad()
+def test_depth_is_splatted_when_it_is_looked_at(
+    build: Build, perturb: Perturb, camera: MakeCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same depth as in one pass with the colours, of what was drawn: in a box, of what lies in the box."""
+    model = perturb(build(head={"mode": "residual"})).eval()
+    box = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, 0.0]), torch.tensor([1.0, 1.0, 1.0]))
+    view, background = model.view_of(camera()), model._get_background_color()
+    rasterise, passes = model.backend.rasterize, []
+    monkeypatch.setattr(model.backend, "rasterize", lambda *a, **k: passes.append(k) or rasterise(*a, **k))
+    found = []
+    for crop in (None, box):
+        outputs = model.get_outputs_for_camera(camera(), crop)
+        assert outputs["rgb"].shape[-1] == 3
+        assert [p["render_depth"] for p in passes] == [False]
+        inside = slice(None) if crop is None else crop.within(model.means).squeeze(-1)
+        pictures, _ = model.render({k: v[inside] for k, v in model.gaussians.items()}, view, background, depth=True)
+        seen = pictures["accumulation"] > 0
+        passes.clear()
+        found.append(outputs["depth"])
+        assert [p["render_depth"] for p in passes] == [True]
+        torch.testing.assert_close(found[-1][seen], pictures["depth"][seen])
+        passes.clear()
+    assert not torch.equal(*found)
+
+
+@torch.no_grad()
 def test_a_crop_without_primitives_has_the_same_keys(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
     model = perturb(build()).eval()
     whole = model.get_outputs_for_camera(camera())
