@@ -3,6 +3,9 @@
 The path runs from test camera to test camera (nerfstudio's interpolation). Between neighbouring frames the camera's motion is
 taken out by depth (``sundae_ns.evaluation.change``); what is left is flicker, and a little of what bilinear sampling does,
 which both pictures share. Writes results/steadiness.json.
+
+``--reference`` measures the pictures of another run on the same capture as well, by the depth of the first: those of the full
+field, say, which are steady by construction. What they show is what detail and the error of the depth alone amount to.
 """
 
 from __future__ import annotations
@@ -32,12 +35,14 @@ def main() -> None:
     parser.add_argument(
         "--phases", type=int, choices=PHASES, help="how often the head runs a frame; default: the run's"
     )
+    parser.add_argument("--reference", type=Path, help="config.yml of another run on the same capture")
     parser.add_argument("--out", type=Path, default=RESULTS)
     options = parser.parse_args()
     run = load_run(options.load_config)
     model, cameras = run.model, run.cameras
     if options.phases is not None and model.head is not None:
         model.head.config.phases = options.phases
+    other = None if options.reference is None else load_run(options.reference).model
     first = cameras[0]
     stations = Cameras(
         torch.cat([camera.camera_to_worlds for camera in cameras]).cpu(),
@@ -47,11 +52,13 @@ def main() -> None:
     )
     path = get_interpolated_camera_path(stations, steps=options.steps, order_poses=True)
     background = model._get_background_color()
-    changes: dict[str, list[float]] = {"rgb": [], "base_rgb": []}
+    changes: dict[str, list[float]] = {"rgb": [], "base_rgb": []} | ({} if other is None else {"reference": []})
     before: dict[str, Frame] = {}
     for i in track(range(len(path)), description="Frames"):
         view = model.view_of(path[i : i + 1])
         pictures, _ = model.render(model.gaussians, view, background)
+        if other is not None:
+            pictures["reference"] = other.render(other.gaussians, view, background)[0]["rgb"]
         for name, values in changes.items():
             frame = Frame(pictures[name], pictures["depth"], pictures["accumulation"], view.viewmat, view.K)
             if name in before:
@@ -68,6 +75,9 @@ def main() -> None:
         "change_of_base_colours": mean(changes["base_rgb"]),
     }
     figures["ratio"] = figures["change_with_head"] / figures["change_of_base_colours"]
+    if other is not None:
+        figures["change_of_reference"] = mean(changes["reference"])
+        figures["reference_ratio"] = figures["change_of_reference"] / figures["change_of_base_colours"]
     print(figures)
     options.out.write_text(json.dumps(figures, indent=2) + "\n")
 
