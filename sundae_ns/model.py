@@ -103,6 +103,7 @@ class SundaeModel(SplatfactoModel):
     def populate_modules(self) -> None:
         """Build the field, the head and what training needs. The model's device is not known yet."""
         config = self.config
+        config.pruning = replace(config.pruning, logits=config.sh_degree == 0)
         config.pruning.validate()
         if config.head.mode != "off":
             config.head.validate()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
+import tyro
+
 from sundae_ns.errors import ConfigError
 
 Mode = Literal["one-shot", "continuous", "auto", "off"]
@@ -98,6 +100,8 @@ class PruningConfig:
     """Auto: steps from one look at the held-back views to the next."""
     patience: int = 4
     """Auto: looks after which a cut that has not recovered is taken back, unless half of the gain that it promises would do."""
+    logits: tyro.conf.Suppress[bool] = False
+    """Whether ``features_dc`` holds logits of colours instead of harmonics. Not an option: a model says so of its field."""
 
     @property
     def tolerated_drop(self) -> float:
