@@ -151,6 +151,11 @@ class PruningConfig:
         return self.prune_at if self.mode in ("one-shot", "auto") else None
 
     @property
+    def first_prune(self) -> int | None:
+        """Step after which something is pruned for the first time; None where nothing is."""
+        return self.start if self.mode == "continuous" else self.ends_growth_at
+
+    @property
     def settled_at(self) -> int:
         """Step after which the field keeps its primitives."""
         return self.stop if self.mode == "continuous" else self.last_prune
