@@ -195,9 +195,9 @@ class ContinuousPruning(PruningPolicy):
     """
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """At ``start`` and each ``every`` steps from there until ``stop``; from then on where there are more than are allowed.
+        """At ``start`` and each ``every`` steps from there until ``stop``, towards a target only where there are more.
 
-        Where there is a target to go down to, only with more than that.
+        From ``stop`` on whenever there are more than the target, or without one than the cap.
         """
         config, target = self.config, self.config.target_primitives
         scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
