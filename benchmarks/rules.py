@@ -37,7 +37,7 @@ from sundae_ns.evaluation.records import wait_for_lock
 from sundae_ns.measure import sizes
 from sundae_ns.model import SundaeModel
 from sundae_ns.pruning import field_graph, make_policy
-from sundae_ns.pruning.scores import on_graph_device
+from sundae_ns.pruning.scores import for_graph
 from sundae_ns.schedulers import Decay
 
 RESULTS = Path(__file__).parent / "results" / "rules.jsonl"
@@ -223,7 +223,7 @@ class Bench:
         self._rewind(branch.seed, options.steps)
         choice = dict(branch.options)
         if REACH in choice:
-            graph = field_graph(on_graph_device(self.model.gaussians, self.pruning), self.pruning)
+            graph = field_graph(for_graph(self.model.gaussians, self.pruning), self.pruning)
             choice |= {"sigma": graph.sigma, "tau": graph.tau * choice.pop(REACH) ** 2}
         if choice.get("rounds", 1) > 1:
             # A tenth of the branch apart: all branches are trained for the same time in all.

@@ -71,13 +71,32 @@ def prune_if_due(model: SundaeModel, attributes: TrainingCallbackAttributes, ste
     record(model, attributes, report, step, before=before, after=after)
 
 
+def warn_if_too_short(model: SundaeModel, last_step: int) -> None:
+    """Say so where a training that ends with this step never comes to its first prune."""
+    pruning, ranks = model.config.pruning, 1 if model.shards is None else model.shards.ranks
+    first = pruning.first_prune
+    # A warm start is pruned at once.
+    if first is None or last_step >= first or model.config.warm_start is not None or model.pruning_state["num_prunes"]:
+        return
+    waits = ", and the head takes no part" if model.head is not None and model.config.head.start_at is None else ""
+    option = "start" if pruning.mode == "continuous" else "prune-at"
+    # Steps of one picture, which options count by.
+    CONSOLE.print(
+        f"[yellow]Warning: training ends after {(last_step + 1) * ranks:,} steps, and the first prune needs more than "
+        f"{first * ranks:,} (pruning.{option}): nothing is pruned{waits}; train longer, or prune earlier",
+        soft_wrap=True,
+    )
+
+
 def finish(model: SundaeModel, attributes: TrainingCallbackAttributes, step: int) -> None:
-    """Say what training took at its peak, and whether a budget was met."""
+    """Say what training took at its peak, and whether a budget was met or nothing was pruned."""
     primitives, memory = model.pruning_state["peak"], peak_memory(model.device) / 1e6
     CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {model.device.type} memory")
     writer.put_dict(name="Peak", scalar_dict={"primitives": primitives, "memory_mb": memory}, step=step)
     if model.budget is not None:
         model.budget.finish(model, attributes)
+    else:
+        warn_if_too_short(model, step)
     writer.write_out_storage()
 
 

@@ -167,9 +167,11 @@ def make_strategy(config: SundaeModelConfig, pictures: int) -> CappedStrategy | 
         config: of the model.
         pictures: how many the field is trained on; each is seen once after opacities are reset, before anything grows.
     """
-    pruning = config.pruning
+    pruning, stop = config.pruning, config.stop_split_at
     continuous = pruning.mode == "continuous"
-    stop = min(config.stop_split_at, pruning.stop if continuous else pruning.ends_growth_at or config.stop_split_at)
+    ends = pruning.stop if continuous else pruning.ends_growth_at
+    if ends is not None:
+        stop = min(stop, ends)
     cap = pruning.max_primitives if continuous else None
     if config.warmup == "mcmc":
         return ChainStrategy(

@@ -82,8 +82,9 @@ def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError
     return MemoryExhaustedError(
         f"the GPU's memory is full: {asked}, with {primitives:,} primitives; try --pipeline.datamanager.cache-images cpu "
         "(pictures in host memory), --pipeline.datamanager.camera-res-scale-factor 0.5 (smaller pictures), or "
-        f"--pipeline.model.pruning.mode continuous --pipeline.model.pruning.max-primitives {max(primitives // 2, 1)} "
-        "(a lower peak); --load-dir goes on from the last checkpoint"
+        "--pipeline.model.pruning.mode continuous --pipeline.model.pruning.keep-ratio 0.5 "
+        f"--pipeline.model.pruning.max-primitives {max(primitives // 2, 1)} (a lower peak); "
+        "--load-dir goes on from the last checkpoint"
     )
 
 

@@ -25,7 +25,7 @@ from rich.progress import track
 from torch import Tensor
 
 from sundae_ns import checkpoint
-from sundae_ns.after_step import finish, prune_if_due
+from sundae_ns.after_step import finish, prune_if_due, warn_if_too_short
 from sundae_ns.budget import Budget
 from sundae_ns.compensation import PHASES, CompensationHead, HeadConfig, training_window
 from sundae_ns.datamanager import NO_PICTURES, SundaeDatamanager
@@ -103,6 +103,7 @@ class SundaeModel(SplatfactoModel):
     def populate_modules(self) -> None:
         """Build the field, the head and what training needs. The model's device is not known yet."""
         config = self.config
+        config.pruning = replace(config.pruning, logits=config.sh_degree == 0)
         config.pruning.validate()
         if config.head.mode != "off":
             config.head.validate()
@@ -449,6 +450,9 @@ class SundaeModel(SplatfactoModel):
         self.attached = True
         if self.budget is not None:
             self.budget.check(cast(Any, training_callback_attributes.pipeline).datamanager)
+        trainer = training_callback_attributes.trainer
+        if trainer is not None:
+            warn_if_too_short(self, cast(Any, trainer).last_step)
         callbacks = super().get_training_callbacks(training_callback_attributes)
         for location, act in (
             (TrainingCallbackLocation.AFTER_TRAIN, finish),

@@ -22,7 +22,7 @@ from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import Decision, PruningConfig, band_rule, decide, field_graph, single_prune
-from sundae_ns.pruning.scores import on_graph_device
+from sundae_ns.pruning.scores import for_graph
 
 if TYPE_CHECKING:
     from sundae_ns.model import SundaeModel
@@ -142,7 +142,7 @@ class Preview(torch.nn.Module):
         if config.uses_graph and config.edges not in self._graphs:
             finite = finite_mask(params)
             usable = {name: value.detach()[finite] for name, value in params.items()}
-            self._graphs[config.edges] = field_graph(on_graph_device(usable, config), config)
+            self._graphs[config.edges] = field_graph(for_graph(usable, config), config)
         return decide(
             params, config, lambda: self._contribution_of(model, config), graph=self._graphs.get(config.edges)
         )

@@ -73,23 +73,26 @@ def colors_of(params: Mapping[str, Tensor], center: Tensor, style: Style) -> Ten
     return (spherical_harmonics(degree, params["means"] - center, coeffs, backend=style.backend) + 0.5).clamp_min(0)
 
 
+def _pass(params: Mapping[str, Tensor], view: View, style: Style) -> dict[str, Any]:
+    """What every pass over a view tells the rasteriser: how primitives lie, and how they are seen."""
+    return {
+        "means": params["means"],
+        "quats": params["quats"],
+        "scales": params["scales"].exp(),
+        "opacities": params["opacities"].sigmoid().squeeze(-1),
+        "viewmat": view.viewmat,
+        "K": view.K,
+        "width": view.width,
+        "height": view.height,
+        "near_plane": NEAR_PLANE,
+        "antialiased": style.antialiased,
+        "backend": style.backend,
+    }
+
+
 def splat(params: Mapping[str, Tensor], view: View, channels: Tensor, style: Style, **options: Any) -> Rasterization:
     """Splat values of the primitives ``[N, C]``; options are those of ``rasterize``."""
-    return rasterize(
-        params["means"],
-        params["quats"],
-        params["scales"].exp(),
-        params["opacities"].sigmoid().squeeze(-1),
-        channels,
-        view.viewmat,
-        view.K,
-        view.width,
-        view.height,
-        near_plane=NEAR_PLANE,
-        antialiased=style.antialiased,
-        backend=style.backend,
-        **options,
-    )
+    return rasterize(colors=channels, **_pass(params, view, style), **options)
 
 
 def render(
@@ -164,15 +167,4 @@ def weights_of(
         background = background.to(params["means"].device)
         pictures, splatted = render(params, view, background, style, depth=False, compensate=False)
         pixels = pixel_detail(pictures["base_rgb"], keep_ratio * float((splatted.radii > 0).sum()))
-    return blending_weights(
-        params["means"],
-        params["quats"],
-        params["scales"].exp(),
-        params["opacities"].sigmoid().squeeze(-1),
-        view.viewmat,
-        view.K,
-        view.width,
-        view.height,
-        pixels=pixels,
-        backend=style.backend,
-    )
+    return blending_weights(pixels=pixels, **_pass(params, view, style))

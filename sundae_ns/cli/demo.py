@@ -15,6 +15,7 @@ from rich.progress import Progress
 
 from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.data import write_scene
+from sundae_ns.errors import ConfigError
 from sundae_ns.evaluation import ComparisonRow, Quality, RunFigures, report_text, save_comparison
 
 METHOD = "sundae-tiny"
@@ -49,6 +50,14 @@ def _quality(results: dict[str, float], suffix: str = "") -> Quality:
     return Quality(results["psnr" + suffix], results["ssim" + suffix], results.get("lpips" + suffix))
 
 
+def _check_steps(steps: int) -> None:
+    from sundae_ns.method_configs import sundae_tiny  # slow to import
+
+    prune_at = sundae_tiny.config.pipeline.model.pruning.prune_at
+    if steps <= prune_at:
+        raise ConfigError(f"steps is {steps}: the demo prunes after step {prune_at}; give more, or leave it out")
+
+
 def run_demo(out: Path, steps: int | None = None, console: Console | None = None) -> int:
     """Make the scene, train, evaluate, and print the table.
 
@@ -58,8 +67,11 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         console: where to print.
 
     Raises:
+        ConfigError: so few steps never come to the prune.
         SundaeError: a command failed; the message shows the end of its output.
     """
+    if steps is not None:
+        _check_steps(steps)
     console = console or Console()
     out.mkdir(parents=True, exist_ok=True)
     scene, run = out / "scene", out / "runs" / "demo" / METHOD / "run"

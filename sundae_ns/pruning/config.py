@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
+import tyro
+
 from sundae_ns.errors import ConfigError
 
 Mode = Literal["one-shot", "continuous", "auto", "off"]
@@ -84,7 +86,8 @@ class PruningConfig:
     every: int = 2000
     """Steps from one continuous prune to the next."""
     max_primitives: int | None = None
-    """Continuous: never more than this many at any step, densification included. Auto: keep at most this many."""
+    """Continuous: never more than this many at any step, densification included; each prune keeps the smaller of this and the
+    keep ratio's count. Auto: keep at most this many."""
     target_primitives: int | None = None
     """Continuous: each prune goes down to exactly this count where there are more, instead of by the keep ratio; the last one
     comes after densification, and where that has left fewer, the field is filled up."""
@@ -97,6 +100,8 @@ class PruningConfig:
     """Auto: steps from one look at the held-back views to the next."""
     patience: int = 4
     """Auto: looks after which a cut that has not recovered is taken back, unless half of the gain that it promises would do."""
+    logits: tyro.conf.Suppress[bool] = False
+    """Whether ``features_dc`` holds logits of colours instead of harmonics. Not an option: a model says so of its field."""
 
     @property
     def tolerated_drop(self) -> float:
@@ -129,9 +134,11 @@ class PruningConfig:
         return self.score == "detail-contribution"
 
     def share(self, n: int) -> float:
-        """Share of ``n`` primitives that a prune keeps: the keep ratio, or what the target or the cap leaves."""
-        goal = self.max_primitives if self.target_primitives is None else self.target_primitives
-        return self.keep_ratio if goal is None else min(1.0, goal / n)
+        """Share of ``n`` primitives that one prune keeps: what the target leaves, else the ratio of a round under the cap."""
+        if self.target_primitives is not None:
+            return min(1.0, self.target_primitives / n)
+        ratio = self.keep_ratio ** (1 / self.rounds)
+        return ratio if self.max_primitives is None else min(ratio, self.max_primitives / n)
 
     @property
     def last_prune(self) -> int:
@@ -142,6 +149,11 @@ class PruningConfig:
     def ends_growth_at(self) -> int | None:
         """Step of the prune that follows densification; None where there is none."""
         return self.prune_at if self.mode in ("one-shot", "auto") else None
+
+    @property
+    def first_prune(self) -> int | None:
+        """Step after which something is pruned for the first time; None where nothing is."""
+        return self.start if self.mode == "continuous" else self.ends_growth_at
 
     @property
     def settled_at(self) -> int:
@@ -177,8 +189,8 @@ class PruningConfig:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ConfigError(f"{name} is {value}: use at least {least}")
-        if self.mode != "auto" and self.stop < self.start:
-            raise ConfigError(f"stop ({self.stop}) lies before start ({self.start}): swap them, or set mode to off")
+        if self.mode == "continuous" and self.stop < self.start:
+            raise ConfigError(f"start ({self.start}) lies after stop ({self.stop}): swap them")
         if self.rounds > 1 and self.mode in ("continuous", "auto"):
             raise ConfigError(f"rounds is {self.rounds} but mode is {self.mode}: set mode to one-shot, or drop rounds")
         for name in ("tau", "sigma"):
@@ -223,7 +235,6 @@ def single_prune(config: PruningConfig, keep_ratio: float) -> PruningConfig:
         mode="one-shot",
         keep_ratio=keep_ratio,
         rounds=1,
-        start=0,
         max_primitives=None,
         target_primitives=None,
         max_psnr_drop=None,

@@ -16,7 +16,7 @@ from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.coverage import band_shares, neighbor_order, select_systematic
 from sundae_ns.pruning.edges import field_graph
 from sundae_ns.pruning.redistribution import grown, merged
-from sundae_ns.pruning.scores import Contribution, Response, coherence, on_graph_device, response, score
+from sundae_ns.pruning.scores import Contribution, Response, coherence, for_graph, response, score
 from sundae_ns.pruning.selection import kept_count, select_band, select_random, select_sampled, select_top
 
 
@@ -86,7 +86,7 @@ def decide(
     if not config.uses_graph:
         graph = None
     elif graph is None:
-        graph = field_graph(on_graph_device(usable, config), config)
+        graph = field_graph(for_graph(usable, config), config)
     found = response(usable, config, graph) if config.uses_response else None
     coherent = coherence(graph, count, config, finite.device) if graph is not None and config.uses_coherence else None
     values = score(usable, config, found, weights, coherent)
@@ -119,7 +119,7 @@ def _redistributed(
     assert graph is not None
     if weights is None:
         raise ConfigError("a merge needs a pass over the training views and there are none: set redistribution to grow")
-    return merged(params, graph, mask, weights())
+    return merged(params, graph, mask, weights(), logits=config.logits)
 
 
 def _select(values: Tensor, config: PruningConfig, count: int, found: Response | None, points: Tensor) -> Tensor:

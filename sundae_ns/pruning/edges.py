@@ -32,7 +32,8 @@ def field_graph(params: Mapping[str, Tensor], config: PruningConfig) -> Neighbor
     A field of no more primitives than neighbours has the graph of all pairs within reach.
 
     Args:
-        params: the field, all finite, N primitives; the graph is built where the tensors are.
+        params: the field, all finite, N primitives, colours as harmonics (:func:`sundae_ns.pruning.scores.for_graph`); the
+            graph is built where the tensors are.
         config: neighbours, width, reach and kind of edges are taken from it.
 
     Raises:

@@ -190,17 +190,22 @@ class ContinuousPruning(PruningPolicy):
 
     The alternative strategy of the paper (section "Continuous Pruning as a Strategy"), whose final count is loosely held:
     each prune goes by ``keep_ratio``. With ``target_primitives`` each goes down to exactly that count, the last one when
-    densification has ended, which makes it the final count. ``max_primitives`` caps every step in between: densification
-    has to be bounded by it (:class:`sundae_ns.densification.CappedStrategy`), so that no prune has to.
+    densification has ended, which makes it the final count. ``max_primitives`` caps what a prune leaves, and every step in
+    between, where densification has to be bounded by it (:class:`sundae_ns.densification.CappedStrategy`).
     """
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """At ``start`` and each ``every`` steps from there until ``stop``; with a count to go down to also at ``stop``."""
-        config, goal = self.config, self._goal
+        """At ``start`` and each ``every`` steps from there until ``stop``, towards a target only where there are more.
+
+        From ``stop`` on whenever there are more than the target, or without one than the cap.
+        """
+        config, target = self.config, self.config.target_primitives
         scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
-        last = goal is not None and step >= config.stop
-        above = goal is None or n > goal
-        return (scheduled or last) and above and step > state["pruned_at"]
+        most = config.max_primitives if target is None else target
+        above = most is not None and n > most
+        by_share = scheduled and target is None
+        by_count = above and (scheduled or step >= config.stop)
+        return (by_share or by_count) and step > state["pruned_at"]
 
     def _config_at(self, step: int) -> PruningConfig:
         # Another draw each time, and after a resume the same as without it.
@@ -236,13 +241,12 @@ class ContinuousPruning(PruningPolicy):
             state["peak"] = max(state["peak"], n + lacking)
         return report
 
-    @property
-    def _goal(self) -> int | None:
-        config = self.config
-        return config.max_primitives if config.target_primitives is None else config.target_primitives
-
     def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
-        return self._goal
+        config = self.config
+        if config.target_primitives is not None:
+            return config.target_primitives
+        count = kept_count(config.keep_ratio, n)
+        return count if config.max_primitives is None else min(count, config.max_primitives)
 
 
 def make_policy(config: PruningConfig) -> PruningPolicy:

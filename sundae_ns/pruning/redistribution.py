@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.gaussians.merging import merge
+from sundae_ns.gaussians.parameters import rgb_to_logit
 from sundae_ns.graphs import NeighborGraph, knn
 
 MOST_HOPS = 64
@@ -82,7 +83,10 @@ def _either_way(graph: NeighborGraph, heir: Tensor, distance: Tensor, lengths: T
     return heir
 
 
-def merged(params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, weight: Tensor) -> dict[str, Tensor]:
+@torch.no_grad()
+def merged(
+    params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, weight: Tensor, *, logits: bool = False
+) -> dict[str, Tensor]:
     """Those that stay, with what their neighbours leave them: see :func:`heirs` and :func:`sundae_ns.gaussians.merge`.
 
     Args:
@@ -90,11 +94,21 @@ def merged(params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, wei
         graph: its graph.
         mask: True for primitives that stay, bool ``[N]``.
         weight: what each primitive counts ``[N]``: its blending weight in the training views.
+        logits: whether ``features_dc`` holds logits of colours: the mean is that of the colours, as pictures have it.
 
     Returns:
         Parameters of those that stay ``[M, ...]``.
     """
-    return merge(params, heirs(graph, mask), weight)
+    heir = heirs(graph, mask)
+    if not logits:
+        return merge(params, heir, weight)
+    own = params["features_dc"].detach()
+    colors = own.sigmoid()
+    values = merge({**params, "features_dc": colors}, heir, weight)
+    stay, mixed = mask.to(own.device), values["features_dc"]
+    # There and back the logit of a saturated colour would be another.
+    values["features_dc"] = torch.where(mixed == colors[stay], own[stay], rgb_to_logit(mixed))
+    return values
 
 
 @torch.no_grad()

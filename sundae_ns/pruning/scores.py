@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.filters import high_pass, local_coherence, response_magnitude
-from sundae_ns.gaussians.parameters import num_primitives
+from sundae_ns.gaussians.parameters import num_primitives, rgb_to_sh
 from sundae_ns.graphs import NeighborGraph, laplacian
 from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.edges import field_graph
@@ -36,8 +36,10 @@ class Response:
     """How many primitives have no neighbour within the threshold."""
 
 
-def on_graph_device(params: Mapping[str, Tensor], config: PruningConfig) -> Mapping[str, Tensor]:
-    """What graphs and signals of a field are made from, on the device that the configuration names for it."""
+def for_graph(params: Mapping[str, Tensor], config: PruningConfig) -> Mapping[str, Tensor]:
+    """What graphs and signals of a field are made from: colours as harmonics, on the device that the configuration names."""
+    if config.logits:
+        params = {**params, "features_dc": rgb_to_sh(params["features_dc"].detach().sigmoid())}
     if config.graph_device == "field":
         return params
     return {name: params[name].detach().cpu() for name in ("means", "features_dc", "opacities", "scales", "quats")}
@@ -56,7 +58,7 @@ def response(params: Mapping[str, Tensor], config: PruningConfig, graph: Neighbo
         DataError: there is only one primitive, or positions are not finite.
     """
     device = params["means"].device
-    params = on_graph_device(params, config)
+    params = for_graph(params, config)
     graph = field_graph(params, config) if graph is None else graph
     signal = SIGNALS[config.signal](params)
     magnitude = response_magnitude(high_pass(graph, signal, isolated="nan")).to(device)

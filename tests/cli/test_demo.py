@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sundae_ns.cli.demo import _comparison
+from sundae_ns.cli.demo import _comparison, run_demo
 from sundae_ns.cli.process import run_logged
 from sundae_ns.errors import SundaeError
 
@@ -40,6 +40,24 @@ def test_comparison_takes_the_pictures_apart(tmp_path: Path) -> None:
     with Image.open(tmp_path / "sheet.png") as sheet:
         colors = {color for _, color in sheet.convert("RGB").getcolors(1 << 20)}
     assert {(255, 255, 255), (200, 200, 200), (245, 245, 245), (50, 50, 50)} <= colors
+
+
+@pytest.mark.parametrize(
+    ("steps", "said"),
+    [(steps, f"steps is {steps}: the demo prunes after step 600; give more") for steps in (-3, 0, 300, 600)]
+    + [(601, "made"), (None, "made")],
+)
+def test_too_few_steps_for_the_prune_are_refused_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int | None, said: str
+) -> None:
+    def make(*_: object, **__: object) -> None:
+        raise SundaeError("made")
+
+    monkeypatch.setattr("sundae_ns.cli.demo.write_scene", make)
+    with pytest.raises(SundaeError, match=said) as error:
+        run_demo(tmp_path / "demo", steps=steps)
+    assert "\n" not in str(error.value)
+    assert (tmp_path / "demo").exists() == (said == "made")
 
 
 def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:

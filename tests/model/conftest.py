@@ -80,7 +80,7 @@ def _batch(width: int = 40, height: int = 32, channels: int = 3) -> dict[str, Te
 class Training:
     """Steps a model as nerfstudio's trainer does, without one."""
 
-    def __init__(self, model: SundaeModel) -> None:
+    def __init__(self, model: SundaeModel, trainer: Any = None) -> None:
         self.model = model
         groups = model.get_param_groups()
         self.optimizers = Optimizers(
@@ -88,7 +88,7 @@ class Training:
         )
         pipeline = SimpleNamespace(datamanager=FakeDatamanager(), model=model)
         self.callbacks = model.get_training_callbacks(
-            TrainingCallbackAttributes(self.optimizers, None, pipeline, None)  # type: ignore[arg-type]
+            TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)  # type: ignore[arg-type]
         )
 
     def run_callbacks(self, location: TrainingCallbackLocation, step: int) -> None:
@@ -154,8 +154,8 @@ def datamanager() -> FakeDatamanager:
 
 
 @pytest.fixture
-def training_of() -> Callable[[SundaeModel], Training]:
-    """Set up the training of a model, which then goes step by step."""
+def training_of() -> Callable[..., Training]:
+    """Set up the training of a model, and of what stands for a trainer if need be, which then goes step by step."""
     return Training
 
 

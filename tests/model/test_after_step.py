@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,7 +14,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from sundae_ns.model import SundaeModel
 
 Build = Callable[..., SundaeModel]
-TrainingOf = Callable[[SundaeModel], Any]
+TrainingOf = Callable[..., Any]
 
 N = 60
 """Primitives of a model that is built without a count."""
@@ -83,3 +85,70 @@ def test_rounds_prune_to_the_count_and_the_head_waits_for_the_last(
     assert counts == [60] * 3 + [44] * 2 + [33] * 2 + [24] * 4
     assert active == [False] * 8 + [True] * 3
     assert all(torch.isfinite(value).all() for value in training.model.gauss_params.values())
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    return [line for line in capsys.readouterr().out.splitlines() if "first prune" in line]
+
+
+@pytest.mark.parametrize(
+    ("pruning", "head", "ending"),
+    [
+        (
+            {"prune_at": 3},
+            {},
+            "3 (pruning.prune-at): nothing is pruned, and the head takes no part; train longer, or prune",
+        ),
+        ({"prune_at": 3}, {"mode": "off"}, "3 (pruning.prune-at): nothing is pruned; train longer, or prune earlier"),
+        ({"prune_at": 3}, {"start_at": 1}, "3 (pruning.prune-at): nothing is pruned; train longer, or prune earlier"),
+        ({"mode": "continuous", "start": 3}, {}, "3 (pruning.start): nothing is pruned, and the head takes no part"),
+    ],
+)
+def test_a_run_that_never_prunes_says_so_in_one_line_before_and_after(
+    build: Build,
+    training_of: TrainingOf,
+    capsys: pytest.CaptureFixture[str],
+    pruning: dict[str, Any],
+    head: dict[str, Any],
+    ending: str,
+) -> None:
+    training = training_of(build(pruning=pruning, head=head), SimpleNamespace(last_step=2))
+    (before,) = said(capsys)
+    assert before.startswith("Warning: training ends after 3 steps, and the first prune needs more than " + ending)
+    for step in range(3):
+        training.step(step)
+    assert said(capsys) == []
+    training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN, 2)
+    assert said(capsys) == [before]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"pruning": {"prune_at": 2}},
+        {"pruning": {"mode": "off"}},
+        {"pruning": {"mode": "continuous", "start": 2}},
+        {"pruning": {"prune_at": 100}, "warm_start": Path("anything")},
+    ],
+)
+def test_a_run_that_prunes_or_is_not_to_says_nothing(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str], options: dict[str, Any]
+) -> None:
+    model = build(**options)
+    model._warm_start_error = None
+    training = training_of(model, SimpleNamespace(last_step=2))
+    training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 2)
+    training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN, 2)
+    assert said(capsys) == []
+
+
+def test_a_search_that_never_begins_says_so_once_at_each_end(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = build(pruning={"mode": "auto", "prune_at": 3})
+    monkeypatch.setattr(model.budget, "check", lambda _: None)
+    training = training_of(model, SimpleNamespace(last_step=2))
+    assert len(said(capsys)) == 1
+    training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 2)
+    training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN, 2)
+    assert capsys.readouterr().out.count("Warning") == 1

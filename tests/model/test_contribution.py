@@ -7,17 +7,22 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from sundae_ns.model import SundaeModel
 
 Build = Callable[..., SundaeModel]
+TrainingOf = Callable[[SundaeModel], Any]
 
 N = 60
 """Primitives of a model that is built without a count."""
 
 
-def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: Any) -> None:
-    model = build(pruning={"score": "contribution"})
+@pytest.mark.parametrize("mode", ["classic", "antialiased"])
+def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: Any, mode: str) -> None:
+    model = build(pruning={"score": "contribution"}, rasterize_mode=mode)
+    # Thinner than a pixel, where the two modes differ by far.
+    model.gauss_params["scales"].data[:30] = -6.0
     model.gauss_params["means"].data[4] = torch.tensor([0.0, 0.0, 50.0])
     total = model.contribution(datamanager)
     assert total.shape == (N,)
@@ -40,3 +45,23 @@ def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(buil
     ratio = found[1][seen] / found[0][seen]
     assert float(ratio.max()) > 1.1
     assert float(ratio.min()) < 0.9
+
+
+def test_a_round_weighs_detail_for_what_it_keeps(
+    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not for what the last of the rounds will have left."""
+    training = training_of(build(pruning={"rounds": 2, "round_every": 2, "keep_ratio": 0.25}))
+    asked, weights_of = [], training.model.weights_of
+
+    def spy(view: Any, keep_ratio: float | None = None) -> Tensor:
+        asked.append(keep_ratio)
+        return weights_of(view, keep_ratio)
+
+    monkeypatch.setattr(training.model, "weights_of", spy)
+    counts = []
+    for step in range(6):
+        training.step(step)
+        counts.append(training.model.num_points)
+    assert counts == [60, 60, 60, 30, 30, 15]
+    assert asked == [0.5] * 6

@@ -83,3 +83,19 @@ def test_continuous_pruning_merges_and_leaves_adam_in_order(
     assert len(counts) == 2
     assert all(after == round(before / 2) for after, before in counts)
     assert counts[0][1] > N
+
+
+@pytest.mark.parametrize("warmup", ["densify", "mcmc"])
+@pytest.mark.parametrize("prune_at", [0, 4])
+def test_nothing_grows_after_the_prune(build: Build, training_of: TrainingOf, prune_at: int, warmup: str) -> None:
+    """Not even where the prune is the first thing that happens, as it may be after a warm start."""
+    grows = {"warmup_length": 0, "refine_every": 3, "reset_alpha_every": 100, "densify_grad_thresh": 1e-9}
+    model = build(pruning={"prune_at": prune_at}, stop_split_at=14, warmup=warmup, **grows)
+    model.strategy.pause_refine_after_reset = 0
+    training, counts = training_of(model), []
+    for step in range(11):
+        training.step(step)
+        counts.append(model.num_points)
+    assert (max(counts[:prune_at], default=0) > N) == (prune_at > 0)
+    assert len(set(counts[prune_at:])) == 1
+    assert counts[-1] == round(0.5 * (N if prune_at == 0 else counts[prune_at - 1]))

@@ -128,7 +128,9 @@ def test_continuous_keeps_a_share_on_schedule() -> None:
 
 
 def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
-    config = PruningConfig(mode="continuous", start=0, every=2, stop=100, max_primitives=110, num_neighbors=4)
+    config = PruningConfig(
+        mode="continuous", start=0, every=2, stop=100, max_primitives=110, keep_ratio=1.0, num_neighbors=4
+    )
     policy = make_policy(config)
     state = policy.initialize_state()
     counts, peaks = [], []
@@ -142,8 +144,6 @@ def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
         peaks.append(state["peak"])
     assert counts == [110, 125, 110, 125, 110, 125]
     assert peaks == [115, 125, 140, 140, 140, 140]
-    few = field(50)
-    assert run(policy, few, range(4))[0] == []
 
 
 @pytest.mark.parametrize("last", [60, 90])
@@ -276,10 +276,28 @@ def test_the_last_options_that_work() -> None:
     PruningConfig(mode="continuous", **edge).validate()  # type: ignore[arg-type]
 
 
-def test_continuous_leaves_a_field_alone_that_holds_the_cap() -> None:
-    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=1, max_primitives=100))
+def test_continuous_leaves_a_field_alone_that_holds_the_target() -> None:
+    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=1, target_primitives=100))
     state = policy.initialize_state()
     assert [policy.due(state, 0, n) for n in (99, 100, 101)] == [False, False, True]
+
+
+@pytest.mark.parametrize(("cap", "expected"), [(200, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
+def test_continuous_under_a_cap_keeps_the_share_too(cap: int, expected: list[int]) -> None:
+    config = PruningConfig(
+        mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, max_primitives=cap, num_neighbors=4
+    )
+    reports, _ = run(make_policy(config), field(), range(13))
+    assert [report.step for report in reports] == [2, 5, 8]
+    assert [report.after for report in reports] == expected
+
+
+def test_a_field_above_the_cap_is_pruned_when_continuous_pruning_has_ended() -> None:
+    """As after a resume under a lower cap."""
+    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_primitives=100))
+    state = policy.initialize_state()
+    assert [policy.due(state, step, 101) for step in (9, 10, 30)] == [False, True, True]
+    assert not policy.due(state, 30, 100)
 
 
 def test_continuous_prunes_a_step_once() -> None:
@@ -310,7 +328,7 @@ def test_mode_names_the_policy(mode: Any, kind: type[PruningPolicy]) -> None:
         {"num_neighbors": 0},
         {"every": 0},
         {"prune_at": -1},
-        {"start": 5, "stop": 4},
+        {"start": 5, "stop": 4, "mode": "continuous"},
         {"tau": 0.0},
         {"sigma": -1.0},
         {"max_primitives": 0, "mode": "continuous"},
@@ -352,6 +370,14 @@ def test_one_budget_is_enough(budget: dict[str, object]) -> None:
     PruningConfig(mode="auto", stop=20000, **budget).validate()  # type: ignore[arg-type]
 
 
-def test_the_share_is_that_of_what_the_cap_leaves() -> None:
-    config = PruningConfig(mode="continuous", max_primitives=30)
-    assert (config.share(60), config.share(10), PruningConfig(keep_ratio=0.2).share(60)) == (0.5, 1.0, 0.2)
+def test_the_share_is_that_of_what_a_prune_leaves() -> None:
+    target = PruningConfig(mode="continuous", target_primitives=30)
+    assert (target.share(60), target.share(10), PruningConfig(keep_ratio=0.2).share(60)) == (0.5, 1.0, 0.2)
+    cap = PruningConfig(mode="continuous", max_primitives=30, keep_ratio=0.6)
+    assert (cap.share(60), cap.share(10)) == (0.5, 0.6)
+    assert PruningConfig(keep_ratio=0.25, rounds=2).share(60) == 0.5
+
+
+@pytest.mark.parametrize("mode", ["off", "one-shot"])
+def test_the_schedule_of_another_mode_is_not_looked_at(mode: Any) -> None:
+    PruningConfig(mode=mode, start=2000, stop=1000).validate()

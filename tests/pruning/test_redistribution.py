@@ -16,7 +16,7 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.gaussians.parameters import rgb_to_sh
+from sundae_ns.gaussians.parameters import rgb_to_sh, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
 from sundae_ns.pruning import PruningConfig, decide, field_graph, grown, heirs, make_policy
 from sundae_ns.schedulers import Decay, notify_pruned
@@ -114,6 +114,34 @@ def test_a_merge_keeps_what_is_seen_in_all(edges: Any) -> None:
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
     # Those that stay are the same as without a merge.
     assert torch.equal(decide(params, replace(config, redistribution="none"), weights).mask, decision.mask)
+
+
+@pytest.mark.parametrize("device", ["cpu", "field"])
+@pytest.mark.parametrize(
+    "rule",
+    [
+        {},
+        {"score": "response-contribution", "selection": "sampled"},
+        {"score": "response-contribution", "signal": "colors", "edges": "centres"},
+    ],
+)
+def test_logits_are_pruned_as_the_colours_that_they_are(rule: dict[str, Any], device: Any) -> None:
+    """The same primitives stay as of the field in harmonics, and their colours become the same, not their logits."""
+    logits = field()
+    logits["features_dc"] *= 4
+    harmonics = {**logits, "features_dc": rgb_to_sh(logits["features_dc"].sigmoid())}
+    config = PruningConfig(keep_ratio=0.3, graph_device=device, **rule)
+    found, expected = decide(logits, replace(config, logits=True), weights), decide(harmonics, config, weights)
+    assert torch.equal(found.mask, expected.mask)
+    assert found.values is not None
+    assert expected.values is not None
+    colors = sh_to_rgb(expected.values["features_dc"]).clamp(1e-3, 1 - 1e-3)
+    own = logits["features_dc"][found.mask]
+    same = found.values["features_dc"] == own
+    assert 0 < int(same.all(dim=1).sum()) < found.kept
+    torch.testing.assert_close(found.values["features_dc"].sigmoid()[~same], colors[~same], rtol=0, atol=1e-6)
+    for name in found.values.keys() - {"features_dc"}:
+        assert torch.equal(found.values[name], expected.values[name])
 
 
 def test_growth_is_the_spacing_of_those_that_stay_over_that_of_all() -> None:
