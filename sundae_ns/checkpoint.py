@@ -281,10 +281,21 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
     field = {name: state[key].float() for name, key in keys.items()}
     _check_field(field, path)
-    if field["features_rest"].shape[1] == 0:
-        # Of a model without harmonics these are logits of colours.
+    if field["features_rest"].shape[1] == 0 and _holds_logits(state.get(f"_model.{EXTRA_STATE}")):
         field["features_dc"] = rgb_to_sh(field["features_dc"].sigmoid())
     return field, True
+
+
+def _holds_logits(extra: Any) -> bool:
+    """Whether band 0 of a checkpoint without other bands holds logits of colours, as of a model without harmonics.
+
+    A field that a search for a budget has left without bands holds harmonics. Checkpoints that do not say are told apart by
+    that, and those of splatfacto have no extra state.
+    """
+    if not isinstance(extra, Mapping):
+        return True
+    said = extra.get("logits")
+    return said if isinstance(said, bool) else "budget" not in extra
 
 
 def _check_field(field: Mapping[str, Tensor], path: Path) -> None:

@@ -249,6 +249,7 @@ class SundaeModel(SplatfactoModel):
         state = checkpoint.extra_state(
             self.step, self.num_features, self.strategy_state, self.pruning_state, self.trained_focal
         )
+        state["logits"] = self.config.pruning.logits
         return state if self.budget is None else {**state, "budget": self.budget.state()}
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor
 from sundae_ns import checkpoint
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import SPLAT_NAMES
+from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.storage import MODEL_FRAME, write_ply
 
 
@@ -101,6 +102,30 @@ def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> Non
     assert in_model_frame
     assert tuple(read) == SPLAT_NAMES
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
+
+
+@pytest.mark.parametrize(
+    ("extra", "logits"),
+    [
+        (None, True),
+        ({}, True),
+        ({"logits": True, "budget": {}}, True),
+        ({"logits": False}, False),
+        ({"budget": {}}, False),
+        ({"logits": torch.zeros(2)}, True),
+    ],
+)
+def test_a_field_without_bands_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
+    """Logits in a model without harmonics; harmonics where a search has left them out."""
+    state = {f"_model.gauss_params.{name}": value for name, value in field().items()}
+    state["_model.gauss_params.features_rest"] = state["_model.gauss_params.features_rest"][:, :0]
+    if extra is not None:
+        state["_model._extra_state"] = extra
+    torch.save({"step": 1, "pipeline": state}, tmp_path / "step-000000001.ckpt")
+    read, _ = checkpoint.read_field(tmp_path)
+    stored = field()["features_dc"]
+    expected = sh_to_rgb(read["features_dc"]).logit() if logits else read["features_dc"]
+    torch.testing.assert_close(expected, stored)
 
 
 @pytest.mark.parametrize("inside", [".", "nerfstudio_models"])
