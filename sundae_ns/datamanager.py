@@ -29,6 +29,14 @@ NO_PICTURES = "sundae_no_pictures"
 """Key of a dataset's metadata and of a batch: there is a camera alone, and grey stands for its picture."""
 
 
+def without_pictures(run: object = "this run") -> DataError:
+    """The error for training or evaluating on grey, which stands for the pictures of a run without its capture."""
+    return DataError(
+        f"{run} was unpacked without its capture: its cameras are there to look through, not to train or evaluate on; give "
+        "the capture to sundae unpack with --data"
+    )
+
+
 class LightNerfstudioParser(Nerfstudio):
     """The ``nerfstudio-data`` parser, reading sparse clouds without open3d, which needs system libraries of a desktop."""
 

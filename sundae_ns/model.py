@@ -28,10 +28,10 @@ from sundae_ns import checkpoint
 from sundae_ns.after_step import finish, prune_if_due
 from sundae_ns.budget import Budget
 from sundae_ns.compensation import PHASES, CompensationHead, HeadConfig, training_window
-from sundae_ns.datamanager import NO_PICTURES, SundaeDatamanager
+from sundae_ns.datamanager import NO_PICTURES, SundaeDatamanager, without_pictures
 from sundae_ns.densification import CappedStrategy, make_strategy
 from sundae_ns.distributed import Arrived, Course, GlobalPruning, Look, Shards, Timetable, slack_of_step
-from sundae_ns.errors import ConfigError, DataError, out_of_memory
+from sundae_ns.errors import ConfigError, out_of_memory
 from sundae_ns.evaluation import LazyOutputs, Lpips, psnr, ssim
 from sundae_ns.initial_field import initial_field
 from sundae_ns.late_outputs import FieldKey, ShownResponse, empty_outputs, late_outputs
@@ -509,10 +509,7 @@ class SundaeModel(SplatfactoModel):
 
     def _target(self, batch: dict[str, Any], outputs: dict[str, Any]) -> Tensor:
         if NO_PICTURES in batch:
-            raise DataError(
-                "this run was unpacked without its capture: its cameras are there to look through, not to train or evaluate "
-                "on; give the capture to sundae unpack with --data"
-            )
+            raise without_pictures()
         truth = cut(self.get_gt_img(batch["image"]), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
 

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from sundae_ns import checkpoint
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.datamanager import SundaeDatamanagerConfig
+from sundae_ns.datamanager import SundaeDatamanagerConfig, without_pictures
 from sundae_ns.errors import CheckpointError, PackError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
@@ -85,6 +85,8 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
     else:
         field.pop(FEATURES, None)
     manager = _manager(config)
+    if data is not None and not manager.pictures:
+        raise without_pictures(path.parent)
     manager.data = data or manager.data
     meta = {
         "source": {"method": config.method_name, "step": int(loaded["step"])},
@@ -177,10 +179,13 @@ def _cameras(manager: SundaeDatamanagerConfig, most: int) -> dict[str, Tensor]:
 
 
 def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
-    """Plain values by which the same capture is read, split and scaled again; None for one of a rare parser."""
+    """Plain values by which the same capture is read, split and scaled again; None for one of a rare parser.
+
+    Neither is there one of a run without its capture, whose cameras are not where those of the capture are.
+    """
     parser = manager.dataparser
     kind = next((name for name, known in _PARSERS.items() if type(parser) is known), None)
-    if kind is None:
+    if kind is None or not manager.pictures:
         return None
     options: dict[str, Any] = {}
     for name, default in _options(_PARSERS[kind]).items():

@@ -118,6 +118,14 @@ def test_pictures_of_the_run_are_those_of_the_scene(tmp_path: Path) -> None:
     assert (pictures[0] - 1).abs().max() > 0.2
 
 
+def test_a_run_without_its_capture_names_none(tmp_path: Path) -> None:
+    """It is read otherwise than the capture was: what it would state of it put every camera in a wrong place."""
+    blind = write_run(scene(), tmp_path, "x").parent
+    assert scene_of_run(blind).meta["capture"] is None
+    with pytest.raises(DataError, match="unpacked without its capture"):
+        scene_of_run(blind, data=tmp_path)
+
+
 def test_a_scene_without_cameras_is_looked_at_from_outside(tmp_path: Path) -> None:
     pipeline = opened(write_run(Scene(field(), head(), None, meta()), tmp_path, "a"))
     (camera,) = [pipeline.datamanager.train_dataset.cameras[0:1]]
