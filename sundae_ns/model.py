@@ -33,7 +33,7 @@ from sundae_ns.densification import CappedStrategy, make_strategy
 from sundae_ns.distributed import Arrived, Course, GlobalPruning, Look, Shards, Timetable, slack_of_step
 from sundae_ns.errors import ConfigError, out_of_memory
 from sundae_ns.evaluation import LazyOutputs, Lpips, psnr, ssim
-from sundae_ns.initial_field import initial_field
+from sundae_ns.initial_field import Start, initial_field
 from sundae_ns.late_outputs import FieldKey, ShownResponse, empty_outputs, late_outputs
 from sundae_ns.losses import chain_losses, picture_loss
 from sundae_ns.preview import Preview, in_viewer
@@ -118,7 +118,7 @@ class SundaeModel(SplatfactoModel):
         self.step = 0
         self.num_features = 0 if config.head.mode == "off" else config.head.num_features
         self.strategy = make_strategy(config, self.num_train_data)
-        params, self._warm_start_error = initial_field(
+        params, self._start = initial_field(
             config,
             self.seed_points,
             self.kwargs.get("metadata") or {},
@@ -278,7 +278,7 @@ class SundaeModel(SplatfactoModel):
             value.data = value.data.new_zeros(n, *expected[f"gauss_params.{name}"].shape[1:])
         if self.budget is not None:
             self.head = self.budget.prepare_head(state_dict[checkpoint.EXTRA_STATE], self.head)
-        self._warm_start_error = None
+        self._start = Start()
         # Past SplatfactoModel's own loader on purpose: it replaces parameters and resets the step.
         return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
 
@@ -439,8 +439,7 @@ class SundaeModel(SplatfactoModel):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Splatfacto's callbacks, then pruning: after densification has had its say on the same step."""
-        if self._warm_start_error is not None:
-            raise self._warm_start_error
+        self._start.announce()
         backend = self.backend  # an unusable rasteriser should be known before the first step
         CONSOLE.log(f"rasteriser: {backend.name} on {self.device}")
         self.attached = True

@@ -267,6 +267,11 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
     return path
 
 
+def is_unpacked(config: TrainerConfig) -> bool:
+    """Whether a run was written by :func:`write_run`: it has a field to show, and nothing that training goes on from."""
+    return config.timestamp == TIMESTAMP
+
+
 def _refusal(reason: str) -> PackError:
     return PackError(f"the packed scene states {reason}; update this program, or pack it again")
 

@@ -49,7 +49,8 @@ def test_the_report_counts_every_byte(packed: Packed) -> None:
 
 
 def test_ns_eval_finds_the_same_quality(tiny: Any, packed: Packed, call: Any, tmp_path: Path) -> None:
-    call("ns-eval", "--load-config", packed.config, "--output-path", tmp_path / "out.json")
+    said = call("ns-eval", "--load-config", packed.config, "--output-path", tmp_path / "out.json")
+    assert "sparse point cloud" not in said.stdout, "the field is finished, wherever it started"
     after = json.loads((tmp_path / "out.json").read_text())["results"]
     run = load_run(tiny.config)
     assert after["gaussian_count"] == run.model.num_points
