@@ -342,6 +342,7 @@ class SundaeModel(SplatfactoModel):
         """
         return render(params, view, background, self._style, depth=depth, compensate=compensate)
 
+    @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> _Outputs:  # type: ignore[override]
         """Render a camera, or what of it lies in a box; unlike splatfacto's, this leaves the camera on its device."""
         self.set_crop(obb_box)

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from sundae_ns import checkpoint
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.datamanager import SundaeDatamanagerConfig, without_pictures
+from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, without_pictures
 from sundae_ns.errors import CheckpointError, PackError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
@@ -220,6 +220,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
         The run's ``config.yml``, which is written last.
 
     Raises:
+        DataError: the capture is not there, or cannot be used.
         PackError: the scene states what cannot be, or there is a run of that name already.
         StorageError: no room or no right to write.
     """
@@ -249,6 +250,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
         config.data = folder / "cameras"
     else:
         manager.dataparser, manager.camera_res_scale_factor = _capture(scene.meta.get("capture"))
+        check_capture(manager.dataparser, data, ("train", "test"))
         config.data = data.resolve()
     manager.data = config.data
     with writing(f"cannot write to {folder}"):

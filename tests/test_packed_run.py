@@ -150,6 +150,21 @@ def test_a_run_is_never_replaced(tmp_path: Path) -> None:
     assert config.read_bytes() == before
 
 
+@pytest.mark.parametrize("parser", ["colmap", "nerfstudio-data"])
+@pytest.mark.parametrize("kind", ["missing", "empty", "pictures"])
+def test_what_is_no_capture_is_refused_before_anything_is_written(tmp_path: Path, kind: str, parser: str) -> None:
+    capture = tmp_path / "capture"
+    if kind != "missing":
+        capture.mkdir()
+    if kind == "pictures":
+        (capture / "a.jpg").touch()
+    found = scene()
+    found.meta["capture"] = {"parser": parser, "options": {}, "scale": 1.0}
+    with pytest.raises(DataError, match=str(capture)):
+        write_run(found, tmp_path / "runs", "a", data=capture)
+    assert not (tmp_path / "runs").exists()
+
+
 def test_an_interrupted_unpack_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any) -> None:
         raise StorageError("the disk is full")

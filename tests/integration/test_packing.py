@@ -33,7 +33,7 @@ def packed(tiny: Any, call: Any, tmp_path_factory: pytest.TempPathFactory) -> Pa
     folder = tmp_path_factory.mktemp("packed")
     file = folder / "tiny.sundae"
     output = call("sundae", "pack", tiny.folder, "-o", file).stdout
-    call("sundae", "unpack", file, "-o", folder / "runs", "--data", tiny.scene)
+    assert call("sundae", "unpack", file, "-o", folder / "runs", "--data", tiny.scene).stderr == ""
     call("sundae", "unpack", file, "-o", folder / "runs", "--name", "blind")
     config, blind = (folder / "runs" / name / "sundae" / "unpacked" / "config.yml" for name in ("tiny", "blind"))
     return Packed(file, output, config, blind)
@@ -51,6 +51,7 @@ def test_the_report_counts_every_byte(packed: Packed) -> None:
 def test_ns_eval_finds_the_same_quality(tiny: Any, packed: Packed, call: Any, tmp_path: Path) -> None:
     said = call("ns-eval", "--load-config", packed.config, "--output-path", tmp_path / "out.json")
     assert "sparse point cloud" not in said.stdout, "the field is finished, wherever it started"
+    assert "UserWarning" not in said.stderr
     after = json.loads((tmp_path / "out.json").read_text())["results"]
     run = load_run(tiny.config)
     assert after["gaussian_count"] == run.model.num_points
