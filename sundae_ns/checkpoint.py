@@ -22,6 +22,7 @@ from torch import Tensor
 from sundae_ns.errors import CheckpointError, StorageError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, rgb_to_sh
 from sundae_ns.storage.atomic import replacing
+from sundae_ns.storage.kinds import kind_of, refuse
 from sundae_ns.storage.ply import read_ply, sh_degree_of
 from sundae_ns.storage.point_cloud import is_nerfstudio_ply
 
@@ -270,7 +271,8 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         if not checkpoints(folder):
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
         path = newest_whole(folder)[0]
-    if path.suffix == ".ply" and path.is_file():
+    refuse(path, packed="sundae unpack makes a run of it: give that, or its checkpoint")
+    if kind_of(path) == "ply" or (path.suffix == ".ply" and path.is_file()):
         field = read_ply(path)
         _check_field(field, path)
         return field, is_nerfstudio_ply(path)

@@ -23,7 +23,8 @@ from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.packed_run import write_run
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.run_config import load_config
-from sundae_ns.storage.packing import is_packed, read_scene
+from sundae_ns.storage.kinds import kind_of, refuse
+from sundae_ns.storage.packing import read_scene
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,11 @@ def open_scene(path: Path, *, data: Path | None = None) -> Opened:
         DataError: the capture is gone, or cannot be used.
         PackError: the packed scene is damaged, or states what cannot be.
     """
-    if is_packed(path):
+    if kind_of(path) == "packed":
         return open_packed(path, data=data)
+    refuse(
+        path, ply="it comes without test views; give the folder of a finished run, its config.yml, or a packed scene"
+    )
     config = path / "config.yml" if path.is_dir() else path
     if config.name == "config.yml" and config.is_file():
         return open_run(config, data=data)
@@ -193,9 +197,14 @@ def load_run(path: Path) -> Opened:
 
     Raises:
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
-        DataError: its capture is gone, or cannot be used.
+        DataError: its capture is gone, or cannot be used, or it was unpacked without one.
     """
     path = path / "config.yml" if path.is_dir() else path
+    refuse(
+        path,
+        packed="give the folder of a run, which sundae unpack makes of it beside its capture; sundae report takes it as it is",
+        ply="it comes without test views; give the folder of a finished run",
+    )
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist; give the folder of a finished run, or its config.yml")
     model = getattr(getattr(load_config(path), "pipeline", None), "model", None)
