@@ -20,10 +20,10 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, StorageError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, rgb_to_sh
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes, rgb_to_sh
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.kinds import kind_of, refuse
-from sundae_ns.storage.ply import read_ply, sh_degree_of
+from sundae_ns.storage.ply import read_ply
 from sundae_ns.storage.point_cloud import is_nerfstudio_ply
 
 EXTRA_STATE = "_extra_state"
@@ -294,12 +294,5 @@ def _check_field(field: Mapping[str, Tensor], path: Path) -> None:
     n = len(field["means"]) if field["means"].ndim else 0
     if n == 0:
         raise CheckpointError(f"{path} holds no primitives; give another file")
-    rest = field["features_rest"].shape
-    columns = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
-    shapes: dict[str, tuple[int, ...]] = {name: (n, *rows) for name, rows in columns.items()}
-    shapes["features_rest"] = (n, rest[1] if len(rest) > 1 else 0, 3)
-    wrong = [name for name, shape in shapes.items() if tuple(field[name].shape) != shape]
-    if wrong or sh_degree_of(shapes["features_rest"][1]) is None:
-        raise CheckpointError(
-            f"{path} has parameters of odd shapes ({', '.join(wrong) or 'features_rest'}); give another"
-        )
+    for odd in odd_shapes(field):
+        raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")

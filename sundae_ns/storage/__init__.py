@@ -2,7 +2,7 @@
 
 from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module, megabytes
 from sundae_ns.storage.atomic import replacing, write_text
-from sundae_ns.storage.ply import read_ply, sh_degree_of, write_ply
+from sundae_ns.storage.ply import read_ply, write_ply
 from sundae_ns.storage.point_cloud import (
     MODEL_FRAME,
     is_nerfstudio_ply,
@@ -25,7 +25,6 @@ __all__ = [
     "read_ply",
     "read_point_cloud",
     "replacing",
-    "sh_degree_of",
     "similarity",
     "write_ply",
     "write_point_cloud",
