@@ -66,8 +66,7 @@ def nvcc() -> Finding:
     """Whether there is a CUDA compiler that builds gsplat's kernels: torch refuses one of another major version."""
     purpose = "gsplat needs it once, to build its kernels"
     built = torch.version.cuda
-    version = built or "of torch's version"
-    mend = f"NVIDIA's CUDA toolkit {version}, with its bin folder in PATH and CUDA_HOME set to it"
+    mend = "NVIDIA's CUDA toolkit of torch's version, with CUDA_HOME set to it and its bin folder in PATH"
     if built:
         place = f"/usr/local/cuda-{built}"
         mend = (
