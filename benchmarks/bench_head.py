@@ -1,6 +1,6 @@
 """Time the heads alone on CUDA, each as one CUDA graph; append a JSON line for each to results/heads.jsonl.
 
-    python benchmarks/bench_head.py
+    python benchmarks/bench_head.py [--results FILE]
 
 Inference: ``ms_HxW`` is the whole head in fp16 as the model runs it, from splatted fp32 pictures to the compensated one;
 ``ms_layers_HxW`` the network alone, layer by layer, weights and picture in fp16. Training: forward and backward in bf16 with
@@ -9,6 +9,7 @@ fp32 weights, as ``ns-train`` runs it, and layer by layer.
 
 from __future__ import annotations
 
+import argparse
 import json
 from dataclasses import replace
 from functools import partial
@@ -46,6 +47,11 @@ def recorded(net: torch.nn.Module, picture: torch.Tensor) -> torch.cuda.CUDAGrap
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    if not torch.cuda.is_available():
+        parser.error("there is no CUDA device to time the heads on; sundae doctor says more")
     for config in HEADS:
         channels = config.num_features + 4
         line: dict[str, object] = {
@@ -79,7 +85,7 @@ def main() -> None:
                 line[f"ms_{name}_{height}x{width}"] = median_ms(step, device=picture.device).median_ms
             line["parameters"] = sum(p.numel() for p in head.parameters())
         print(json.dumps(line))
-        with open(RESULTS, "a") as file:
+        with open(options.results, "a") as file:
             file.write(json.dumps(line) + "\n")
 
 

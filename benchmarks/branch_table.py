@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 from pathlib import Path
 
 BRANCHES = Path(__file__).parent / "results" / "branches.jsonl"
 
 
 def main() -> None:
-    steps = int(sys.argv[1]) if len(sys.argv) > 1 else 4000
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("steps", type=int, nargs="?", default=4000, help="length of the fine-tunes to show")
+    steps = parser.parse_args().steps
     lines = [json.loads(line) for line in BRANCHES.read_text().splitlines()]
+    if steps not in (known := sorted({line["steps"] for line in lines})):
+        parser.error(f"there are no branches of {steps} steps; give one of {', '.join(map(str, known))}")
     lines = [line for line in lines if line["steps"] == steps]
     scenes = list(dict.fromkeys(line["scene"] for line in lines))
     by_name: dict[str, dict[str, dict[str, float]]] = {}

@@ -7,6 +7,7 @@ Exits with 1 if a case ended in anything but success or a one-line error of the 
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections import Counter
@@ -37,6 +38,7 @@ class Tally:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0]).parse_args()
     tally = Tally()
     with redirect_stdout(sys.stderr):
         code = pytest.main(["-q", "-p", "no:cacheprovider", str(ROOT / "tests" / "fuzz")], plugins=[tally])

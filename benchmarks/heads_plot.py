@@ -1,4 +1,4 @@
-"""What a head gains against its milliseconds and against its bytes: python benchmarks/heads_plot.py.
+"""What a head gains against its milliseconds and against its bytes: python benchmarks/heads_plot.py [-o FIGURE].
 
 Gains are those of ``branches.jsonl`` over the same field without a head (4,000 steps, pruned to 10%), milliseconds those of
 ``heads.jsonl`` (one H100, 824 x 1240, fp16, kernels). The paper prints gains of its three sizes on two other scenes, and no
@@ -7,6 +7,7 @@ times that could be compared: they stand in the plot of bytes alone.
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 from typing import NamedTuple
@@ -49,6 +50,9 @@ def lines(name: str) -> list[dict]:  # type: ignore[type-arg]
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("-o", "--out", type=Path, default=FIGURE)
+    options = parser.parse_args()
     branches = [line for line in lines("branches.jsonl") if line["steps"] == STEPS]
     timed = {
         Head(line["size"], line["num_features"], line["pixel_unshuffle"]): line
@@ -86,8 +90,9 @@ def main() -> None:
     by_time.set_xlim(0.5, 6)
     by_time.set_xticks([0.5, 1, 2, 5])
     by_bytes.set_xticks([1, 2, 5, 10, 20, 50, 100])
-    figure.savefig(FIGURE, dpi=110)
-    print(f"wrote {FIGURE}")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(options.out, dpi=110)
+    print(f"wrote {options.out}")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""Plot quality against bytes and against time of the measured runs: python benchmarks/plot.py."""
+"""Plot quality against bytes and against time of the measured runs: python benchmarks/plot.py [RUNS] [-o FIGURE]."""
 
 from __future__ import annotations
 
+import argparse
 import csv
 from pathlib import Path
 
@@ -22,7 +23,11 @@ def ran_beside_others(variant: str) -> bool:
 
 
 def main() -> None:
-    with open(RUNS, newline="") as file:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("runs", type=Path, nargs="?", default=RUNS)
+    parser.add_argument("-o", "--out", type=Path, default=FIGURE)
+    options = parser.parse_args()
+    with open(options.runs, newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["ms_frame"]]
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, panels = plt.subplots(len(scenes), 2, figsize=(13, 4.2 * len(scenes)), layout="constrained")
@@ -63,9 +68,9 @@ def main() -> None:
             panel.grid(alpha=0.3)
         handles, names = line[0].get_legend_handles_labels()
         line[1].legend(handles, names, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    FIGURE.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(FIGURE, dpi=110)
-    print(f"wrote {FIGURE}")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(options.out, dpi=110)
+    print(f"wrote {options.out}")
 
 
 if __name__ == "__main__":

@@ -20,9 +20,10 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, StorageError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, rgb_to_sh
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes, rgb_to_sh
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.ply import read_ply, sh_degree_of
+from sundae_ns.storage.kinds import kind_of, refuse
+from sundae_ns.storage.ply import read_ply
 from sundae_ns.storage.point_cloud import is_nerfstudio_ply
 
 EXTRA_STATE = "_extra_state"
@@ -270,7 +271,8 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         if not checkpoints(folder):
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
         path = newest_whole(folder)[0]
-    if path.suffix == ".ply" and path.is_file():
+    refuse(path, packed="sundae unpack makes a run of it: give that, or its checkpoint")
+    if kind_of(path) == "ply" or (path.suffix == ".ply" and path.is_file()):
         field = read_ply(path)
         _check_field(field, path)
         return field, is_nerfstudio_ply(path)
@@ -303,12 +305,5 @@ def _check_field(field: Mapping[str, Tensor], path: Path) -> None:
     n = len(field["means"]) if field["means"].ndim else 0
     if n == 0:
         raise CheckpointError(f"{path} holds no primitives; give another file")
-    rest = field["features_rest"].shape
-    columns = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
-    shapes: dict[str, tuple[int, ...]] = {name: (n, *rows) for name, rows in columns.items()}
-    shapes["features_rest"] = (n, rest[1] if len(rest) > 1 else 0, 3)
-    wrong = [name for name, shape in shapes.items() if tuple(field[name].shape) != shape]
-    if wrong or sh_degree_of(shapes["features_rest"][1]) is None:
-        raise CheckpointError(
-            f"{path} has parameters of odd shapes ({', '.join(wrong) or 'features_rest'}); give another"
-        )
+    for odd in odd_shapes(field):
+        raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")

@@ -17,7 +17,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
 
-from sundae_ns.data.capture import check_picture, check_transforms, undecodable
+from sundae_ns.data.capture import check_picture, check_transforms, no_transforms, undecodable
 from sundae_ns.data.colmap import check_colmap
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.storage.point_cloud import read_point_cloud
@@ -27,6 +27,14 @@ DATASET_FRAME = "sundae_dataset_frame"
 
 NO_PICTURES = "sundae_no_pictures"
 """Key of a dataset's metadata and of a batch: there is a camera alone, and grey stands for its picture."""
+
+
+def without_pictures(run: object = "this run") -> DataError:
+    """The error for training or evaluating on grey, which stands for the pictures of a run without its capture."""
+    return DataError(
+        f"{run} was unpacked without its capture: its cameras are there to look through, not to train or evaluate on; give "
+        "the capture to sundae unpack with --data"
+    )
 
 
 class LightNerfstudioParser(Nerfstudio):
@@ -65,6 +73,8 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
         check_colmap(data / parser.colmap_path, images, points=parser.load_3D_points)
     elif isinstance(parser, NerfstudioDataParserConfig):
         path = data if data.suffix == ".json" else data / "transforms.json"
+        if not path.is_file():
+            raise no_transforms(data)
         check_transforms(path, splits=splits, camera_models=CAMERA_MODEL_TO_TYPE)
 
 

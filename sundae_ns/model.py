@@ -28,12 +28,12 @@ from sundae_ns import checkpoint
 from sundae_ns.after_step import finish, prune_if_due, warn_if_too_short
 from sundae_ns.budget import Budget
 from sundae_ns.compensation import PHASES, CompensationHead, HeadConfig, training_window
-from sundae_ns.datamanager import NO_PICTURES, SundaeDatamanager
+from sundae_ns.datamanager import NO_PICTURES, SundaeDatamanager, without_pictures
 from sundae_ns.densification import CappedStrategy, make_strategy
 from sundae_ns.distributed import Arrived, Course, GlobalPruning, Look, Shards, Timetable, slack_of_step
-from sundae_ns.errors import ConfigError, DataError, out_of_memory
+from sundae_ns.errors import ConfigError, out_of_memory
 from sundae_ns.evaluation import LazyOutputs, Lpips, psnr, ssim
-from sundae_ns.initial_field import initial_field
+from sundae_ns.initial_field import Start, initial_field
 from sundae_ns.late_outputs import FieldKey, ShownResponse, empty_outputs, late_outputs
 from sundae_ns.losses import chain_losses, picture_loss
 from sundae_ns.preview import Preview, in_viewer
@@ -119,7 +119,7 @@ class SundaeModel(SplatfactoModel):
         self.step = 0
         self.num_features = 0 if config.head.mode == "off" else config.head.num_features
         self.strategy = make_strategy(config, self.num_train_data)
-        params, self._warm_start_error = initial_field(
+        params, self._start = initial_field(
             config,
             self.seed_points,
             self.kwargs.get("metadata") or {},
@@ -280,7 +280,7 @@ class SundaeModel(SplatfactoModel):
             value.data = value.data.new_zeros(n, *expected[f"gauss_params.{name}"].shape[1:])
         if self.budget is not None:
             self.head = self.budget.prepare_head(state_dict[checkpoint.EXTRA_STATE], self.head)
-        self._warm_start_error = None
+        self._start = Start()
         # Past SplatfactoModel's own loader on purpose: it replaces parameters and resets the step.
         return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
 
@@ -346,6 +346,7 @@ class SundaeModel(SplatfactoModel):
         """
         return render(params, view, background, self._style, depth=depth, compensate=compensate)
 
+    @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> _Outputs:  # type: ignore[override]
         """Render a camera, or what of it lies in a box; unlike splatfacto's, this leaves the camera on its device."""
         self.set_crop(obb_box)
@@ -444,8 +445,7 @@ class SundaeModel(SplatfactoModel):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         """Splatfacto's callbacks, then pruning: after densification has had its say on the same step."""
-        if self._warm_start_error is not None:
-            raise self._warm_start_error
+        self._start.announce()
         backend = self.backend  # an unusable rasteriser should be known before the first step
         CONSOLE.log(f"rasteriser: {backend.name} on {self.device}")
         self.attached = True
@@ -517,10 +517,7 @@ class SundaeModel(SplatfactoModel):
 
     def _target(self, batch: dict[str, Any], outputs: dict[str, Any]) -> Tensor:
         if NO_PICTURES in batch:
-            raise DataError(
-                "this run was unpacked without its capture: its cameras are there to look through, not to train or evaluate "
-                "on; give the capture to sundae unpack with --data"
-            )
+            raise without_pictures()
         truth = cut(self.get_gt_img(batch["image"]), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
 

@@ -17,13 +17,14 @@ from torch import Tensor
 
 from sundae_ns import checkpoint
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig, without_pictures
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.packed_run import write_run
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.run_config import load_config
-from sundae_ns.storage.packing import is_packed, read_scene
+from sundae_ns.storage.kinds import kind_of, refuse
+from sundae_ns.storage.packing import read_scene
 
 
 @dataclass(frozen=True)
@@ -66,8 +67,11 @@ def open_scene(path: Path, *, data: Path | None = None) -> Opened:
         DataError: the capture is gone, or cannot be used.
         PackError: the packed scene is damaged, or states what cannot be.
     """
-    if is_packed(path):
+    if kind_of(path) == "packed":
         return open_packed(path, data=data)
+    refuse(
+        path, ply="it comes without test views; give the folder of a finished run, its config.yml, or a packed scene"
+    )
     config = path / "config.yml" if path.is_dir() else path
     if config.name == "config.yml" and config.is_file():
         return open_run(config, data=data)
@@ -131,13 +135,15 @@ def open_pipeline(
 
     Raises:
         CheckpointError: the run is of another method, or has no whole checkpoint.
-        DataError: its capture is gone, or cannot be used.
+        DataError: its capture is gone, or cannot be used, or it was unpacked without one.
     """
     config = load_config(path)
     pipeline_config = config.pipeline if isinstance(config, TrainerConfig) else None
     model_config = getattr(pipeline_config, "model", None)
     if pipeline_config is None or not isinstance(model_config, SplatfactoModelConfig):
         raise CheckpointError(f"{path} is of a method without Gaussians; give runs of sundae or splatfacto")
+    if not getattr(pipeline_config.datamanager, "pictures", True):
+        raise without_pictures(path.parent)  # and a capture given now would not be read as it was in training
     folder = path.parent / config.relative_model_dir
     newest, _ = checkpoint.newest_whole(folder)
     stock = not isinstance(model_config, SundaeModelConfig)
@@ -187,14 +193,20 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
 
 
 def load_run(path: Path) -> Opened:
-    """Open a finished run of sundae by its ``config.yml``, and no other method's.
+    """Open a finished run of sundae by its folder or ``config.yml``, and no other method's.
 
     Raises:
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
-        DataError: its capture is gone, or cannot be used.
+        DataError: its capture is gone, or cannot be used, or it was unpacked without one.
     """
+    path = path / "config.yml" if path.is_dir() else path
+    refuse(
+        path,
+        packed="give the folder of a run, which sundae unpack makes of it beside its capture; sundae report takes it as it is",
+        ply="it comes without test views; give the folder of a finished run",
+    )
     if not path.is_file():
-        raise CheckpointError(f"{path} does not exist; give the config.yml of a run's folder")
+        raise CheckpointError(f"{path} does not exist; give the folder of a finished run, or its config.yml")
     model = getattr(getattr(load_config(path), "pipeline", None), "model", None)
     if not isinstance(model, SundaeModelConfig):
         raise CheckpointError(f"{path} is a run of another method; give one of sundae")

@@ -29,13 +29,14 @@ from torch import Tensor
 
 from sundae_ns import checkpoint
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.datamanager import SundaeDatamanagerConfig
+from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, without_pictures
 from sundae_ns.errors import CheckpointError, PackError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rendering import degree_in_use
 from sundae_ns.run_config import load_config
 from sundae_ns.storage.atomic import write_text, writing
+from sundae_ns.storage.kinds import refuse
 from sundae_ns.storage.packing import Scene
 
 TIMESTAMP = "unpacked"
@@ -68,6 +69,11 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
         DataError: its capture is gone, or cannot be used.
     """
+    refuse(
+        run,
+        packed="give the run that was packed, or the one that sundae unpack makes of it",
+        ply="give the folder of a run; sundae export turns a .ply into .spz or .sog",
+    )
     path = run / "config.yml" if run.is_dir() else run
     config = _read_config(path)
     source = checkpoint.newest_whole(path.parent / config.relative_model_dir)[0]
@@ -85,6 +91,8 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
     else:
         field.pop(FEATURES, None)
     manager = _manager(config)
+    if data is not None and not manager.pictures:
+        raise without_pictures(path.parent)
     manager.data = data or manager.data
     meta = {
         "source": {"method": config.method_name, "step": int(loaded["step"])},
@@ -177,10 +185,13 @@ def _cameras(manager: SundaeDatamanagerConfig, most: int) -> dict[str, Tensor]:
 
 
 def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
-    """Plain values by which the same capture is read, split and scaled again; None for one of a rare parser."""
+    """Plain values by which the same capture is read, split and scaled again; None for one of a rare parser.
+
+    Neither is there one of a run without its capture, whose cameras are not where those of the capture are.
+    """
     parser = manager.dataparser
     kind = next((name for name, known in _PARSERS.items() if type(parser) is known), None)
-    if kind is None:
+    if kind is None or not manager.pictures:
         return None
     options: dict[str, Any] = {}
     for name, default in _options(_PARSERS[kind]).items():
@@ -215,6 +226,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
         The run's ``config.yml``, which is written last.
 
     Raises:
+        DataError: the capture is not there, or cannot be used.
         PackError: the scene states what cannot be, or there is a run of that name already.
         StorageError: no room or no right to write.
     """
@@ -244,6 +256,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
         config.data = folder / "cameras"
     else:
         manager.dataparser, manager.camera_res_scale_factor = _capture(scene.meta.get("capture"))
+        check_capture(manager.dataparser, data, ("train", "test"))
         config.data = data.resolve()
     manager.data = config.data
     with writing(f"cannot write to {folder}"):
@@ -260,6 +273,11 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
     )
     write_text(path, yaml.dump(config))
     return path
+
+
+def is_unpacked(config: TrainerConfig) -> bool:
+    """Whether a run was written by :func:`write_run`: it has a field to show, and nothing that training goes on from."""
+    return config.timestamp == TIMESTAMP
 
 
 def _refusal(reason: str) -> PackError:

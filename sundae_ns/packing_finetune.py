@@ -19,6 +19,8 @@ from torch import Tensor
 from sundae_ns.errors import CheckpointError, ConfigError, out_of_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.opening import open_pipeline
+from sundae_ns.packed_run import is_unpacked
+from sundae_ns.run_config import load_config
 from sundae_ns.storage.packing import Codecs, PackConfig, Scene, fit_scene
 
 RATES = {
@@ -68,14 +70,19 @@ def finetune(
 
     Raises:
         ConfigError: an option cannot work.
-        CheckpointError: the run still densifies, or cannot be opened.
+        CheckpointError: the run still densifies, was unpacked from a scene, or cannot be opened.
         DataError: its capture is gone, or cannot be used.
         MemoryExhaustedError: the GPU's memory is full.
     """
     if steps < 1:
         raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")
+    path = run / "config.yml" if run.is_dir() else run
+    if is_unpacked(load_config(path)):
+        raise CheckpointError(
+            f"{run} was unpacked from a packed scene and cannot be fine-tuned; fine-tune the run that was packed"
+        )
     scene, codecs = fit_scene(scene, config)
-    opened = open_pipeline(run / "config.yml" if run.is_dir() else run, data=data, test_mode="val")
+    opened = open_pipeline(path, data=data, test_mode="val")
     pipeline, model = opened.pipeline, opened.model
     if model.densifying:
         raise CheckpointError(f"{run} was still growing when it was saved; train it to its end, or pack it as it is")

@@ -105,6 +105,8 @@ def load_config(path: Path) -> Any:
         ) from error
     except Exception as error:  # PyYAML, enumerations and modules that are gone raise of many kinds
         reason = " ".join(str(error).split())[:200] or type(error).__name__
+        if isinstance(error, UnicodeDecodeError):
+            reason = "it is no text"
         raise CheckpointError(
             f"{path} is not a run's config.yml, or of another version ({reason}); give the folder of a run"
         ) from error

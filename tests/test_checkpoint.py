@@ -143,6 +143,8 @@ def test_ply(tmp_path: Path, comments: tuple[str, ...], in_model_frame: bool) ->
     read, in_frame = checkpoint.read_field(tmp_path / "a.ply")
     assert in_frame is in_model_frame
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
+    renamed = (tmp_path / "a.ply").rename(tmp_path / "cloud")
+    assert torch.equal(checkpoint.read_field(renamed)[0]["means"], params["means"])
 
 
 class Burglar:

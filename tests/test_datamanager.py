@@ -175,3 +175,24 @@ def test_no_training_images(own_copy: Path) -> None:
     edit(own_copy, train_filenames=[])
     with pytest.raises(DataError, match="no training images"):
         manager(own_copy)
+
+
+@pytest.mark.parametrize(
+    ("file", "advice"),
+    [
+        ("a.jpg", "has no transforms.json; make a capture of pictures with `ns-process-data images --data"),
+        ("sparse/0/cameras.bin", "it is in COLMAP layout: add `colmap --colmap-path sparse/0` to ns-train"),
+        ("colmap/sparse/0/cameras.txt", "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
+    ],
+)
+def test_a_folder_that_is_no_capture_says_how_to_make_one_of_it(tmp_path: Path, file: str, advice: str) -> None:
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).touch()
+    with pytest.raises(DataError, match=advice):
+        manager(tmp_path)
+
+
+def test_a_file_that_is_no_capture(tmp_path: Path) -> None:
+    (tmp_path / "walk.mp4").touch()
+    with pytest.raises(DataError, match="no capture but a file; ns-process-data video"):
+        manager(tmp_path / "walk.mp4")

@@ -118,6 +118,14 @@ def test_pictures_of_the_run_are_those_of_the_scene(tmp_path: Path) -> None:
     assert (pictures[0] - 1).abs().max() > 0.2
 
 
+def test_a_run_without_its_capture_names_none(tmp_path: Path) -> None:
+    """It is read otherwise than the capture was: what it would state of it put every camera in a wrong place."""
+    blind = write_run(scene(), tmp_path, "x").parent
+    assert scene_of_run(blind).meta["capture"] is None
+    with pytest.raises(DataError, match="unpacked without its capture"):
+        scene_of_run(blind, data=tmp_path)
+
+
 def test_a_scene_without_cameras_is_looked_at_from_outside(tmp_path: Path) -> None:
     pipeline = opened(write_run(Scene(field(), head(), None, meta()), tmp_path, "a"))
     (camera,) = [pipeline.datamanager.train_dataset.cameras[0:1]]
@@ -140,6 +148,21 @@ def test_a_run_is_never_replaced(tmp_path: Path) -> None:
     with pytest.raises(PackError, match="is a run already"):
         write_run(scene(), tmp_path, "a")
     assert config.read_bytes() == before
+
+
+@pytest.mark.parametrize("parser", ["colmap", "nerfstudio-data"])
+@pytest.mark.parametrize("kind", ["missing", "empty", "pictures"])
+def test_what_is_no_capture_is_refused_before_anything_is_written(tmp_path: Path, kind: str, parser: str) -> None:
+    capture = tmp_path / "capture"
+    if kind != "missing":
+        capture.mkdir()
+    if kind == "pictures":
+        (capture / "a.jpg").touch()
+    found = scene()
+    found.meta["capture"] = {"parser": parser, "options": {}, "scale": 1.0}
+    with pytest.raises(DataError, match=str(capture)):
+        write_run(found, tmp_path / "runs", "a", data=capture)
+    assert not (tmp_path / "runs").exists()
 
 
 def test_an_interrupted_unpack_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,6 +23,7 @@ from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, res
 from sundae_ns.run_folder import find_config, read_config, training_cameras
 from sundae_ns.storage import replacing, write_point_cloud, write_text
 from sundae_ns.storage.atomic import writing
+from sundae_ns.storage.kinds import kind_of
 
 RULES = {"high": "high-pass", "low": "low-pass", "combined": "combined"}
 """Captions of the rules, by their names."""
@@ -103,7 +104,7 @@ def response_figures(magnitude: Tensor) -> dict[str, Any]:
 def _views(points: Tensor, source: Path, view: int | None) -> tuple[list[Look], str]:
     """From where to look, and in words: through a training camera if the run and its capture are there."""
     try:
-        config = find_config(source) if source.suffix != ".ply" else None
+        config = find_config(source) if kind_of(source) != "ply" else None
         if config is None:
             raise DataError("the field comes without a run, and so without cameras")
         cameras = training_cameras(read_config(config))

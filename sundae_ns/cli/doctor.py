@@ -6,8 +6,10 @@ import ctypes.util
 import importlib.util
 import os
 import platform
+import re
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
@@ -18,6 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
+LEAST_DRIVERS = {"12": 525, "13": 580}
+"""Oldest drivers on Linux by the CUDA version that torch is built for, from the release notes of NVIDIA's CUDA toolkit."""
 
 
 @dataclass(frozen=True)
@@ -52,17 +56,48 @@ def cuda() -> Finding:
     mend = (
         "apt-get install nvidia-driver (Ubuntu: ubuntu-drivers install), then reboot; nvidia-smi shows whether it works"
     )
+    least = LEAST_DRIVERS.get(torch.version.cuda.partition(".")[0])
+    if least:
+        mend += f", and its version: this torch is built for CUDA {torch.version.cuda}, which needs {least} or newer"
     return Finding("CUDA", False, "no device that torch can use", mend, needed=False)
 
 
 def nvcc() -> Finding:
-    """Whether the CUDA compiler is there, which builds gsplat's kernels once."""
-    home = os.environ.get("CUDA_HOME", "/usr/local/cuda")
-    found = shutil.which("nvcc") or shutil.which("nvcc", path=str(Path(home) / "bin"))
-    if found:
-        return Finding("nvcc", True, found)
-    mend = "apt-get install nvidia-cuda-toolkit, or NVIDIA's toolkit of torch's CUDA version with CUDA_HOME set to it"
-    return Finding("nvcc", False, "not found; gsplat needs it once, to build its kernels", mend, needed=False)
+    """Whether there is a CUDA compiler that builds gsplat's kernels: torch refuses one of another major version."""
+    purpose = "gsplat needs it once, to build its kernels"
+    built = torch.version.cuda
+    mend = "NVIDIA's CUDA toolkit of torch's version, with CUDA_HOME set to it and its bin folder in PATH"
+    if built:
+        place = f"/usr/local/cuda-{built}"
+        mend = (
+            f"apt-get install cuda-toolkit-{built.replace('.', '-')} from NVIDIA's repository (Ubuntu 24.04's own "
+            f"nvidia-cuda-toolkit is 12.0), then export CUDA_HOME={place} PATH={place}/bin:$PATH"
+        )
+    in_path = shutil.which("nvcc")
+    home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
+    # As torch looks for it.
+    found = Path(in_path) if in_path and not home else Path(home or "/usr/local/cuda") / "bin" / "nvcc"
+    if not found.is_file():
+        where = f" in {found.parent}, to which CUDA_HOME points" if home else ""
+        return Finding("nvcc", False, f"not found{where}; {purpose}", mend, needed=False)
+    if not in_path:  # gsplat calls it by its name before it lets torch build
+        detail = f"{found} is not in PATH; {purpose}"
+        return Finding("nvcc", False, detail, f"export PATH={found.parent}:$PATH", needed=False)
+    release = _release_of(found)
+    if built and release.partition(".")[0] != built.partition(".")[0]:
+        detail = f"{found} is of CUDA {release or 'an unknown version'}, this torch is built for {built}; {purpose}"
+        return Finding("nvcc", False, detail, mend, needed=False)
+    return Finding("nvcc", True, f"{found} {release}, for gsplat's kernels")
+
+
+def _release_of(compiler: Path) -> str:
+    """The CUDA version that a compiler says it is of, ``13.0`` for one; empty if it says none."""
+    try:
+        said = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True, timeout=60).stdout
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    found = re.search(r"release (\d+\.\d+)", said)
+    return found[1] if found else ""
 
 
 def kernels_built() -> bool:
@@ -149,16 +184,22 @@ def lpips() -> Finding:
 def system_library(name: str, package: str) -> Finding:
     """Whether a library is there that open3d, and so ns-export, loads."""
     if ctypes.util.find_library(name):
-        return Finding(f"lib{name}", True, "found")
+        return Finding(f"lib{name}", True, "found, for ns-export")
     return Finding(f"lib{name}", False, "not found; ns-export needs it", f"apt-get install {package}", needed=False)
 
 
-def ffmpeg() -> Finding:
-    """Whether ffmpeg is there, without which ns-render does not start, not even for single images."""
-    found = shutil.which("ffmpeg")
+def program(name: str, command: str, purpose: str) -> Finding:
+    """Whether a program is there that commands of nerfstudio call; its package is called as it is.
+
+    Args:
+        name: of the finding.
+        command: to look for in PATH.
+        purpose: the commands that do not start without it.
+    """
+    found = shutil.which(command)
     if found:
-        return Finding("ffmpeg", True, found)
-    return Finding("ffmpeg", False, "not found; ns-render needs it", "apt-get install ffmpeg", needed=False)
+        return Finding(name, True, f"{found}, for {purpose}")
+    return Finding(name, False, f"not found, for {purpose}", f"apt-get install {command}", needed=False)
 
 
 def examine(compile_kernels: bool = False) -> list[Finding]:
@@ -173,7 +214,9 @@ def examine(compile_kernels: bool = False) -> list[Finding]:
         lpips,
         lambda: system_library("usb-1.0", "libusb-1.0-0"),
         lambda: system_library("GL", "libgl1"),
-        ffmpeg,
+        lambda: program("COLMAP", "colmap", "ns-process-data, which makes captures of pictures and videos"),
+        # ns-render asks for it even where it writes images only.
+        lambda: program("ffmpeg", "ffmpeg", "ns-process-data and ns-render"),
     ]
     return versions() + [finding() for finding in findings]
 

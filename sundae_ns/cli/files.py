@@ -26,25 +26,36 @@ def export(
     Antialiased scenes are marked as such. Primitives that are not finite are left out.
 
     Args:
-        scene: folder of a run, its config.yml, or a file of sundae pack.
+        scene: folder of a run, its config.yml, a file of sundae pack, or a 3DGS .ply of any program.
         out: the file; its name says the format: .ply (exact), .spz or .sog (much smaller, rounded). An older one is
             replaced once the new one is whole.
         upright: turn the scene so that viewers show it upright: nerfstudio's z points up, their -y. For showing only; a
             warm start takes the coordinates as they were.
     """
+    from sundae_ns.errors import ConfigError
     from sundae_ns.packed_run import scene_of_run
+    from sundae_ns.storage import is_nerfstudio_ply, ply_comments, read_ply
+    from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.packing import read_scene
-    from sundae_ns.storage.viewers import check_format, write_for_viewers
+    from sundae_ns.storage.viewers import ANTIALIASED, check_format, write_for_viewers
 
     check_format(out)
     check_folder(out)
-    found = read_scene(scene) if scene.suffix == ".sundae" else scene_of_run(scene, max_cameras=0)
-    stated = found.meta.get("model")
-    model = stated if isinstance(stated, dict) else {}
-    antialiased = model.get("rasterize_mode") == "antialiased"
-    written = write_for_viewers(
-        out, found.field, antialiased=antialiased, sigmoid_colors=model.get("sh_degree") == 0, upright=upright
-    )
+    kind = kind_of(scene)
+    if kind == "ply":
+        if out.suffix.lower() == ".ply":
+            raise ConfigError(f"{scene} is a .ply already; give a name that ends in .spz or .sog")
+        if upright and not is_nerfstudio_ply(scene):
+            raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
+        field, antialiased, sigmoid_colors = read_ply(scene), ANTIALIASED in ply_comments(scene), False
+    else:
+        packed = kind == "packed" or scene.suffix == ".sundae"
+        found = read_scene(scene) if packed else scene_of_run(scene, max_cameras=0)
+        stated = found.meta.get("model")
+        model = stated if isinstance(stated, dict) else {}
+        field, antialiased = found.field, model.get("rasterize_mode") == "antialiased"
+        sigmoid_colors = model.get("sh_degree") == 0
+    written = write_for_viewers(out, field, antialiased=antialiased, sigmoid_colors=sigmoid_colors, upright=upright)
     mode = ", antialiased" if antialiased else ""
     print(f"{out}: {written.primitives:,} primitives, degree {written.degree}{mode}, {written.bytes:,} bytes")
     if written.dropped:
@@ -82,6 +93,7 @@ def prune(
     from sundae_ns.errors import ConfigError
     from sundae_ns.pruning import PruningConfig, decide, footprint
     from sundae_ns.storage import read_ply
+    from sundae_ns.storage.kinds import refuse
     from sundae_ns.storage.ply import keep_vertices
 
     if out.suffix.lower() != ".ply":
@@ -89,6 +101,7 @@ def prune(
     check_folder(out)
     config = PruningConfig(keep_ratio=keep, score=score, selection=selection, signal=signal, gamma=gamma, seed=seed)
     config.validate()
+    refuse(source, packed="sundae export makes a .ply of it, which can be pruned")
     field = read_ply(source)
     decision = decide(field, config, lambda: footprint(field))
     keep_vertices(source, out, decision.mask)

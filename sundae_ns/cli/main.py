@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -150,7 +151,10 @@ def bands(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``sundae``; exits with 2 and one line on an error of ours."""
     try:
-        code = app.cli(prog="sundae", description="SUNDAE for nerfstudio.", args=arguments)
+        with warnings.catch_warnings():
+            # nerfstudio's own, at its import: a user of ours can do nothing about them.
+            warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
+            code = app.cli(prog="sundae", description="SUNDAE for nerfstudio.", args=arguments)
     except SundaeError as error:
         print(f"sundae: {error}", file=sys.stderr)
         sys.exit(2)

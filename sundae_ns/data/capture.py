@@ -7,6 +7,7 @@ functions of files; they read text and the headers of pictures, no pixels.
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -91,6 +92,24 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise DataError(f"{path} holds no JSON object; give the transforms.json of a capture")
     return found
+
+
+def no_transforms(data: Path) -> DataError:
+    """The error for a path where a capture's ``transforms.json`` is looked for in vain: what to do with what is there."""
+    if data.is_file():
+        return DataError(f"{data} is no capture but a file; ns-process-data video makes a capture of a video")
+    for model in ("sparse/0", "colmap/sparse/0", "sparse"):
+        if any((data / model / name).is_file() for name in ("cameras.bin", "cameras.txt")):
+            return DataError(
+                f"{data} has no transforms.json; it is in COLMAP layout: add `colmap --colmap-path {model}` to ns-train"
+            )
+    return DataError(f"{data} has no transforms.json; {how_to_make_one(data)}")
+
+
+def how_to_make_one(pictures: Path) -> str:
+    """The command that makes a capture of a folder of pictures."""
+    folder = shlex.quote(str(pictures))
+    return f"make a capture of pictures with `ns-process-data images --data {folder} --output-dir CAPTURE`"
 
 
 def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: Collection[str] = ()) -> None:

@@ -29,6 +29,11 @@ SH_C0 = 0.28209479177387814
 SPLAT_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
 """What every 3DGS field has; the names are those of splatfacto's checkpoints."""
 
+_COLUMNS = {"means": 3, "scales": 3, "quats": 4, "features_dc": 3, "opacities": 1}
+
+MAX_SH_DEGREE = 4
+"""Highest degree of spherical harmonics that a field may have."""
+
 FEATURES = "features"
 """The extra parameter that SUNDAE attaches to each primitive."""
 
@@ -41,6 +46,28 @@ def num_primitives(params: Mapping[str, Tensor]) -> int:
 def sh_degree(features_rest: Tensor) -> int:
     """Degree of spherical harmonics whose bands 1 and up are ``[N, K, 3]``, K = (degree + 1)^2 - 1."""
     return round((features_rest.shape[1] + 1) ** 0.5) - 1
+
+
+def sh_degree_of(coefficients: int) -> int | None:
+    """Degree whose bands 1 and up have ``coefficients`` per channel, (degree + 1)^2 - 1; None if there is none."""
+    return next((d for d in range(MAX_SH_DEGREE + 1) if (d + 1) ** 2 - 1 == coefficients), None)
+
+
+def odd_shapes(params: Mapping[str, Tensor]) -> list[str]:
+    """What is wrong with the shapes of a field that has all of :data:`SPLAT_NAMES`: a clause for each parameter.
+
+    N is as many as there are ``means``; ``features`` are not looked at.
+    """
+    n = params["means"].shape[0] if params["means"].ndim else 0
+    rest = params["features_rest"].shape
+    known = len(rest) > 1 and sh_degree_of(rest[1]) is not None
+    wanted: dict[str, tuple[int | str, ...]] = {name: (n, columns) for name, columns in _COLUMNS.items()}
+    wanted["features_rest"] = (n, rest[1] if known else "(degree + 1)^2 - 1", 3)
+    return [
+        f"{name} has shape {list(params[name].shape)}; it must be [{', '.join(map(str, shape))}]"
+        for name, shape in wanted.items()
+        if tuple(params[name].shape) != shape
+    ]
 
 
 def rgb_to_sh(rgb: Tensor) -> Tensor:

@@ -2,8 +2,14 @@
 
 from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module, megabytes
 from sundae_ns.storage.atomic import replacing, write_text
-from sundae_ns.storage.ply import read_ply, sh_degree_of, write_ply
-from sundae_ns.storage.point_cloud import MODEL_FRAME, is_nerfstudio_ply, read_point_cloud, write_point_cloud
+from sundae_ns.storage.ply import read_ply, write_ply
+from sundae_ns.storage.point_cloud import (
+    MODEL_FRAME,
+    is_nerfstudio_ply,
+    ply_comments,
+    read_point_cloud,
+    write_point_cloud,
+)
 from sundae_ns.storage.sog import write_sog
 from sundae_ns.storage.spz import write_spz
 from sundae_ns.storage.transform import similarity
@@ -15,10 +21,10 @@ __all__ = [
     "bytes_of_module",
     "is_nerfstudio_ply",
     "megabytes",
+    "ply_comments",
     "read_ply",
     "read_point_cloud",
     "replacing",
-    "sh_degree_of",
     "similarity",
     "write_ply",
     "write_point_cloud",

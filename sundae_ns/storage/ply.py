@@ -18,7 +18,7 @@ from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, sh_degree_of
 from sundae_ns.storage.atomic import replacing
 
 _COLUMNS = {
@@ -29,7 +29,6 @@ _COLUMNS = {
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
 _NORMALS = ("nx", "ny", "nz")
-_MAX_SH_DEGREE = 4
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 MAX_HEADER = 1 << 16
@@ -41,11 +40,6 @@ def _rest_columns(count: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(count))
 
 
-def sh_degree_of(coefficients: int) -> int | None:
-    """Degree whose bands 1 and up have ``coefficients`` per channel, (degree + 1)^2 - 1; None if there is none."""
-    return next((d for d in range(_MAX_SH_DEGREE + 1) if (d + 1) ** 2 - 1 == coefficients), None)
-
-
 def check_field(params: Mapping[str, Tensor]) -> None:
     """Raise ``DataError`` unless all parameters of primitives with base colours are there, in their shapes."""
     missing = [name for name in SPLAT_NAMES if name not in params]
@@ -53,13 +47,8 @@ def check_field(params: Mapping[str, Tensor]) -> None:
         raise DataError(
             f"The field has no {', '.join(missing)}; a file of primitives needs all of {', '.join(SPLAT_NAMES)}."
         )
-    n = num_primitives(params)
-    for name, columns in _COLUMNS.items():
-        if params[name].shape != (n, len(columns)):
-            raise DataError(f"{name} has shape {list(params[name].shape)}; it must be [{n}, {len(columns)}].")
-    rest = params["features_rest"].shape
-    if len(rest) != 3 or rest[0] != n or rest[2] != 3 or sh_degree_of(rest[1]) is None:
-        raise DataError(f"features_rest has shape {list(rest)}; it must be [{n}, (degree + 1)^2 - 1, 3].")
+    for odd in odd_shapes(params):
+        raise DataError(f"{odd}.")
 
 
 def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[str] = ()) -> None:
@@ -106,7 +95,7 @@ def _damage(path: Path) -> str | None:
     with path.open("rb") as file:
         header, found, _ = file.read(MAX_HEADER).partition(b"end_header")
     lines = [line.split() for line in header.splitlines()]
-    if not found or lines[0] != [b"ply"]:
+    if not found or lines[:1] != [[b"ply"]]:
         return "it has no header of a .ply"
     text = [b"format", b"ascii", b"1.0"] in lines
     # In ascii, each value takes a digit and a space.

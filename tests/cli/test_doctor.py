@@ -123,17 +123,80 @@ def test_built_kernels_are_found_where_torch_puts_them(tmp_path: Path, monkeypat
     assert doctor.kernels_built()
 
 
-@pytest.mark.parametrize("where", ["path", "home", None])
-def test_nvcc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str | None) -> None:
+def compiler(folder: Path, says: str) -> Path:
+    """A program that says which CUDA it is of, as nvcc does."""
+    folder.mkdir(parents=True, exist_ok=True)
+    made = folder / "nvcc"
+    made.write_text(f"#!/bin/sh\necho '{says}'\n")
+    made.chmod(0o755)
+    return made
+
+
+@pytest.fixture
+def no_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder that is the whole PATH, of a torch that is built for CUDA 13.0."""
     folder = tmp_path / "bin"
     folder.mkdir()
-    monkeypatch.setenv("PATH", str(folder if where == "path" else tmp_path))
-    monkeypatch.setenv("CUDA_HOME", str(tmp_path if where == "home" else tmp_path / "none"))
-    if where:
-        (folder / "nvcc").touch(mode=0o755)
+    monkeypatch.setenv("PATH", str(folder))
+    for name in ("CUDA_HOME", "CUDA_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    return folder
+
+
+@pytest.mark.parametrize("release", ["13.0", "13.1"])
+def test_nvcc_of_the_same_major_version_will_do(no_compiler: Path, release: str) -> None:
+    nvcc = compiler(no_compiler, f"Cuda compilation tools, release {release}, V{release}.88")
+    assert finding("nvcc") == doctor.Finding("nvcc", True, f"{nvcc} {release}, for gsplat's kernels")
+
+
+@pytest.mark.parametrize("said", ["Cuda compilation tools, release 12.0, V12.0.140", "release 3.0", "hello"])
+def test_nvcc_of_another_version_is_refused_by_torch(no_compiler: Path, said: str) -> None:
+    compiler(no_compiler, said)
     found = finding("nvcc")
-    assert found.ok == bool(where)
-    assert bool(found.mend) != found.ok
+    assert not found.ok
+    assert not found.needed
+    assert "this torch is built for 13.0" in found.detail
+    assert found.mend.startswith("apt-get install cuda-toolkit-13-0 ")
+    assert "export CUDA_HOME=/usr/local/cuda-13.0" in found.mend
+
+
+def test_torch_without_cuda_has_no_version_to_compare(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.version, "cuda", None)
+    monkeypatch.setenv("CUDA_HOME", str(no_compiler / "nowhere"))
+    assert "CUDA toolkit of torch's version" in finding("nvcc").mend
+    monkeypatch.setenv("CUDA_HOME", str(no_compiler.parent))
+    compiler(no_compiler, "release 12.0")
+    assert finding("nvcc").ok
+
+
+def test_nvcc_is_looked_for_as_torch_and_gsplat_do(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """gsplat calls what is in PATH, torch what is in CUDA_HOME: both have to be there, and torch's version counts."""
+    home = no_compiler.parent / "cuda"
+    monkeypatch.setenv("CUDA_HOME", str(home))
+    compiler(no_compiler, "release 12.0")
+    assert f"not found in {home / 'bin'}" in finding("nvcc").detail
+    nvcc = compiler(home / "bin", "release 13.0")
+    assert finding("nvcc").detail.startswith(f"{nvcc} 13.0")
+    (no_compiler / "nvcc").unlink()
+    assert finding("nvcc").mend == f"export PATH={home / 'bin'}:$PATH"
+
+
+def test_a_driver_has_to_be_new_enough(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    assert "built for CUDA 13.0, which needs 580 or newer" in finding("CUDA").mend
+    monkeypatch.setattr(torch.version, "cuda", "99.0")
+    assert "needs" not in finding("CUDA").mend
+
+
+def test_programs_of_nerfstudios_commands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert finding("COLMAP").mend == "apt-get install colmap"
+    assert finding("ffmpeg").mend == "apt-get install ffmpeg"
+    for name in ("colmap", "ffmpeg"):
+        (tmp_path / name).touch(mode=0o755)
+    assert finding("COLMAP").detail.startswith(f"{tmp_path / 'colmap'}, for ns-process-data")
+    assert finding("ffmpeg").detail == f"{tmp_path / 'ffmpeg'}, for ns-process-data and ns-render"
 
 
 @pytest.mark.parametrize("at_hand", [True, False])
@@ -186,11 +249,14 @@ def test_a_package_that_is_missing_is_not(no_cuda: None, monkeypatch: pytest.Mon
     assert "no-such-package: pip install no-such-package" in text
 
 
-def test_everything_at_hand_needs_no_advice(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_everything_at_hand_needs_no_advice(cuda: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     _kernels(monkeypatch, None)
     monkeypatch.setattr(evaluation, "lpips_weights_available", lambda: True)
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
-    monkeypatch.setattr(shutil, "which", lambda *_, **__: "/usr/local/cuda/bin/nvcc")
+    monkeypatch.setattr(shutil, "which", lambda name: str(tmp_path / name))
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setenv("CUDA_HOME", str(tmp_path))
+    compiler(tmp_path / "bin", "release 13.0")
     code, text = report(compile_kernels=True)
     assert code == 0
     assert "To mend" not in text

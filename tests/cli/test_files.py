@@ -13,8 +13,9 @@ from torch import Tensor
 from sundae_ns.cli import main
 from sundae_ns.gaussians import SPLAT_NAMES, from_points
 from sundae_ns.gaussians.parameters import SH_C0
-from sundae_ns.storage import is_nerfstudio_ply, read_ply, write_ply
+from sundae_ns.storage import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
 from sundae_ns.storage.packing import Scene, read_scene, write_scene
+from sundae_ns.storage.viewers import write_for_viewers
 
 
 def run(*arguments: object) -> int:
@@ -51,6 +52,32 @@ def test_export_to_other_formats(tmp_path: Path, kind: str, capsys: pytest.Captu
     said = " ".join(capsys.readouterr().out.split())
     assert f"a{kind}: 200 primitives, degree 1, antialiased, {out.stat().st_size:,} bytes" in said
     assert out.read_bytes()[:2] == {".spz": b"\x1f\x8b", ".sog": b"PK"}[kind]
+
+
+@pytest.mark.parametrize("kind", [".spz", ".sog"])
+@pytest.mark.parametrize("comments", [[], ["SplatRenderMode: mip"]])
+def test_export_of_a_ply_of_any_program(
+    tmp_path: Path, kind: str, comments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By whatever name, and like the same field out of a packed scene: a .ply knows the harmonics' first band."""
+    given = field()
+    given["means"][3] = torch.nan
+    write_ply(tmp_path / "stranger.bin", given, comments=comments)
+    out, same = tmp_path / f"a{kind}", tmp_path / f"b{kind}"
+    assert run("export", tmp_path / "stranger.bin", "-o", out) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    mode = ", antialiased" if comments else ""
+    assert f"a{kind}: 199 primitives, degree 1{mode}, {out.stat().st_size:,} bytes 1 were not finite" in said
+    finite = {name: value[torch.arange(200) != 3] for name, value in given.items()}
+    write_for_viewers(same, finite, antialiased=bool(comments))
+    assert out.read_bytes() == same.read_bytes()
+
+
+def test_export_of_a_ply_of_nerfstudio_upright(tmp_path: Path) -> None:
+    write_ply(tmp_path / "in.ply", field(), comments=[MODEL_FRAME])
+    assert run("export", tmp_path / "in.ply", "-o", tmp_path / "a.spz", "--upright") == 0
+    write_for_viewers(tmp_path / "b.spz", field(), upright=True)
+    assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
 
 
 def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
@@ -107,7 +134,21 @@ def test_prune_keeps_rows_as_they_are(tmp_path: Path, options: list[str], capsys
         (["prune", "in.ply", "-o", "no/a.ply"], "no is no folder"),
         (["export", "in.ply", "-o", "a.splat"], "not named .ply or .spz or .sog"),
         (["export", "in.ply", "-o", "no/a.sog"], "no is no folder"),
-        (["export", "in.ply", "-o", "a.ply"], "not a run's config.yml"),
+        (["export", "in.ply", "-o", "a.ply"], "in.ply is a .ply already; give a name that ends in .spz or .sog"),
+        (["export", "in.ply", "-o", "a.sog", "--upright"], "not in nerfstudio's coordinates"),
+        (
+            ["export", "in.bin", "-o", "a.ply"],
+            "in.bin is not a run's config.yml, or of another version (it is no text)",
+        ),
+        (["prune", "in.sundae", "-o", "a.ply"], "in.sundae is a packed scene; sundae export makes a .ply of it"),
+        (["pack", "in.sundae", "-o", "a.sundae"], "in.sundae is a packed scene; give the run that was packed"),
+        (["pack", "in.ply", "-o", "a.sundae"], "in.ply is a .ply file; give the folder of a run"),
+        (["unpack", "in.ply"], "in.ply is no packed scene; give a file that sundae pack wrote"),
+        (["bands", "in.sundae", "-o", "."], "in.sundae is a packed scene; sundae unpack makes a run of it"),
+        (["bench", "graph", "--field", "in.sundae"], "in.sundae is a packed scene; sundae unpack makes a run of it"),
+        (["bench", "frame", "--load-config", "in.sundae"], "in.sundae is a packed scene; give the folder of a run"),
+        (["bench", "frame", "--load-config", "in.ply"], "in.ply is a .ply file; it comes without test views"),
+        (["report", "in.ply", "-o", "."], "in.ply is a .ply file; it comes without test views"),
         (["export", "nothing.sundae", "-o", "a.ply"], "nothing.sundae cannot be read"),
     ],
 )
@@ -120,7 +161,10 @@ def test_refusals_are_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_ply(Path("in.ply"), field())
+    write_scene(Path("in.sundae"), Scene(field()))
+    Path("in.bin").write_bytes(b"\x1f\x8b\xff")
+    before = sorted(tmp_path.iterdir())
     assert run(*arguments) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
     assert says in line
-    assert [path.name for path in tmp_path.iterdir()] == ["in.ply"]
+    assert sorted(tmp_path.iterdir()) == before

@@ -62,6 +62,7 @@ def test_harmed_cloud(harmed: Any, verdict: Any, tmp_path: Path, seed: int, text
 ODD: dict[str, bytes] = {
     "empty": b"",
     "no header": b"\x00" * 100,
+    "nothing before the end of its header": b"end_header\n" + b"\x00" * 100,
     "only a header": HEADER % (b"binary_little_endian", b"100", XYZ),
     "a huge count": HEADER % (b"binary_little_endian", b"99999999999999", XYZ) + b"\x00" * 120,
     "a huge count of lists": HEADER % (b"binary_little_endian", b"9999999999", b"property list int float x\n")

@@ -93,7 +93,7 @@ def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixt
     assert lines[0]["psnr"] != lines[0]["psnr_base"]
     assert lines[1]["psnr"] == lines[1]["psnr_base"]
     with pytest.raises(SystemExit):
-        main(["bench", "frame", *arguments])
+        main(["bench", "frame", *arguments[2:], "--load-config", str(tiny.folder)])
     assert "PSNR off" in capsys.readouterr().out
 
 

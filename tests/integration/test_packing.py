@@ -14,6 +14,7 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 from PIL import Image
 
+from sundae_ns.cli import main
 from sundae_ns.evaluation import psnr
 from sundae_ns.opening import load_run
 
@@ -32,7 +33,7 @@ def packed(tiny: Any, call: Any, tmp_path_factory: pytest.TempPathFactory) -> Pa
     folder = tmp_path_factory.mktemp("packed")
     file = folder / "tiny.sundae"
     output = call("sundae", "pack", tiny.folder, "-o", file).stdout
-    call("sundae", "unpack", file, "-o", folder / "runs", "--data", tiny.scene)
+    assert call("sundae", "unpack", file, "-o", folder / "runs", "--data", tiny.scene).stderr == ""
     call("sundae", "unpack", file, "-o", folder / "runs", "--name", "blind")
     config, blind = (folder / "runs" / name / "sundae" / "unpacked" / "config.yml" for name in ("tiny", "blind"))
     return Packed(file, output, config, blind)
@@ -48,7 +49,9 @@ def test_the_report_counts_every_byte(packed: Packed) -> None:
 
 
 def test_ns_eval_finds_the_same_quality(tiny: Any, packed: Packed, call: Any, tmp_path: Path) -> None:
-    call("ns-eval", "--load-config", packed.config, "--output-path", tmp_path / "out.json")
+    said = call("ns-eval", "--load-config", packed.config, "--output-path", tmp_path / "out.json")
+    assert "sparse point cloud" not in said.stdout, "the field is finished, wherever it started"
+    assert "UserWarning" not in said.stderr
     after = json.loads((tmp_path / "out.json").read_text())["results"]
     run = load_run(tiny.config)
     assert after["gaussian_count"] == run.model.num_points
@@ -67,6 +70,20 @@ def test_ns_render_needs_no_capture(packed: Packed, call: Any, tmp_path: Path) -
     frames = [np.asarray(Image.open(path)) for path in sorted(tmp_path.glob("*.png"))]
     assert len(frames) > 5
     assert all(frame.shape == (48, 48, 3) and frame.std() > 5 for frame in frames)
+
+
+@pytest.mark.parametrize("command", ["report", "bench frame"])
+def test_grey_is_no_truth(
+    tiny: Any, packed: Packed, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    run, out = packed.blind.parent, str(tmp_path / "out")
+    words = ["report", str(run), "-o", out] if command == "report" else ["bench", "frame", "--load-config", str(run)]
+    # Naming a capture makes no run of it: the cameras of the two do not agree.
+    for more in ([], ["--data", str(tiny.scene)] if command == "report" else []):
+        with pytest.raises(SystemExit, match="2"):
+            main([*words, *more])
+        (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("sundae: ")]
+        assert f"{run} was unpacked without its capture" in line
 
 
 def test_the_viewer_shows_a_run_without_its_capture(packed: Packed) -> None:

@@ -173,6 +173,10 @@ def test_runs_that_cannot_be_tuned(tiny: Any, tmp_path: Path) -> None:
         finetune(run, scene, PackConfig(), 3)
     with pytest.raises(ConfigError, match="changes nothing"):
         finetune(run, scene, PackConfig(), 0)
+    for name, data in (("beside its capture", tiny.scene), ("alone", None)):
+        unpacked = write_run(scene, tmp_path, name, data=data).parent
+        with pytest.raises(CheckpointError, match="unpacked from a packed scene and cannot be fine-tuned"):
+            finetune(unpacked, scene, PackConfig(), 3)
 
 
 def test_rates_rise_and_fall_to_nothing() -> None:

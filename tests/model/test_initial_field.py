@@ -27,23 +27,40 @@ N = 60
 
 @pytest.mark.parametrize("seed_points", [None, (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8))])
 def test_without_a_sparse_cloud_points_are_random(
-    build: Build, seed_points: Any, capsys: pytest.CaptureFixture[str]
+    build: Build, training_of: TrainingOf, seed_points: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = build(seed_points=seed_points, num_random=40, random_scale=2.0)
     assert model.num_points == 40
     assert model.means.abs().max() <= 1
+    training_of(model)
     assert "no sparse point cloud" in " ".join(capsys.readouterr().out.split())
 
 
-def test_random_points_on_request_need_no_warning(build: Build, capsys: pytest.CaptureFixture[str]) -> None:
-    model = build(random_init=True, num_random=40)
-    assert model.num_points == 40
+def test_a_finished_run_is_not_warned_of_what_it_did_not_start_from(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nor is training that goes on from a checkpoint: its field takes the place of the points."""
+    model = build(seed_points=None, num_random=40)
+    model.load_state_dict(build().state_dict())
+    training_of(model)
     assert "Warning" not in capsys.readouterr().out
 
 
-def test_a_cloud_above_the_cap_is_cut_before_the_first_step(build: Build, capsys: pytest.CaptureFixture[str]) -> None:
+def test_random_points_on_request_need_no_warning(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = build(random_init=True, num_random=40)
+    assert model.num_points == 40
+    training_of(model)
+    assert "Warning" not in capsys.readouterr().out
+
+
+def test_a_cloud_above_the_cap_is_cut_before_the_first_step(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+) -> None:
     model = build(pruning={"mode": "continuous", "max_primitives": 25})
     assert model.num_points == 25
+    training_of(model)
     assert "starting from 25 of them" in " ".join(capsys.readouterr().out.split())
 
 

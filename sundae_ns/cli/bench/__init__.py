@@ -90,7 +90,7 @@ def frame(
     """Time the frames of a finished run: splat, head and whole, each beside the error of the frames that were timed.
 
     Args:
-        load_config: the run's config.yml.
+        load_config: the run's folder, or its config.yml.
         factors: sizes to show, as factors on the pictures' sides; the truth is resized alike.
         precisions: arithmetic of the head; by default all three on CUDA, and fp32 on a CPU, which knows no other.
         phases: how often the head runs for a frame, over as many places of its grid; by default as the run says.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from sundae_ns.data.capture import how_to_make_one
 from sundae_ns.errors import ConfigError, DataError
 
 Kind = Literal["warm-up", "branch", "mcmc", "stock"]
@@ -130,7 +131,9 @@ def parser_of(data: Path, downscale: int = 1) -> tuple[str, ...]:
         if downscale != 1:
             raise ConfigError("--downscale is for captures in COLMAP layout; transforms.json names its own pictures")
         return ()
-    raise DataError(f"{data} is no capture: it has neither sparse/0 nor transforms.json; give the folder of one")
+    if not data.is_dir():
+        raise DataError(f"{data} is no folder; give the folder of a capture")
+    raise DataError(f"{data} is no capture: it has neither sparse/0 nor transforms.json; {how_to_make_one(data)}")
 
 
 def plan_scene(

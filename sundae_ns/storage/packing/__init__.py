@@ -2,7 +2,7 @@
 
 from sundae_ns.storage.packing.codecs import Codecs
 from sundae_ns.storage.packing.config import FINETUNED, PackConfig
-from sundae_ns.storage.packing.container import VERSION, is_packed, read_header
+from sundae_ns.storage.packing.container import VERSION, read_header
 from sundae_ns.storage.packing.scene import (
     CAMERAS,
     PackReport,
@@ -22,7 +22,6 @@ __all__ = [
     "PackReport",
     "Scene",
     "fit_scene",
-    "is_packed",
     "read_header",
     "read_scene",
     "write_fitted",

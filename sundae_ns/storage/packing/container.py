@@ -189,15 +189,6 @@ def _entry(name: str, array: Array, parts: list[bytes]) -> dict[str, Any]:
     }
 
 
-def is_packed(path: Path) -> bool:
-    """Whether a path leads to a file that begins like a packed scene."""
-    try:
-        with path.open("rb") as file:
-            return file.read(len(MAGIC)) == MAGIC
-    except OSError:
-        return False
-
-
 def read_header(path: Path) -> Header:
     """Read and check the header, without the sections.
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import PackError
-from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives
+from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, odd_shapes, sh_degree_of
 from sundae_ns.storage.packing import codebooks, container, quantize, transform
 from sundae_ns.storage.packing.codebooks import Codebooks
 from sundae_ns.storage.packing.codecs import Codecs, as_matrix, fit, part_crumbs
@@ -27,7 +27,6 @@ from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array
 from sundae_ns.storage.packing.quantize import Blocks, Rotations, Uniform
 from sundae_ns.storage.packing.transform import Transformed
-from sundae_ns.storage.ply import sh_degree_of
 
 CAMERAS = {"poses": ("<f4", (3, 4)), "intrinsics": ("<f8", (4,)), "sizes": ("<u4", (2,))}
 """Arrays of the cameras, ``[M, ...]`` each: camera-to-world with OpenGL axes in the model's coordinates; fx, fy, cx, cy in
@@ -75,21 +74,13 @@ def _check(params: Mapping[str, Tensor]) -> None:
     n = num_primitives(params)
     if n == 0:
         raise PackError("the field has no primitives; there is nothing to pack")
-    shapes: dict[str, tuple[int, ...]] = {
-        "means": (n, 3),
-        "scales": (n, 3),
-        "quats": (n, 4),
-        "features_dc": (n, 3),
-        "opacities": (n, 1),
-    }
-    rest = params["features_rest"].shape
-    wrong = [name for name, shape in shapes.items() if tuple(params[name].shape) != shape]
-    if len(rest) != 3 or rest[0] != n or rest[2] != 3 or sh_degree_of(rest[1]) is None:
-        wrong.append("features_rest")
-    if FEATURES in params and (params[FEATURES].ndim != 2 or not 1 <= params[FEATURES].shape[1] <= _MOST_FEATURES):
-        wrong.append(FEATURES)
-    if wrong:
-        raise PackError(f"{wrong[0]} has shape {list(params[wrong[0]].shape)} in a field of {n} primitives")
+    for odd in odd_shapes(params):
+        raise PackError(odd)
+    features = params.get(FEATURES)
+    if features is not None and not (
+        features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MOST_FEATURES
+    ):
+        raise PackError(f"features has shape {list(features.shape)}; it must be [{n}, 1 to {_MOST_FEATURES}]")
     known = {name: params[name].float() for name in (*SPLAT_NAMES, FEATURES) if name in params}
     broken = n - int(finite_mask(known).sum())
     if broken:

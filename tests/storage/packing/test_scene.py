@@ -155,6 +155,9 @@ def test_what_cannot_be_packed_is_refused(tmp_path: Path) -> None:
         write_scene(path, Scene(field() | {"scales": torch.zeros(600, 2)}))
     with pytest.raises(PackError, match="features_rest has shape"):
         write_scene(path, Scene(field() | {"features_rest": torch.zeros(600, 7, 3)}))
+    for features in (torch.zeros(7, 3), torch.zeros(600), torch.zeros(600, 0)):
+        with pytest.raises(PackError, match=r"features has shape .*; it must be \[600, 1 to 256\]"):
+            write_scene(path, Scene(field() | {"features": features}))
     with pytest.raises(PackError, match="head has weights that are not finite"):
         write_scene(path, Scene(field(), {"a": torch.full((2, 2), torch.nan)}))
     with pytest.raises(PackError, match="too large for fp16"):
