@@ -22,10 +22,10 @@ from sundae_ns.budget.run import Run
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError
-from sundae_ns.gaussians import FEATURES, finite_mask, from_points
+from sundae_ns.gaussians import FEATURES, from_points
 from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.pruning import PruneReport, PruningConfig
-from sundae_ns.pruning.search import Point, Search
+from sundae_ns.pruning.search import NO_PICTURE, Point, Search
 from sundae_ns.storage import accounting, megabytes
 
 if TYPE_CHECKING:
@@ -173,13 +173,18 @@ class Budget:
 
     def _begin(self, run: Run) -> None:
         model, search = run.model, self.search
-        run.keep(finite_mask(run.params))
+        self._dropped(run.drop_nonfinite())
         # Densification has ended, and what it counted would not follow a field that goes back to more primitives.
         model.strategy_state.clear()
         model.strategy_state.update(model.strategy.initialize_state(scene_scale=1.0))
         search.began, search.before = model.schedule_step, model.num_points
         search.views = len(run.datamanager.holdout_indices)
         search.reference = run.measure()
+        if search.reference == NO_PICTURE:
+            raise DataError(
+                "the warm-up field makes pictures that are not numbers: the training has diverged, go back to an earlier "
+                "checkpoint"
+            )
         search.target = search.reference - self.config.tolerated_drop
         CONSOLE.log(
             f"step {model.step}: warm-up field of {model.num_points:,} primitives, PSNR {search.reference:.3f} dB on "
@@ -214,7 +219,7 @@ class Budget:
         head_to_come = search.phase == "field" and heads.may_pay(run, self._largest)
         deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
         left = deadline - step if head_to_come else run.steps_left
-        value = run.measure()
+        value = run.measure() if search.trying else self._measure_finite(run)
         verdict = search.judge(value, step, left, config.patience)
         point = self._look_at(run, value, search.phase, verdict)
         search.curve.append(point)
@@ -235,8 +240,9 @@ class Budget:
         # A network that does not help, or that waits for its turn, is not waited for.
         tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
         over = step >= deadline or left < config.patience * config.search_every
-        if over or search.looks >= tired * config.patience or search.rejected >= MAX_REJECTED:
-            self._end_phase(run)
+        lost = search.head and value == NO_PICTURE  # no training brings its weights back
+        if over or lost or search.looks >= tired * config.patience or search.rejected >= MAX_REJECTED:
+            self._end_phase(run, value)
         else:
             self._cut_or_rest(run, value)
 
@@ -247,10 +253,10 @@ class Budget:
         if count is None:
             return
         self._accepted = run.snapshot(head=search.head)
-        run.cut_to(count, config)
+        self._dropped(run.cut_to(count, config))
         search.cut(value, count, run.model.schedule_step)
 
-    def _end_phase(self, run: Run) -> None:
+    def _end_phase(self, run: Run, value: float) -> None:
         search, step = self.search, run.model.schedule_step
         if search.phase == "field" and heads.may_pay(run, self._largest) and step < self.config.stop:
             self._fallback = run.snapshot(head=search.head)
@@ -261,7 +267,7 @@ class Budget:
         if search.phase == "head":
             assert self._fallback is not None
             without = {name: entry["value"] for name, entry in self._fallback["field"].items() if name != FEATURES}
-            if sizes.bytes_of(run.params, self.head_config) >= sizes.bytes_of(without, None):
+            if value == NO_PICTURE or sizes.bytes_of(run.params, self.head_config) >= sizes.bytes_of(without, None):
                 search.steps_lost += step - search.head_at
                 search.head = False
                 self._restore(run, self._fallback)
@@ -285,7 +291,7 @@ class Budget:
             head = self.head_config if search.head else None
             count = accounting.rows_within(run.params, config.max_bytes, lambda rows: sizes.bytes_of(rows, head))
         if count < model.num_points:
-            run.cut_to(count, config)
+            self._dropped(run.cut_to(count, config))
         search.accepted = model.num_points
         search.curve.append(self._look_at(run, run.measure(), "field", "cut"))
 
@@ -293,8 +299,8 @@ class Budget:
         search, model = self.search, run.model
         search.phase = "done"
         self._accepted = self._fallback = None
-        if run.degree > 0:
-            value = run.measure()
+        value = run.measure() if run.degree > 0 else NO_PICTURE
+        if value > NO_PICTURE:
             least = value - FLAT_SHARE * self.config.tolerated_drop
             if run.steps_left == 0:  # nothing makes up for it any more
                 least = max(least, min(value, search.target))
@@ -308,7 +314,7 @@ class Budget:
             step=model.schedule_step,
             before=search.before,
             after=model.num_points,
-            dropped_nonfinite=0,
+            dropped_nonfinite=search.dropped_nonfinite,
             peak=model.pruning_state["peak"],
             seconds=search.seconds,
             tau=None,
@@ -330,10 +336,10 @@ class Budget:
 
     def _end_trial(self, run: Run) -> None:
         search, tolerated = self.search, self.config.tolerated_drop
-        search.degrees[str(search.degree)] = run.measure()
+        value = search.degrees[str(search.degree)] = self._measure_finite(run)
         top = max(int(name) for name in search.degrees)
         if search.degree == search.lowest_degree(top, tolerated):
-            self._accepted = run.snapshot(head=search.head)
+            self._accepted = run.snapshot(head=search.head) if value > NO_PICTURE else self._fallback
         degree = search.next_degree(top, tolerated)
         if len(search.degrees) > 1:  # this trial, or the one that it has replaced
             search.steps_lost += run.model.schedule_step - search.cut_at
@@ -341,7 +347,7 @@ class Budget:
             self._restore(run, self._fallback)
             self._start_trial(run, degree)
             return
-        if search.degree != search.lowest_degree(top, tolerated):
+        if search.degree != search.lowest_degree(top, tolerated) or value == NO_PICTURE:
             self._restore(run, self._accepted)
         self._fallback = None
         levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
@@ -349,6 +355,21 @@ class Budget:
         self._after_bands(run)
 
     # -------------------------------------------------------------------------------------------------- small things
+
+    def _measure_finite(self, run: Run) -> float:
+        """PSNR on the held-back views, without primitives that are not finite if these are what spoils it."""
+        value = run.measure()
+        dropped = run.drop_nonfinite() if value == NO_PICTURE else 0
+        if not dropped:
+            return value
+        self._dropped(dropped)
+        self.search.accepted = run.model.num_points
+        return run.measure()
+
+    def _dropped(self, count: int) -> None:
+        self.search.dropped_nonfinite += count
+        if count:
+            CONSOLE.print(f"[yellow]Warning: dropped {count} primitives that were not finite")
 
     def _restore(self, run: Run, saved: dict[str, Snapshot] | None) -> None:
         run.restore(saved)

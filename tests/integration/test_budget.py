@@ -20,6 +20,7 @@ from torch import Tensor
 
 from sundae_ns import budget
 from sundae_ns.budget import Budget, bytes_of, driver
+from sundae_ns.budget.run import EXACT
 from sundae_ns.budget.run import Run as Searched
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.data import write_scene
@@ -29,6 +30,7 @@ from sundae_ns.measure import sizes
 from sundae_ns.method_configs import sundae_auto
 from sundae_ns.packed_run import scene_of_run, write_run
 from sundae_ns.packing_finetune import finetune
+from sundae_ns.pruning.search import NO_PICTURE, Search
 from sundae_ns.storage.packing import PackConfig, read_scene, write_fitted
 
 STEPS, SAVE, PRUNE_AT, STOP = 90, 10, 20, 70
@@ -168,6 +170,108 @@ def test_a_run_that_ends_before_its_search_may_be_trained_on(make: Make, monkeyp
     trainer.train()
     found = Run(trainer).found
     assert (found["phase"], found["trying"], found["curve"][-1]["verdict"]) == ("field", True, "missed")
+
+
+def spoil(monkeypatch: pytest.MonkeyPatch, when: Callable[[Searched], bool], values: Callable[[Any], Tensor]) -> None:
+    """Make some numbers of a model NaN after the first step of training at which it is time."""
+    after_step, done = Budget.after_step, []
+
+    def spoiled(self: Budget, model: Any, attributes: Any) -> None:
+        if not done and when(Searched.of(model, attributes)):
+            values(model).data.fill_(torch.nan)
+            done.append(model.step)
+        after_step(self, model, attributes)
+
+    monkeypatch.setattr(Budget, "after_step", spoiled)
+
+
+def about_to_look(run: Searched, phase: str, *, trying: bool) -> bool:
+    found: Budget = run.model.budget  # type: ignore[assignment]
+    return (found.search.phase, found.search.trying) == (phase, trying) and found._look_is_due(run)
+
+
+@pytest.mark.parametrize("trying", [False, True])
+def test_a_head_that_is_no_longer_numbers_is_taken_back(
+    make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch, trying: bool
+) -> None:
+    def when(run: Searched) -> bool:
+        return about_to_look(run, "head", trying=trying)
+
+    spoil(monkeypatch, when, lambda model: next(model.head.parameters()))
+    trainer = make(model_options=small_head)
+    trainer.train()
+    found = Run(trainer).found
+    looks = [(look["verdict"], look["psnr"]) for look in found["curve"]]
+    assert ("rejected" if trying else "resting", NO_PICTURE) in looks
+    assert (found["phase"], found["head"], looks[-1][0]) == ("done", False, "reached")
+    assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
+
+
+def test_primitives_that_are_no_longer_numbers_go_at_the_next_look(
+    make: Make, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def when(run: Searched) -> bool:
+        return about_to_look(run, "field", trying=False)
+
+    spoil(monkeypatch, when, lambda model: model.gauss_params["features_dc"][:3])
+    # Nothing is cut at once: what is looked at next rests.
+    monkeypatch.setattr(Search, "next_count", lambda self, *_: 100 if self.looks > 1 and self.accepted == 197 else None)
+    trainer = make(max_psnr_drop=3.0)
+    trainer.train()
+    found = Run(trainer).found
+    rested = [look["primitives"] for look in found["curve"] if look["verdict"] == "resting"]
+    assert rested[:1] == [197], "and the look is one at the others"
+    assert found["dropped_nonfinite"] == 3
+    assert "dropped 3 primitives that were not finite" in capsys.readouterr().out
+    assert all(look["psnr"] > 5 for look in found["curve"])
+    (report,) = json.loads((trainer.base_dir / "prune.json").read_text())
+    assert (report["dropped_nonfinite"], report["before"], report["after"]) == (3, 200, 100)
+
+
+def test_primitives_that_are_no_longer_numbers_go_before_the_contribution(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut_to, contribution, asked = Searched.cut_to, Searched.contribution, []
+
+    def spoiled(run: Searched, *arguments: Any) -> int:
+        run.params["opacities"].data[:2] = torch.nan
+        return cut_to(run, *arguments)
+
+    def noted(run: Searched, share: float | None = None) -> Tensor:
+        asked.append((run.model.num_points, share))
+        return contribution(run, share)
+
+    monkeypatch.setattr(Searched, "cut_to", spoiled)
+    monkeypatch.setattr(Searched, "contribution", noted)
+    trainer = make(max_psnr_drop=None, max_primitives=37)
+    trainer.train()
+    assert asked[0] == (198, 37 / 198)
+    assert trainer.pipeline.model.num_points == 37
+    assert Run(trainer).found["dropped_nonfinite"] == 2
+
+
+def test_a_warm_up_without_pictures_says_so_and_is_saved(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = make()
+    monkeypatch.setattr(Searched, "measure", lambda _: NO_PICTURE)
+    with pytest.raises(DataError, match="warm-up field .* the training has diverged, go back to an earlier checkpoint"):
+        trainer.train()
+    assert (trainer.checkpoint_dir / f"step-{PRUNE_AT:09d}.ckpt").exists()
+
+
+def test_a_look_is_always_a_number(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = make()
+    model: Any = trainer.pipeline.model
+    run = Searched(model, None, trainer.pipeline.datamanager)  # type: ignore[arg-type]
+    assert 5 < run.measure() < 40
+    views = list(run.datamanager.holdout_views)
+    model.eval()
+    with torch.no_grad():
+        exact = model.get_outputs_for_camera(views[0][0])["rgb"]
+    model.train()
+    monkeypatch.setattr(type(run.datamanager), "holdout_views", [(views[0][0], {"image": exact})])
+    assert run.measure() == EXACT
+    model.gauss_params["features_dc"].data[:] = torch.nan
+    assert run.measure() == NO_PICTURE
 
 
 def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:
