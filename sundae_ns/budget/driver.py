@@ -341,7 +341,7 @@ class Budget:
         if search.degree == search.lowest_degree(top, tolerated):
             self._accepted = run.snapshot(head=search.head) if value > NO_PICTURE else self._fallback
         degree = search.next_degree(top, tolerated)
-        if len(search.degrees) > 1:  # this trial, or the one that it has replaced
+        if len(search.degrees) > 1 or value == NO_PICTURE:  # this trial, or the one that it has replaced
             search.steps_lost += run.model.schedule_step - search.cut_at
         if degree is not None:
             self._restore(run, self._fallback)

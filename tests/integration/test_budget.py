@@ -204,7 +204,45 @@ def test_a_head_that_is_no_longer_numbers_is_taken_back(
     looks = [(look["verdict"], look["psnr"]) for look in found["curve"]]
     assert ("rejected" if trying else "resting", NO_PICTURE) in looks
     assert (found["phase"], found["head"], looks[-1][0]) == ("done", False, "reached")
+    assert [psnr for _, psnr in looks].count(NO_PICTURE) == 1, "it is not waited for"
     assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
+
+
+def test_a_head_that_makes_no_picture_does_not_stay_for_its_bytes(
+    make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def when(run: Searched) -> bool:
+        found: Budget = run.model.budget  # type: ignore[assignment]
+        return found.search.cuts > 0 and about_to_look(run, "head", trying=False)
+
+    spoil(monkeypatch, when, lambda model: next(model.head.parameters()))
+    monkeypatch.setattr(budget.sizes, "head_bytes", lambda _: 0)
+    trainer = make(model_options=small_head, max_psnr_drop=3.0)
+    trainer.train()
+    found = Run(trainer).found
+    assert found["curve"][-2]["psnr"] == NO_PICTURE
+    assert (found["phase"], found["head"], found["curve"][-1]["verdict"]) == ("done", False, "reached")
+
+
+def test_where_no_trial_makes_a_picture_the_warm_up_field_stays(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    restore, gone_back = Searched.restore, []
+
+    def noted(run: Searched, saved: Any) -> None:
+        trained = run.model.means.detach().clone()
+        restore(run, saved)
+        gone_back.append((run.model.schedule_step, torch.equal(run.model.means, trained)))
+
+    def measure(run: Searched) -> float:
+        return 20.0 if run.model.budget.search.phase == "before" else NO_PICTURE  # type: ignore[union-attr]
+
+    monkeypatch.setattr(Searched, "restore", noted)
+    monkeypatch.setattr(Searched, "measure", measure)
+    trainer = make(model_options={"head": HeadConfig(mode="off")})
+    trainer.train()
+    found = Run(trainer).found
+    assert gone_back == [(PRUNE_AT + 12, False)]
+    assert (found["degrees"], found["degree"], found["steps_lost"]) == ({"1": NO_PICTURE}, 1, 12)
+    assert (found["phase"], found["zeroed"], found["primitives"]) == ("done", 0, 200), "nothing to tell flat colours by"
 
 
 def test_primitives_that_are_no_longer_numbers_go_at_the_next_look(
