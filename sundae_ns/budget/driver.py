@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
@@ -22,7 +22,7 @@ from sundae_ns.budget.run import Run
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError
-from sundae_ns.gaussians import FEATURES, from_points
+from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.pruning import PruneReport, PruningConfig
 from sundae_ns.pruning.search import NO_PICTURE, Point, Search
@@ -37,6 +37,17 @@ TRIAL_LOOKS = 3
 """Length, in looks, of the training that is compared with other bands."""
 FLAT_SHARE = 0.25
 """Share of the tolerated drop that flat colours may cost, right when bands go."""
+
+
+class _Clock(NamedTuple):
+    """What time there is in a phase."""
+
+    head_to_come: bool
+    """Whether a head may join after it."""
+    left: int
+    """Steps of training that a cut has to recover in."""
+    over: bool
+    """Whether it is too late for another cut."""
 
 
 class Budget:
@@ -138,7 +149,7 @@ class Budget:
         started = time.perf_counter()
         if search.phase == "before" and step >= config.prune_at:
             self._begin(run)
-        elif search.phase == "bands" and step - search.cut_at >= TRIAL_LOOKS * config.search_every:
+        elif search.phase == "bands" and (self._trained(run) or self._time_is_up(run)):
             self._end_trial(run)
         elif search.phase in ("field", "head") and self._look_is_due(run):
             self._look(run)
@@ -161,7 +172,11 @@ class Budget:
         cost = {"max_psnr_drop": drop, "max_bytes": stored, "max_primitives": count}[option]
         end.verdict = "reached" if cost <= limit else "missed"
         search.curve = [old for old in search.curve if old.phase != "final"] + [end]
-        unfinished = f" The search had not ended: train on to step {config.stop}." if search.searching else ""
+        unfinished = ""
+        if search.searching:
+            # Steps of the schedule run ahead of training's own after a warm start.
+            last = max(config.stop, model.schedule_step + config.search_every) - model.schedule_step + model.step
+            unfinished = f" The search had not ended: train on to step {last}."
         CONSOLE.log(
             f"budget {option} {limit:,}: {end.verdict}. {count:,} of {search.before:,} primitives, "
             f"{megabytes(stored)}, harmonics of degree {run.degree}, "
@@ -192,7 +207,7 @@ class Budget:
         )
         run.restart_rates(head=False)
         search.degree = run.degree
-        if search.degree > 0:
+        if search.degree > 0 and not self._time_is_up(run):
             search.phase = "bands"
             self._fallback = run.snapshot(head=search.head)
             self._start_trial(run, search.degree)
@@ -205,20 +220,36 @@ class Budget:
             self._done(run)
             return
         self.search.begin("field", run.model.num_points)
-        self._cut_or_rest(run, run.measure())
+        value = run.measure()
+        if self._clock(run).over:
+            self._end_phase(run, value)
+        else:
+            self._cut_or_rest(run, value)
 
-    def _look_is_due(self, run: Run) -> bool:
-        search, config, step = self.search, self.config, run.model.schedule_step
-        # A run that ends before the search was meant to may be trained on; else this is the last word on the last cut.
-        time_is_up = search.trying and step >= config.stop and run.steps_left == 0
-        return time_is_up or (step - search.began) % config.search_every == 0
+    def _time_is_up(self, run: Run) -> bool:
+        """Whether this step has the last word; a run that ends before the search was meant to may be trained on."""
+        return run.model.schedule_step >= self.config.stop and run.steps_left == 0
 
-    def _look(self, run: Run) -> None:
-        search, config, step = self.search, self.config, run.model.schedule_step
+    def _clock(self, run: Run) -> _Clock:
+        config, search, step = self.config, self.search, run.model.schedule_step
         # Half of the time is the head's, if it may join.
         head_to_come = search.phase == "field" and heads.may_pay(run, self._largest)
         deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
         left = deadline - step if head_to_come else run.steps_left
+        return _Clock(head_to_come, left, step >= deadline or left < self._least_time)
+
+    @property
+    def _least_time(self) -> int:
+        """Steps that something new needs to be judged."""
+        return self.config.patience * self.config.search_every
+
+    def _look_is_due(self, run: Run) -> bool:
+        regular = (run.model.schedule_step - self.search.began) % self.config.search_every == 0
+        return regular or (self.search.trying and self._time_is_up(run))
+
+    def _look(self, run: Run) -> None:
+        search, config, step = self.search, self.config, run.model.schedule_step
+        head_to_come, left, over = self._clock(run)
         value = run.measure() if search.trying else self._measure_finite(run)
         verdict = search.judge(value, step, left, config.patience)
         point = self._look_at(run, value, search.phase, verdict)
@@ -239,7 +270,6 @@ class Budget:
             value = search.before_cut
         # A network that does not help, or that waits for its turn, is not waited for.
         tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
-        over = step >= deadline or left < config.patience * config.search_every
         lost = search.head and value == NO_PICTURE  # no training brings its weights back
         if over or lost or search.looks >= tired * config.patience or search.rejected >= MAX_REJECTED:
             self._end_phase(run, value)
@@ -250,7 +280,7 @@ class Budget:
         """Cut on as far as the margin allows; nothing where it allows nothing."""
         config, search = self.config, self.search
         count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
-        if count is None:
+        if count is None or run.steps_left == 0:
             return
         self._accepted = run.snapshot(head=search.head)
         self._dropped(run.cut_to(count, config))
@@ -258,17 +288,18 @@ class Budget:
 
     def _end_phase(self, run: Run, value: float) -> None:
         search, step = self.search, run.model.schedule_step
-        if search.phase == "field" and heads.may_pay(run, self._largest) and step < self.config.stop:
+        too_late = step >= self.config.stop or run.steps_left < self._least_time
+        if search.phase == "field" and heads.may_pay(run, self._largest) and not too_late:
             self._fallback = run.snapshot(head=search.head)
             search.begin("head", search.accepted)
-            search.head_at = step
+            search.head_at, search.lost_at_join = step, search.steps_lost
             heads.join(run, search, self._largest, run.model.num_points)
             return
         if search.phase == "head":
             assert self._fallback is not None
-            without = {name: entry["value"] for name, entry in self._fallback["field"].items() if name != FEATURES}
-            if value == NO_PICTURE or sizes.bytes_of(run.params, self.head_config) >= sizes.bytes_of(without, None):
-                search.steps_lost += step - search.head_at
+            without = len(self._fallback["field"]["means"]["value"]) * run.row
+            if value == NO_PICTURE or sizes.bytes_of(run.params, self.head_config) >= without:
+                search.steps_lost = search.lost_at_join + step - search.head_at
                 search.head = False
                 self._restore(run, self._fallback)
         if not search.head and self._largest is not None:
@@ -292,6 +323,7 @@ class Budget:
             count = accounting.rows_within(run.params, config.max_bytes, lambda rows: sizes.bytes_of(rows, head))
         if count < model.num_points:
             self._dropped(run.cut_to(count, config))
+            search.cut_at = model.schedule_step
         search.accepted = model.num_points
         search.curve.append(self._look_at(run, run.measure(), "field", "cut"))
 
@@ -334,8 +366,19 @@ class Budget:
             search.degree = degree
         search.cut_at = run.model.schedule_step
 
+    def _trained(self, run: Run) -> bool:
+        """Whether a trial has had as much training as all others."""
+        return run.model.schedule_step - self.search.cut_at >= TRIAL_LOOKS * self.config.search_every
+
     def _end_trial(self, run: Run) -> None:
         search, tolerated = self.search, self.config.tolerated_drop
+        if not self._trained(run):
+            # The run ends in its midst. All bands have nothing to prove.
+            if search.degrees:
+                search.steps_lost += run.model.schedule_step - search.cut_at
+                self._restore(run, self._accepted)
+            self._leave_trials(run)
+            return
         value = search.degrees[str(search.degree)] = self._measure_finite(run)
         top = max(int(name) for name in search.degrees)
         if search.degree == search.lowest_degree(top, tolerated):
@@ -349,9 +392,14 @@ class Budget:
             return
         if search.degree != search.lowest_degree(top, tolerated) or value == NO_PICTURE:
             self._restore(run, self._accepted)
+        self._leave_trials(run)
+
+    def _leave_trials(self, run: Run) -> None:
+        search = self.search
         self._fallback = None
-        levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
-        CONSOLE.log(f"harmonics of degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
+        if search.degrees:
+            levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
+            CONSOLE.log(f"harmonics of degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
         self._after_bands(run)
 
     # -------------------------------------------------------------------------------------------------- small things

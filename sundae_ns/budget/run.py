@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sundae_ns.budget.sizes import bytes_of
 from sundae_ns.datamanager import SundaeDatamanager
+from sundae_ns.errors import DataError
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.parameters import sh_degree
@@ -66,9 +67,14 @@ class Run(NamedTuple):
         return sh_degree(self.params["features_rest"])
 
     @property
+    def bare(self) -> dict[str, Tensor]:
+        """The field without features."""
+        return {name: value for name, value in self.params.items() if name != FEATURES}
+
+    @property
     def row(self) -> int:
         """Bytes of a primitive without features."""
-        return bytes_of({name: value[:1] for name, value in self.params.items() if name != FEATURES}, None)
+        return bytes_of({name: value[:1] for name, value in self.bare.items()}, None)
 
     @property
     def steps_left(self) -> int:
@@ -112,18 +118,33 @@ class Run(NamedTuple):
     def measure(self) -> float:
         """Mean PSNR over the held-back views, dB, the head included where it takes part; always finite.
 
-        Where a picture is not all numbers it is ``NO_PICTURE``, and of a view it is at most ``EXACT``.
+        Where a picture is not all numbers it is ``NO_PICTURE``, and of a view it is at most ``EXACT``. What a mask leaves
+        out of training does not count.
+
+        Raises:
+            DataError: masks leave nothing.
         """
         model = self.model
         training = model.training
         model.eval()
         background = model._get_background_color()
         values = []
-        for camera, batch in self.datamanager.holdout_views:
+        for camera, batch in self.datamanager.holdout_views():
             pictures, _ = model.render(self.params, model.view_of(camera), background, depth=False)
             target = model.composite_with_background(model.get_gt_img(batch["image"]), background)
-            values.append(psnr(pictures["rgb"], target).clamp_max(EXACT))
+            picture = pictures["rgb"]
+            if "mask" in batch:
+                mask = batch["mask"].to(picture.device).squeeze(-1) > 0
+                if not mask.any():
+                    continue
+                picture, target = picture[mask][None], target[mask][None]
+            values.append(psnr(picture, target).clamp_max(EXACT))
         model.train(training)
+        if not values:
+            raise DataError(
+                "masks leave nothing of the held-back views that judge; mend them, or hold back others with "
+                "--pipeline.datamanager.holdout-every"
+            )
         value = float(torch.stack(values).mean())
         return value if math.isfinite(value) else NO_PICTURE
 

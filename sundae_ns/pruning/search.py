@@ -108,6 +108,8 @@ class Search:
     """Whether the head takes part."""
     head_at: int = 0
     """Step of the schedule at which it joined."""
+    lost_at_join: int = 0
+    """``steps_lost`` at that step."""
     head_size: str = ""
     """Size that was chosen for it; empty before."""
     num_features: int = -1

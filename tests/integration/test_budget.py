@@ -297,19 +297,129 @@ def test_a_warm_up_without_pictures_says_so_and_is_saved(make: Make, monkeypatch
 
 
 def test_a_look_is_always_a_number(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    trainer = make()
-    model: Any = trainer.pipeline.model
-    run = Searched(model, None, trainer.pipeline.datamanager)  # type: ignore[arg-type]
+    run = searched(make())
+    model: Any = run.model
     assert 5 < run.measure() < 40
-    views = list(run.datamanager.holdout_views)
+    views = list(run.datamanager.holdout_views())
     model.eval()
     with torch.no_grad():
         exact = model.get_outputs_for_camera(views[0][0])["rgb"]
     model.train()
-    monkeypatch.setattr(type(run.datamanager), "holdout_views", [(views[0][0], {"image": exact})])
+    monkeypatch.setattr(run.datamanager, "holdout_views", lambda: [(views[0][0], {"image": exact})])
     assert run.measure() == EXACT
     model.gauss_params["features_dc"].data[:] = torch.nan
     assert run.measure() == NO_PICTURE
+
+
+END_OF_BANDS = PRUNE_AT + 2 * 12
+"""Step at which a field of degree 1 has been compared with one of degree 0."""
+
+
+def degree_0_will_do(run: Searched) -> float:
+    return 20.0
+
+
+@pytest.mark.parametrize(
+    ("stop", "steps", "degree", "lost"),
+    [
+        (PRUNE_AT + 1, STEPS, 0, 12),  # the trials go on behind it
+        (END_OF_BANDS, END_OF_BANDS + 1, 0, 12),
+        (END_OF_BANDS + 1, END_OF_BANDS + 2, 0, 12),  # no time to judge another cut
+        (END_OF_BANDS - 4, END_OF_BANDS - 3, 1, 8),  # the run ends in the midst of the second trial
+        (PRUNE_AT + 5, PRUNE_AT + 6, 1, 0),  # of the first
+        (PRUNE_AT, PRUNE_AT + 1, 1, 0),
+    ],
+)
+def test_nothing_is_tried_that_nobody_can_judge(
+    make: Make, monkeypatch: pytest.MonkeyPatch, stop: int, steps: int, degree: int, lost: int
+) -> None:
+    snapshot, kept = Searched.snapshot, []
+
+    def noted(run: Searched, *, head: bool) -> Any:
+        kept.append(run.model.means.detach().clone())
+        return snapshot(run, head=head)
+
+    monkeypatch.setattr(Searched, "snapshot", noted)
+    monkeypatch.setattr(Searched, "measure", degree_0_will_do)
+    trainer = make(model_options={"head": HeadConfig(mode="off")}, stop=stop, max_num_iterations=steps)
+    trainer.train()
+    run = Run(trainer)
+    (final,) = run.found["curve"]
+    assert (final["phase"], final["verdict"], final["primitives"]) == ("final", "reached", 200)
+    assert (run.found["phase"], run.found["degree"], run.found["steps_lost"]) == ("done", degree, lost)
+    assert trainer.pipeline.model.gauss_params["features_rest"].shape[1] == (degree + 1) ** 2 - 1
+    if lost == 8:
+        assert torch.equal(trainer.pipeline.model.means, kept[-1]), "the field of the first trial"
+
+
+def test_a_count_is_kept_by_a_run_that_ends_in_the_midst_of_a_trial(make: Make) -> None:
+    at = END_OF_BANDS - 4
+    trainer = make(max_psnr_drop=None, max_primitives=37, stop=at, max_num_iterations=at + 1)
+    trainer.train()
+    found = Run(trainer).found
+    assert (found["phase"], found["primitives"], found["curve"][-1]["verdict"]) == ("done", 37, "reached")
+
+
+@pytest.mark.parametrize("stop", [STOP, 200])
+def test_no_head_joins_and_nothing_is_cut_where_too_few_steps_are_left(
+    make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch, stop: int
+) -> None:
+    monkeypatch.setattr(Searched, "measure", degree_0_will_do)
+    steps = END_OF_BANDS + (5 if stop == STOP else 1)
+    trainer = make(model_options=small_head, stop=stop, max_num_iterations=steps)
+    trainer.train()
+    found = Run(trainer).found
+    assert (found["primitives"], found["trying"], found["head"]) == (200, False, False)
+    assert found["phase"] == ("done" if stop == STOP else "field"), "the half that comes before the head may go on"
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_a_run_that_ends_in_the_midst_says_how_far_to_train_on(
+    done: Run, make: Make, capsys: pytest.CaptureFixture[str], warm: bool
+) -> None:
+    start = {"warm_start": done.trainer.checkpoint_dir / f"step-{SAVE:09d}.ckpt"} if warm else {}
+    trainer = make(model_options=start, max_num_iterations=PRUNE_AT + 4)
+    trainer.train()
+    assert Run(trainer).found["phase"] == "bands"
+    expected = STOP - PRUNE_AT if warm else STOP
+    assert f"train on to step {expected}." in " ".join(capsys.readouterr().out.split())
+
+
+def searched(trainer: Trainer) -> Searched:
+    return Searched(trainer.pipeline.model, None, trainer.pipeline.datamanager)  # type: ignore[arg-type]
+
+
+def test_what_masks_leave_out_of_training_judges_nothing(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = searched(make())
+    views = list(run.datamanager.holdout_views())
+
+    def measured(mask: Tensor | None, color: int = 0) -> float:
+        shown = []
+        for camera, batch in views:
+            image = batch["image"].clone()
+            if mask is not None:
+                image[~mask] = color
+            shown.append((camera, {"image": image, **({} if mask is None else {"mask": mask[..., None]})}))
+        monkeypatch.setattr(run.datamanager, "holdout_views", lambda: iter(shown))
+        return run.measure()
+
+    left = torch.zeros(24, 24, dtype=torch.bool)
+    left[:, :12] = True
+    assert measured(left) != pytest.approx(measured(~left), abs=0.01)
+    assert measured(left) == measured(left, 255)
+    assert measured(torch.ones_like(left)) == pytest.approx(measured(None), abs=1e-4)
+    with pytest.raises(DataError, match="masks leave nothing of the held-back views"):
+        measured(torch.zeros_like(left))
+
+
+def test_a_view_that_is_masked_whole_is_passed_over(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = searched(make())
+    first, *others = run.datamanager.holdout_views()
+    monkeypatch.setattr(run.datamanager, "holdout_views", lambda: iter(others))
+    expected = run.measure()
+    hidden = (first[0], {**first[1], "mask": torch.zeros(24, 24, 1, dtype=torch.bool)})
+    monkeypatch.setattr(run.datamanager, "holdout_views", lambda: iter([hidden, *others]))
+    assert run.measure() == expected
 
 
 def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:
@@ -320,6 +430,14 @@ def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:
     assert sizes(done.model).total == done.found["curve"][-1]["bytes"]
     columns = (done.found["degree"] + 1) ** 2 - 1
     assert done.model.gauss_params["features_rest"].shape[1] == columns
+
+
+def test_what_is_written_is_json(done: Run) -> None:
+    def refuse(constant: str) -> None:
+        pytest.fail(f"{constant} is no JSON")
+
+    found = json.loads((done.folder / "budget.json").read_text(), parse_constant=refuse)
+    assert found["lowered"] is None
 
 
 def test_it_can_be_packed(done: Run, tmp_path: Path) -> None:
@@ -388,7 +506,9 @@ def test_primitives_are_kept_exactly(make: Make) -> None:
     trainer = make(max_psnr_drop=None, max_primitives=37)
     trainer.train()
     assert trainer.pipeline.model.num_points == 37
-    assert Run(trainer).found["curve"][-1]["primitives"] == 37
+    look, final = Run(trainer).found["curve"]
+    assert (look["verdict"], look["primitives"], final["primitives"]) == ("cut", 37, 37)
+    assert (look["since_cut"], final["since_cut"]) == (0, final["step"] - look["step"])
 
 
 @pytest.fixture
@@ -398,6 +518,21 @@ def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         budget.sizes, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
     )
     return {"head": HeadConfig(size="small", pixel_unshuffle=1, num_features=13)}
+
+
+def test_what_is_lost_with_a_head_is_counted_once(
+    make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Searched, "measure", lambda run: 20.0 if run.model.num_points == 200 else 5.0)
+    trainer = make(model_options=small_head)
+    trainer.train()
+    found = Run(trainer).found
+    *_, last, _ = found["curve"]
+    taken_back = [p["since_cut"] for p in found["curve"] if (p["phase"], p["verdict"]) == ("field", "rejected")]
+    assert [point["verdict"] for point in found["curve"] if point["phase"] == "head"].count("rejected") > 1
+    assert found["head_dropped"]
+    # One of two trials, cuts without the head, and all since it joined.
+    assert found["steps_lost"] == 12 + sum(taken_back) + last["step"] - found["head_at"]
 
 
 def test_a_head_of_the_chosen_size_joins_and_is_loaded_again(
