@@ -369,7 +369,7 @@ def test_no_head_joins_and_nothing_is_cut_where_too_few_steps_are_left(
     trainer = make(model_options=small_head, stop=stop, max_num_iterations=steps)
     trainer.train()
     found = Run(trainer).found
-    assert (found["primitives"], found["trying"], found["head"]) == (200, False, False)
+    assert (found["primitives"], found["trying"], found["head_at"]) == (200, False, 0)
     assert found["phase"] == ("done" if stop == STOP else "field"), "the half that comes before the head may go on"
 
 
