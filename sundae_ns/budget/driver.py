@@ -280,7 +280,7 @@ class Budget:
         """Cut on as far as the margin allows; nothing where it allows nothing."""
         config, search = self.config, self.search
         count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
-        if count is None or run.steps_left == 0:
+        if count is None or run.steps_left < config.search_every:  # no look would judge it
             return
         self._accepted = run.snapshot(head=search.head)
         self._dropped(run.cut_to(count, config))

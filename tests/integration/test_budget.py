@@ -365,7 +365,7 @@ def test_no_head_joins_and_nothing_is_cut_where_too_few_steps_are_left(
     make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch, stop: int
 ) -> None:
     monkeypatch.setattr(Searched, "measure", degree_0_will_do)
-    steps = END_OF_BANDS + (5 if stop == STOP else 1)
+    steps = END_OF_BANDS + (5 if stop == STOP else 4)
     trainer = make(model_options=small_head, stop=stop, max_num_iterations=steps)
     trainer.train()
     found = Run(trainer).found
