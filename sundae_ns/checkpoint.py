@@ -179,13 +179,16 @@ def extra_state(
     }
 
 
-def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], num_features: int) -> None:
+def check_model_state(
+    state: Mapping[str, Any], expected: Mapping[str, Tensor], num_features: int, *, shard: bool = False
+) -> None:
     """Check that a model's state fits the model, before anything is changed.
 
     Args:
         state: state of the checkpoint's model, without the pipeline's prefix.
         expected: ``state_dict`` of the model it is loaded into.
         num_features: feature width of that model; 0 without a head.
+        shard: whether it is a rank's part of one, which may be empty.
 
     Raises:
         CheckpointError: another method's checkpoint, another format, feature width or head.
@@ -219,7 +222,7 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], 
                 "load it with the options that it was trained with"
             )
     rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
-    if len(rows) != 1 or rows[0] == 0:
+    if len(rows) != 1 or (rows[0] == 0 and not shard):
         raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")
     _check_running_state(extra, rows[0])
 

@@ -203,10 +203,10 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         for index in self.train_indices:
             yield self.train_dataset.cameras[index : index + 1]
 
-    @property
-    def holdout_views(self) -> list[tuple[Cameras, dict[str, torch.Tensor]]]:
-        """Held-back views as (camera, batch) pairs, in the form that nerfstudio's evaluation takes."""
-        return [self._view(index) for index in self.holdout_indices]
+    def holdout_views(self) -> Iterator[tuple[Cameras, dict[str, torch.Tensor]]]:
+        """Held-back views as (camera, batch) pairs, in the form that nerfstudio's evaluation takes; one is loaded at a time."""
+        for index in self.holdout_indices:
+            yield self._view(index)
 
     def _view(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         batch = dict(self.cached_train[index])

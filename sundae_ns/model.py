@@ -274,7 +274,7 @@ class SundaeModel(SplatfactoModel):
         expected: Mapping[str, Any] = self.state_dict()
         if self.budget is not None:
             expected = self.budget.shapes(state_dict.get(checkpoint.EXTRA_STATE), expected)
-        checkpoint.check_model_state(state_dict, expected, self.num_features)
+        checkpoint.check_model_state(state_dict, expected, self.num_features, shard=self.shards is not None)
         n = state_dict["gauss_params.means"].shape[0]
         for name, value in self.gauss_params.items():
             value.data = value.data.new_zeros(n, *expected[f"gauss_params.{name}"].shape[1:])

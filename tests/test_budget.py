@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sundae_ns.budget import Budget
-from sundae_ns.compensation import HeadConfig
+from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.pruning.search import Search
@@ -60,6 +60,20 @@ def test_a_state_goes_from_one_search_to_the_next(phase: str) -> None:
     again = budget()
     again.load_state(made.state())
     assert again.state() == made.state()
+
+
+def test_once_it_is_decided_that_a_scene_needs_no_head_there_is_none() -> None:
+    made = budget()
+    assert made.head_config == HeadConfig()
+    made.search.head_size, made.search.num_features = "tiny", 5
+    assert made.head_config == HeadConfig(size="tiny", num_features=5)
+    made.search.head_dropped, made.search.head_size, made.search.num_features = True, "", 0
+    assert made.head_config is None
+    expected = {"gauss_params.features": torch.zeros(2, 13), "head.weight": torch.zeros(3)}
+    extra = {"method": "sundae", "budget": {"numbers": {**made.search.state(), "degree": -1}}}
+    shaped = made.shapes(extra, expected)
+    assert {name: value.shape for name, value in shaped.items()} == {"gauss_params.features": (2, 0)}
+    assert made.prepare_head(extra, CompensationHead(HeadConfig())) is None
 
 
 def test_of_another_methods_checkpoint_nothing_is_known() -> None:

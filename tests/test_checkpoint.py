@@ -70,6 +70,12 @@ def test_another_number_of_primitives_fits() -> None:
     checkpoint.check_model_state(model_state(9), model_state(6), 5)
 
 
+def test_a_part_of_a_field_may_be_empty_and_a_field_may_not() -> None:
+    checkpoint.check_model_state(model_state(0), model_state(6), 5, shard=True)
+    with pytest.raises(CheckpointError, match=r"parameters of \[0\] primitives"):
+        checkpoint.check_model_state(model_state(0), model_state(6), 5)
+
+
 def _without(name: str) -> dict[str, Any]:
     return {key: value for key, value in model_state().items() if key != name}
 

@@ -35,10 +35,10 @@ def shapes(search: Search, largest: HeadConfig | None, expected: Mapping[str, Te
     """
     shaped = dict(expected)
     rest, features = "gauss_params.features_rest", "gauss_params.features"
-    head = None if search.head_dropped else chosen_head(search, largest)
+    head = chosen_head(search, largest)
     if search.degree >= 0:
         shaped[rest] = shaped[rest][:, : (search.degree + 1) ** 2 - 1]
-    if search.head_dropped:
+    if head is None:
         shaped = {name: value for name, value in shaped.items() if not name.startswith("head.")}
     if features in shaped:
         shaped[features] = shaped[features][:, : 0 if head is None else head.num_features]

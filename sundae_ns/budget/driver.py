@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
@@ -22,10 +22,10 @@ from sundae_ns.budget.run import Run
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, ConfigError, DataError
-from sundae_ns.gaussians import FEATURES, finite_mask, from_points
+from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.pruning import PruneReport, PruningConfig
-from sundae_ns.pruning.search import Point, Search
+from sundae_ns.pruning.search import NO_PICTURE, Point, Search
 from sundae_ns.storage import accounting, megabytes
 
 if TYPE_CHECKING:
@@ -37,6 +37,17 @@ TRIAL_LOOKS = 3
 """Length, in looks, of the training that is compared with other bands."""
 FLAT_SHARE = 0.25
 """Share of the tolerated drop that flat colours may cost, right when bands go."""
+
+
+class _Clock(NamedTuple):
+    """What time there is in a phase."""
+
+    head_to_come: bool
+    """Whether a head may join after it."""
+    left: int
+    """Steps of training that a cut has to recover in."""
+    over: bool
+    """Whether it is too late for another cut."""
 
 
 class Budget:
@@ -138,7 +149,7 @@ class Budget:
         started = time.perf_counter()
         if search.phase == "before" and step >= config.prune_at:
             self._begin(run)
-        elif search.phase == "bands" and step - search.cut_at >= TRIAL_LOOKS * config.search_every:
+        elif search.phase == "bands" and (self._trained(run) or self._time_is_up(run)):
             self._end_trial(run)
         elif search.phase in ("field", "head") and self._look_is_due(run):
             self._look(run)
@@ -161,7 +172,11 @@ class Budget:
         cost = {"max_psnr_drop": drop, "max_bytes": stored, "max_primitives": count}[option]
         end.verdict = "reached" if cost <= limit else "missed"
         search.curve = [old for old in search.curve if old.phase != "final"] + [end]
-        unfinished = f" The search had not ended: train on to step {config.stop}." if search.searching else ""
+        unfinished = ""
+        if search.searching:
+            # Steps of the schedule run ahead of training's own after a warm start.
+            last = max(config.stop, model.schedule_step + config.search_every) - model.schedule_step + model.step
+            unfinished = f" The search had not ended: train on to step {last}."
         CONSOLE.log(
             f"budget {option} {limit:,}: {end.verdict}. {count:,} of {search.before:,} primitives, "
             f"{megabytes(stored)}, harmonics of degree {run.degree}, "
@@ -173,13 +188,18 @@ class Budget:
 
     def _begin(self, run: Run) -> None:
         model, search = run.model, self.search
-        run.keep(finite_mask(run.params))
+        self._dropped(run.drop_nonfinite())
         # Densification has ended, and what it counted would not follow a field that goes back to more primitives.
         model.strategy_state.clear()
         model.strategy_state.update(model.strategy.initialize_state(scene_scale=1.0))
         search.began, search.before = model.schedule_step, model.num_points
         search.views = len(run.datamanager.holdout_indices)
         search.reference = run.measure()
+        if search.reference == NO_PICTURE:
+            raise DataError(
+                "the warm-up field makes pictures that are not numbers: the training has diverged, go back to an earlier "
+                "checkpoint"
+            )
         search.target = search.reference - self.config.tolerated_drop
         CONSOLE.log(
             f"step {model.step}: warm-up field of {model.num_points:,} primitives, PSNR {search.reference:.3f} dB on "
@@ -187,7 +207,7 @@ class Budget:
         )
         run.restart_rates(head=False)
         search.degree = run.degree
-        if search.degree > 0:
+        if search.degree > 0 and not self._time_is_up(run):
             search.phase = "bands"
             self._fallback = run.snapshot(head=search.head)
             self._start_trial(run, search.degree)
@@ -200,21 +220,37 @@ class Budget:
             self._done(run)
             return
         self.search.begin("field", run.model.num_points)
-        self._cut_or_rest(run, run.measure())
+        value = run.measure()
+        if self._clock(run).over:
+            self._end_phase(run, value)
+        else:
+            self._cut_or_rest(run, value)
 
-    def _look_is_due(self, run: Run) -> bool:
-        search, config, step = self.search, self.config, run.model.schedule_step
-        # A run that ends before the search was meant to may be trained on; else this is the last word on the last cut.
-        time_is_up = search.trying and step >= config.stop and run.steps_left == 0
-        return time_is_up or (step - search.began) % config.search_every == 0
+    def _time_is_up(self, run: Run) -> bool:
+        """Whether this step has the last word; a run that ends before the search was meant to may be trained on."""
+        return run.model.schedule_step >= self.config.stop and run.steps_left == 0
 
-    def _look(self, run: Run) -> None:
-        search, config, step = self.search, self.config, run.model.schedule_step
+    def _clock(self, run: Run) -> _Clock:
+        config, search, step = self.config, self.search, run.model.schedule_step
         # Half of the time is the head's, if it may join.
         head_to_come = search.phase == "field" and heads.may_pay(run, self._largest)
         deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
         left = deadline - step if head_to_come else run.steps_left
-        value = run.measure()
+        return _Clock(head_to_come, left, step >= deadline or left < self._least_time)
+
+    @property
+    def _least_time(self) -> int:
+        """Steps that something new needs to be judged."""
+        return self.config.patience * self.config.search_every
+
+    def _look_is_due(self, run: Run) -> bool:
+        regular = (run.model.schedule_step - self.search.began) % self.config.search_every == 0
+        return regular or (self.search.trying and self._time_is_up(run))
+
+    def _look(self, run: Run) -> None:
+        search, config, step = self.search, self.config, run.model.schedule_step
+        head_to_come, left, over = self._clock(run)
+        value = run.measure() if search.trying else self._measure_finite(run)
         verdict = search.judge(value, step, left, config.patience)
         point = self._look_at(run, value, search.phase, verdict)
         search.curve.append(point)
@@ -234,9 +270,9 @@ class Budget:
             value = search.before_cut
         # A network that does not help, or that waits for its turn, is not waited for.
         tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
-        over = step >= deadline or left < config.patience * config.search_every
-        if over or search.looks >= tired * config.patience or search.rejected >= MAX_REJECTED:
-            self._end_phase(run)
+        lost = search.head and value == NO_PICTURE  # no training brings its weights back
+        if over or lost or search.looks >= tired * config.patience or search.rejected >= MAX_REJECTED:
+            self._end_phase(run, value)
         else:
             self._cut_or_rest(run, value)
 
@@ -244,25 +280,26 @@ class Budget:
         """Cut on as far as the margin allows; nothing where it allows nothing."""
         config, search = self.config, self.search
         count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
-        if count is None:
+        if count is None or run.steps_left < config.search_every:  # no look would judge it
             return
         self._accepted = run.snapshot(head=search.head)
-        run.cut_to(count, config)
+        self._dropped(run.cut_to(count, config))
         search.cut(value, count, run.model.schedule_step)
 
-    def _end_phase(self, run: Run) -> None:
+    def _end_phase(self, run: Run, value: float) -> None:
         search, step = self.search, run.model.schedule_step
-        if search.phase == "field" and heads.may_pay(run, self._largest) and step < self.config.stop:
+        too_late = step >= self.config.stop or run.steps_left < self._least_time
+        if search.phase == "field" and heads.may_pay(run, self._largest) and not too_late:
             self._fallback = run.snapshot(head=search.head)
             search.begin("head", search.accepted)
-            search.head_at = step
+            search.head_at, search.lost_at_join = step, search.steps_lost
             heads.join(run, search, self._largest, run.model.num_points)
             return
         if search.phase == "head":
             assert self._fallback is not None
-            without = {name: entry["value"] for name, entry in self._fallback["field"].items() if name != FEATURES}
-            if sizes.bytes_of(run.params, self.head_config) >= sizes.bytes_of(without, None):
-                search.steps_lost += step - search.head_at
+            without = len(self._fallback["field"]["means"]["value"]) * run.row
+            if value == NO_PICTURE or sizes.bytes_of(run.params, self.head_config) >= without:
+                search.steps_lost = search.lost_at_join + step - search.head_at
                 search.head = False
                 self._restore(run, self._fallback)
         if not search.head and self._largest is not None:
@@ -285,7 +322,8 @@ class Budget:
             head = self.head_config if search.head else None
             count = accounting.rows_within(run.params, config.max_bytes, lambda rows: sizes.bytes_of(rows, head))
         if count < model.num_points:
-            run.cut_to(count, config)
+            self._dropped(run.cut_to(count, config))
+            search.cut_at = model.schedule_step
         search.accepted = model.num_points
         search.curve.append(self._look_at(run, run.measure(), "field", "cut"))
 
@@ -293,8 +331,8 @@ class Budget:
         search, model = self.search, run.model
         search.phase = "done"
         self._accepted = self._fallback = None
-        if run.degree > 0:
-            value = run.measure()
+        value = run.measure() if run.degree > 0 else NO_PICTURE
+        if value > NO_PICTURE:
             least = value - FLAT_SHARE * self.config.tolerated_drop
             if run.steps_left == 0:  # nothing makes up for it any more
                 least = max(least, min(value, search.target))
@@ -308,7 +346,7 @@ class Budget:
             step=model.schedule_step,
             before=search.before,
             after=model.num_points,
-            dropped_nonfinite=0,
+            dropped_nonfinite=search.dropped_nonfinite,
             peak=model.pruning_state["peak"],
             seconds=search.seconds,
             tau=None,
@@ -328,27 +366,58 @@ class Budget:
             search.degree = degree
         search.cut_at = run.model.schedule_step
 
+    def _trained(self, run: Run) -> bool:
+        """Whether a trial has had as much training as all others."""
+        return run.model.schedule_step - self.search.cut_at >= TRIAL_LOOKS * self.config.search_every
+
     def _end_trial(self, run: Run) -> None:
         search, tolerated = self.search, self.config.tolerated_drop
-        search.degrees[str(search.degree)] = run.measure()
+        if not self._trained(run):
+            # The run ends in its midst. All bands have nothing to prove.
+            if search.degrees:
+                search.steps_lost += run.model.schedule_step - search.cut_at
+                self._restore(run, self._accepted)
+            self._leave_trials(run)
+            return
+        value = search.degrees[str(search.degree)] = self._measure_finite(run)
         top = max(int(name) for name in search.degrees)
         if search.degree == search.lowest_degree(top, tolerated):
-            self._accepted = run.snapshot(head=search.head)
+            self._accepted = run.snapshot(head=search.head) if value > NO_PICTURE else self._fallback
         degree = search.next_degree(top, tolerated)
-        if len(search.degrees) > 1:  # this trial, or the one that it has replaced
+        if len(search.degrees) > 1 or value == NO_PICTURE:  # this trial, or the one that it has replaced
             search.steps_lost += run.model.schedule_step - search.cut_at
         if degree is not None:
             self._restore(run, self._fallback)
             self._start_trial(run, degree)
             return
-        if search.degree != search.lowest_degree(top, tolerated):
+        if search.degree != search.lowest_degree(top, tolerated) or value == NO_PICTURE:
             self._restore(run, self._accepted)
+        self._leave_trials(run)
+
+    def _leave_trials(self, run: Run) -> None:
+        search = self.search
         self._fallback = None
-        levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
-        CONSOLE.log(f"harmonics of degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
+        if search.degrees:
+            levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
+            CONSOLE.log(f"harmonics of degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
         self._after_bands(run)
 
     # -------------------------------------------------------------------------------------------------- small things
+
+    def _measure_finite(self, run: Run) -> float:
+        """PSNR on the held-back views, without primitives that are not finite if these are what spoils it."""
+        value = run.measure()
+        dropped = run.drop_nonfinite() if value == NO_PICTURE else 0
+        if not dropped:
+            return value
+        self._dropped(dropped)
+        self.search.accepted = run.model.num_points
+        return run.measure()
+
+    def _dropped(self, count: int) -> None:
+        self.search.dropped_nonfinite += count
+        if count:
+            CONSOLE.print(f"[yellow]Warning: dropped {count} primitives that were not finite")
 
     def _restore(self, run: Run, saved: dict[str, Snapshot] | None) -> None:
         run.restore(saved)

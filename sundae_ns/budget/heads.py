@@ -44,7 +44,7 @@ def drop(run: Run, search: Search) -> None:
 def prepared(search: Search, largest: HeadConfig | None, head: CompensationHead | None) -> CompensationHead | None:
     """The head of a model as a search has left it, its values still to be loaded; None where it has none."""
     chosen = sizes.chosen_head(search, largest)
-    if head is None or chosen is None or search.head_dropped:
+    if head is None or chosen is None:
         return None
     if head.config != chosen:
         head.resize(chosen)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -13,13 +14,15 @@ from torch import Tensor
 
 from sundae_ns.budget.sizes import bytes_of
 from sundae_ns.datamanager import SundaeDatamanager
+from sundae_ns.errors import DataError
 from sundae_ns.evaluation import psnr
-from sundae_ns.gaussians import FEATURES, keep
+from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.parameters import sh_degree
-from sundae_ns.gaussians.rewriting import rewrite
 from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, restore, restore_module, snapshot
-from sundae_ns.pruning import PruningConfig, decide
+from sundae_ns.pruning import PruningConfig
 from sundae_ns.pruning.bands import mean_basis
+from sundae_ns.pruning.cutting import cut, drop_nonfinite
+from sundae_ns.pruning.search import NO_PICTURE
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.schedulers import notify_pruned
 from sundae_ns.views import View
@@ -28,6 +31,8 @@ if TYPE_CHECKING:
     from sundae_ns.model import SundaeModel
     from sundae_ns.trainer import SundaeTrainer
 
+EXACT = 100.0
+"""PSNR of a picture that is right to the last digit, dB; no camera's 8 bits tell more."""
 MAX_VIEWS = 64
 """Training views, evenly chosen, that each scoring looks at: it is repeated at each cut."""
 
@@ -62,9 +67,14 @@ class Run(NamedTuple):
         return sh_degree(self.params["features_rest"])
 
     @property
+    def bare(self) -> dict[str, Tensor]:
+        """The field without features."""
+        return {name: value for name, value in self.params.items() if name != FEATURES}
+
+    @property
     def row(self) -> int:
         """Bytes of a primitive without features."""
-        return bytes_of({name: value[:1] for name, value in self.params.items() if name != FEATURES}, None)
+        return bytes_of({name: value[:1] for name, value in self.bare.items()}, None)
 
     @property
     def steps_left(self) -> int:
@@ -106,40 +116,62 @@ class Run(NamedTuple):
 
     @torch.no_grad()
     def measure(self) -> float:
-        """Mean PSNR over the held-back views, dB, the head included where it takes part."""
+        """Mean PSNR over the held-back views, dB, the head included where it takes part; always finite.
+
+        Where a picture is not all numbers it is ``NO_PICTURE``, and of a view it is at most ``EXACT``. What a mask leaves
+        out of training does not count.
+
+        Raises:
+            DataError: masks leave nothing.
+        """
         model = self.model
         training = model.training
         model.eval()
         background = model._get_background_color()
         values = []
-        for camera, batch in self.datamanager.holdout_views:
+        for camera, batch in self.datamanager.holdout_views():
             pictures, _ = model.render(self.params, model.view_of(camera), background, depth=False)
             target = model.composite_with_background(model.get_gt_img(batch["image"]), background)
-            values.append(psnr(pictures["rgb"], target))
+            picture = pictures["rgb"]
+            if "mask" in batch:
+                mask = batch["mask"].to(picture.device).squeeze(-1) > 0
+                if not mask.any():
+                    continue
+                picture, target = picture[mask][None], target[mask][None]
+            values.append(psnr(picture, target).clamp_max(EXACT))
         model.train(training)
-        return float(torch.stack([torch.as_tensor(value) for value in values]).mean())
+        if not values:
+            raise DataError(
+                "masks leave nothing of the held-back views that judge; mend them, or hold back others with "
+                "--pipeline.datamanager.holdout-every"
+            )
+        value = float(torch.stack(values).mean())
+        return value if math.isfinite(value) else NO_PICTURE
 
     # ------------------------------------------------------------------------------------------------------- fields
 
-    def keep(self, mask: Tensor) -> None:
-        """Leave the primitives of a mask, bool ``[N]``."""
-        keep(self.params, self.optimizers.optimizers, self.model.pruning_state, mask)
+    def drop_nonfinite(self) -> int:
+        """Remove primitives with a NaN or infinite parameter; how many these were."""
+        return drop_nonfinite(self.params, self.optimizers.optimizers, self.model.pruning_state)
 
-    def cut_to(self, count: int, config: PruningConfig) -> None:
-        """Keep ``count`` primitives, chosen as ``config`` says.
+    def cut_to(self, count: int, config: PruningConfig) -> int:
+        """Keep ``count`` primitives, chosen as ``config`` says, or all that are finite if there are not so many.
+
+        Returns:
+            How many primitives have gone because they were not finite.
 
         Raises:
             DataError: the field cannot be scored.
         """
         step = self.model.schedule_step
         options = replace(config, seed=config.seed + step)
-        ratio = count / self.model.num_points if options.uses_detail else None
-        decision = decide(self.params, options, lambda: self.contribution(ratio), count=count)
-        self.keep(decision.mask)
-        if decision.values is not None:
-            rewrite(self.params, self.optimizers.optimizers, decision.values)
-        self.model.pruning_state["pruned_at"] = step
-        self.model.pruning_state["num_prunes"] += 1
+
+        def contribution() -> Tensor:
+            return self.contribution(count / self.model.num_points if options.uses_detail else None)
+
+        state, optimizers = self.model.pruning_state, self.optimizers.optimizers
+        decision = cut(self.params, optimizers, state, options, contribution, step=step, count=lambda _: count)
+        return decision.dropped_nonfinite
 
     def snapshot(self, *, head: bool) -> dict[str, Snapshot]:
         """Copies of the field, and of the head where it takes part, with what the optimizers know of them."""

@@ -58,6 +58,8 @@ def head_for(stored: int, primitives: int, largest: HeadConfig) -> HeadConfig | 
 
 def chosen_head(search: Search, largest: HeadConfig | None) -> HeadConfig | None:
     """The head that a search has chosen, before that the largest that it may choose; None for none at all."""
-    if largest is None or not search.head_size:
+    if largest is None or search.head_dropped:
+        return None
+    if not search.head_size:
         return largest
     return replace(largest, size=search.head_size, num_features=search.num_features)  # type: ignore[arg-type]

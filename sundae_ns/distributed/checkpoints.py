@@ -9,7 +9,9 @@ from typing import Any
 
 from sundae_ns.distributed.batches import scaled_group
 from sundae_ns.distributed.shards import Shards, bounds
+from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians.surgery import per_primitive
+from sundae_ns.pruning.policy import NEVER
 
 _FIELD = "_model.gauss_params."
 _EXTRA = "_model._extra_state"
@@ -41,11 +43,17 @@ def state_of_rank(loaded: Mapping[str, Any], rank: int, ranks: int, names: Itera
         names: parameters of the field.
 
     Returns:
-        The part; the checkpoint as it is if it is another method's, which loading then says.
+        The part, which is of no primitive where there are fewer than ranks; the checkpoint as it is if it is another
+        method's, which loading then says.
+
+    Raises:
+        CheckpointError: there is no primitive in the whole of it.
     """
     if not isinstance(loaded["pipeline"].get(_EXTRA), Mapping):
         return dict(loaded)
     n = len(loaded["pipeline"][_FIELD + "means"])
+    if n == 0:
+        raise CheckpointError("the checkpoint holds no primitives; give another")
     start, end = bounds(n, ranks)[rank : rank + 2]
 
     def part(value: Any) -> Any:
@@ -65,6 +73,10 @@ def _map_state(
     def after(step: int) -> int:  # the last step of as many pictures; -1, before the first, stays
         return math.floor((step + 1) / factor) - 1
 
+    def after_prune(step: int) -> int:
+        # One in the midst of the first batch stays one: else the field would be pruned again.
+        return step if step == NEVER else max(after(step), 0)
+
     pipeline = {key: change(value) if key.startswith(_FIELD) else value for key, value in state["pipeline"].items()}
     if _EXTRA in pipeline:
         extra = pipeline[_EXTRA]
@@ -72,7 +84,7 @@ def _map_state(
             **extra,
             "step": after(extra["step"]),
             "strategy": {key: change(value) for key, value in extra["strategy"].items()},
-            "pruning": {**extra["pruning"], "pruned_at": after(extra["pruning"]["pruned_at"])},
+            "pruning": {**extra["pruning"], "pruned_at": after_prune(extra["pruning"]["pruned_at"])},
         }
     optimizers, field = {}, set(names)
     for name, held in state["optimizers"].items():
@@ -94,7 +106,7 @@ def _map_state(
         for decay in held["lr_lambdas"]:
             spans = {key: round(decay[key] / factor) for key in ("max_steps", "warmup_steps")}
             pruned_at = decay["pruned_at"]
-            decays.append({**decay, **spans, "pruned_at": None if pruned_at is None else after(pruned_at)})
+            decays.append({**decay, **spans, "pruned_at": None if pruned_at is None else after_prune(pruned_at)})
         schedulers[name] = {**held, **rates, "lr_lambdas": decays, "last_epoch": round(held["last_epoch"] / factor)}
     parts = {"pipeline": pipeline, "optimizers": optimizers, "schedulers": schedulers}
     return {**state, "step": after(state["step"]), **parts}

@@ -1,7 +1,7 @@
 """Which primitives stay: signals, scores, exact selection, and the policies that decide when. Floor 2.
 
-:func:`decide` turns a field and a configuration into a mask and changes nothing; a policy from :func:`make_policy`
-calls it at its steps and applies the mask with :func:`sundae_ns.gaussians.surgery.keep`.
+:func:`decide` turns a field and a configuration into a mask and changes nothing; :func:`sundae_ns.pruning.cutting.cut` asks
+it, and prunes a field in training by what it says: at the steps of a policy from :func:`make_policy`, or of a search.
 """
 
 from sundae_ns.pruning.config import PruningConfig, band_rule, single_prune

@@ -1,8 +1,8 @@
 """When to prune: policies of plain numbers whose running state lives in a dict.
 
-The four verbs are those of gsplat's densification strategies. A policy decides a mask and
-:func:`sundae_ns.gaussians.surgery.keep` applies it. The state holds integers only, so that it can be stored in a
-checkpoint and a resumed run neither prunes twice nor forgets its peak.
+Their verbs, ``initialize_state`` and ``step_post_backward``, are called as those of gsplat's densification strategies. A
+policy says when, :func:`sundae_ns.pruning.cutting.cut` does it. The state holds integers only, so that it can be stored in
+a checkpoint and a resumed run neither prunes twice nor forgets its peak.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -17,13 +18,11 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from sundae_ns.errors import DataError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, num_primitives
+from sundae_ns.gaussians.parameters import num_primitives
 from sundae_ns.gaussians.relocation import grow
-from sundae_ns.gaussians.rewriting import rewrite
-from sundae_ns.gaussians.surgery import check_wiring, keep, keep_state, per_primitive
+from sundae_ns.gaussians.surgery import per_primitive
 from sundae_ns.pruning.config import PruningConfig
-from sundae_ns.pruning.decision import decide
+from sundae_ns.pruning.cutting import cut
 from sundae_ns.pruning.report import PruneReport
 from sundae_ns.pruning.scores import Contribution
 from sundae_ns.pruning.selection import kept_count
@@ -36,7 +35,7 @@ LEAST_OPACITY = 0.005
 
 @dataclass(frozen=True)
 class PruningPolicy:
-    """Base of the policies: the four verbs, the running peak, and the prune itself. Subclasses say when it is due."""
+    """Base of the policies: the running state with its peak, and the report. Subclasses say when a prune is due."""
 
     config: PruningConfig
     """Options; not changed."""
@@ -45,33 +44,9 @@ class PruningPolicy:
         """Whether a field of ``n`` primitives is to be pruned after this step."""
         raise NotImplementedError
 
-    def check_sanity(self, params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> None:
-        """Check options, names of the field, and that the optimizers hold its tensors.
-
-        Raises:
-            ConfigError: an option cannot work.
-            DataError: a parameter is missing, or parameters and optimizers do not fit.
-        """
-        self.config.validate()
-        missing = [name for name in SPLAT_NAMES if name not in params]
-        if missing:
-            raise DataError(f"the field lacks {', '.join(missing)}: it is not a 3DGS field, load another")
-        check_wiring(params, optimizers)
-
     def initialize_state(self) -> dict[str, Any]:
         """Running state: step of the last prune (-1 for none), number of prunes, most primitives so far."""
         return {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
-
-    def step_pre_backward(
-        self,
-        params: Mapping[str, Tensor],
-        optimizers: Mapping[str, Optimizer],
-        state: MutableMapping[str, Any],
-        step: int,
-        info: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Count the primitives before the backward pass, where memory peaks."""
-        state["peak"] = max(state["peak"], num_primitives(params))
 
     @torch.no_grad()
     def step_post_backward(
@@ -110,28 +85,21 @@ class PruningPolicy:
         if not self.due(state, step, before):
             return None
         started = _now(params)
-
-        def apply(mask: Tensor) -> None:
-            keep(params, optimizers, state, mask)
-            if strategy_state is not None:
-                keep_state(strategy_state, mask)
-
-        finite = finite_mask(params)
-        dropped = before - int(finite.sum())
-        if dropped:
-            # Before the decision: the contribution is a render of the field, and one NaN spoils all of its pixels.
-            apply(finite)
-        decision = decide(params, self._config_at(step), contribution, count=self._count(state, before - dropped))
-        apply(decision.mask)
-        if decision.values is not None:
-            rewrite(params, optimizers, decision.values)
-        state["pruned_at"] = step
-        state["num_prunes"] += 1
+        decision = cut(
+            params,
+            optimizers,
+            state,
+            self._config_at(step),
+            contribution,
+            step=step,
+            count=partial(self._count, state),
+            strategy_state=strategy_state,
+        )
         return PruneReport(
             step=step,
             before=before,
             after=decision.kept,
-            dropped_nonfinite=dropped,
+            dropped_nonfinite=decision.dropped_nonfinite,
             peak=state["peak"],
             seconds=_now(params) - started,
             tau=decision.tau,

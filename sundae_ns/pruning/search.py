@@ -33,6 +33,9 @@ DEEPEST, SHALLOWEST = 1.0, 0.15
 TRUST = 0.5
 """Share of a foreseen gain that is counted on once ``patience`` has ended; before that, all of it."""
 
+NO_PICTURE = 0.0
+"""PSNR of a look at pictures that are not all numbers, dB: none whose values are in [0, 1] is worse."""
+
 FORMER = {"last_psnr"}
 """Entries of states that older versions have written, without a use today."""
 REQUIRED = {"phase", "reference", "target", "accepted", "degree", "curve"}
@@ -105,6 +108,8 @@ class Search:
     """Whether the head takes part."""
     head_at: int = 0
     """Step of the schedule at which it joined."""
+    lost_at_join: int = 0
+    """``steps_lost`` at that step."""
     head_size: str = ""
     """Size that was chosen for it; empty before."""
     num_features: int = -1
@@ -121,6 +126,8 @@ class Search:
     """Time that looking, scoring and cutting took, training not counted."""
     views: int = 0
     """Held-back views."""
+    dropped_nonfinite: int = 0
+    """Primitives that went because a parameter of theirs was NaN or infinite."""
     zeroed: int = 0
     """Primitives whose bands above 0 were found to carry nothing, and were set to 0."""
     degrees: dict[str, float] = field(default_factory=dict)
@@ -164,13 +171,18 @@ class Search:
             return top
         best, worst = self.lowest_degree(top, tolerated), -1
         for name, value in self.degrees.items():
-            if value < self.degrees[str(top)] - tolerated:
+            if value < self._of_all_bands(top) - tolerated:
                 worst = max(worst, int(name))
         return None if best - worst <= 1 else (best + worst) // 2
 
     def lowest_degree(self, top: int, tolerated: float) -> int:
         """The lowest degree among those tried that loses no more than is tolerated."""
-        return min(int(name) for name, value in self.degrees.items() if value >= self.degrees[str(top)] - tolerated)
+        enough = self._of_all_bands(top) - tolerated
+        return min((int(name) for name, value in self.degrees.items() if value >= enough), default=top)
+
+    def _of_all_bands(self, top: int) -> float:
+        value = self.degrees[str(top)]
+        return value if value > NO_PICTURE else self.reference
 
     def next_count(self, psnr: float, least: int, patience: int) -> int | None:
         """Primitives after the next cut; None if the margin is too small for one, or there is nothing left to cut.
@@ -230,13 +242,14 @@ class Search:
             self._rest(psnr, patience)
             return "resting"
         self.trail.append([step - self.cut_at, psnr])
-        margin = psnr - self.aim
-        if margin < 0 and left > 0 and self._may_recover(left, patience):
+        margin, seen = psnr - self.aim, psnr > NO_PICTURE
+        if margin < 0 and left > 0 and seen and self._may_recover(left, patience):
             return "waiting"
         self.trying, self.looks, self.best, self.stuck = False, 0, math.nan, 0
         recovered = margin if margin >= 0 else self.foreseen(max(left, 0), TRUST) - self.aim
-        # Training gains meanwhile, and a lucky cut does not make the next one cheap.
-        self.slope = max((self.margin - recovered) / math.log2(self.accepted / self.tried), self.slope / 2)
+        if seen:
+            # Training gains meanwhile, and a lucky cut does not make the next one cheap.
+            self.slope = max((self.margin - recovered) / math.log2(self.accepted / self.tried), self.slope / 2)
         if margin >= 0:
             self.accepted, self.cuts = self.tried, self.cuts + 1
             if self.accepted <= self.failed:
@@ -259,7 +272,7 @@ class Search:
             self.best, self.stuck = psnr, 0
         # A head that has not proven itself yet goes again, and the field that it joined is at its target.
         proven = self.phase == "field" or self.cuts > 0
-        if psnr < self.aim and self.stuck >= patience and proven:
+        if NO_PICTURE < psnr < self.aim and self.stuck >= patience and proven:
             # Less by half of what may be lost: the field would have gone on losing.
             self.lowered = psnr - 0.5 * self.tolerated
 

@@ -18,7 +18,7 @@ from torch.nn import Parameter
 
 from sundae_ns.distributed import bounds, checkpoints, moves, pruning
 from sundae_ns.distributed.shards import per_primitive
-from sundae_ns.errors import ConfigError
+from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.pruning import PruningConfig, make_policy
 
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "features")
@@ -151,6 +151,27 @@ def test_a_step_within_a_batch_becomes_the_last_whole_batch() -> None:
         whole = a_checkpoint(step=step)
         part = checkpoints.state_of_rank(whole, 0, RANKS, NAMES)
         assert (part["step"], part["pipeline"]["_model._extra_state"]["step"]) == (after, after)
+
+
+@pytest.mark.parametrize(
+    ("ranks", "pruned_at"), [(2, 0), (4, 0), (4, 1), (8, 0), (8, 1), (8, 5), (2, 7), (3, -1), (1, 0)]
+)
+def test_a_prune_in_the_midst_of_the_first_batch_is_not_done_again(ranks: int, pruned_at: int) -> None:
+    whole = a_checkpoint()
+    whole["pipeline"]["_model._extra_state"]["pruning"] = {"pruned_at": pruned_at, "num_prunes": int(pruned_at >= 0)}
+    whole["schedulers"]["means"]["lr_lambdas"][1]["pruned_at"] = max(pruned_at, 0)
+    part = checkpoints.state_of_rank(whole, 0, ranks, NAMES)
+    state = part["pipeline"]["_model._extra_state"]["pruning"]
+    assert make_policy(PruningConfig(prune_at=0)).due(state, 30, 10) == (pruned_at < 0)
+    assert part["schedulers"]["means"]["lr_lambdas"][1]["pruned_at"] >= 0
+    assert state["pruned_at"] <= pruned_at
+
+
+def test_a_rank_may_have_no_primitive_of_a_checkpoint_that_has_some() -> None:
+    parts = [checkpoints.state_of_rank(a_checkpoint(n=1), rank, 2, NAMES) for rank in range(2)]
+    assert [len(part["pipeline"]["_model.gauss_params.means"]) for part in parts] == [0, 1]
+    with pytest.raises(CheckpointError, match="the checkpoint holds no primitives; give another"):
+        checkpoints.state_of_rank(a_checkpoint(n=0), 0, 2, NAMES)
 
 
 def test_only_values_of_every_primitive_are_rows() -> None:

@@ -128,13 +128,27 @@ def check_frozen(shards: Shards, folder: Path) -> None:
     train(frozen(folder, "two"), shards.rank, RANKS)
 
 
+def check_few(shards: Shards, folder: Path) -> None:
+    """A field of one primitive trains, is saved and resumed, though one rank has nothing."""
+    config = frozen(folder, "few")
+    model: Any = config.pipeline.model
+    model.pruning.keep_ratio = 1e-6
+    train(config, shards.rank, RANKS)
+    config = frozen(folder, "few again")
+    config.load_checkpoint = models(folder, "few") / f"step-{RANKS - 1:09d}.ckpt"
+    config.max_num_iterations = 2 * RANKS
+    trainer = train(config, shards.rank, RANKS)
+    assert trainer.step == 2
+    assert trainer.pipeline.model.shards.counts == [0, 1]
+
+
 def models(folder: Path, name: str) -> Path:
     return folder / name / "sundae-tiny" / "now" / "nerfstudio_models"
 
 
 def checks(folder: Path) -> dict[str, Callable[[Shards], None]]:
     """What each rank goes through, in this order."""
-    return {check.__name__: partial(check, folder=folder) for check in (check_training, check_frozen)}
+    return {check.__name__: partial(check, folder=folder) for check in (check_training, check_frozen, check_few)}
 
 
 @dataclass

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from sundae_ns import budget
 from sundae_ns.budget import Budget, bytes_of, driver
+from sundae_ns.budget.run import EXACT
 from sundae_ns.budget.run import Run as Searched
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.data import write_scene
@@ -29,6 +30,7 @@ from sundae_ns.measure import sizes
 from sundae_ns.method_configs import sundae_auto
 from sundae_ns.packed_run import scene_of_run, write_run
 from sundae_ns.packing_finetune import finetune
+from sundae_ns.pruning.search import NO_PICTURE, Search
 from sundae_ns.storage.packing import PackConfig, read_scene, write_fitted
 
 STEPS, SAVE, PRUNE_AT, STOP = 90, 10, 20, 70
@@ -170,6 +172,256 @@ def test_a_run_that_ends_before_its_search_may_be_trained_on(make: Make, monkeyp
     assert (found["phase"], found["trying"], found["curve"][-1]["verdict"]) == ("field", True, "missed")
 
 
+def spoil(monkeypatch: pytest.MonkeyPatch, when: Callable[[Searched], bool], values: Callable[[Any], Tensor]) -> None:
+    """Make some numbers of a model NaN after the first step of training at which it is time."""
+    after_step, done = Budget.after_step, []
+
+    def spoiled(self: Budget, model: Any, attributes: Any) -> None:
+        if not done and when(Searched.of(model, attributes)):
+            values(model).data.fill_(torch.nan)
+            done.append(model.step)
+        after_step(self, model, attributes)
+
+    monkeypatch.setattr(Budget, "after_step", spoiled)
+
+
+def about_to_look(run: Searched, phase: str, *, trying: bool) -> bool:
+    found: Budget = run.model.budget  # type: ignore[assignment]
+    return (found.search.phase, found.search.trying) == (phase, trying) and found._look_is_due(run)
+
+
+@pytest.mark.parametrize("trying", [False, True])
+def test_a_head_that_is_no_longer_numbers_is_taken_back(
+    make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch, trying: bool
+) -> None:
+    def when(run: Searched) -> bool:
+        return about_to_look(run, "head", trying=trying)
+
+    spoil(monkeypatch, when, lambda model: next(model.head.parameters()))
+    trainer = make(model_options=small_head)
+    trainer.train()
+    found = Run(trainer).found
+    looks = [(look["verdict"], look["psnr"]) for look in found["curve"]]
+    assert ("rejected" if trying else "resting", NO_PICTURE) in looks
+    assert (found["phase"], found["head"], looks[-1][0]) == ("done", False, "reached")
+    assert [psnr for _, psnr in looks].count(NO_PICTURE) == 1, "it is not waited for"
+    assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
+
+
+def test_a_head_that_makes_no_picture_does_not_stay_for_its_bytes(
+    make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def when(run: Searched) -> bool:
+        found: Budget = run.model.budget  # type: ignore[assignment]
+        return found.search.cuts > 0 and about_to_look(run, "head", trying=False)
+
+    spoil(monkeypatch, when, lambda model: next(model.head.parameters()))
+    monkeypatch.setattr(budget.sizes, "head_bytes", lambda _: 0)
+    trainer = make(model_options=small_head, max_psnr_drop=3.0)
+    trainer.train()
+    found = Run(trainer).found
+    assert found["curve"][-2]["psnr"] == NO_PICTURE
+    assert (found["phase"], found["head"], found["curve"][-1]["verdict"]) == ("done", False, "reached")
+
+
+def test_where_no_trial_makes_a_picture_the_warm_up_field_stays(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    restore, gone_back = Searched.restore, []
+
+    def noted(run: Searched, saved: Any) -> None:
+        trained = run.model.means.detach().clone()
+        restore(run, saved)
+        gone_back.append((run.model.schedule_step, torch.equal(run.model.means, trained)))
+
+    def measure(run: Searched) -> float:
+        return 20.0 if run.model.budget.search.phase == "before" else NO_PICTURE  # type: ignore[union-attr]
+
+    monkeypatch.setattr(Searched, "restore", noted)
+    monkeypatch.setattr(Searched, "measure", measure)
+    trainer = make(model_options={"head": HeadConfig(mode="off")})
+    trainer.train()
+    found = Run(trainer).found
+    assert gone_back == [(PRUNE_AT + 12, False)]
+    assert (found["degrees"], found["degree"], found["steps_lost"]) == ({"1": NO_PICTURE}, 1, 12)
+    assert (found["phase"], found["zeroed"], found["primitives"]) == ("done", 0, 200), "nothing to tell flat colours by"
+
+
+def test_primitives_that_are_no_longer_numbers_go_at_the_next_look(
+    make: Make, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def when(run: Searched) -> bool:
+        return about_to_look(run, "field", trying=False)
+
+    spoil(monkeypatch, when, lambda model: model.gauss_params["features_dc"][:3])
+    # Nothing is cut at once: what is looked at next rests.
+    monkeypatch.setattr(Search, "next_count", lambda self, *_: 100 if self.looks > 1 and self.accepted == 197 else None)
+    trainer = make(max_psnr_drop=3.0)
+    trainer.train()
+    found = Run(trainer).found
+    rested = [look["primitives"] for look in found["curve"] if look["verdict"] == "resting"]
+    assert rested[:1] == [197], "and the look is one at the others"
+    assert found["dropped_nonfinite"] == 3
+    assert "dropped 3 primitives that were not finite" in capsys.readouterr().out
+    assert all(look["psnr"] > 5 for look in found["curve"])
+    (report,) = json.loads((trainer.base_dir / "prune.json").read_text())
+    assert (report["dropped_nonfinite"], report["before"], report["after"]) == (3, 200, 100)
+
+
+def test_primitives_that_are_no_longer_numbers_go_before_the_contribution(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cut_to, contribution, asked = Searched.cut_to, Searched.contribution, []
+
+    def spoiled(run: Searched, *arguments: Any) -> int:
+        run.params["opacities"].data[:2] = torch.nan
+        return cut_to(run, *arguments)
+
+    def noted(run: Searched, share: float | None = None) -> Tensor:
+        asked.append((run.model.num_points, share))
+        return contribution(run, share)
+
+    monkeypatch.setattr(Searched, "cut_to", spoiled)
+    monkeypatch.setattr(Searched, "contribution", noted)
+    trainer = make(max_psnr_drop=None, max_primitives=37)
+    trainer.train()
+    assert asked[0] == (198, 37 / 198)
+    assert trainer.pipeline.model.num_points == 37
+    assert Run(trainer).found["dropped_nonfinite"] == 2
+
+
+def test_a_warm_up_without_pictures_says_so_and_is_saved(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = make()
+    monkeypatch.setattr(Searched, "measure", lambda _: NO_PICTURE)
+    with pytest.raises(DataError, match="warm-up field .* the training has diverged, go back to an earlier checkpoint"):
+        trainer.train()
+    assert (trainer.checkpoint_dir / f"step-{PRUNE_AT:09d}.ckpt").exists()
+
+
+def test_a_look_is_always_a_number(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = searched(make())
+    model: Any = run.model
+    assert 5 < run.measure() < 40
+    views = list(run.datamanager.holdout_views())
+    model.eval()
+    with torch.no_grad():
+        exact = model.get_outputs_for_camera(views[0][0])["rgb"]
+    model.train()
+    monkeypatch.setattr(run.datamanager, "holdout_views", lambda: [(views[0][0], {"image": exact})])
+    assert run.measure() == EXACT
+    model.gauss_params["features_dc"].data[:] = torch.nan
+    assert run.measure() == NO_PICTURE
+
+
+END_OF_BANDS = PRUNE_AT + 2 * 12
+"""Step at which a field of degree 1 has been compared with one of degree 0."""
+
+
+def degree_0_will_do(run: Searched) -> float:
+    return 20.0
+
+
+@pytest.mark.parametrize(
+    ("stop", "steps", "degree", "lost"),
+    [
+        (PRUNE_AT + 1, STEPS, 0, 12),  # the trials go on behind it
+        (END_OF_BANDS, END_OF_BANDS + 1, 0, 12),
+        (END_OF_BANDS + 1, END_OF_BANDS + 2, 0, 12),  # no time to judge another cut
+        (END_OF_BANDS - 4, END_OF_BANDS - 3, 1, 8),  # the run ends in the midst of the second trial
+        (PRUNE_AT + 5, PRUNE_AT + 6, 1, 0),  # of the first
+        (PRUNE_AT, PRUNE_AT + 1, 1, 0),
+    ],
+)
+def test_nothing_is_tried_that_nobody_can_judge(
+    make: Make, monkeypatch: pytest.MonkeyPatch, stop: int, steps: int, degree: int, lost: int
+) -> None:
+    snapshot, kept = Searched.snapshot, []
+
+    def noted(run: Searched, *, head: bool) -> Any:
+        kept.append(run.model.means.detach().clone())
+        return snapshot(run, head=head)
+
+    monkeypatch.setattr(Searched, "snapshot", noted)
+    monkeypatch.setattr(Searched, "measure", degree_0_will_do)
+    trainer = make(model_options={"head": HeadConfig(mode="off")}, stop=stop, max_num_iterations=steps)
+    trainer.train()
+    run = Run(trainer)
+    (final,) = run.found["curve"]
+    assert (final["phase"], final["verdict"], final["primitives"]) == ("final", "reached", 200)
+    assert (run.found["phase"], run.found["degree"], run.found["steps_lost"]) == ("done", degree, lost)
+    assert trainer.pipeline.model.gauss_params["features_rest"].shape[1] == (degree + 1) ** 2 - 1
+    if lost == 8:
+        assert torch.equal(trainer.pipeline.model.means, kept[-1]), "the field of the first trial"
+
+
+def test_a_count_is_kept_by_a_run_that_ends_in_the_midst_of_a_trial(make: Make) -> None:
+    at = END_OF_BANDS - 4
+    trainer = make(max_psnr_drop=None, max_primitives=37, stop=at, max_num_iterations=at + 1)
+    trainer.train()
+    found = Run(trainer).found
+    assert (found["phase"], found["primitives"], found["curve"][-1]["verdict"]) == ("done", 37, "reached")
+
+
+@pytest.mark.parametrize("stop", [STOP, 200])
+def test_no_head_joins_and_nothing_is_cut_where_too_few_steps_are_left(
+    make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch, stop: int
+) -> None:
+    monkeypatch.setattr(Searched, "measure", degree_0_will_do)
+    steps = END_OF_BANDS + (5 if stop == STOP else 4)
+    trainer = make(model_options=small_head, stop=stop, max_num_iterations=steps)
+    trainer.train()
+    found = Run(trainer).found
+    assert (found["primitives"], found["trying"], found["head_at"]) == (200, False, 0)
+    assert found["phase"] == ("done" if stop == STOP else "field"), "the half that comes before the head may go on"
+
+
+@pytest.mark.parametrize("warm", [False, True])
+def test_a_run_that_ends_in_the_midst_says_how_far_to_train_on(
+    done: Run, make: Make, capsys: pytest.CaptureFixture[str], warm: bool
+) -> None:
+    start = {"warm_start": done.trainer.checkpoint_dir / f"step-{SAVE:09d}.ckpt"} if warm else {}
+    trainer = make(model_options=start, max_num_iterations=PRUNE_AT + 4)
+    trainer.train()
+    assert Run(trainer).found["phase"] == "bands"
+    expected = STOP - PRUNE_AT if warm else STOP
+    assert f"train on to step {expected}." in " ".join(capsys.readouterr().out.split())
+
+
+def searched(trainer: Trainer) -> Searched:
+    return Searched(trainer.pipeline.model, None, trainer.pipeline.datamanager)  # type: ignore[arg-type]
+
+
+def test_what_masks_leave_out_of_training_judges_nothing(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = searched(make())
+    views = list(run.datamanager.holdout_views())
+
+    def measured(mask: Tensor | None, color: int = 0) -> float:
+        shown = []
+        for camera, batch in views:
+            image = batch["image"].clone()
+            if mask is not None:
+                image[~mask] = color
+            shown.append((camera, {"image": image, **({} if mask is None else {"mask": mask[..., None]})}))
+        monkeypatch.setattr(run.datamanager, "holdout_views", lambda: iter(shown))
+        return run.measure()
+
+    left = torch.zeros(24, 24, dtype=torch.bool)
+    left[:, :12] = True
+    assert measured(left) != pytest.approx(measured(~left), abs=0.01)
+    assert measured(left) == measured(left, 255)
+    assert measured(torch.ones_like(left)) == pytest.approx(measured(None), abs=1e-4)
+    with pytest.raises(DataError, match="masks leave nothing of the held-back views"):
+        measured(torch.zeros_like(left))
+
+
+def test_a_view_that_is_masked_whole_is_passed_over(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = searched(make())
+    first, *others = run.datamanager.holdout_views()
+    monkeypatch.setattr(run.datamanager, "holdout_views", lambda: iter(others))
+    expected = run.measure()
+    hidden = (first[0], {**first[1], "mask": torch.zeros(24, 24, 1, dtype=torch.bool)})
+    monkeypatch.setattr(run.datamanager, "holdout_views", lambda: iter([hidden, *others]))
+    assert run.measure() == expected
+
+
 def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:
     # The head is half a megabyte, the field a few kilobytes.
     assert done.found["head_dropped"]
@@ -178,6 +430,14 @@ def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:
     assert sizes(done.model).total == done.found["curve"][-1]["bytes"]
     columns = (done.found["degree"] + 1) ** 2 - 1
     assert done.model.gauss_params["features_rest"].shape[1] == columns
+
+
+def test_what_is_written_is_json(done: Run) -> None:
+    def refuse(constant: str) -> None:
+        pytest.fail(f"{constant} is no JSON")
+
+    found = json.loads((done.folder / "budget.json").read_text(), parse_constant=refuse)
+    assert found["lowered"] is None
 
 
 def test_it_can_be_packed(done: Run, tmp_path: Path) -> None:
@@ -246,7 +506,9 @@ def test_primitives_are_kept_exactly(make: Make) -> None:
     trainer = make(max_psnr_drop=None, max_primitives=37)
     trainer.train()
     assert trainer.pipeline.model.num_points == 37
-    assert Run(trainer).found["curve"][-1]["primitives"] == 37
+    look, final = Run(trainer).found["curve"]
+    assert (look["verdict"], look["primitives"], final["primitives"]) == ("cut", 37, 37)
+    assert (look["since_cut"], final["since_cut"]) == (0, final["step"] - look["step"])
 
 
 @pytest.fixture
@@ -256,6 +518,21 @@ def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         budget.sizes, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
     )
     return {"head": HeadConfig(size="small", pixel_unshuffle=1, num_features=13)}
+
+
+def test_what_is_lost_with_a_head_is_counted_once(
+    make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Searched, "measure", lambda run: 20.0 if run.model.num_points == 200 else 5.0)
+    trainer = make(model_options=small_head)
+    trainer.train()
+    found = Run(trainer).found
+    *_, last, _ = found["curve"]
+    taken_back = [p["since_cut"] for p in found["curve"] if (p["phase"], p["verdict"]) == ("field", "rejected")]
+    assert [point["verdict"] for point in found["curve"] if point["phase"] == "head"].count("rejected") > 1
+    assert found["head_dropped"]
+    # One of two trials, cuts without the head, and all since it joined.
+    assert found["steps_lost"] == 12 + sum(taken_back) + last["step"] - found["head_at"]
 
 
 def test_a_head_of_the_chosen_size_joins_and_is_loaded_again(

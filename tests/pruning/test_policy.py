@@ -58,7 +58,6 @@ def run(
     reports = []
     options.setdefault("contribution", lambda: params["opacities"].detach().sigmoid().squeeze(1))
     for step in steps:
-        policy.step_pre_backward(params, optimizers, state, step, {})
         train_step(params, optimizers)
         report = policy.step_post_backward(params, optimizers, state, step, {}, **options)
         if report is not None:
@@ -76,7 +75,6 @@ def saved_and_loaded(state: dict[str, Any]) -> dict[str, Any]:
 def test_one_shot_prunes_once_and_training_goes_on() -> None:
     made = field()
     policy = make_policy(PruningConfig(prune_at=3, keep_ratio=0.25))
-    policy.check_sanity(*made)
     losses = []
     state = policy.initialize_state()
     for step in range(8):
@@ -249,13 +247,23 @@ def test_a_failed_prune_leaves_field_and_state() -> None:
     assert state["pruned_at"] == -1
 
 
-def test_sanity_check_names_the_fault() -> None:
-    policy = make_policy(PruningConfig())
+def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
+    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=0.5))
     params, optimizers = field()
-    with pytest.raises(DataError, match="lacks opacities"):
-        policy.check_sanity({k: v for k, v in params.items() if k != "opacities"}, optimizers)
+    foreign = {**params, "means": Parameter(torch.zeros(100, 3))}
     with pytest.raises(DataError, match="optimizer of 'means'"):
-        policy.check_sanity({**params, "means": Parameter(torch.zeros(100, 3))}, optimizers)
+        policy.step_post_backward(
+            foreign, optimizers, policy.initialize_state(), 0, contribution=lambda: torch.ones(100)
+        )
+    assert len(foreign["means"]) == 100
+
+
+def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
+    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=0.5))
+    params, optimizers = field(10)
+    params["opacities"].data[:] = torch.nan
+    with pytest.raises(DataError, match="none of 10 primitives is finite: the training has diverged"):
+        policy.step_post_backward(params, optimizers, policy.initialize_state(), 0)
 
 
 def test_report_is_one_line_of_plain_numbers() -> None:

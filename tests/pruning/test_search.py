@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.pruning.search import DEEPEST, SHALLOWEST, Point, Search
+from sundae_ns.pruning.search import DEEPEST, NO_PICTURE, SHALLOWEST, Point, Search
 
 
 def search(accepted: int = 1000, **options: Any) -> Search:
@@ -171,7 +171,22 @@ def test_a_head_that_has_not_let_anything_go_yet_lowers_nothing() -> None:
 
 
 def test_a_picture_that_is_not_a_number_is_no_success() -> None:
-    assert verdicts(cut_in_half(), math.nan) == ["rejected"]
+    found = cut_in_half()
+    assert verdicts(found, NO_PICTURE) == ["rejected"]
+    assert (found.accepted, found.failed) == (1000, 500)
+    assert found.slope == 0, "it says nothing of what a halving costs"
+    assert found.next_count(30.1, 1, 3) == int(1000 * 0.5**0.5)
+    assert Search.from_state(found.state()).state()["trail"] == [[10, NO_PICTURE]]
+
+
+def test_a_field_without_pictures_is_trained_and_neither_cut_nor_taken_for_all_there_is() -> None:
+    found = rest(search(), 30.1, *[NO_PICTURE] * 9)
+    assert (found.stuck, found.aim, found.next_count(NO_PICTURE, 1, 3)) == (9, 30.0, None)
+
+
+def test_no_band_goes_where_all_of_them_have_made_no_picture() -> None:
+    found = Search(reference=30.0, degrees={"3": NO_PICTURE})
+    assert (found.next_degree(3, 0.1), found.lowest_degree(3, 0.1)) == (None, 3)
 
 
 def test_what_has_failed_is_come_up_to_from_above() -> None:
