@@ -34,7 +34,7 @@ from rich.progress import track
 
 import sundae_ns.after_step
 import sundae_ns.checkpoint
-import sundae_ns.pruning.policy
+import sundae_ns.pruning.cutting
 import sundae_ns.storage.atomic
 from sundae_ns.data import write_scene
 from sundae_ns.errors import CheckpointError
@@ -99,8 +99,8 @@ PLACES: dict[str, Callable[[int], None]] = {
     "save: half written": lambda n: after(n, sundae_ns.checkpoint.torch, "save", half_saved),
     "save: not yet on the disk": lambda n: after(3 * n, sundae_ns.storage.atomic, "_flush", at_once),
     "save: the older one not yet gone": lambda n: after(n, sundae_ns.checkpoint, "save", when_done),
-    "prune: deciding": lambda n: after(1, sundae_ns.pruning.policy, "decide", at_once),
-    "prune: sliced": lambda n: after(1, sundae_ns.pruning.policy, "keep", when_done),
+    "prune: deciding": lambda n: after(1, sundae_ns.pruning.cutting, "decide", at_once),
+    "prune: sliced": lambda n: after(1, sundae_ns.pruning.cutting, "keep", when_done),
     "prune: half recorded": lambda n: after(1, sundae_ns.after_step, "write_text", half_recorded),
 }
 ANY = "any time"

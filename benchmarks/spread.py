@@ -36,7 +36,7 @@ from rich.progress import track
 from sundae_ns.data import write_scene
 from sundae_ns.distributed import shorten
 from sundae_ns.evaluation import psnr
-from sundae_ns.pruning import policy
+from sundae_ns.pruning import cutting
 
 NEVER = 10**9
 
@@ -78,17 +78,17 @@ def started(config: Any) -> Iterator[Any]:
 def masks() -> Iterator[list[torch.Tensor]]:
     """What every prune keeps, while it lasts."""
     found: list[torch.Tensor] = []
-    original = policy.keep
+    original = cutting.keep
 
     def keep(params: Any, optimizers: Any, states: Any, mask: torch.Tensor) -> Any:
         found.append(mask.cpu().clone())
         return original(params, optimizers, states, mask)
 
-    policy.keep = keep  # type: ignore[assignment]
+    cutting.keep = keep  # type: ignore[assignment]
     try:
         yield found
     finally:
-        policy.keep = original
+        cutting.keep = original
 
 
 @torch.no_grad()
