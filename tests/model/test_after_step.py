@@ -11,6 +11,7 @@ import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
+from sundae_ns.initial_field import Start
 from sundae_ns.model import SundaeModel
 
 Build = Callable[..., SundaeModel]
@@ -135,7 +136,7 @@ def test_a_run_that_prunes_or_is_not_to_says_nothing(
     build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str], options: dict[str, Any]
 ) -> None:
     model = build(**options)
-    model._warm_start_error = None
+    model._start = Start()  # of a file that need not be there
     training = training_of(model, SimpleNamespace(last_step=2))
     training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 2)
     training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN, 2)
