@@ -14,7 +14,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
-from sundae_ns.errors import ConfigError
+from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.evaluation import COLUMNS, Lpips, Measured, flip_available, lpips_weights_available, save_comparison
 from sundae_ns.evaluation.curves import Curves, read_curves
 from sundae_ns.evaluation.document import document
@@ -40,12 +40,12 @@ def run_report(
     repeats: int = 5,
     console: Console | None = None,
 ) -> int:
-    """Measure and write; options are those of the command.
+    """Measure and write; options are those of the command. The exit code: 1 if a run had to be left out.
 
     Raises:
         ConfigError: nothing to report on, or a number that cannot work.
-        CheckpointError: a path that cannot be opened.
-        DataError: a capture is gone or has no test views.
+        CheckpointError: no path can be opened; this of the first.
+        DataError: no run has its capture with test views; this of the first.
         StorageError: the folder cannot be written to.
     """
     if not paths:
@@ -63,23 +63,32 @@ def run_report(
     curves: dict[str, Curves] = {}
     notes = _missing_metrics(lpips_net, lpips)
     pictures: dict[str, list[tuple[str, str]]] = {}
+    failures: list[SundaeError] = []
     columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         everything = progress.add_task("Scenes", total=len(paths))
         for number, path in enumerate(paths, start=1):
             task = progress.add_task(f"Opening {path}", total=None)
-            opened = _quietly(path, data)
-            label = _label(opened, {run.label for run in runs})
-            progress.update(task, description=f"Measuring {label}", total=len(opened.cameras))
-            measured = measure_scene(
-                opened,
-                label=label,
-                lpips=lpips,
-                warmup=warmup,
-                repeats=repeats,
-                progress=lambda task=task: progress.advance(task),  # type: ignore[misc]
-                command=command,
-            )
+            try:
+                opened = _quietly(path, data)
+                label = _label(opened, {run.label for run in runs})
+                progress.update(task, description=f"Measuring {label}", total=len(opened.cameras))
+                measured = measure_scene(
+                    opened,
+                    label=label,
+                    lpips=lpips,
+                    warmup=warmup,
+                    repeats=repeats,
+                    progress=lambda task=task: progress.advance(task),  # type: ignore[misc]
+                    command=command,
+                )
+            except SundaeError as error:
+                # What was measured of the others is not to be lost.
+                failures.append(error)
+                notes.append(f"{path}: {error}")
+                progress.remove_task(task)
+                progress.advance(everything)
+                continue
             name = f"errors-{number}.{'png' if opened.truths[0].shape[1] <= PNG_WIDTH else 'jpg'}"
             _error_maps(out / name, opened, measured)
             pictures.setdefault(measured.scene, []).append((f"{label}: worst and median view", name))
@@ -95,6 +104,8 @@ def run_report(
             runs.append(measured)
             progress.remove_task(task)
             progress.advance(everything)
+        if not runs:
+            raise failures[0]
         progress.add_task("Drawing", total=None)
         scenes = {scene: [run for run in runs if run.scene == scene] for scene in dict.fromkeys(r.scene for r in runs)}
         printed = {scene: printed_of(scene, own[0].resolution) for scene, own in scenes.items()}
@@ -107,7 +118,7 @@ def run_report(
     for note in notes:
         console.print(f"[yellow]Left out: {note}", highlight=False)
     console.print(f"wrote {out / 'report.md'}, with report.csv, report.json and pictures beside it", highlight=False)
-    return 0
+    return 1 if failures else 0
 
 
 def _quietly(path: Path, data: Path | None) -> Opened:
@@ -118,7 +129,7 @@ def _quietly(path: Path, data: Path | None) -> Opened:
 
 def _label(opened: Opened, taken: Collection[str]) -> str:
     """A short name, one of a kind."""
-    label = "/".join(part for part in (opened.variant, opened.method) if part)
+    label = "/".join(dict.fromkeys(part for part in (opened.variant, opened.method) if part))
     if label in taken:
         label += f"/{opened.source.name}"
     first, count = label, 1

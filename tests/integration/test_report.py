@@ -138,6 +138,18 @@ def test_errors_are_one_line(
     assert "at least 0" in one_line(capsys)
 
 
+def test_a_run_that_cannot_be_opened_does_not_lose_the_others(
+    tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = (tmp_path / "nowhere", tiny.folder, tiny.scene)
+    assert sundae("report", *paths, "-o", tmp_path / "out", "--repeats", 0) == 1
+    assert len(read_rows(tmp_path / "out" / "report.csv")) == 1
+    said, page = capsys.readouterr().out, (tmp_path / "out" / "report.md").read_text()
+    for text in ("does not exist", "is no run"):
+        assert text in " ".join(said.split())
+        assert text in page
+
+
 def test_a_capture_that_moved(tiny: Any, stock: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
     (run / "nerfstudio_models").mkdir(parents=True)
