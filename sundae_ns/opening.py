@@ -23,6 +23,7 @@ from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.packed_run import write_run
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.run_config import load_config
+from sundae_ns.run_folder import config_of
 from sundae_ns.storage.kinds import kind_of, refuse
 from sundae_ns.storage.packing import read_scene
 
@@ -72,7 +73,7 @@ def open_scene(path: Path, *, data: Path | None = None) -> Opened:
     refuse(
         path, ply="it comes without test views; give the folder of a finished run, its config.yml, or a packed scene"
     )
-    config = path / "config.yml" if path.is_dir() else path
+    config = config_of(path)
     if config.name == "config.yml" and config.is_file():
         return open_run(config, data=data)
     reason = "is no run" if path.exists() else "does not exist"
@@ -199,7 +200,7 @@ def load_run(path: Path) -> Opened:
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
         DataError: its capture is gone, or cannot be used, or it was unpacked without one.
     """
-    path = path / "config.yml" if path.is_dir() else path
+    path = config_of(path)
     refuse(
         path,
         packed="give the folder of a run, which sundae unpack makes of it beside its capture; sundae report takes it as it is",

@@ -35,6 +35,7 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rendering import degree_in_use
 from sundae_ns.run_config import load_config
+from sundae_ns.run_folder import config_of
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.kinds import refuse
 from sundae_ns.storage.packing import Scene
@@ -74,7 +75,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
         packed="give the run that was packed, or the one that sundae unpack makes of it",
         ply="give the folder of a run; sundae export turns a .ply into .spz or .sog",
     )
-    path = run / "config.yml" if run.is_dir() else run
+    path = config_of(run)
     config = _read_config(path)
     source = checkpoint.newest_whole(path.parent / config.relative_model_dir)[0]
     loaded = checkpoint.load(source)

@@ -21,6 +21,7 @@ from sundae_ns.model import SundaeModel
 from sundae_ns.opening import open_pipeline
 from sundae_ns.packed_run import is_unpacked
 from sundae_ns.run_config import load_config
+from sundae_ns.run_folder import config_of
 from sundae_ns.storage.packing import Codecs, PackConfig, Scene, fit_scene
 
 RATES = {
@@ -76,7 +77,7 @@ def finetune(
     """
     if steps < 1:
         raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")
-    path = run / "config.yml" if run.is_dir() else run
+    path = config_of(run)
     if is_unpacked(load_config(path)):
         raise CheckpointError(
             f"{run} was unpacked from a packed scene and cannot be fine-tuned; fine-tune the run that was packed"

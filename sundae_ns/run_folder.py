@@ -69,6 +69,11 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
         return []
 
 
+def config_of(run: Path) -> Path:
+    """Where the ``config.yml`` of a run lies that is named by its folder, or by that file; whether it is there is not asked."""
+    return run / "config.yml" if run.is_dir() else run
+
+
 def find_config(path: Path) -> Path | None:
     """The ``config.yml`` of the run that a path belongs to: the file, the run's folder, its checkpoints or one of them."""
     if path.name == "config.yml" and path.is_file():

@@ -236,12 +236,11 @@ class Budget:
         head_to_come = search.phase == "field" and heads.may_pay(run, self._largest)
         deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
         left = deadline - step if head_to_come else run.steps_left
-        return _Clock(head_to_come, left, step >= deadline or left < self._least_time)
+        return _Clock(head_to_come, left, self._is_over(run, deadline, left))
 
-    @property
-    def _least_time(self) -> int:
-        """Steps that something new needs to be judged."""
-        return self.config.patience * self.config.search_every
+    def _is_over(self, run: Run, deadline: int, left: int) -> bool:
+        """Whether it is too late for something new, which has to be judged: what is left must do for the looks at it."""
+        return run.model.schedule_step >= deadline or left < self.config.patience * self.config.search_every
 
     def _look_is_due(self, run: Run) -> bool:
         regular = (run.model.schedule_step - self.search.began) % self.config.search_every == 0
@@ -288,7 +287,7 @@ class Budget:
 
     def _end_phase(self, run: Run, value: float) -> None:
         search, step = self.search, run.model.schedule_step
-        too_late = step >= self.config.stop or run.steps_left < self._least_time
+        too_late = self._is_over(run, self.config.stop, run.steps_left)
         if search.phase == "field" and heads.may_pay(run, self._largest) and not too_late:
             self._fallback = run.snapshot(head=search.head)
             search.begin("head", search.accepted)

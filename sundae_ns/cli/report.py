@@ -86,22 +86,20 @@ def run_report(
                 # What was measured of the others is not to be lost.
                 failures.append(error)
                 notes.append(f"{path}: {error}")
-                progress.remove_task(task)
-                progress.advance(everything)
-                continue
-            name = f"errors-{number}.{'png' if opened.truths[0].shape[1] <= PNG_WIDTH else 'jpg'}"
-            _error_maps(out / name, opened, measured)
-            pictures.setdefault(measured.scene, []).append((f"{label}: worst and median view", name))
-            found = read_curves(opened.curves) if opened.curves is not None else None
-            if found is not None:
-                curves[label] = found
-                measured = replace(measured, peak_vram_mib=max(found.memory.values, default=0.0) or None)
-            elif opened.curves is not None:
-                notes.append(
-                    f"Curves of {label}: there are no event files of tensorboard in {opened.curves}; "
-                    "--vis viewer+tensorboard writes them."
-                )
-            runs.append(measured)
+            else:
+                name = f"errors-{number}.{'png' if opened.truths[0].shape[1] <= PNG_WIDTH else 'jpg'}"
+                _error_maps(out / name, opened, measured)
+                pictures.setdefault(measured.scene, []).append((f"{label}: worst and median view", name))
+                found = read_curves(opened.curves) if opened.curves is not None else None
+                if found is not None:
+                    curves[label] = found
+                    measured = replace(measured, peak_vram_mib=max(found.memory.values, default=0.0) or None)
+                elif opened.curves is not None:
+                    notes.append(
+                        f"Curves of {label}: there are no event files of tensorboard in {opened.curves}; "
+                        "--vis viewer+tensorboard writes them."
+                    )
+                runs.append(measured)
             progress.remove_task(task)
             progress.advance(everything)
         if not runs:
