@@ -74,7 +74,7 @@ def view_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None 
 def _numbers(camera: Cameras) -> list[float]:
     """Camera-to-world row by row, focal lengths, centre and size; in one piece, since from a GPU each would be waited for.
 
-    Read by itself, because nerfstudio's methods of cameras build tensors and cameras anew: they took as long as to splat.
+    Read by itself, because nerfstudio's methods of cameras build tensors and cameras anew, at every step and frame.
     """
     parts = (camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
     return torch.cat([part.detach().flatten().to(torch.float64) for part in parts]).tolist()  # type: ignore[no-any-return]
