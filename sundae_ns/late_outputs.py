@@ -63,7 +63,8 @@ def late_outputs(
     """``depth``, ``features`` (principal components as colours) and ``response`` (of the primitives seen), to be made.
 
     Args:
-        pictures: from :func:`sundae_ns.rendering.render`; depth may be None, and is splatted when it is looked at.
+        pictures: from :func:`sundae_ns.rendering.render`; depth and features are splatted when they are looked at, unless
+            they are there, as where other ranks had to take part.
         drawn: the primitives that they were made of.
         field: all primitives. Both mappings are kept and have to stay as they are.
         mask: which of them were drawn, bool ``[N]``; None for all.
@@ -73,8 +74,8 @@ def late_outputs(
     """
     alpha = pictures["accumulation"]
     return {
-        "depth": Later(partial(_depth_image, pictures["depth"], drawn, view, style, alpha)),
-        "features": Later(partial(_feature_colors, field, pictures["feature_image"], alpha)),
+        "depth": Later(partial(_depth_image, pictures.get("depth"), drawn, view, style, alpha)),
+        "features": Later(partial(_feature_colors, pictures.get("feature_image"), field, drawn, view, style, alpha)),
         "response": Later(partial(_response_image, field, mask, view, style, values)),
     }
 
@@ -86,8 +87,17 @@ def _depth_image(depth: Tensor | None, drawn: Mapping[str, Tensor], view: View, 
     return display.fill_depth(depth, alpha)
 
 
-def _feature_colors(field: Mapping[str, Tensor], image: Tensor, alpha: Tensor) -> Tensor:
-    if image.shape[-1] == 0:
+def _feature_colors(
+    image: Tensor | None,
+    field: Mapping[str, Tensor],
+    drawn: Mapping[str, Tensor],
+    view: View,
+    style: Style,
+    alpha: Tensor,
+) -> Tensor:
+    if image is None and style.head is not None:
+        image = splat(drawn, view, drawn[FEATURES], style).colors
+    if image is None or image.shape[-1] == 0:
         return alpha.new_zeros(*alpha.shape[:2], 3)
     return display.feature_colors(image, *display.principal_components(field[FEATURES]), alpha)
 

@@ -39,6 +39,7 @@ from sundae_ns.losses import chain_losses, picture_loss
 from sundae_ns.preview import Preview, in_viewer
 from sundae_ns.pruning import PruningConfig, PruningPolicy, make_policy
 from sundae_ns.rasterization import Backend, Rasterization, select_backend
+from sundae_ns.recordings import Recordings
 from sundae_ns.rendering import NEAR_PLANE, Style, colors_of, render, weights_of
 from sundae_ns.views import View, cut, view_of
 
@@ -160,6 +161,7 @@ class SundaeModel(SplatfactoModel):
         self.preview = Preview()
         self._backend: Backend | None = None
         self._response = ShownResponse()
+        self._recordings = Recordings()
         self.attached = False
         """Whether a trainer drives this model."""
         self.trained_focal: tuple[float, float] | None = None
@@ -400,12 +402,18 @@ class SundaeModel(SplatfactoModel):
             rows = mask[preview.mask]
             params = {**params, **{k: v[rows] for k, v in preview.values.items()}}
         compensate = preview is None and (self.compensate.value if in_viewer() else self.compensated)
-        # Depth is left for later, but where other ranks have to take part in it.
-        pictures, _ = self.render(params, view, background, compensate=compensate, depth=self.shards is not None)
+        if self.shards is not None:  # nothing is left for later where other ranks have to take part in it
+            pictures, _ = self.render(params, view, background, compensate=compensate)
+        else:
+            if mask is None:
+                pictures = self._recordings.render(params, view, background, self._style, compensate=compensate)
+            else:
+                pictures, _ = self.render(params, view, background, compensate=compensate, depth=False)
+            pictures.pop("feature_image", None)
         field = dict(self.gaussians)
         values = partial(self._response.values, field, self._response_key, self.config.pruning)
         pictures.update(late_outputs(pictures, dict(params), field, mask, view, self._style, values))
-        pictures.pop("feature_image")
+        pictures.pop("feature_image", None)
         return LazyOutputs({**pictures, "background": background.expand(view.height, view.width, 3)})
 
     @property

@@ -34,9 +34,10 @@ class View(NamedTuple):
     def zoomed(self, factor: float) -> View:
         """The camera that sees the same in a picture whose sides are ``factor`` times as long."""
         width, height = (max(round(side * factor), 1) for side in (self.width, self.height))
-        # By what rounding made of the factor, so that the pictures' edges agree.
-        scale = self.K.new_tensor([[width / self.width], [height / self.height], [1.0]])
-        return View(self.viewmat, self.K * scale, width, height, self.focal * factor)
+        # By what rounding made of the factor, so that the pictures' edges agree. Row by row, for numbers in a tensor would
+        # have to be copied to the device, and waited for.
+        K = torch.stack([self.K[0] * (width / self.width), self.K[1] * (height / self.height), self.K[2]])
+        return View(self.viewmat, K, width, height, self.focal * factor)
 
     def cut(self, window: Window) -> View:
         """The camera that sees this window of the picture alone."""

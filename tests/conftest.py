@@ -2,11 +2,37 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib
 import os
+import shutil
+import subprocess
+from collections.abc import Callable, Sequence
 
 import pytest
 import torch
+from torch import Tensor
+
+Launch = Callable[[int, Sequence[Tensor | int | float]], None]
+CompileKernels = Callable[..., dict[str, Launch]]
+
+# What a GPU's compiler knows by itself, and a loop over the threads. A block has one thread here, so that what the threads
+# of a block share is filled before it is read.
+_SHIM = """
+#include <math.h>
+#define __device__
+#define __global__
+#define __forceinline__ inline
+#define __restrict__
+#define __shared__ static
+#define __align__(n) __attribute__((aligned(n)))
+#define __syncthreads()
+inline float rsqrtf(float x) { return 1 / sqrtf(x); }
+struct Index { unsigned x; };
+static Index blockIdx, blockDim = {1}, threadIdx;
+%s
+extern "C" void at(unsigned block) { blockIdx.x = block; }
+"""
 
 
 def pytest_configure() -> None:
@@ -37,3 +63,36 @@ def open3d() -> None:
         importlib.import_module("open3d")
     except (ImportError, OSError) as error:
         pytest.skip(f"open3d does not import here: {error}")
+
+
+@pytest.fixture(scope="session")
+def compile_kernels(tmp_path_factory: pytest.TempPathFactory) -> CompileKernels:
+    """The very lines of CUDA kernels, compiled for the CPU: source, names and options of the compiler to launches."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("no g++ here to compile the kernels for the CPU")
+    folder = tmp_path_factory.mktemp("kernels")
+
+    def compile_them(source: str, names: Sequence[str], options: Sequence[str] = ()) -> dict[str, Launch]:
+        library = folder / f"{abs(hash((source, *options)))}.so"
+        if not library.exists():
+            library.with_suffix(".cpp").write_text(_SHIM % source)
+            flags = ["-O1", "-w", "-shared", "-fPIC", *options]
+            subprocess.run([compiler, *flags, "-o", library, library.with_suffix(".cpp")], check=True)
+        loaded = ctypes.CDLL(str(library))
+
+        def launch_of(name: str) -> Launch:
+            def launch(threads: int, arguments: Sequence[Tensor | int | float]) -> None:
+                values = [
+                    ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_int(a) for a in arguments
+                ]
+                # More threads than asked for, as whole blocks have.
+                for block in range(threads + 3):
+                    loaded.at(block)
+                    getattr(loaded, name)(*values)
+
+            return launch
+
+        return {name: launch_of(name) for name in names}
+
+    return compile_them

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1] / "sundae_ns"
 FLOORS = {
     "errors": 0,
     "nvrtc": 0,
+    "cuda_graphs": 0,
     "graphs": 0,
     "filters": 0,
     "gaussians": 1,
@@ -35,6 +36,7 @@ FLOORS = {
     "losses": 3,
     "model": 3,
     "preview": 3,
+    "recordings": 3,
     "rendering": 3,
     "run_config": 3,
     "run_folder": 3,

@@ -7,10 +7,8 @@ picture size that stays. Gradients are the business of :mod:`sundae_ns.compensat
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple, cast
 
 import torch
@@ -19,12 +17,7 @@ from torch import Tensor, nn
 
 from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
-
-MAX_SIZES = 4
-"""Recordings kept at a time: each holds its own activations."""
-
-RECORD_AT = 3
-"""A size is recorded when it is shown for this time in a row: a viewer that is being resized never shows one twice."""
+from sundae_ns.cuda_graphs import Kept, aside, record
 
 
 class Weights:
@@ -214,16 +207,6 @@ def pixel_stride(picture: Tensor) -> int:
     return pixel
 
 
-@contextmanager
-def aside(device: torch.device) -> Iterator[None]:
-    """Run once what is going to be recorded: it allocates and chooses kernels, neither of which can be recorded."""
-    side = torch.cuda.Stream(device)
-    side.wait_stream(torch.cuda.current_stream(device))
-    with torch.cuda.stream(side):
-        yield
-    torch.cuda.current_stream(device).wait_stream(side)
-
-
 class _Recording(NamedTuple):
     graph: torch.cuda.CUDAGraph
     folded: Tensor
@@ -245,9 +228,7 @@ class FusedInference:
     def __init__(self, net: UNet, residual: bool) -> None:
         self.net = net
         self.residual = residual
-        self._recorded: OrderedDict[tuple[object, ...], _Recording] = OrderedDict()
-        self._last: tuple[object, ...] | None = None
-        self._in_a_row = 0
+        self._recorded: Kept[_Recording] = Kept()
 
     def __call__(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
         """One picture.
@@ -268,19 +249,15 @@ class FusedInference:
         launches = compiled(base.device, dtype, definitions(net, self.residual))
         height, width = base.shape[:2]
         key = (height, width, dtype, net.out.weight.data_ptr())
-        self._in_a_row = self._in_a_row + 1 if key == self._last else 1
-        self._last = key
-        if key not in self._recorded and self._in_a_row >= RECORD_AT:
-            if len(self._recorded) >= MAX_SIZES:
-                self._recorded.popitem(last=False)
-            self._recorded[key] = self._record(folded_room(net, height, width, base, dtype).zero_(), launches)
-        recording = self._recorded.get(key)
+        recording = None
+        if not torch.cuda.is_current_stream_capturing():  # else it is part of somebody else's recording
+            room = partial(folded_room, net, height, width, base, dtype)
+            recording = self._recorded.get(key, lambda: self._record(room().zero_(), launches))
         folded = folded_room(net, height, width, base, dtype) if recording is None else recording.folded
         fold(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
         if recording is None:
             raw = self._run(folded, launches)
         else:
-            self._recorded.move_to_end(key)
             recording.graph.replay()
             raw = recording.raw
         return unfold(net, raw, base, alpha, launches)
@@ -294,8 +271,5 @@ class FusedInference:
     def _record(self, folded: Tensor, launches: Launches) -> _Recording:
         with aside(folded.device):
             self._run(folded, launches)
-        graph = torch.cuda.CUDAGraph()
-        # A training loop beside a viewer may allocate meanwhile; only this thread's work belongs to the recording.
-        with torch.cuda.graph(graph, capture_error_mode="thread_local"):
-            raw = self._run(folded, launches)
+        graph, raw = record(lambda: self._run(folded, launches))
         return _Recording(graph, folded, raw)

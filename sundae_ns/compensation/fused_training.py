@@ -14,10 +14,8 @@ import torch
 from torch import Tensor
 
 from sundae_ns.compensation.fused import (
-    MAX_SIZES,
     Tape,
     Weights,
-    aside,
     bias_of,
     convolutions,
     fold,
@@ -30,6 +28,7 @@ from sundae_ns.compensation.fused import (
 )
 from sundae_ns.compensation.kernels import BACKWARD, FORWARD, PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
+from sundae_ns.cuda_graphs import MAX_SIZES, aside, record
 from sundae_ns.errors import SundaeError
 
 
@@ -242,13 +241,16 @@ class FusedTraining:
             tape = network(self.net, weights, folded, launches)
             network_backward(self.net, weights, tape, torch.zeros_like(_last(tape)), launches)
             del tape
-        forward, backward = torch.cuda.CUDAGraph(), torch.cuda.CUDAGraph()
-        with torch.cuda.graph(forward, capture_error_mode="thread_local"):
+
+        def passed() -> Tape:
             weights.refresh()
-            tape = network(self.net, weights, folded, launches)
+            return network(self.net, weights, folded, launches)
+
+        forward, tape = record(passed)
         to_raw = torch.empty_like(_last(tape))
-        with torch.cuda.graph(backward, pool=forward.pool(), capture_error_mode="thread_local"):
-            to_folded, to_parameters = network_backward(self.net, weights, tape, to_raw, launches)
+        backward, (to_folded, to_parameters) = record(
+            lambda: network_backward(self.net, weights, tape, to_raw, launches), shares=forward
+        )
         return _Pass(weights, folded, tape, to_raw, to_folded, to_parameters, forward, backward)
 
 

@@ -6,6 +6,8 @@
 ``cpu`` computes what the reference does in loops that numba compiles, several times as fast, on a CPU.
 """
 
+from sundae_ns.rasterization.gsplat_backend import GsplatBackend
+from sundae_ns.rasterization.gsplat_tiles import Room
 from sundae_ns.rasterization.interface import blending_weights, rasterize, spherical_harmonics
 from sundae_ns.rasterization.select import BackendName, numba_problem, select_backend
 from sundae_ns.rasterization.types import Backend, Rasterization
@@ -13,7 +15,9 @@ from sundae_ns.rasterization.types import Backend, Rasterization
 __all__ = [
     "Backend",
     "BackendName",
+    "GsplatBackend",
     "Rasterization",
+    "Room",
     "blending_weights",
     "numba_problem",
     "rasterize",

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
 from sundae_ns.rasterization.constants import constant
+from sundae_ns.rasterization.gsplat_harmonics import harmonics
+from sundae_ns.rasterization.gsplat_tiles import TILE, Room, tile_lists
 from sundae_ns.rasterization.reference import ReferenceBackend, largest_axis
 from sundae_ns.rasterization.types import Rasterization
 
 _CHANNELS_PER_PASS = 32
 
+_LARGE = 2**20
+"""Pixels from which on lists of our own, shorter ones, save more time than their starting takes."""
+
 
 class GsplatBackend:
-    """The kernels of gsplat; float32 tensors on a CUDA device."""
+    """The kernels of gsplat; float32 tensors on a CUDA device.
+
+    Args:
+        room: for pairs of tiles and primitives, so that nothing has to be waited for; None: as much as needed.
+    """
 
     name = "gsplat"
+
+    def __init__(self, room: Room | None = None) -> None:
+        self._room = room
 
     def rasterize(
         self,
@@ -41,7 +56,7 @@ class GsplatBackend:
         Raises:
             BackendError: The tensors are not float32 on a CUDA device.
         """
-        from gsplat import rasterization
+        from gsplat import fully_fused_projection, rasterize_to_pixels
 
         _check_kernels_take(means)
         if means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
@@ -61,34 +76,73 @@ class GsplatBackend:
                 absgrad=absgrad,
                 render_depth=render_depth,
             )
-        channels = colors.shape[1]
-        rendered, alpha, info = rasterization(
+        radii, means2d, depths, conics, compensations = fully_fused_projection(
             means,
+            None,
             _without_zeros(quats),
             scales,
-            opacities,
-            colors,
             viewmat[None],
             K[None],
             width,
             height,
             near_plane=near_plane,
             far_plane=far_plane,
-            sh_degree=None,
-            packed=False,
-            render_mode="RGB+ED" if render_depth else "RGB",
-            absgrad=absgrad,
-            rasterize_mode="antialiased" if antialiased else "classic",
-            # Each pass overwrites absgrad with that of its own channels, so with absgrad there must be one pass only.
-            channel_chunk=max(_CHANNELS_PER_PASS, channels + 1) if absgrad else _CHANNELS_PER_PASS,
+            calc_compensations=antialiased,
+            **({"opacities": opacities} if _projection_takes_opacities() else {}),
         )
+        seen_opacities = opacities[None] if compensations is None else opacities * compensations
+        starts, primitives = self._lists(means2d, conics, seen_opacities, depths, radii, width, height)
+        channels = torch.cat([colors, depths[0, :, None]], dim=1) if render_depth else colors
+        # Each pass overwrites absgrad with that of its own channels, so with absgrad there must be one pass only.
+        passes = [channels] if absgrad else channels.split(_CHANNELS_PER_PASS, dim=1)
+        blended = [
+            rasterize_to_pixels(
+                means2d,
+                conics,
+                some[None],
+                seen_opacities,
+                width,
+                height,
+                TILE,
+                starts,
+                primitives,
+                absgrad=absgrad,
+            )
+            for some in passes
+        ]
+        alpha = blended[0][1][0]
+        picture = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
+        depth = None
+        if render_depth:
+            picture, depth = picture[..., :-1], picture[..., -1:] / alpha.clamp(min=1e-10)
         return Rasterization(
-            colors=rendered[0, ..., :channels],
-            depth=rendered[0, ..., channels:] if render_depth else None,
-            alpha=alpha[0],
-            radii=largest_axis(info["radii"][0]),
-            info=info,
+            colors=picture,
+            depth=depth,
+            alpha=alpha,
+            radii=largest_axis(radii[0]),
+            info={
+                "means2d": means2d,
+                "radii": radii,
+                "width": width,
+                "height": height,
+                "n_cameras": 1,
+                "gaussian_ids": None,
+            },
         )
+
+    def _lists(
+        self, means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, radii: Tensor, width: int, height: int
+    ) -> tuple[Tensor, Tensor]:
+        """Where the list of each tile begins, and the primitives of all lists."""
+        from gsplat import isect_offset_encode, isect_tiles
+
+        if self._room is not None or width * height >= _LARGE:
+            room = self._room or Room()
+            lists = tile_lists(means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, room=room)
+            return lists.starts, lists.primitives
+        columns, rows = -(-width // TILE), -(-height // TILE)
+        _, pairs, primitives = isect_tiles(means2d, radii, depths, TILE, columns, rows)
+        return isect_offset_encode(pairs, 1, columns, rows), primitives
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``.
@@ -101,7 +155,17 @@ class GsplatBackend:
         _check_kernels_take(directions)
         if directions.shape[0] == 0:
             return ReferenceBackend().spherical_harmonics(degree, directions, coeffs)
+        if not torch.is_grad_enabled():
+            return harmonics(degree, directions, coeffs)
         return spherical_harmonics(degree, directions, coeffs)
+
+
+@functools.cache
+def _projection_takes_opacities() -> bool:
+    """Whether this gsplat (from 1.5 on) fits radii to them."""
+    from gsplat import fully_fused_projection
+
+    return "opacities" in inspect.signature(fully_fused_projection).parameters
 
 
 def _check_kernels_take(tensor: Tensor) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
-import shutil
-import subprocess
 from collections.abc import Callable
 
 import pytest
@@ -17,58 +14,23 @@ from torch import Tensor, nn
 from sundae_ns import nvrtc
 from sundae_ns.compensation import CompensationHead, HeadConfig, fused, kernels
 from sundae_ns.compensation.fused_training import FusedTraining
+from sundae_ns.cuda_graphs import MAX_SIZES
 from sundae_ns.errors import BackendError, SundaeError
 
-# What a GPU's compiler knows by itself, pictures of floats, and a loop over the threads. A block has one thread here, so
-# that what the threads of a block share is filled before it is read.
-SHIM = """
-#define __device__
-#define __global__
-#define __forceinline__ inline
-#define __shared__ static
-#define __align__(n) __attribute__((aligned(n)))
-#define __syncthreads()
+PICTURES_OF_FLOATS = """
 typedef float T;
 inline float load(T v) { return v; }
 inline T store(float v) { return v; }
-struct Index { unsigned x; };
-static Index blockIdx, blockDim = {1}, threadIdx;
-%s
-extern "C" void at(unsigned block) { blockIdx.x = block; }
 """
 
 Compile = Callable[[CompensationHead], kernels.Launches]
 
 
 @pytest.fixture(scope="module")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Compile:
-    compiler = shutil.which("g++")
-    if compiler is None:
-        pytest.skip("no g++ here to compile the kernels for the CPU")
-    folder = tmp_path_factory.mktemp("kernels")
-    (folder / "kernels.cpp").write_text(SHIM % kernels.SOURCE)
-
+def compiled(compile_kernels: Callable[..., kernels.Launches]) -> Compile:
     def compile_for(head: CompensationHead) -> kernels.Launches:
         options = kernels.definitions(head.net, head.config.mode == "residual")
-        library = folder / f"{abs(hash(options))}.so"
-        if not library.exists():
-            flags = ["-O1", "-w", "-shared", "-fPIC", *options]
-            subprocess.run([compiler, *flags, "-o", library, folder / "kernels.cpp"], check=True)
-        loaded = ctypes.CDLL(str(library))
-
-        def launch_of(name: str) -> kernels.Launch:
-            def launch(threads: int, arguments: list[Tensor | int | float]) -> None:
-                values = [
-                    ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_int(a) for a in arguments
-                ]
-                # More threads than asked for, as whole blocks have.
-                for block in range(threads + 3):
-                    loaded.at(block)
-                    getattr(loaded, name)(*values)
-
-            return launch
-
-        return {name: launch_of(name) for name in kernels.FORWARD + kernels.BACKWARD}
+        return compile_kernels(PICTURES_OF_FLOATS + kernels.SOURCE, kernels.FORWARD + kernels.BACKWARD, options)
 
     return compile_for
 
@@ -186,7 +148,10 @@ def test_the_same_gradients_at_any_size(
     head = make(num_features=num_features)
     pictures, to_out = splatted(height, width, num_features, seed=seed), torch.randn(height, width, 3)
     training = FusedTraining(head.net, True, compiled(head))
-    assert_same(of_kernels(head, pictures, to_out, training), of_layers(head, pictures, to_out))
+    both = zip(of_kernels(head, pictures, to_out, training), of_layers(head, pictures, to_out), strict=True)
+    for found, expected in both:
+        # By the norm: among so many pictures is one with an activation so near zero that rounding decides on its slope.
+        assert float((found - expected).norm()) <= 2e-3 * max(float(expected.norm()), 1e-3)
 
 
 def test_gradients_of_an_earlier_picture_are_refused(compiled: Compile) -> None:
@@ -233,7 +198,7 @@ def test_on_a_gpu_at_every_size_and_with_weights_that_change(precision: str, tol
         assert float((found - expected).abs().max()) < tolerance * scale
         kept.append((found, found.clone()))
     assert quick._can_fuse
-    assert len(quick._inference._recorded) == fused.MAX_SIZES
+    assert len(quick._inference._recorded) == MAX_SIZES
     for found, copy in kept:  # nobody's picture was written over by a later one
         assert torch.equal(found, copy)
 
@@ -293,4 +258,4 @@ def test_training_on_a_gpu_is_that_of_the_layers(mode: str) -> None:
     for table, slack in [*((each, 0.1) for each in norms), (together, 0.01)]:
         error, allowed, whole = table.unbind(1)
         assert (error <= 4 * allowed + slack * whole).all(), (error, allowed, whole)
-    assert len(quick._training._recorded) == fused.MAX_SIZES
+    assert len(quick._training._recorded) == MAX_SIZES

@@ -1,0 +1,81 @@
+"""Work of a GPU that is recorded once and played back: CUDA graphs, and which of them are kept. Floor 0."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from typing import Generic, TypeVar
+
+import torch
+
+MAX_SIZES = 4
+"""Recordings kept at a time: each holds its own pictures and activations."""
+
+RECORD_AT = 3
+"""What comes for this time in a row is recorded: a viewer that is being resized never shows one size twice."""
+
+Result = TypeVar("Result")
+
+
+@contextmanager
+def aside(device: torch.device) -> Iterator[None]:
+    """Run once what is going to be recorded: it allocates and chooses kernels, neither of which can be recorded."""
+    side = torch.cuda.Stream(device)
+    side.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(side):
+        yield
+    torch.cuda.current_stream(device).wait_stream(side)
+
+
+def record(
+    run: Callable[[], Result], shares: torch.cuda.CUDAGraph | None = None
+) -> tuple[torch.cuda.CUDAGraph, Result]:
+    """Record what ``run`` does, without doing it.
+
+    Args:
+        run: must have run before (:func:`aside`), wait for nothing, and read only what stays where it is.
+        shares: a graph whose memory this one uses too; they are played in this order.
+
+    Returns:
+        The graph, and what ``run`` returned: tensors that the graph writes whenever it is played.
+    """
+    graph = torch.cuda.CUDAGraph()
+    # A training loop beside a viewer may allocate meanwhile; only this thread's work belongs to the recording.
+    pool = None if shares is None else shares.pool()
+    with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
+        result = run()
+    return graph, result
+
+
+class Kept(Generic[Result]):
+    """Recordings, by what tells them apart: a few of those that were used last."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[Hashable, Result] = OrderedDict()
+        self._last: Hashable = None
+        self._in_a_row = 0
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def get(self, key: Hashable, make: Callable[[], Result]) -> Result | None:
+        """The recording for ``key``, made when it is asked for often enough in a row; None before."""
+        self._in_a_row = self._in_a_row + 1 if key == self._last else 1
+        self._last = key
+        if key not in self._kept:
+            if self._in_a_row < RECORD_AT:
+                return None
+            if len(self._kept) >= MAX_SIZES:
+                self._kept.popitem(last=False)
+            self._kept[key] = make()
+        self._kept.move_to_end(key)
+        return self._kept[key]
+
+    def put(self, key: Hashable, recording: Result) -> None:
+        """Keep another recording for a key that there is one for."""
+        self._kept[key] = recording
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._kept.clear()

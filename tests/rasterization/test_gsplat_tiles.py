@@ -1,0 +1,187 @@
+"""The lists of primitives that gsplat is given for its tiles: the kernels' very lines, compiled for the CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from sundae_ns import nvrtc
+from sundae_ns.errors import BackendError
+from sundae_ns.rasterization import gsplat_harmonics, gsplat_tiles
+from sundae_ns.rasterization.gsplat_tiles import TILE, Room, tile_lists
+from sundae_ns.rasterization.harmonics import evaluate_harmonics
+
+Field = dict[str, Tensor]
+
+
+@pytest.fixture(autouse=True)
+def on_cpu(compile_kernels: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
+    def compiled(_: torch.device, dtype: torch.dtype) -> tuple[Any, ...]:
+        names = ("count_tiles", "list_tiles")
+        return tuple(compile_kernels(gsplat_tiles.SOURCE, names, gsplat_tiles.definitions(dtype)).values())
+
+    monkeypatch.setattr(gsplat_tiles, "_compiled", compiled)
+    monkeypatch.setattr(
+        gsplat_harmonics,
+        "_compiled",
+        lambda _: compile_kernels(gsplat_harmonics.SOURCE, ["harmonics"])["harmonics"],
+    )
+
+
+def field(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Field:
+    """Footprints of all sizes and shapes, up to needles across the picture, in and around it."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator)
+
+    angle, sides = uniform(n) * 6.3, 10 ** (uniform(2, n) * (largest + 1) - 1)
+    c, s = angle.cos(), angle.sin()
+    xx = sides[0] * c * c + sides[1] * s * s + 0.3
+    yy = sides[0] * s * s + sides[1] * c * c + 0.3
+    xy = (sides[0] - sides[1]) * c * s
+    det = (xx.double() * yy.double() - xy.double() ** 2).float()
+    radii = (3 * sides.amax(0).add(0.3).sqrt()).ceil().int()
+    radii[::17] = 0
+    depths = uniform(n) + 0.1
+    depths[1::9] = depths[0]  # ties
+    return {
+        "means2d": (uniform(n, 2) * 1.4 - 0.2) * torch.tensor([float(width), float(height)]),
+        "conics": torch.stack([yy / det, -xy / det, xx / det], dim=1),
+        "opacities": uniform(n) ** 3,
+        "depths": depths,
+        "radii": radii,
+    }
+
+
+def in_square(of: Field, column: int, row: int, columns: int, rows: int) -> Tensor:
+    """Whether gsplat has a tile in the square of each primitive ``[N]``."""
+    radii = of["radii"].float().view(len(of["depths"]), -1).expand(-1, 2) / TILE
+    low = (of["means2d"] / TILE - radii).floor().clamp(min=0).minimum(torch.tensor([columns, rows]))
+    high = (of["means2d"] / TILE + radii).ceil().clamp(min=0).minimum(torch.tensor([columns, rows]))
+    at = torch.tensor([column, row])
+    return (radii > 0).all(dim=1) & (low <= at).all(dim=1) & (high > at).all(dim=1)
+
+
+def most_alpha(of: Field, column: int, row: int, width: int, height: int) -> Tensor:
+    """Largest alpha of each primitive over the pixels of a tile, float64 ``[N]``."""
+    ys, xs = torch.meshgrid(
+        torch.arange(row * TILE, min(row * TILE + TILE, height)) + 0.5,
+        torch.arange(column * TILE, min(column * TILE + TILE, width)) + 0.5,
+        indexing="ij",
+    )
+    dx = xs.reshape(1, -1).double() - of["means2d"][:, :1].double()
+    dy = ys.reshape(1, -1).double() - of["means2d"][:, 1:].double()
+    a, b, c = of["conics"].double().T[..., None]
+    exponents = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
+    return (of["opacities"][:, None].double() * (-exponents).exp()).amax(dim=1)
+
+
+def by_tile(of: Field, width: int, height: int, room: Room | None = None) -> list[Tensor]:
+    lists = tile_lists(**of, width=width, height=height, room=room or Room())
+    ends = [*lists.starts.flatten()[1:].tolist(), len(lists.primitives)]
+    starts = lists.starts.flatten().tolist()
+    return [lists.primitives[start:end].long() for start, end in zip(starts, ends, strict=True)]
+
+
+@pytest.mark.parametrize(("width", "height"), [(150, 100), (1, 1), (400, 37), (33, 260)])
+def test_nothing_that_is_blended_is_missing_and_hardly_anything_else_is_there(width: int, height: int) -> None:
+    of = field(300, width, height)
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    needed = listed = squares = 0
+    for tile, found in enumerate(by_tile(of, width, height)):
+        row, column = divmod(tile, columns)
+        square = in_square(of, column, row, columns, rows)
+        blended = square & (most_alpha(of, column, row, width, height) >= 1 / 255)
+        there = torch.zeros_like(square).index_fill(0, found, True)
+        assert not (blended & ~there).any()
+        assert not (there & ~square).any()
+        order = of["depths"][found] * 1000 + found  # by depth, and ties by index
+        assert (of["depths"][found].diff() >= 0).all()
+        assert (order.diff()[of["depths"][found].diff() == 0] > 0).all()
+        needed, listed, squares = (
+            needed + int(blended.sum()),
+            listed + len(found),
+            squares + int(square.sum()),
+        )
+    assert listed <= 1.02 * needed + 2
+    if columns * rows > 1:  # this test can tell them from gsplat's own
+        assert squares > 2 * listed
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6), largest=st.sampled_from([1.0, 4.0, 7.0]), shift=st.sampled_from([0.0, 3000.0]))
+def test_needles_far_away_are_not_dropped(seed: int, largest: float, shift: float) -> None:
+    width, height = 70, 50
+    of = field(40, width, height, largest=largest, seed=seed)
+    of["means2d"] += shift * torch.randn(40, 2, generator=torch.Generator().manual_seed(seed))
+    of["radii"][:] = 10000
+    for tile, found in enumerate(by_tile(of, width, height)):
+        row, column = divmod(tile, 5)
+        # As gsplat sums the exponent in float32: what rounding makes visible may be there, and what is visible must be.
+        blended = most_alpha(of, column, row, width, height) >= 1.01 / 255
+        assert not (blended & ~torch.zeros(40, dtype=torch.bool).index_fill(0, found, True)).any()
+
+
+def test_what_is_not_a_number_is_left_to_gsplat() -> None:
+    of = field(20, 64, 64)
+    of["radii"][:] = 100
+    of["conics"][3], of["opacities"][5], of["conics"][7] = torch.nan, torch.nan, 0.0
+    for found in by_tile(of, 64, 64):
+        assert {3, 5, 7} <= set(found.tolist())
+
+
+def test_a_radius_for_each_axis() -> None:
+    of = field(200, 150, 100)
+    both = {**of, "radii": of["radii"][:, None].repeat(1, 2)}
+    assert all(torch.equal(a, b) for a, b in zip(by_tile(both, 150, 100), by_tile(of, 150, 100), strict=True))
+    both["radii"][:, 1] = both["radii"][:, 1] // 3
+    for tile, found in enumerate(by_tile(both, 150, 100)):
+        assert in_square(both, tile % 10, tile // 10, 10, 7)[found].all()
+
+
+def test_room_leaves_the_lists_as_they_are_and_tells_what_was_needed() -> None:
+    of, room = field(200, 150, 100), Room()
+    exact = by_tile(of, 150, 100, room)
+    (needed,) = room.needed
+    assert int(needed) == sum(map(len, exact))
+    for spare in (0, 1000):
+        roomy = Room(int(needed) + spare)
+        *found, below = by_tile(of, 150, 100, roomy)[: len(exact) + 1]
+        assert all(torch.equal(a, b) for a, b in zip(found, exact, strict=True))
+        assert len(below) == spare  # a tile below the picture has what is left
+    short = Room(int(needed) - 5)
+    by_tile(of, 150, 100, short)
+    assert int(short.needed[0]) == int(needed)
+
+
+def test_more_tiles_than_16_bits_count() -> None:
+    of = field(5, 30, 30)
+    of["means2d"] = torch.tensor([[3275.0 * TILE, 5.0]] * 5)
+    found = by_tile(of, 3300 * TILE, 10 * TILE)
+    assert {tile % 3300 // 100 for tile, list_ in enumerate(found) if len(list_)} == {32}
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_harmonics_are_those_of_the_reference(degree: int) -> None:
+    directions, coeffs = torch.randn(100, 3) * 3, torch.randn(100, 25, 3)
+    found = gsplat_harmonics.harmonics(degree, directions, coeffs)
+    exact = evaluate_harmonics(degree, directions.double(), coeffs.double())
+    torch.testing.assert_close(found.double(), exact, rtol=0, atol=5e-6)
+
+
+def test_they_compile_for_gpus() -> None:
+    try:
+        for dtype in (torch.int16, torch.int32):
+            nvrtc.compile_cubin(gsplat_tiles.SOURCE, "sm_75", gsplat_tiles.definitions(dtype))
+        nvrtc.compile_cubin(gsplat_harmonics.SOURCE, "sm_90")
+    except BackendError as error:
+        if "libnvrtc" not in str(error) and "without CUDA" not in str(error):
+            raise
+        pytest.skip(f"no NVRTC here: {error}")
