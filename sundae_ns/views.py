@@ -78,7 +78,7 @@ def _numbers(camera: Cameras) -> list[float]:
     Read by itself, because nerfstudio's methods of cameras build tensors and cameras anew, at every step and frame.
     """
     parts = (camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    return torch.cat([part.detach().flatten().to(torch.float64) for part in parts]).tolist()  # type: ignore[no-any-return]
+    return torch.cat([part.detach().flatten() for part in parts]).tolist()  # type: ignore[no-any-return]
 
 
 def _world_to_camera(pose: Sequence[float]) -> list[float]:

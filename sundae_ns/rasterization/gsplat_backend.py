@@ -17,15 +17,14 @@ from sundae_ns.rasterization.types import Rasterization
 
 _CHANNELS_PER_PASS = 32
 
-_LARGE = 2**20
-"""Pixels from which on lists of our own, shorter ones, save more time than their starting takes."""
-
 
 class GsplatBackend:
     """The kernels of gsplat; float32 tensors on a CUDA device.
 
     Args:
-        room: for pairs of tiles and primitives, so that nothing has to be waited for; None: as much as needed.
+        room: for pairs of a tile and a primitive: the tiles get lists of our own, which are shorter than gsplat's, and with
+            which nothing has to be waited for; but more kernels make them, which pays where they are played back. None:
+            gsplat's lists.
     """
 
     name = "gsplat"
@@ -136,9 +135,8 @@ class GsplatBackend:
         """Where the list of each tile begins, and the primitives of all lists."""
         from gsplat import isect_offset_encode, isect_tiles
 
-        if self._room is not None or width * height >= _LARGE:
-            room = self._room or Room()
-            lists = tile_lists(means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, room=room)
+        if self._room is not None:
+            lists = tile_lists(means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, room=self._room)
             return lists.starts, lists.primitives
         columns, rows = -(-width // TILE), -(-height // TILE)
         _, pairs, primitives = isect_tiles(means2d, radii, depths, TILE, columns, rows)
