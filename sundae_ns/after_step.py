@@ -72,18 +72,23 @@ def prune_if_due(model: SundaeModel, attributes: TrainingCallbackAttributes, ste
 
 
 def warn_if_too_short(model: SundaeModel, last_step: int) -> None:
-    """Say so where a training that ends with this step never comes to its first prune."""
+    """Say so where a training that ends with this step never comes to its first prune, or not to its last."""
     pruning, ranks = model.config.pruning, 1 if model.shards is None else model.shards.ranks
-    first = pruning.first_prune
+    first, last = pruning.first_prune, pruning.settled_at
     # A warm start is pruned at once.
-    if first is None or last_step >= first or model.config.warm_start is not None or model.pruning_state["num_prunes"]:
+    if first is None or last_step >= last or model.config.warm_start is not None:
         return
+    if last_step >= first or model.pruning_state["num_prunes"]:
+        which, due, found = "last", last, "more primitives are left than asked for"
+        option = "stop" if pruning.mode == "continuous" else "rounds"
+    else:
+        which, due, found = "first", first, "nothing is pruned"
+        option = "start" if pruning.mode == "continuous" else "prune-at"
     waits = ", and the head takes no part" if model.head is not None and model.config.head.start_at is None else ""
-    option = "start" if pruning.mode == "continuous" else "prune-at"
     # Steps of one picture, which options count by.
     CONSOLE.print(
-        f"[yellow]Warning: training ends after {(last_step + 1) * ranks:,} steps, and the first prune needs more than "
-        f"{first * ranks:,} (pruning.{option}): nothing is pruned{waits}; train longer, or prune earlier",
+        f"[yellow]Warning: training ends after {(last_step + 1) * ranks:,} steps, and the {which} prune needs more than "
+        f"{due * ranks:,} (pruning.{option}): {found}{waits}; train longer, or prune earlier",
         soft_wrap=True,
     )
 

@@ -11,6 +11,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, replace
 from functools import partial
+from threading import Lock
 from typing import Any
 
 import torch
@@ -51,6 +52,8 @@ class Recordings:
         self._kept: Kept[_Recording] = Kept()
         self._of: object = None
         self._can_record = True
+        # A viewer renders in its own thread, and a recording reads what it was given last.
+        self._lock = Lock()
 
     def render(
         self, field: Mapping[str, Tensor], view: View, background: Tensor, style: Style, *, compensate: bool = True
@@ -73,22 +76,31 @@ class Recordings:
         """
         if not (self._can_record and _recordable(field, style)):
             return render(field, view, background, style, depth=False, compensate=compensate)[0]
-        key = self._key(field, view, style, compensate)
-        record_for = partial(_record, field, view, background, style, compensate)
         try:
-            recording = self._kept.get(key, record_for)
-            if recording is not None:
-                made, needed = _play(recording, view, background)
-                if needed > recording.pairs:
-                    recording = record_for(pairs=int(SPARE * needed))
-                    self._kept.put(key, recording)
-                    made, _ = _play(recording, view, background)
+            with self._lock:
+                made = self._played(field, view, background, style, compensate)
+            if made is not None:
                 return made
         except (BackendError, RuntimeError) as error:
             _log.warning("frames are rendered kernel by kernel, for they cannot be recorded: %s", error)
             self._kept.clear()
             self._can_record = False
         return render(field, view, background, style, depth=False, compensate=compensate)[0]
+
+    def _played(
+        self, field: Mapping[str, Tensor], view: View, background: Tensor, style: Style, compensate: bool
+    ) -> dict[str, Any] | None:
+        record_for = partial(_record, field, view, background, style, compensate)
+        key = self._key(field, view, style, compensate)
+        recording = self._kept.get(key, record_for)
+        if recording is None:
+            return None
+        made, needed = _play(recording, view, background)
+        if needed > recording.pairs:
+            recording = record_for(pairs=int(SPARE * needed))
+            self._kept.put(key, recording)
+            made, _ = _play(recording, view, background)
+        return made
 
     def _key(self, field: Mapping[str, Tensor], view: View, style: Style, compensate: bool) -> object:
         """What a recording has fixed. The field is told by where it lies, which is what a recording reads."""

@@ -89,7 +89,7 @@ def test_rounds_prune_to_the_count_and_the_head_waits_for_the_last(
 
 
 def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
-    return [line for line in capsys.readouterr().out.splitlines() if "first prune" in line]
+    return [line for line in capsys.readouterr().out.splitlines() if " prune needs more" in line]
 
 
 @pytest.mark.parametrize(
@@ -103,19 +103,31 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
         ({"prune_at": 3}, {"mode": "off"}, "3 (pruning.prune-at): nothing is pruned; train longer, or prune earlier"),
         ({"prune_at": 3}, {"start_at": 1}, "3 (pruning.prune-at): nothing is pruned; train longer, or prune earlier"),
         ({"mode": "continuous", "start": 3}, {}, "3 (pruning.start): nothing is pruned, and the head takes no part"),
+        (
+            {"mode": "continuous", "start": 1, "every": 1, "stop": 5},
+            {},
+            "5 (pruning.stop): more primitives are left than asked for, and the head takes no part; train longer",
+        ),
+        (
+            {"prune_at": 1, "rounds": 3, "round_every": 2},
+            {"start_at": 0},
+            "5 (pruning.rounds): more primitives are left than asked for; train longer, or prune earlier",
+        ),
     ],
 )
-def test_a_run_that_never_prunes_says_so_in_one_line_before_and_after(
+def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_after(
     build: Build,
     training_of: TrainingOf,
     capsys: pytest.CaptureFixture[str],
     pruning: dict[str, Any],
     head: dict[str, Any],
     ending: str,
+    tmp_path: Path,
 ) -> None:
-    training = training_of(build(pruning=pruning, head=head), SimpleNamespace(last_step=2))
+    training = training_of(build(pruning=pruning, head=head), SimpleNamespace(last_step=2, base_dir=tmp_path))
     (before,) = said(capsys)
-    assert before.startswith("Warning: training ends after 3 steps, and the first prune needs more than " + ending)
+    which = "first" if "nothing" in ending else "last"
+    assert before.startswith(f"Warning: training ends after 3 steps, and the {which} prune needs more than " + ending)
     for step in range(3):
         training.step(step)
     assert said(capsys) == []
@@ -128,7 +140,8 @@ def test_a_run_that_never_prunes_says_so_in_one_line_before_and_after(
     [
         {"pruning": {"prune_at": 2}},
         {"pruning": {"mode": "off"}},
-        {"pruning": {"mode": "continuous", "start": 2}},
+        {"pruning": {"mode": "continuous", "start": 1, "stop": 2}},
+        {"pruning": {"prune_at": 1, "rounds": 2, "round_every": 1}},
         {"pruning": {"prune_at": 100}, "warm_start": Path("anything")},
     ],
 )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -120,6 +122,26 @@ def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(
     recorder.needed = 150
     model.get_outputs_for_camera(camera())
     assert len(recorder.recorded) == 2
+
+
+def test_one_thread_plays_at_a_time(
+    build: Build, perturb: Perturb, camera: MakeCamera, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = perturb(build()).eval()
+    inside, most, play = [0], [0], recorder.play
+
+    def slowly(*arguments: Any) -> Any:
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        time.sleep(0.02)
+        made = play(*arguments)
+        inside[0] -= 1
+        return made
+
+    monkeypatch.setattr(recordings, "_play", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: model.get_outputs_for_camera(camera())["rgb"], range(12)))
+    assert (most[0], recorder.played) == (1, 10)
 
 
 @pytest.mark.parametrize("error", [BackendError("no compiler: install one"), torch.cuda.OutOfMemoryError("full")])
