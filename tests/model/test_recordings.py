@@ -95,17 +95,18 @@ def test_what_a_recording_has_fixed_makes_another_one(
 
     assert show() == 1
     assert show(width=41) == 2
+    assert show(height=33) == 3
     model.compensated = False
-    assert show() == 3
+    assert show() == 4
     model.compensated = True
     assert model.head is not None
     model.head.config = replace(model.head.config, phases=2)
-    assert show() == 4
-    model.trained_focal = (10.0, 10.0)  # the camera's is 30: the head runs at another scale
     assert show() == 5
+    model.trained_focal = (10.0, 10.0)  # the camera's is 30: the head runs at another scale
+    assert show() == 6
     with torch.no_grad():
         model.gauss_params["means"] = torch.nn.Parameter(model.gauss_params["means"].clone())
-    assert show() == 6
+    assert show() == 7
     assert len(model._recordings._kept) == 1  # those of a field that is gone hold memory for nothing
 
 

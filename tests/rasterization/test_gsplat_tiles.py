@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -90,9 +91,9 @@ def by_tile(of: Field, width: int, height: int, room: Room | None = None) -> lis
     return [lists.primitives[start:end].long() for start, end in zip(starts, ends, strict=True)]
 
 
-@pytest.mark.parametrize(("width", "height"), [(150, 100), (1, 1), (400, 37), (33, 260)])
+@pytest.mark.parametrize(("width", "height"), [(150, 100), (1, 1), (400, 37), (20, 700)])
 def test_nothing_that_is_blended_is_missing_and_hardly_anything_else_is_there(width: int, height: int) -> None:
-    of = field(300, width, height)
+    of = field(300, width, height, largest=5.5)
     columns, rows = -(-width // TILE), -(-height // TILE)
     needed = listed = squares = 0
     for tile, found in enumerate(by_tile(of, width, height)):
@@ -127,6 +128,19 @@ def test_needles_far_away_are_not_dropped(seed: int, largest: float, shift: floa
         # As gsplat sums the exponent in float32: what rounding makes visible may be there, and what is visible must be.
         blended = most_alpha(of, column, row, width, height) >= 1.01 / 255
         assert not (blended & ~torch.zeros(40, dtype=torch.bool).index_fill(0, found, True)).any()
+
+
+def test_where_it_is_least_between_two_tiles_either_may_be_the_one() -> None:
+    """A faint needle that leans over the gap between two tiles: the one on the far side of the border is reached."""
+    of = field(1, 64, 64)
+    c, s = math.cos(1.7074472511921694), math.sin(1.7074472511921694)
+    xx, xy, yy = 625.1582971 * c * c + 0.3, 625.1582971 * c * s, 625.1582971 * s * s + 0.3
+    of["conics"][0] = torch.tensor([yy, -xy, xx], dtype=torch.float64) / (xx * yy - xy * xy)
+    of["means2d"][0] = torch.tensor([32.12918686614097, 32.5 - 0.9142656220370688])
+    of["opacities"][0], of["radii"][0] = math.exp(0.1) / 255, 100
+    alphas = [float(most_alpha(of, column, 2, 64, 64)) for column in range(4)]
+    assert [alpha >= 1 / 255 for alpha in alphas] == [False, True, False, False]
+    assert len(by_tile(of, 64, 64)[2 * 4 + 1]) == 1
 
 
 def test_what_is_not_a_number_is_left_to_gsplat() -> None:
