@@ -21,6 +21,7 @@ from typing import Any
 
 import run
 import torch
+import torch.nn.functional as F
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
@@ -36,7 +37,9 @@ from sundae_ns.model import SundaeModel
 RESULTS = Path(__file__).parent / "results" / "branches.jsonl"
 FIELD = ("features_dc", "features_rest", "opacities", "scales", "quats", "features")
 
-EXPERIMENTS = "skip width flip rates cooldown picture_loss_on_base apart average weight_decay dropout".split()
+EXPERIMENTS = (
+    "every window halved skip width flip rates cooldown picture_loss_on_base apart average weight_decay dropout".split()
+)
 
 
 @dataclass
@@ -93,6 +96,41 @@ def with_dropout(forward: Any, share: float) -> Any:
             kept[:3] = 1
             splatted = splatted * kept
         return forward(self, base, splatted, alpha)
+
+    return wrapped
+
+
+def now_and_then(head_active: Any, every: int) -> Any:
+    """In training the head takes part in every so many-th step; the others train base colours by themselves."""
+    return property(lambda self: head_active.fget(self) and not (self.training and self.step % every))
+
+
+def in_window(forward: Any, share: float) -> Any:
+    """In training the head sees a random band of rows; outside of it base colours have the loss of the picture."""
+
+    def wrapped(self: CompensationHead, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
+        if not torch.is_grad_enabled():
+            return forward(self, base, splatted, alpha)
+        height, fold = len(base), self.config.pixel_unshuffle
+        rows = max(int(height * share) // fold, 1) * fold
+        top = int(torch.randint(0, (height - rows) // fold + 1, ())) * fold
+        band = slice(top, top + rows)
+        seen = [picture[band].contiguous() for picture in (base, splatted, alpha)]
+        return torch.cat([base[:top], forward(self, *seen), base[top + rows :]])
+
+    return wrapped
+
+
+def with_halved_features(forward: Any) -> Any:
+    """All pixels of a block of 2 x 2 have the same features, their mean."""
+
+    def wrapped(self: CompensationHead, base: Tensor, splatted: Tensor, alpha: Tensor) -> Tensor:
+        height, width = base.shape[:2]
+        features = splatted[..., 3:].permute(2, 0, 1)[None]
+        padded = F.pad(features, (0, width % 2, 0, height % 2), mode="replicate")
+        coarse = F.avg_pool2d(padded, 2).repeat_interleave(2, dim=2).repeat_interleave(2, dim=3)
+        again = coarse[0, :, :height, :width].permute(1, 2, 0)
+        return forward(self, base, torch.cat([splatted[..., :3], again], dim=-1), alpha)
 
     return wrapped
 
@@ -184,6 +222,11 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--apart", action="store_true", help="the head's loss does not move the field")
     parser.add_argument("--average", type=float, help="decay of a moving average of all parameters, which is evaluated")
     parser.add_argument("--weight-decay", type=float, help="decoupled, of the head's weights, times its rate")
+    parser.add_argument("--every", type=int, help="steps from one in which the head takes part to the next")
+    parser.add_argument(
+        "--window", type=float, help="share of a picture's rows that the head sees; others train base colours"
+    )
+    parser.add_argument("--halved", action="store_true", help="features as if splatted at half the resolution")
     parser.add_argument("--dropout", type=float, help="share of feature channels hidden from the head at random")
     own, extra = sys.argv[1:], []
     if "--" in own:
@@ -226,6 +269,12 @@ def main() -> None:
         SundaeModel.get_loss_dict = with_picture_loss_on_base(SundaeModel.get_loss_dict)  # type: ignore[method-assign]
     if options.dropout is not None:
         CompensationHead.forward = with_dropout(CompensationHead.forward, options.dropout)  # type: ignore[method-assign]
+    if options.every is not None:
+        SundaeModel.head_active = now_and_then(SundaeModel.head_active, options.every)  # type: ignore[method-assign]
+    if options.window is not None:
+        CompensationHead.forward = in_window(CompensationHead.forward, options.window)  # type: ignore[method-assign]
+    if options.halved:
+        CompensationHead.forward = with_halved_features(CompensationHead.forward)  # type: ignore[method-assign]
     if options.apart:
         rendering.splat = apart(rendering.splat)
         CompensationHead.forward = unmoved(CompensationHead.forward)  # type: ignore[method-assign]

@@ -9,7 +9,7 @@
 The warm-up is trained once and kept under ``--out``; of several processes the first makes it and the others wait. Branches
 that have a line already are passed over, so a run that was stopped goes on where it was. All branches train without a head,
 see the same views in the same order for the same seed, and let their rates decay over their own length. ``--list`` shows
-the branches that would run.
+the branches that would run, ``--missing`` those without a line as jobs for ``jobs.py``: the first makes the warm-up.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import argparse
 import copy
 import json
 import shlex
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -108,6 +109,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--rows", type=Path, default=run.RESULTS, help="CSV file of rows; - for none")
     parser.add_argument("--list", action="store_true", help="print the branches and stop")
+    parser.add_argument("--missing", action="store_true", help="print a job for each branch without a line, and stop")
     return parser.parse_args()
 
 
@@ -162,7 +164,7 @@ class Bench:
         self.step = self.pruning.prune_at
         self.weights: dict[tuple[bool, float], torch.Tensor] = {}
         self._measured = self.model.contribution
-        self.start = self._warm_up(options.out / f"{options.scene}-{options.method}-{self.step}.ckpt")
+        self.start = self._warm_up(warm_up_of(options, self.step))
 
     def _warm_up(self, path: Path) -> dict[str, Any]:
         """The state right before the prune: from the file, or trained into it."""
@@ -311,12 +313,57 @@ def key_of(options: argparse.Namespace, branch: Branch, warmup: int) -> dict[str
     }
 
 
+def warm_up_of(options: argparse.Namespace, step: int) -> Path:
+    """File of the field before the prune; a folder for each capture, since files in the making have one name in a folder."""
+    return Path(options.out) / options.scene / f"{options.method}-{step}.ckpt"
+
+
 def is_finished(path: Path, key: dict[str, Any]) -> bool:
     return any(all(line[name] == value for name, value in key.items()) for line in finished(path))
 
 
 def finished(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def jobs_of(options: argparse.Namespace, wanted: list[Branch]) -> list[dict[str, Any]]:
+    """Jobs for ``jobs.py``, one a branch; all but the first wait for the warm-up that it makes."""
+    known = {
+        (line["scene"], line["method"], line["steps"], line["rule"], line["keep"], line["seed"])
+        for line in finished(options.results)
+    }
+    own = ["--scene", options.scene, "--data", str(options.data.resolve()), "--steps", str(options.steps)]
+    own += [
+        "--method",
+        options.method,
+        "--out",
+        str(options.out.resolve()),
+        "--results",
+        str(options.results.resolve()),
+    ]
+    own += ["--rows", str(options.rows) if str(options.rows) == "-" else str(options.rows.resolve())]
+    own += [] if options.warmup is None else ["--warmup", str(options.warmup)]
+    jobs: list[dict[str, Any]] = []
+    for number, branch in enumerate(wanted):
+        if (options.scene, options.method, options.steps, branch.rule, branch.keep, branch.seed) in known:
+            continue
+        # As one of a list of one, whatever the number: each process has a folder of its own.
+        which = [
+            "--rules",
+            branch.rule,
+            "--keep",
+            f"{branch.keep:g}",
+            "--seeds",
+            str(branch.seed),
+            "--shard",
+            f"0/{number + 2}",
+        ]
+        command = shlex.join([sys.executable, str(Path(__file__).resolve()), *own, *which])
+        needs = [jobs[0]["name"]] if jobs else []
+        jobs.append(
+            {"name": f"{options.scene}-{branch.keep:g}-{branch.rule}-{branch.seed}", "command": command, "needs": needs}
+        )
+    return jobs
 
 
 def append(path: Path, line: dict[str, Any]) -> None:
@@ -333,6 +380,10 @@ def main() -> None:
     if options.list:
         for branch in mine:
             print(json.dumps(branch._asdict()))
+        return
+    if options.missing:
+        for job in jobs_of(options, mine):
+            print(json.dumps(job))
         return
     bench = Bench(options)
     for branch in mine:
