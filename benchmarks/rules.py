@@ -33,6 +33,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import Progress
 
 from sundae_ns import checkpoint
+from sundae_ns.cli.bench.plan import schedule_of
 from sundae_ns.evaluation import RunRow, append_row
 from sundae_ns.evaluation.records import wait_for_lock
 from sundae_ns.measure import sizes
@@ -327,7 +328,7 @@ def finished(path: Path) -> list[dict[str, Any]]:
 
 
 def jobs_of(options: argparse.Namespace, wanted: list[Branch]) -> list[dict[str, Any]]:
-    """Jobs for ``jobs.py``, one a branch; all but the first wait for the warm-up that it makes."""
+    """Jobs for ``jobs.py``, one a branch; all but the first wait for the warm-up, which the first makes if need be."""
     known = {
         (line["scene"], line["method"], line["steps"], line["rule"], line["keep"], line["seed"])
         for line in finished(options.results)
@@ -343,6 +344,7 @@ def jobs_of(options: argparse.Namespace, wanted: list[Branch]) -> list[dict[str,
     ]
     own += ["--rows", str(options.rows) if str(options.rows) == "-" else str(options.rows.resolve())]
     own += [] if options.warmup is None else ["--warmup", str(options.warmup)]
+    step = schedule_of(options.method, warmup=options.warmup, finetune=None, scale=1.0).warmup
     jobs: list[dict[str, Any]] = []
     for number, branch in enumerate(wanted):
         if (options.scene, options.method, options.steps, branch.rule, branch.keep, branch.seed) in known:
@@ -359,7 +361,7 @@ def jobs_of(options: argparse.Namespace, wanted: list[Branch]) -> list[dict[str,
             f"0/{number + 2}",
         ]
         command = shlex.join([sys.executable, str(Path(__file__).resolve()), *own, *which])
-        needs = [jobs[0]["name"]] if jobs else []
+        needs = [str(warm_up_of(options, step).resolve())] if jobs else []
         jobs.append(
             {"name": f"{options.scene}-{branch.keep:g}-{branch.rule}-{branch.seed}", "command": command, "needs": needs}
         )

@@ -129,7 +129,7 @@ def test_branches_without_a_line_are_jobs(
     first, *others = [json.loads(job) for job in capsys.readouterr().out.splitlines()]
     assert [job["name"] for job in (first, *others)] == ["s-0.1-paper-0", "s-0.01-random-0", "s-0.01-paper-0"]
     assert first["needs"] == []
-    assert all(job["needs"] == [first["name"]] for job in others)
+    assert all(job["needs"] == [str(tmp_path / "out" / "s" / "sundae-15000.ckpt")] for job in others)
     # What a job runs is that branch and no other.
     monkeypatch.setattr(sys, "argv", others[0]["command"].split()[1:] + ["--list"])
     rules.main()
