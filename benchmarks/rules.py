@@ -329,42 +329,24 @@ def finished(path: Path) -> list[dict[str, Any]]:
 
 def jobs_of(options: argparse.Namespace, wanted: list[Branch]) -> list[dict[str, Any]]:
     """Jobs for ``jobs.py``, one a branch; all but the first wait for the warm-up, which the first makes if need be."""
-    known = {
-        (line["scene"], line["method"], line["steps"], line["rule"], line["keep"], line["seed"])
-        for line in finished(options.results)
-    }
-    own = ["--scene", options.scene, "--data", str(options.data.resolve()), "--steps", str(options.steps)]
-    own += [
-        "--method",
-        options.method,
-        "--out",
-        str(options.out.resolve()),
-        "--results",
-        str(options.results.resolve()),
-    ]
-    own += ["--rows", str(options.rows) if str(options.rows) == "-" else str(options.rows.resolve())]
-    own += [] if options.warmup is None else ["--warmup", str(options.warmup)]
     step = schedule_of(options.method, warmup=options.warmup, finetune=None, scale=1.0).warmup
+    rows = options.rows if str(options.rows) == "-" else options.rows.resolve()
+    shared = (
+        f"--scene {options.scene} --method {options.method} --steps {options.steps} --rows {shlex.quote(str(rows))}"
+    )
+    shared += "".join(
+        f" --{name} {shlex.quote(str(vars(options)[name].resolve()))}" for name in ("data", "out", "results")
+    )
+    shared += "" if options.warmup is None else f" --warmup {options.warmup}"
     jobs: list[dict[str, Any]] = []
-    for number, branch in enumerate(wanted):
-        if (options.scene, options.method, options.steps, branch.rule, branch.keep, branch.seed) in known:
-            continue
-        # As one of a list of one, whatever the number: each process has a folder of its own.
-        which = [
-            "--rules",
-            branch.rule,
-            "--keep",
-            f"{branch.keep:g}",
-            "--seeds",
-            str(branch.seed),
-            "--shard",
-            f"0/{number + 2}",
-        ]
-        command = shlex.join([sys.executable, str(Path(__file__).resolve()), *own, *which])
-        needs = [str(warm_up_of(options, step).resolve())] if jobs else []
-        jobs.append(
-            {"name": f"{options.scene}-{branch.keep:g}-{branch.rule}-{branch.seed}", "command": command, "needs": needs}
-        )
+    for number, branch in enumerate(wanted, start=2):
+        if not is_finished(options.results, key_of(options, branch, step)):
+            # The first of so many parts of a list of one is that one: each process has a folder of its own.
+            own = f"--rules {branch.rule} --keep {branch.keep:g} --seeds {branch.seed} --shard 0/{number}"
+            name = f"{options.scene}-{branch.keep:g}-{branch.rule}-{branch.seed}"
+            command = f"{sys.executable} {Path(__file__).resolve()} {shared} {own}"
+            needs = [str(warm_up_of(options, step).resolve())] if jobs else []
+            jobs.append({"name": name, "command": command, "needs": needs})
     return jobs
 
 

@@ -110,20 +110,8 @@ def test_branches_without_a_line_are_jobs(
     results = tmp_path / "rules.jsonl"
     line = {"scene": "s", "method": "sundae", "steps": 7, "rule": "random", "keep": 0.1, "seed": 0, "warmup": 15000}
     results.write_text(json.dumps(line) + "\n")
-    options = [
-        "--scene",
-        "s",
-        "--data",
-        str(tmp_path),
-        "--steps",
-        "7",
-        "--keep",
-        "0.1",
-        "0.01",
-        "--results",
-        str(results),
-    ]
-    options += ["--rules", "random", "paper", "--rows", "-", "--missing"]
+    options = "--scene s --steps 7 --keep 0.1 0.01 --rules random paper --rows - --missing".split()
+    options += ["--data", str(tmp_path), "--out", str(tmp_path / "out"), "--results", str(results)]
     monkeypatch.setattr(sys, "argv", ["rules.py", *options])
     rules.main()
     first, *others = [json.loads(job) for job in capsys.readouterr().out.splitlines()]
