@@ -72,23 +72,28 @@ def prune_if_due(model: SundaeModel, attributes: TrainingCallbackAttributes, ste
 
 
 def warn_if_too_short(model: SundaeModel, last_step: int) -> None:
-    """Say so where a training that ends with this step never comes to its first prune, or not to its last."""
+    """Say so where a training that ends with this step does not come to its first prune, its last, or its head."""
     pruning, ranks = model.config.pruning, 1 if model.shards is None else model.shards.ranks
-    first, last = pruning.first_prune, pruning.settled_at
+    first, done = pruning.first_prune, model.pruning_state["num_prunes"]
     # A warm start is pruned at once.
-    if first is None or last_step >= last or model.config.warm_start is not None:
+    if first is None or last_step >= pruning.settled_at or model.config.warm_start is not None:
         return
-    if last_step >= first or model.pruning_state["num_prunes"]:
-        which, due, found = "last", last, "more primitives are left than asked for"
-        option = "stop" if pruning.mode == "continuous" else "rounds"
+    continuous, head_waits = pruning.mode == "continuous", model.head is not None and model.config.head.start_at is None
+    target = pruning.target_primitives
+    if last_step < first and not done:
+        what, due, option = "first prune", first, "start" if continuous else "prune-at"
+        found = "nothing is pruned" + (", and the head takes no part" if head_waits else "")
+    elif last_step < pruning.last_due and not (done and target is not None and model.num_points <= target):
+        what, due, option = "last prune", pruning.last_due, "stop" if continuous else "rounds"
+        found = "more primitives are left than asked for" + (", and the head takes no part" if head_waits else "")
+    elif head_waits:
+        what, due, option, found = "head", pruning.settled_at, "stop" if continuous else "rounds", "it takes no part"
     else:
-        which, due, found = "first", first, "nothing is pruned"
-        option = "start" if pruning.mode == "continuous" else "prune-at"
-    waits = ", and the head takes no part" if model.head is not None and model.config.head.start_at is None else ""
+        return
     # Steps of one picture, which options count by.
     CONSOLE.print(
-        f"[yellow]Warning: training ends after {(last_step + 1) * ranks:,} steps, and the {which} prune needs more than "
-        f"{due * ranks:,} (pruning.{option}): {found}{waits}; train longer, or prune earlier",
+        f"[yellow]Warning: training ends after {(last_step + 1) * ranks:,} steps, and the {what} needs more than "
+        f"{due * ranks:,} (pruning.{option}): {found}; train longer, or prune earlier",
         soft_wrap=True,
     )
 

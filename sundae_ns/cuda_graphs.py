@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
@@ -17,24 +18,51 @@ RECORD_AT = 3
 
 Result = TypeVar("Result")
 
+_thread = threading.local()
+_one_at_a_time = threading.Lock()
+
 
 @contextmanager
 def aside(device: torch.device) -> Iterator[None]:
     """Run once what is going to be recorded: it allocates and chooses kernels, neither of which can be recorded."""
-    side = torch.cuda.Stream(device)
+    side = _side_stream(device)
     side.wait_stream(torch.cuda.current_stream(device))
-    with torch.cuda.stream(side):
+    with torch.cuda.stream(side), _recording():
         yield
     torch.cuda.current_stream(device).wait_stream(side)
 
 
+def recording() -> bool:
+    """Whether this thread is about to record something, or does: what it calls meanwhile is to make no recording of its own."""
+    return getattr(_thread, "recording", False)
+
+
+@contextmanager
+def _recording() -> Iterator[None]:
+    before, _thread.recording = recording(), True
+    try:
+        yield
+    finally:
+        _thread.recording = before
+
+
+def _side_stream(device: torch.device) -> torch.cuda.Stream:
+    # One for all recordings, because memory that torch keeps for one stream does not serve another; of each thread, because
+    # what another one does on a stream would be recorded with it.
+    streams: dict[torch.device, torch.cuda.Stream] = _thread.__dict__.setdefault("streams", {})
+    if device not in streams:
+        streams[device] = torch.cuda.Stream(device)
+    return streams[device]
+
+
 def record(
-    run: Callable[[], Result], shares: torch.cuda.CUDAGraph | None = None
+    run: Callable[[], Result], device: torch.device, shares: torch.cuda.CUDAGraph | None = None
 ) -> tuple[torch.cuda.CUDAGraph, Result]:
     """Record what ``run`` does, without doing it.
 
     Args:
         run: must have run before (:func:`aside`), wait for nothing, and read only what stays where it is.
+        device: where it runs.
         shares: a graph whose memory this one uses too; they are played in this order.
 
     Returns:
@@ -43,8 +71,10 @@ def record(
     graph = torch.cuda.CUDAGraph()
     # A training loop beside a viewer may allocate meanwhile; only this thread's work belongs to the recording.
     pool = None if shares is None else shares.pool()
-    with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
-        result = run()
+    # On a stream of this device: torch's own belongs to whichever device was the current one at its first recording.
+    with _one_at_a_time, torch.cuda.device(device), _recording():
+        with torch.cuda.graph(graph, pool=pool, stream=_side_stream(device), capture_error_mode="thread_local"):
+            result = run()
     return graph, result
 
 
@@ -77,5 +107,6 @@ class Kept(Generic[Result]):
         self._kept[key] = recording
 
     def clear(self) -> None:
-        """Forget all."""
+        """Forget all, and what came last."""
         self._kept.clear()
+        self._last, self._in_a_row = None, 0

@@ -15,6 +15,9 @@ from sundae_ns.pruning import PruningConfig, response
 from sundae_ns.rendering import Style, splat
 from sundae_ns.views import View
 
+OUTPUTS = ("rgb", "base_rgb", "depth", "accumulation", "features", "response")
+"""What a picture has beside its background, in the order in which viewers list it."""
+
 FieldKey = tuple[int, int]
 """Tells one state of a field from the next: its primitives, and how often it was pruned."""
 
@@ -63,8 +66,8 @@ def late_outputs(
     """``depth``, ``features`` (principal components as colours) and ``response`` (of the primitives seen), to be made.
 
     Args:
-        pictures: from :func:`sundae_ns.rendering.render`; depth and features are splatted when they are looked at, unless
-            they are there, as where other ranks had to take part.
+        pictures: from :func:`sundae_ns.rendering.render`; depth and features that are not there are splatted when they
+            are looked at, features even of a picture that the head took no part in; but not where other ranks would have to.
         drawn: the primitives that they were made of.
         field: all primitives. Both mappings are kept and have to stay as they are.
         mask: which of them were drawn, bool ``[N]``; None for all.
@@ -95,10 +98,10 @@ def _feature_colors(
     style: Style,
     alpha: Tensor,
 ) -> Tensor:
-    if image is None and style.head is not None:
-        image = splat(drawn, view, drawn[FEATURES], style).colors
     if image is None or image.shape[-1] == 0:
-        return alpha.new_zeros(*alpha.shape[:2], 3)
+        if style.head is None or style.arrivals is not None:
+            return alpha.new_zeros(*alpha.shape[:2], 3)
+        image = splat(drawn, view, drawn[FEATURES], style).colors
     return display.feature_colors(image, *display.principal_components(field[FEATURES]), alpha)
 
 

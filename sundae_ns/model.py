@@ -34,7 +34,7 @@ from sundae_ns.distributed import Arrived, Course, GlobalPruning, Look, Shards, 
 from sundae_ns.errors import ConfigError, out_of_memory
 from sundae_ns.evaluation import LazyOutputs, Lpips, psnr, ssim
 from sundae_ns.initial_field import Start, initial_field
-from sundae_ns.late_outputs import FieldKey, ShownResponse, empty_outputs, late_outputs
+from sundae_ns.late_outputs import OUTPUTS, FieldKey, ShownResponse, empty_outputs, late_outputs
 from sundae_ns.losses import chain_losses, picture_loss
 from sundae_ns.preview import Preview, in_viewer
 from sundae_ns.pruning import PruningConfig, PruningPolicy, make_policy
@@ -402,19 +402,16 @@ class SundaeModel(SplatfactoModel):
             rows = mask[preview.mask]
             params = {**params, **{k: v[rows] for k, v in preview.values.items()}}
         compensate = preview is None and (self.compensate.value if in_viewer() else self.compensated)
-        if self.shards is not None:  # nothing is left for later where other ranks have to take part in it
-            pictures, _ = self.render(params, view, background, compensate=compensate)
+        if mask is None and self.shards is None:
+            pictures = self._recordings.render(params, view, background, self._style, compensate=compensate)
         else:
-            if mask is None:
-                pictures = self._recordings.render(params, view, background, self._style, compensate=compensate)
-            else:
-                pictures, _ = self.render(params, view, background, compensate=compensate, depth=False)
-            pictures.pop("feature_image", None)
+            # Nothing is left for later where other ranks have to take part in it.
+            pictures, _ = self.render(params, view, background, compensate=compensate, depth=self.shards is not None)
         field = dict(self.gaussians)
         values = partial(self._response.values, field, self._response_key, self.config.pruning)
-        pictures.update(late_outputs(pictures, dict(params), field, mask, view, self._style, values))
-        pictures.pop("feature_image", None)
-        return LazyOutputs({**pictures, "background": background.expand(view.height, view.width, 3)})
+        outputs = {**pictures, **late_outputs(pictures, dict(params), field, mask, view, self._style, values)}
+        background = background.expand(view.height, view.width, 3)
+        return LazyOutputs({**{name: outputs[name] for name in OUTPUTS}, "background": background})
 
     @property
     def _response_key(self) -> FieldKey | None:

@@ -42,7 +42,7 @@ class _Recording:
     pairs: int
     """How many it has room for."""
     needed: Tensor
-    """How many there were, int32 ``[]``."""
+    """How many there were, int64 ``[]``."""
 
 
 class Recordings:
@@ -74,18 +74,22 @@ class Recordings:
         Returns:
             ``rgb, base_rgb, accumulation``, each ``[H, W, C]``, the caller's own.
         """
-        if not (self._can_record and _recordable(field, style)):
-            return render(field, view, background, style, depth=False, compensate=compensate)[0]
-        try:
+        if self._can_record and _recordable(field, style):
             with self._lock:
-                made = self._played(field, view, background, style, compensate)
+                try:
+                    made = self._played(field, view, background, style, compensate)
+                except (
+                    BackendError,
+                    RuntimeError,
+                ) as error:  # no compiler, no memory, or what a driver says of a recording
+                    _log.warning("frames are rendered kernel by kernel, for they cannot be recorded: %s", error)
+                    _log.debug("", exc_info=True)
+                    self._kept.clear()
+                    self._can_record, made = False, None
             if made is not None:
                 return made
-        except (BackendError, RuntimeError) as error:
-            _log.warning("frames are rendered kernel by kernel, for they cannot be recorded: %s", error)
-            self._kept.clear()
-            self._can_record = False
-        return render(field, view, background, style, depth=False, compensate=compensate)[0]
+        pictures = render(field, view, background, style, depth=False, compensate=compensate)[0]
+        return {name: pictures[name] for name in SHOWN}
 
     def _played(
         self, field: Mapping[str, Tensor], view: View, background: Tensor, style: Style, compensate: bool
@@ -109,8 +113,11 @@ class Recordings:
             self._kept.clear()
             self._of = of
         head = style.head if compensate else None
-        # The network itself, not its number, which a later one might be given.
-        of_head = None if head is None else (head.net, astuple(head.config), *plan(view.focal, style.trained_focal))
+        of_head: tuple[object, ...] | None = None
+        if head is not None:
+            # The network itself, not its number, which a later one might be given; and where its weights lie.
+            lie = tuple(value.data_ptr() for value in head.net.parameters())
+            of_head = (head.net, lie, astuple(head.config), *plan(view.focal, style.trained_focal))
         return view.width, view.height, style.antialiased, style.logits, style.most_bands, of_head
 
 
@@ -155,7 +162,7 @@ def _record(
             pictures = run(room)
             return {name: pictures[name] for name in SHOWN}, torch.stack(room.needed).amax()
 
-        graph, (made, needed) = record(shown)
+        graph, (made, needed) = record(shown, device)
     return _Recording(graph, given, made, pairs, needed)
 
 

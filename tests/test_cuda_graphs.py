@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from sundae_ns.cuda_graphs import MAX_SIZES, RECORD_AT, Kept
+from concurrent.futures import ThreadPoolExecutor
+
+from sundae_ns import cuda_graphs
+from sundae_ns.cuda_graphs import MAX_SIZES, RECORD_AT, Kept, recording
 
 
 def test_what_comes_often_enough_in_a_row_is_recorded_once() -> None:
@@ -36,3 +39,15 @@ def test_the_one_that_was_used_longest_ago_is_forgotten() -> None:
     assert kept.get(0, lambda: -1) == 7
     kept.clear()
     assert len(kept) == 0
+    assert kept.get(0, lambda: -1) is None  # what came last is forgotten too: it is the first time again
+
+
+def test_a_recording_keeps_what_it_calls_from_recording() -> None:
+    assert not recording()
+    with cuda_graphs._recording():
+        with cuda_graphs._recording():
+            assert recording()
+        assert recording()
+        with ThreadPoolExecutor(1) as pool:
+            assert not pool.submit(recording).result()
+    assert not recording()

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.cuda_graphs import Kept, aside, record
+from sundae_ns.cuda_graphs import recording as recording_elsewhere
 
 
 class Weights:
@@ -250,7 +251,7 @@ class FusedInference:
         height, width = base.shape[:2]
         key = (height, width, dtype, net.out.weight.data_ptr())
         recording = None
-        if not torch.cuda.is_current_stream_capturing():  # else it is part of somebody else's recording
+        if not recording_elsewhere():
             room = partial(folded_room, net, height, width, base, dtype)
             recording = self._recorded.get(key, lambda: self._record(room().zero_(), launches))
         folded = folded_room(net, height, width, base, dtype) if recording is None else recording.folded
@@ -271,5 +272,5 @@ class FusedInference:
     def _record(self, folded: Tensor, launches: Launches) -> _Recording:
         with aside(folded.device):
             self._run(folded, launches)
-        graph, raw = record(lambda: self._run(folded, launches))
+        graph, raw = record(lambda: self._run(folded, launches), folded.device)
         return _Recording(graph, folded, raw)

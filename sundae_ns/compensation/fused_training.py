@@ -246,10 +246,10 @@ class FusedTraining:
             weights.refresh()
             return network(self.net, weights, folded, launches)
 
-        forward, tape = record(passed)
+        forward, tape = record(passed, folded.device)
         to_raw = torch.empty_like(_last(tape))
         backward, (to_folded, to_parameters) = record(
-            lambda: network_backward(self.net, weights, tape, to_raw, launches), shares=forward
+            lambda: network_backward(self.net, weights, tape, to_raw, launches), folded.device, shares=forward
         )
         return _Pass(weights, folded, tape, to_raw, to_folded, to_parameters, forward, backward)
 

@@ -156,6 +156,15 @@ class PruningConfig:
         return self.start if self.mode == "continuous" else self.ends_growth_at
 
     @property
+    def last_due(self) -> int:
+        """Step of the last prune that has to come, as long as nothing grows beyond a target or a cap."""
+        if self.mode != "continuous":
+            return self.last_prune
+        if self.target_primitives is not None or self.max_primitives is not None:
+            return self.stop
+        return self.start + (self.stop - self.start) // self.every * self.every
+
+    @property
     def settled_at(self) -> int:
         """Step after which the field keeps its primitives."""
         return self.stop if self.mode == "continuous" else self.last_prune

@@ -22,9 +22,8 @@ class GsplatBackend:
     """The kernels of gsplat; float32 tensors on a CUDA device.
 
     Args:
-        room: for pairs of a tile and a primitive: the tiles get lists of our own, which are shorter than gsplat's, and with
-            which nothing has to be waited for; but more kernels make them, which pays where they are played back. None:
-            gsplat's lists.
+        room: for pairs of a tile and a primitive, where views are to be recorded: the tiles get lists of our own, which are
+            shorter than gsplat's, and nothing has to be waited for; harmonics have no gradients. None: gsplat's kernels.
     """
 
     name = "gsplat"
@@ -153,7 +152,7 @@ class GsplatBackend:
         _check_kernels_take(directions)
         if directions.shape[0] == 0:
             return ReferenceBackend().spherical_harmonics(degree, directions, coeffs)
-        if not torch.is_grad_enabled():
+        if self._room is not None:
             return harmonics(degree, directions, coeffs)
         return spherical_harmonics(degree, directions, coeffs)
 

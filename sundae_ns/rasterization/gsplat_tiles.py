@@ -127,11 +127,11 @@ __device__ __forceinline__ Footprint footprint(int i, const float* __restrict__ 
 
 // The tiles of one thread, which has every so many-th row of one primitive, primitives being taken in order of depth.
 // Returns their number; where there is a list, they are written down from `at` on, as far as there is room.
-__device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* primitives, int at, int room) {
+__device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* primitives, long long at, int room) {
     const int i = (int)order[thread / lanes];
     const Footprint f = footprint(i, means, conics, opacities, radii, axes, columns, rows);
     if (f.first >= f.last) return 0;
-    const int start = at;
+    const long long start = at;
     for (int row = f.top + thread % lanes; row < f.bottom; row += lanes) {
         int from, to;
         span(f, row, width, height, &from, &to);
@@ -143,7 +143,7 @@ __device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* primi
                 primitives[at] = i;
             }
     }
-    return at - start;
+    return (int)(at - start);
 }
 
 #define WALK(...) walk(n, lanes, order, means, conics, opacities, radii, axes, width, height, columns, rows, __VA_ARGS__)
@@ -154,7 +154,7 @@ extern "C" __global__ void count_tiles(FIELD, int* __restrict__ counts) {
 }
 
 // `ends`: the counts, added up to each thread and with it.
-extern "C" __global__ void list_tiles(FIELD, const int* __restrict__ counts, const int* __restrict__ ends, int room,
+extern "C" __global__ void list_tiles(FIELD, const int* __restrict__ counts, const long long* __restrict__ ends, int room,
                                       TileId* __restrict__ tiles, int* __restrict__ primitives) {
     const long long thread = blockIdx.x * (long long)blockDim.x + threadIdx.x;
     if (thread < (long long)n * lanes)
@@ -170,7 +170,7 @@ class Room:
     pairs: int | None = None
     """Longest lists that are made; None: as long as needed."""
     needed: list[Tensor] = field(default_factory=list)
-    """How many pairs there were, int32 ``[]`` each, for every list since; where that is more than the room, it lacks some."""
+    """How many pairs there were, int64 ``[]`` each, for every list since; where that is more than the room, it lacks some."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def tile_lists(
     )
     counts = torch.empty(n * lanes, dtype=torch.int32, device=device)
     count(n * lanes, [*seen, counts])
-    ends = counts.cumsum(0, dtype=torch.int32)
+    ends = counts.cumsum(0)
     room.needed.append(ends[-1])
     if room.pairs is None:
         pairs, below = int(ends[-1]), 0

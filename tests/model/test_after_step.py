@@ -89,7 +89,7 @@ def test_rounds_prune_to_the_count_and_the_head_waits_for_the_last(
 
 
 def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
-    return [line for line in capsys.readouterr().out.splitlines() if " prune needs more" in line]
+    return [line for line in capsys.readouterr().out.splitlines() if " needs more than " in line]
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,17 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
         ({"prune_at": 3}, {"start_at": 1}, "3 (pruning.prune-at): nothing is pruned; train longer, or prune earlier"),
         ({"mode": "continuous", "start": 3}, {}, "3 (pruning.start): nothing is pruned, and the head takes no part"),
         (
-            {"mode": "continuous", "start": 1, "every": 1, "stop": 5},
+            {"mode": "continuous", "start": 1, "every": 3, "stop": 5},
+            {},
+            "4 (pruning.stop): more primitives are left than asked for, and the head takes no part; train longer",
+        ),
+        (
+            {"mode": "continuous", "start": 1, "every": 5, "stop": 5},
+            {},
+            "5 (pruning.stop): it takes no part; train longer, or prune earlier",
+        ),
+        (
+            {"mode": "continuous", "start": 1, "every": 5, "stop": 5, "max_primitives": 40},
             {},
             "5 (pruning.stop): more primitives are left than asked for, and the head takes no part; train longer",
         ),
@@ -126,8 +136,8 @@ def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_aft
 ) -> None:
     training = training_of(build(pruning=pruning, head=head), SimpleNamespace(last_step=2, base_dir=tmp_path))
     (before,) = said(capsys)
-    which = "first" if "nothing" in ending else "last"
-    assert before.startswith(f"Warning: training ends after 3 steps, and the {which} prune needs more than " + ending)
+    which = "first prune" if "nothing" in ending else "head" if "it takes" in ending else "last prune"
+    assert before.startswith(f"Warning: training ends after 3 steps, and the {which} needs more than " + ending)
     for step in range(3):
         training.step(step)
     assert said(capsys) == []
@@ -141,6 +151,7 @@ def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_aft
         {"pruning": {"prune_at": 2}},
         {"pruning": {"mode": "off"}},
         {"pruning": {"mode": "continuous", "start": 1, "stop": 2}},
+        {"pruning": {"mode": "continuous", "start": 1, "every": 5, "stop": 5}, "head": {"mode": "off"}},
         {"pruning": {"prune_at": 1, "rounds": 2, "round_every": 1}},
         {"pruning": {"prune_at": 100}, "warm_start": Path("anything")},
     ],

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from sundae_ns import recordings
@@ -107,7 +108,13 @@ def test_what_a_recording_has_fixed_makes_another_one(
     with torch.no_grad():
         model.gauss_params["means"] = torch.nn.Parameter(model.gauss_params["means"].clone())
     assert show() == 7
-    assert len(model._recordings._kept) == 1  # those of a field that is gone hold memory for nothing
+    assert len(model._recordings._kept) == 1
+    model.step = 0  # fewer bands of the harmonics take part
+    assert show() == 8
+    model.config.rasterize_mode = "antialiased"
+    assert show() == 9
+    model.step = 10
+    assert show() == 10  # those of a field that is gone hold memory for nothing
 
 
 def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(
@@ -162,7 +169,26 @@ def test_what_cannot_be_recorded_is_rendered_and_said_once(
     assert all(torch.equal(picture, shown[0]) for picture in shown)
 
 
-def test_nothing_is_recorded_on_a_cpu_in_training_or_of_a_part(
+def test_a_part_of_a_field_is_never_recorded(
+    build: Build, perturb: Perturb, camera: MakeCamera, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its tensors are gone with the frame."""
+    model = perturb(build()).eval()
+    box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    for _ in range(2 * RECORD_AT):
+        cropped = model.get_outputs_for_camera(camera(), obb_box=box)["rgb"]
+    half = SimpleNamespace(mask=torch.arange(60) % 2 == 0, values=None)
+    monkeypatch.setattr(model.preview, "decision", lambda _: half)
+    for _ in range(2 * RECORD_AT):
+        previewed = model.get_outputs_for_camera(camera())["rgb"]
+    assert recorder.recorded == []
+    monkeypatch.undo()
+    whole = model.get_outputs_for_camera(camera())["rgb"]
+    assert not torch.equal(cropped, whole)
+    assert not torch.equal(previewed, whole)
+
+
+def test_nothing_is_recorded_on_a_cpu_or_in_training(
     build: Build, perturb: Perturb, camera: MakeCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: Any, **__: Any) -> None:
@@ -210,6 +236,8 @@ def test_what_is_played_back_is_what_would_be_rendered(
     shown = [model.get_outputs_for_camera(view) for view in views]
     assert len(played._kept) == 1
     assert played._can_record
+    if model.head is not None:  # a part of the frame's recording, and none of its own
+        assert len(model.head._inference._recorded) == 0
     for found, truth in zip(shown, expected, strict=True):
         for name, picture in truth.items():
             torch.testing.assert_close(found[name], picture, rtol=0, atol=2e-3 if name == "rgb" else 1e-6)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sundae_ns import nvrtc
 from sundae_ns.errors import BackendError
-from sundae_ns.rasterization import gsplat_harmonics, gsplat_tiles
+from sundae_ns.rasterization import GsplatBackend, gsplat_backend, gsplat_harmonics, gsplat_tiles
 from sundae_ns.rasterization.gsplat_tiles import TILE, Room, tile_lists
 from sundae_ns.rasterization.harmonics import evaluate_harmonics
 
@@ -199,3 +199,19 @@ def test_they_compile_for_gpus() -> None:
         if "libnvrtc" not in str(error) and "without CUDA" not in str(error):
             raise
         pytest.skip(f"no NVRTC here: {error}")
+
+
+def test_outside_of_recordings_harmonics_are_gsplats_with_gradients_or_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU on which no kernel of ours compiles can do without; and where gsplat's do not run, it is found out."""
+
+    def refuse(*_: Any) -> Tensor:
+        raise RuntimeError("no kernel image")
+
+    monkeypatch.setattr(gsplat_backend, "_check_kernels_take", lambda _: None)
+    monkeypatch.setattr("gsplat.spherical_harmonics", refuse)
+    directions, coeffs = torch.ones(1, 3), torch.ones(1, 1, 3)
+    for gradients in (True, False):
+        with torch.set_grad_enabled(gradients), pytest.raises(RuntimeError, match="no kernel image"):
+            GsplatBackend().spherical_harmonics(0, directions, coeffs)
+    found = GsplatBackend(Room()).spherical_harmonics(0, directions, coeffs)
+    torch.testing.assert_close(found, evaluate_harmonics(0, directions, coeffs))
