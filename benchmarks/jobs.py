@@ -17,7 +17,9 @@ import json
 import os
 import signal
 import subprocess
+import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -56,9 +58,15 @@ def parse() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def read(path: Path) -> list[Job]:
+def read(path: Path, gpus: list[int]) -> list[Job]:
     """Jobs of a file of JSON lines."""
-    return [Job(**json.loads(line)) for line in path.read_text().splitlines() if line.strip()]
+    jobs = [Job(**json.loads(line)) for line in path.read_text().splitlines() if line.strip()]
+    for job in jobs:
+        if job.gpu is not None and job.gpu not in gpus:
+            raise SystemExit(
+                f"{job.name} is to run on GPU {job.gpu}, which is not of --gpus; add it there, or change the job"
+            )
+    return jobs
 
 
 class Queue:
@@ -87,40 +95,35 @@ class Queue:
         """Whether it will never start: what it needs has failed, or it would not end in time."""
         return bool(set(job.needs) & set(self.failed)) or job.seconds > self.left
 
-    def gpu_for(self, job: Job) -> int | None:
-        """The GPU with the fewest jobs that it may run on now."""
-        kept = {r.gpu for r in self.running if r.job.alone}
-        # One that is to run alone and could start gets no new neighbours to wait for.
-        kept |= {other.gpu for other in self.waiting if other.alone and other.gpu is not None and self.ready(other)} - (
-            {job.gpu} if job.alone else set()
-        )
-        load = {gpu: sum(r.gpu == gpu for r in self.running) for gpu in self.options.gpus if gpu not in kept}
-        most = 1 if job.alone else self.options.per_gpu
-        free = [gpu for gpu, count in load.items() if count < most and job.gpu in (None, gpu)]
-        return min(free, key=lambda gpu: load[gpu]) if free else None
-
     def start(self) -> None:
-        """Start what can start, in order."""
+        """Start what can start, in order; a GPU on which one is to run alone gets no others to wait for."""
+        load = {gpu: [r for r in self.running if r.gpu == gpu] for gpu in self.options.gpus}
+        kept = {r.gpu for r in self.running if r.job.alone}
         for job in list(self.waiting):
             if self.hopeless(job):
                 self.waiting.remove(job)
                 self.failed.append(job.name)
                 CONSOLE.print(f"[yellow]{job.name} is left out: too late, or what it needs has failed", soft_wrap=True)
-            elif self.ready(job):
-                gpu = self.gpu_for(job)
-                if gpu is None:
-                    continue
+                continue
+            allowed = [gpu for gpu in self.options.gpus if gpu not in kept and job.gpu in (None, gpu)]
+            if not allowed or not self.ready(job):
+                continue
+            gpu = min(allowed, key=lambda gpu: len(load[gpu]))
+            if job.alone:
+                kept.add(gpu)
+            if len(load[gpu]) < (1 if job.alone else self.options.per_gpu):
                 self.waiting.remove(job)
-                environment = {
-                    **os.environ,
-                    "CUDA_VISIBLE_DEVICES": str(gpu),
-                    "OMP_NUM_THREADS": str(self.options.threads),
-                }
-                with open(self.logs / f"{job.name}.log", "ab") as log:
-                    process = subprocess.Popen(
-                        job.command, shell=True, env=environment, stdout=log, stderr=log, start_new_session=True
-                    )
-                self.running.append(Running(job, gpu, process, time.monotonic()))
+                self.running.append(self._started(job, gpu))
+                load[gpu].append(self.running[-1])
+
+    def _started(self, job: Job, gpu: int) -> Running:
+        threads = str(self.options.threads)
+        environment = {**os.environ, "CUDA_VISIBLE_DEVICES": str(gpu), "OMP_NUM_THREADS": threads}
+        with open(self.logs / f"{job.name}.log", "ab") as log:
+            process = subprocess.Popen(
+                job.command, shell=True, env=environment, stdout=log, stderr=log, start_new_session=True
+            )
+        return Running(job, gpu, process, time.monotonic())
 
     def collect(self) -> int:
         """Take note of what has ended; how many ended."""
@@ -138,12 +141,15 @@ class Queue:
 
     def end(self) -> None:
         """End what still runs, with all that it has started."""
+        self.collect()
         for r in self.running:
             os.killpg(r.process.pid, signal.SIGTERM)
         for r in self.running:
             try:
                 r.process.wait(timeout=10)
             except subprocess.TimeoutExpired:
+                pass
+            with suppress(ProcessLookupError):  # those that it started may take no notice of the first signal
                 os.killpg(r.process.pid, signal.SIGKILL)
             self.failed.append(r.job.name)
             CONSOLE.print(f"[yellow]{r.job.name} was ended: the time is over")
@@ -152,7 +158,8 @@ class Queue:
 
 def main() -> int:
     options = parse()
-    queue = Queue(read(options.jobs), options)
+    queue = Queue(read(options.jobs, options.gpus), options)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that what was started is ended too
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=CONSOLE, transient=True) as progress:
         task = progress.add_task("Jobs", total=len(queue.waiting))

@@ -111,7 +111,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--rows", type=Path, default=run.RESULTS, help="CSV file of rows; - for none")
     parser.add_argument("--list", action="store_true", help="print the branches and stop")
     parser.add_argument("--missing", action="store_true", help="print a job for each branch without a line, and stop")
-    return parser.parse_args()
+    options = parser.parse_args()
+    if options.missing and options.sweep:
+        parser.error("--missing lists rules, not the points of a sweep; leave one of the two out")
+    return options
 
 
 def _gamma() -> dict[str, dict[str, Any]]:
@@ -331,20 +334,17 @@ def jobs_of(options: argparse.Namespace, wanted: list[Branch]) -> list[dict[str,
     """Jobs for ``jobs.py``, one a branch; all but the first wait for the warm-up, which the first makes if need be."""
     step = schedule_of(options.method, warmup=options.warmup, finetune=None, scale=1.0).warmup
     rows = options.rows if str(options.rows) == "-" else options.rows.resolve()
-    shared = (
-        f"--scene {options.scene} --method {options.method} --steps {options.steps} --rows {shlex.quote(str(rows))}"
-    )
-    shared += "".join(
-        f" --{name} {shlex.quote(str(vars(options)[name].resolve()))}" for name in ("data", "out", "results")
-    )
-    shared += "" if options.warmup is None else f" --warmup {options.warmup}"
+    shared = ["--scene", options.scene, "--method", options.method, "--steps", str(options.steps), "--rows", str(rows)]
+    for name in ("data", "out", "results"):
+        shared += [f"--{name}", str(vars(options)[name].resolve())]
+    shared += [] if options.warmup is None else ["--warmup", str(options.warmup)]
     jobs: list[dict[str, Any]] = []
     for number, branch in enumerate(wanted, start=2):
         if not is_finished(options.results, key_of(options, branch, step)):
             # The first of so many parts of a list of one is that one: each process has a folder of its own.
-            own = f"--rules {branch.rule} --keep {branch.keep:g} --seeds {branch.seed} --shard 0/{number}"
+            own = f"--rules {branch.rule} --keep {branch.keep:g} --seeds {branch.seed} --shard 0/{number}".split()
             name = f"{options.scene}-{branch.keep:g}-{branch.rule}-{branch.seed}"
-            command = f"{sys.executable} {Path(__file__).resolve()} {shared} {own}"
+            command = shlex.join([sys.executable, str(Path(__file__).resolve()), *shared, *own])
             needs = [str(warm_up_of(options, step).resolve())] if jobs else []
             jobs.append({"name": name, "command": command, "needs": needs})
     return jobs

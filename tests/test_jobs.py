@@ -69,6 +69,22 @@ def test_alone_is_alone(run_jobs: RunJobs, tmp_path: Path) -> None:
     assert sorted(events[:place]) == [[n, what] for n in "ab" for what in ("begins", "ends")]
 
 
+def test_alone_anywhere_keeps_its_place(run_jobs: RunJobs, tmp_path: Path) -> None:
+    notes = tmp_path / "notes"
+    lines = [noting(notes, "a"), {**noting(notes, "timed"), "alone": True}, *(noting(notes, name) for name in "bcd")]
+    lines[1]["needs"] = [str(notes)]  # once the first has begun
+    assert run_jobs(lines, "--per-gpu", "2") == 0
+    events = [line.split()[:2] for line in notes.read_text().splitlines()]
+    place = events.index(["timed", "begins"])
+    assert events[place + 1] == ["timed", "ends"]
+    assert ["c", "begins"] not in events[:place]
+
+
+def test_a_gpu_that_is_not_there_is_refused(run_jobs: RunJobs) -> None:
+    with pytest.raises(SystemExit, match=r"x is to run on GPU 3, which is not of --gpus; add it there"):
+        run_jobs([{"name": "x", "command": "true", "gpu": 3}], "--gpus", "0", "1")
+
+
 def test_a_failure_is_told_and_what_needs_it_left_out(
     run_jobs: RunJobs, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
