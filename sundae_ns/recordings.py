@@ -78,10 +78,8 @@ class Recordings:
             with self._lock:
                 try:
                     made = self._played(field, view, background, style, compensate)
-                except (
-                    BackendError,
-                    RuntimeError,
-                ) as error:  # no compiler, no memory, or what a driver says of a recording
+                # No compiler, no memory, or whatever a driver says of a recording.
+                except (BackendError, RuntimeError) as error:
                     _log.warning("frames are rendered kernel by kernel, for they cannot be recorded: %s", error)
                     _log.debug("", exc_info=True)
                     self._kept.clear()
