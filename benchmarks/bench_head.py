@@ -18,6 +18,7 @@ from pathlib import Path
 import torch
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.cuda_graphs import aside, record
 from sundae_ns.evaluation import median_ms
 
 RESULTS = Path(__file__).parent / "results" / "heads.jsonl"
@@ -34,16 +35,10 @@ PICTURES = ((824, 1240), (1893, 1061), (533, 800))
 
 
 def recorded(net: torch.nn.Module, picture: torch.Tensor) -> torch.cuda.CUDAGraph:
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
+    with aside(picture.device):
         for _ in range(3):
             net(picture)
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        net(picture)
-    return graph
+    return record(lambda: net(picture), picture.device)[0]
 
 
 def main() -> None:

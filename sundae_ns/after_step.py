@@ -78,16 +78,16 @@ def warn_if_too_short(model: SundaeModel, last_step: int) -> None:
     # A warm start is pruned at once.
     if first is None or last_step >= pruning.settled_at or model.config.warm_start is not None:
         return
-    continuous, head_waits = pruning.mode == "continuous", model.head is not None and model.config.head.start_at is None
-    target = pruning.target_primitives
+    begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "rounds")
+    head_waits, target = model.head is not None and model.config.head.start_at is None, pruning.target_primitives
+    and_head = ", and the head takes no part" if head_waits else ""
     if last_step < first and not done:
-        what, due, option = "first prune", first, "start" if continuous else "prune-at"
-        found = "nothing is pruned" + (", and the head takes no part" if head_waits else "")
+        what, due, option, found = "first prune", first, begins, "nothing is pruned" + and_head
     elif last_step < pruning.last_due and not (done and target is not None and model.num_points <= target):
-        what, due, option = "last prune", pruning.last_due, "stop" if continuous else "rounds"
-        found = "more primitives are left than asked for" + (", and the head takes no part" if head_waits else "")
+        what, due, option = "last prune", pruning.last_due, ends
+        found = "more primitives are left than asked for" + and_head
     elif head_waits:
-        what, due, option, found = "head", pruning.settled_at, "stop" if continuous else "rounds", "it takes no part"
+        what, due, option, found = "head", pruning.settled_at, ends, "it takes no part"
     else:
         return
     # Steps of one picture, which options count by.

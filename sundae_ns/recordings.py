@@ -1,8 +1,8 @@
 """Pictures that are only looked at, played back: all that the GPU does for a frame, recorded once for each size.
 
-A frame is about a hundred small kernels. Started one by one from Python, they wait for each other's start most of the time;
-as one CUDA graph they do not. What a recording reads stays where it is: the field, which may be trained meanwhile, the
-head's weights, and the three tensors that camera and background are written to.
+A frame is many small kernels, each started from Python; as one CUDA graph they are started at once. What a recording reads
+stays where it is: the field, which may be trained meanwhile, the head's weights, and the three tensors that camera and
+background are written to.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from sundae_ns.compensation import plan
 from sundae_ns.cuda_graphs import Kept, aside, record
 from sundae_ns.errors import BackendError
 from sundae_ns.rasterization import GsplatBackend, Room
-from sundae_ns.rendering import Style, render
+from sundae_ns.rendering import Style, degree_in_use, render
 from sundae_ns.views import View
 
 SPARE = 1.5
@@ -116,7 +116,8 @@ class Recordings:
             # The network itself, not its number, which a later one might be given; and where its weights lie.
             lie = tuple(value.data_ptr() for value in head.net.parameters())
             of_head = (head.net, lie, astuple(head.config), *plan(view.focal, style.trained_focal))
-        return view.width, view.height, style.antialiased, style.logits, style.most_bands, of_head
+        degree = degree_in_use(field["features_rest"], style.most_bands)
+        return view.width, view.height, style.antialiased, style.logits, degree, of_head
 
 
 def _recordable(field: Mapping[str, Tensor], style: Style) -> bool:
@@ -147,10 +148,10 @@ def _record(
             return render(field, here, given[2], by, depth=False, compensate=compensate)[0]
 
         device = view.viewmat.device
-        with aside(device):
-            measured = Room()
-            run(measured)
         if pairs is None:
+            measured = Room()
+            with aside(device):
+                run(measured)
             pairs = int(SPARE * max(int(needed) for needed in measured.needed)) + 1
         with aside(device):
             run(Room(pairs))

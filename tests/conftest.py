@@ -66,20 +66,30 @@ def open3d() -> None:
 
 
 @pytest.fixture(scope="session")
-def compile_kernels(tmp_path_factory: pytest.TempPathFactory) -> CompileKernels:
-    """The very lines of CUDA kernels, compiled for the CPU: source, names and options of the compiler to launches."""
+def compile_for_cpu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., ctypes.CDLL]:
+    """The very lines of CUDA kernels as a library for the CPU: of a source and options of the compiler."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("no g++ here to compile the kernels for the CPU")
     folder = tmp_path_factory.mktemp("kernels")
 
-    def compile_them(source: str, names: Sequence[str], options: Sequence[str] = ()) -> dict[str, Launch]:
+    def compile_them(source: str, options: Sequence[str] = ()) -> ctypes.CDLL:
         library = folder / f"{abs(hash((source, *options)))}.so"
         if not library.exists():
             library.with_suffix(".cpp").write_text(_SHIM % source)
             flags = ["-O1", "-w", "-shared", "-fPIC", *options]
             subprocess.run([compiler, *flags, "-o", library, library.with_suffix(".cpp")], check=True)
-        loaded = ctypes.CDLL(str(library))
+        return ctypes.CDLL(str(library))
+
+    return compile_them
+
+
+@pytest.fixture(scope="session")
+def compile_kernels(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKernels:
+    """The same as launches: of a source, names of kernels and options of the compiler."""
+
+    def compile_them(source: str, names: Sequence[str], options: Sequence[str] = ()) -> dict[str, Launch]:
+        loaded = compile_for_cpu(source, options)
 
         def launch_of(name: str) -> Launch:
             def launch(threads: int, arguments: Sequence[Tensor | int | float]) -> None:

@@ -17,8 +17,7 @@ from torch import Tensor, nn
 
 from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
-from sundae_ns.cuda_graphs import Kept, aside, record
-from sundae_ns.cuda_graphs import recording as recording_elsewhere
+from sundae_ns.cuda_graphs import Kept, aside, record, recording
 
 
 class Weights:
@@ -250,17 +249,15 @@ class FusedInference:
         launches = compiled(base.device, dtype, definitions(net, self.residual))
         height, width = base.shape[:2]
         key = (height, width, dtype, net.out.weight.data_ptr())
-        recording = None
-        if not recording_elsewhere():
-            room = partial(folded_room, net, height, width, base, dtype)
-            recording = self._recorded.get(key, lambda: self._record(room().zero_(), launches))
-        folded = folded_room(net, height, width, base, dtype) if recording is None else recording.folded
+        room = partial(folded_room, net, height, width, base, dtype)
+        kept = None if recording() else self._recorded.get(key, lambda: self._record(room().zero_(), launches))
+        folded = room() if kept is None else kept.folded
         fold(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
-        if recording is None:
+        if kept is None:
             raw = self._run(folded, launches)
         else:
-            recording.graph.replay()
-            raw = recording.raw
+            kept.graph.replay()
+            raw = kept.raw
         return unfold(net, raw, base, alpha, launches)
 
     def _run(self, folded: Tensor, launches: Launches) -> Tensor:

@@ -218,20 +218,8 @@ def tile_lists(
     n = len(means2d)
     lanes = lanes_of(n)
     order = depths.argsort(stable=True)
-    seen = (
-        n,
-        lanes,
-        order,
-        means2d,
-        conics,
-        opacities,
-        radii,
-        1 if radii.ndim == 1 else 2,
-        width,
-        height,
-        columns,
-        rows,
-    )
+    axes = 1 if radii.ndim == 1 else 2
+    seen = (n, lanes, order, means2d, conics, opacities, radii, axes, width, height, columns, rows)
     counts = torch.empty(n * lanes, dtype=torch.int32, device=device)
     count(n * lanes, [*seen, counts])
     ends = counts.cumsum(0)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
-import subprocess
 from collections.abc import Callable
 from typing import Protocol
 
@@ -18,15 +16,8 @@ from sundae_ns.graphs import knn, radius_neighbors
 from sundae_ns.graphs.traversal import KERNEL, MAX_NEIGHBORS, OPTIONS, SOURCE, Launch, definitions, search_tree
 from sundae_ns.graphs.tree import LEAF, build_tree
 
-# What a GPU's compiler knows by itself, and a loop over the threads.
+# A count of the points looked at, and a loop over the threads.
 SHIM = """
-#include <cmath>
-using std::sqrt;
-#define __device__
-#define __global__
-#define __forceinline__ inline
-struct Index { unsigned x; };
-static Index blockIdx, blockDim, threadIdx;
 extern "C" long long looked_at;
 long long looked_at = 0;
 %s
@@ -48,21 +39,13 @@ class Compile(Protocol):
 
 
 @pytest.fixture(scope="module")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Compile:
-    compiler = shutil.which("g++")
-    if compiler is None:
-        pytest.skip("no g++ here to compile the kernel for the CPU")
-    folder = tmp_path_factory.mktemp("kernel")
+def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
     look = "const double dx = points"
     assert SOURCE.count(look) == 1
-    (folder / "kernel.cpp").write_text(SHIM % SOURCE.replace(look, "++looked_at; " + look))
+    source = SHIM % SOURCE.replace(look, "++looked_at; " + look)
 
     def compile_for(dtype: torch.dtype, k: int, looked_at: list[int] | None = None) -> Launch:
-        library = folder / f"{dtype}.{k}.so"
-        if not library.exists():
-            flags = ["-O1", "-w", "-shared", "-fPIC", "-ffp-contract=off", *definitions(dtype, k)]
-            subprocess.run([compiler, *flags, "-o", library, folder / "kernel.cpp"], check=True)
-        kernel = ctypes.CDLL(str(library))
+        kernel = compile_for_cpu(source, ["-ffp-contract=off", *definitions(dtype, k)])
         counter = ctypes.c_longlong.in_dll(kernel, "looked_at")
 
         def launch(threads: int, arguments: list[Tensor | int | float]) -> None:
