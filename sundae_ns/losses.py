@@ -2,31 +2,53 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 from collections.abc import Mapping
 
+import torch
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-SSIM_WINDOW = 11
+from sundae_ns.errors import BackendError
+from sundae_ns.fused_loss import WINDOW, compiled, fused_loss
+
 MCMC_REGULARISER = 0.01
 """Weights of opacities and sizes in the loss while the field grows by MCMC (lambda_o and lambda_Sigma of the paper)."""
+
+
+_log = logging.getLogger(__name__)
 
 
 def picture_loss(picture: Tensor, target: Tensor, ssim: SSIM, weight: float) -> Tensor:
     """``lambda_1 L1 + lambda_2 (1 - SSIM)`` of the paper, both pictures ``[H, W, 3]``.
 
     Args:
-        picture, target: what was drawn, and what it should be.
+        picture, target: what was drawn, and what it should be; a gradient reaches the first.
         ssim: of pictures ``[1, 3, H, W]``.
         weight: lambda_2; lambda_1 is the rest. Pictures smaller than SSIM's window are compared by L1 alone.
     """
+    small = min(target.shape[:2]) < WINDOW
+    if not small and weight > 0 and picture.is_cuda and picture.dtype == torch.float32 and _fuses(picture.device):
+        return fused_loss(picture, target, weight)
     l1 = (picture - target).abs().mean()
-    if weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
+    if small or weight == 0:
         return l1
     ssim.win = ssim.win.to(target.device)  # once: it would be copied there, and waited for, each time
     # Contiguous planes: on the interleaved colours of a large picture the same convolutions take much longer.
     planes = (image.permute(2, 0, 1)[None].contiguous() for image in (target, picture))
     return (1 - weight) * l1 + weight * (1 - ssim(*planes))
+
+
+@functools.cache
+def _fuses(device: torch.device) -> bool:
+    """Whether the kernels run there; says why not, once."""
+    try:
+        compiled(device)
+    except BackendError as error:
+        _log.warning("SSIM is made of convolutions, not by its kernel, on %s: %s", device, error)
+        return False
+    return True
 
 
 def chain_losses(params: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -32,7 +32,7 @@ from sundae_ns.datamanager import NO_PICTURES, SundaeDatamanager, without_pictur
 from sundae_ns.densification import CappedStrategy, make_strategy
 from sundae_ns.distributed import Arrived, Course, GlobalPruning, Look, Shards, Timetable, slack_of_step
 from sundae_ns.errors import ConfigError, out_of_memory
-from sundae_ns.evaluation import LazyOutputs, Lpips, psnr, ssim
+from sundae_ns.evaluation import Later, LazyOutputs, Lpips, psnr, ssim
 from sundae_ns.initial_field import Start, initial_field
 from sundae_ns.late_outputs import OUTPUTS, FieldKey, ShownResponse, empty_outputs, late_outputs
 from sundae_ns.losses import chain_losses, picture_loss
@@ -526,15 +526,21 @@ class SundaeModel(SplatfactoModel):
         truth = cut(self.get_gt_img(batch["image"]), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
 
-    def get_metrics_dict(self, outputs: dict[str, Any], batch: dict[str, Any]) -> dict[str, Any]:
-        """PSNR with and without the head, and the number of primitives."""
-        target = self._target(batch, outputs)
-        metrics: dict[str, Any] = {
-            "psnr": psnr(outputs["rgb"].detach().clamp(0, 1), target),
-            "psnr_base": psnr(outputs["base_rgb"].detach(), target),
-            "gaussian_count": self.total_points,
-        }
-        self.camera_optimizer.get_metrics_dict(metrics)
+    def get_metrics_dict(  # type: ignore[override]
+        self, outputs: dict[str, Any], batch: dict[str, Any]
+    ) -> LazyOutputs:
+        """PSNR with and without the head, and the number of primitives; computed when looked at, which few steps are."""
+        # Without what the picture was made from, whose memory is wanted for the next step.
+        rgb, base = outputs["rgb"].detach(), outputs["base_rgb"].detach()
+        cut_and_over = {"window": outputs.get("window"), "background": outputs["background"]}
+        metrics = LazyOutputs(
+            {
+                "psnr": Later(lambda: psnr(rgb.clamp(0, 1), self._target(batch, cut_and_over))),
+                "psnr_base": Later(lambda: psnr(base, self._target(batch, cut_and_over))),
+                "gaussian_count": self.total_points,
+            }
+        )
+        self.camera_optimizer.get_metrics_dict(metrics)  # type: ignore[arg-type]
         return metrics
 
     def get_loss_dict(

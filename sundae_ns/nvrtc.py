@@ -69,11 +69,12 @@ class Kernel:
         self._driver = _library("cuda")
         self._device = device
         self._block = block
-        self._function = c_void_p()
+        self._function, self._context = c_void_p(), c_void_p()
         module = c_void_p()
         with torch.cuda.device(device):
             # The driver's calls need torch's context on this thread, and work on the device is what puts it there.
             torch.zeros(1, device=device)
+            self._check(self._driver.cuCtxGetCurrent(byref(self._context)))
             self._check(self._driver.cuModuleLoadData(byref(module), code))
             self._check(self._driver.cuModuleGetFunction(byref(self._function), module, name.encode()))
 
@@ -93,6 +94,8 @@ class Kernel:
         grid = (c_uint(-(-threads // self._block)), c_uint(1), c_uint(1))
         block = (c_uint(self._block), c_uint(1), c_uint(1))
         with torch.cuda.device(self._device):
+            # Autograd's threads may come here before torch has done any work on them.
+            self._check(self._driver.cuCtxSetCurrent(self._context))
             stream = c_void_p(torch.cuda.current_stream(self._device).cuda_stream)
             self._check(
                 self._driver.cuLaunchKernel(self._function, *grid, *block, c_uint(0), stream, pointers, c_void_p())

@@ -91,11 +91,14 @@ def compile_kernels(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKerne
     def compile_them(source: str, names: Sequence[str], options: Sequence[str] = ()) -> dict[str, Launch]:
         loaded = compile_for_cpu(source, options)
 
+        def as_c(argument: Tensor | int | float) -> ctypes.c_void_p | ctypes.c_int | ctypes.c_double:
+            if isinstance(argument, Tensor):
+                return ctypes.c_void_p(argument.data_ptr())
+            return ctypes.c_double(argument) if isinstance(argument, float) else ctypes.c_int(argument)
+
         def launch_of(name: str) -> Launch:
             def launch(threads: int, arguments: Sequence[Tensor | int | float]) -> None:
-                values = [
-                    ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_int(a) for a in arguments
-                ]
+                values = [as_c(a) for a in arguments]
                 # More threads than asked for, as whole blocks have.
                 for block in range(threads + 3):
                     loaded.at(block)

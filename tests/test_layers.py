@@ -16,6 +16,7 @@ FLOORS = {
     "cuda_graphs": 0,
     "graphs": 0,
     "filters": 0,
+    "fused_loss": 1,
     "gaussians": 1,
     "rasterization": 1,
     "compensation": 1,

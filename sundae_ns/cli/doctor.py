@@ -131,11 +131,11 @@ def kernels(compile_kernels: bool) -> Finding:
 
 
 def own_kernels() -> Finding:
-    """Whether the kernels of this package compile and load: neighbour search, and what lies between the head's layers."""
+    """Whether the kernels of this package compile and load: neighbour search, the loss, what lies between the head's layers."""
     name = "our kernels"
     if not torch.cuda.is_available():
         return Finding(name, False, "need a CUDA device", "nothing: on a CPU other code does the same", needed=False)
-    from sundae_ns import nvrtc
+    from sundae_ns import fused_loss, nvrtc
     from sundae_ns.compensation import CompensationHead, HeadConfig, kernels
     from sundae_ns.errors import BackendError
     from sundae_ns.graphs import traversal
@@ -144,11 +144,12 @@ def own_kernels() -> Finding:
     options = (*traversal.OPTIONS, *traversal.definitions(torch.float32, 16))
     try:
         nvrtc.Kernel(traversal.SOURCE, traversal.KERNEL, device, options, traversal.BLOCK)
+        fused_loss.compiled(device)
         net = CompensationHead(HeadConfig()).net
         kernels.compiled(device, torch.bfloat16, kernels.definitions(net, True), kernels.FORWARD + kernels.BACKWARD)
     except BackendError as error:
         cause, mend = str(error).rsplit(": ", 1)
-        detail = f"{cause}: neighbours are searched on the CPU, and the head runs layer by layer"
+        detail = f"{cause}: neighbours are searched on the CPU, head and SSIM run layer by layer"
         return Finding(name, False, detail, mend, needed=False)
     return Finding(name, True, "run")
 

@@ -35,6 +35,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
     monkeypatch.setattr("sundae_ns.nvrtc.Kernel", lambda *_: None)
     monkeypatch.setattr("sundae_ns.compensation.kernels.compiled", lambda *_: {})
+    monkeypatch.setattr("sundae_ns.fused_loss.compiled", lambda *_: None)
 
 
 def _kernels(monkeypatch: pytest.MonkeyPatch, problem: str | None) -> None:
@@ -96,7 +97,8 @@ def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise BackendError("a CUDA kernel does not run (too old): update the driver")
 
-    for place in ("sundae_ns.nvrtc.Kernel", "sundae_ns.compensation.kernels.compiled"):
+    places = ("sundae_ns.nvrtc.Kernel", "sundae_ns.compensation.kernels.compiled", "sundae_ns.fused_loss.compiled")
+    for place in places:
         with monkeypatch.context() as patch:
             patch.setattr(place, refuse)
             found = finding("our kernels")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 
 import pytest
@@ -10,6 +11,7 @@ import torchmetrics.image
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sundae_ns.evaluation import psnr
 from sundae_ns.model import SundaeModel
 
 Build = Callable[..., SundaeModel]
@@ -37,6 +39,24 @@ def test_metrics_with_and_without_the_head(
     assert images["img"].shape == (32, 80, 3)
     # A picture with alpha is composited over the background that it was rendered with.
     assert torch.isfinite(torch.tensor(model.get_image_metrics_and_images(outputs, batch(channels=4))[0]["psnr"]))
+
+
+def test_metrics_of_a_step_cost_nothing_until_they_are_looked_at(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = perturb(build()).train()
+    outputs, asked = model.get_outputs(camera()), []
+    monkeypatch.setattr("sundae_ns.model.psnr", lambda *pictures: asked.append(pictures) or psnr(*pictures))
+    metrics = model.get_metrics_dict(outputs, batch())
+    assert set(metrics) == {"psnr", "psnr_base", "gaussian_count"}
+    assert not asked
+    rgb, graph = outputs["rgb"].detach().clamp(0, 1), weakref.ref(outputs["rgb"])
+    del outputs  # what the picture was made from goes with it
+    assert graph() is None
+    mse = ((rgb - batch()["image"].float() / 255) ** 2).mean()
+    assert float(metrics["psnr"]) == pytest.approx(float(-10 * mse.log10()), abs=1e-4)
+    assert metrics["psnr"] != metrics["psnr_base"]
+    assert len(asked) == 2
 
 
 def test_lpips_is_not_built_and_not_saved(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:

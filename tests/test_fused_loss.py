@@ -1,0 +1,131 @@
+"""Loss and gradient in one kernel each: the kernels' very lines, compiled for the CPU, against pytorch_msssim."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from pytorch_msssim import SSIM
+from torch import Tensor
+
+from sundae_ns import fused_loss as fused
+from sundae_ns import losses, nvrtc
+from sundae_ns.errors import BackendError
+from sundae_ns.fused_loss import Launches, fused_loss
+from sundae_ns.losses import picture_loss
+
+SIZES = [(11, 11), (11, 300), (12, 43), (26, 42), (27, 43), (64, 97)]
+
+
+@pytest.fixture(scope="module")
+def launches(compile_kernels: Callable[..., dict[str, Any]]) -> Launches:
+    return Launches(**compile_kernels(fused.SOURCE, Launches._fields, fused.definitions()))
+
+
+def pictures(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """One with edges and flat parts, and one that is near it."""
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(height, width, 3, generator=generator).mul(3).round() / 3
+    target[: height // 3] = 0.25
+    noise = torch.randn(height, width, 3, generator=generator)
+    return (target + 0.1 * noise).clamp(0, 1), target
+
+
+def exact(picture: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    """Loss and gradient by convolutions in float64."""
+    picture = picture.double().requires_grad_()
+    loss = picture_loss(picture, target.double(), SSIM(data_range=1.0, channel=3).double(), weight)
+    (gradient,) = torch.autograd.grad(loss, picture)
+    return loss.detach(), gradient
+
+
+def found(picture: Tensor, target: Tensor, weight: float, launches: Launches) -> tuple[Tensor, Tensor]:
+    picture = picture.clone().requires_grad_()
+    loss = fused_loss(picture, target, weight, launches)
+    (gradient,) = torch.autograd.grad(loss, picture)
+    return loss.detach(), gradient
+
+
+@pytest.mark.parametrize("weight", [0.2, 1.0])
+@pytest.mark.parametrize("size", SIZES)
+def test_the_loss_and_its_gradient(launches: Launches, size: tuple[int, int], weight: float) -> None:
+    pair = pictures(*size)
+    loss, gradient = found(*pair, weight, launches)
+    expected, slope = exact(*pair, weight)
+    assert loss.item() == pytest.approx(expected.item(), abs=2e-6)
+    assert (gradient - slope).abs().max() < 2e-4 * slope.abs().max()
+
+
+def test_strides_and_what_comes_after_it_do_not_matter(launches: Launches) -> None:
+    picture, target = pictures(40, 50)
+    turned = picture.permute(1, 0, 2).contiguous().permute(1, 0, 2)
+    expected, slope = found(picture, target, 0.2, launches)
+    assert not turned.is_contiguous()
+    turned.requires_grad_()
+    (gradient,) = torch.autograd.grad(3 * fused_loss(turned, target.flip(0).flip(0), 0.2, launches), turned)
+    torch.testing.assert_close(gradient, 3 * slope)
+    with torch.no_grad():
+        assert torch.equal(fused_loss(picture, target, 0.2, launches), expected)
+
+
+def test_the_same_picture_twice_loses_nothing(launches: Launches) -> None:
+    for picture in (pictures(40, 50)[1], torch.zeros(20, 20, 3), torch.ones(20, 20, 3)):
+        loss, gradient = found(picture, picture.clone(), 0.5, launches)
+        assert abs(loss) < 1e-6
+        assert gradient.abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e2, 1e4])
+def test_values_of_any_size(launches: Launches, scale: float) -> None:
+    pair = [scale * p for p in pictures(30, 47)]
+    loss, gradient = found(*pair, 0.2, launches)
+    expected, slope = exact(*pair, 0.2)
+    assert loss.item() == pytest.approx(expected.item(), rel=1e-4, abs=1e-6)
+    assert (gradient - slope).abs().max() < 2e-3 * slope.abs().max()
+
+
+def test_nan_is_not_hidden(launches: Launches) -> None:
+    picture, target = pictures(30, 47)
+    picture[15, 20, 1] = torch.nan
+    loss, gradient = found(picture, target, 0.2, launches)
+    assert loss.isnan()
+    assert gradient[15, 20, 1].isnan()
+    assert gradient[:4].isfinite().all()
+
+
+def test_it_compiles_for_a_gpu() -> None:
+    try:
+        nvrtc._library("nvrtc")
+    except BackendError as error:
+        pytest.skip(str(error))
+    assert nvrtc.compile_cubin(fused.SOURCE, "sm_90", fused.definitions())
+
+
+def test_without_its_kernels_convolutions_do_it(
+    launches: Launches, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(_: torch.device) -> Launches:
+        raise BackendError("NVRTC fails: update torch")
+
+    monkeypatch.setattr(losses, "compiled", refuse)
+    losses._fuses.cache_clear()
+    device = torch.device("cpu")
+    assert [losses._fuses(device), losses._fuses(device)] == [False, False]
+    assert caplog.text.count("NVRTC fails") == 1
+    losses._fuses.cache_clear()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("size", [*SIZES, (1061, 1893)])
+def test_on_a_gpu(size: tuple[int, int]) -> None:
+    picture, target = (p.cuda().requires_grad_(n == 0) for n, p in enumerate(pictures(*size)))
+    loss = picture_loss(picture, target, SSIM(data_range=1.0, channel=3).cuda(), 0.2)
+    assert "_Loss" in type(loss.grad_fn).__name__
+    (gradient,) = torch.autograd.grad(loss, picture)
+    expected, slope = exact(picture.detach(), target, 0.2)
+    assert loss.item() == pytest.approx(expected.item(), abs=2e-6)
+    assert (gradient - slope).abs().max() < 2e-4 * slope.abs().max()
+    again = torch.autograd.grad(picture_loss(picture, target, SSIM(data_range=1.0, channel=3), 0.2), picture)[0]
+    assert torch.equal(again, gradient)
