@@ -192,6 +192,25 @@ class Averaged:
             value.copy_(self.values[name])
 
 
+class Clock:
+    """Milliseconds a step, the device waited for at both ends, once pictures are cached and kernels compiled."""
+
+    first = 100
+
+    def __init__(self, trainer: Any) -> None:
+        self.trainer = trainer
+        self.started: float | None = None
+        self.ms_step: float | None = None
+        """None where there were too few steps."""
+
+    def tick(self, step: int) -> None:
+        last = self.trainer.config.max_num_iterations - 1
+        if step == self.first:
+            self.started = now(self.trainer.device)
+        elif step == last and self.started is not None:
+            self.ms_step = (now(self.trainer.device) - self.started) / (last - self.first) * 1e3
+
+
 def after_each_step(trainer: Any, fn: Any) -> None:
     train_iteration = trainer.train_iteration
 
@@ -304,6 +323,8 @@ def main() -> None:
                 torch._foreach_mul_(group["params"], 1 - group["lr"] * options.weight_decay)
 
         after_each_step(trainer, decay)
+    clock = Clock(trainer)
+    after_each_step(trainer, clock.tick)
     started = now(trainer.device)
     trainer.train()
     seconds = now(trainer.device) - started
@@ -317,6 +338,7 @@ def main() -> None:
         "seed": options.seed,
         "primitives": trainer.pipeline.model.num_points,
         "train_s": seconds,
+        "ms_step": clock.ms_step,
         **run.evaluate(trainer.pipeline),
         **training_views(trainer.pipeline),
         "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",

@@ -8,7 +8,8 @@
 
 The warm-up is trained once and kept under ``--out``; of several processes the first makes it and the others wait. Branches
 that have a line already are passed over, so a run that was stopped goes on where it was. All branches train without a head,
-see the same views in the same order for the same seed, and let their rates decay over their own length. ``--list`` shows
+see the same views in the same order for the same seed, and let their rates decay over their own length. ``--abreast N`` trains
+up to N of them at a time by one step for all (``abreast.py``), which is faster than as many processes. ``--list`` shows
 the branches that would run, ``--missing`` those without a line as jobs for ``jobs.py``: the first makes the warm-up.
 """
 
@@ -17,16 +18,19 @@ from __future__ import annotations
 import argparse
 import copy
 import json
+import os
 import shlex
 import sys
 import time
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import run
 import torch
 import tyro
+from abreast import Abreast, Start, start_of
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -92,6 +96,17 @@ class Branch(NamedTuple):
     options: dict[str, Any]
 
 
+class Pruned(NamedTuple):
+    """A branch right after its prune."""
+
+    branch: Branch
+    start: Start
+    choice: dict[str, Any]
+    before: int
+    quality: dict[str, float]
+    prune_s: float
+
+
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", required=True)
@@ -109,6 +124,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("outputs/rules"))
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--rows", type=Path, default=run.RESULTS, help="CSV file of rows; - for none")
+    parser.add_argument("--abreast", type=int, default=1, help="most branches that are trained by one step for all")
     parser.add_argument("--list", action="store_true", help="print the branches and stop")
     parser.add_argument("--missing", action="store_true", help="print a job for each branch without a line, and stop")
     options = parser.parse_args()
@@ -156,7 +172,9 @@ class Bench:
         self.command = " ".join(["ns-train", options.method, "--data", options.scene, *arguments[3:], options.parser])
         config.pipeline.datamanager.data = config.data
         config.output_dir = options.out
-        config.experiment_name = f"{options.scene}-{options.shard.replace('/', '-of-')}"
+        config.experiment_name = (
+            f"{options.scene}-{os.getpid()}"  # processes that begin in the same second are told apart
+        )
         config.set_timestamp()
         config.vis = "tensorboard"
         config.pipeline.model.evaluate_prune = False
@@ -223,15 +241,15 @@ class Bench:
             self.weights[key] = self._measured(data)
         return self.weights[key]
 
-    def branch(self, branch: Branch) -> dict[str, Any]:
-        """Prune, evaluate, train, evaluate."""
+    def prune(self, branch: Branch) -> Pruned:
+        """Go back, prune, evaluate."""
         options = self.options
         self._rewind(branch.seed, options.steps)
         choice = dict(branch.options)
         if REACH in choice:
             graph = field_graph(for_graph(self.model.gaussians, self.pruning), self.pruning)
             choice |= {"sigma": graph.sigma, "tau": graph.tau * choice.pop(REACH) ** 2}
-        if choice.get("rounds", 1) > 1:
+        if in_rounds(branch):
             # A tenth of the branch apart: all branches are trained for the same time in all.
             choice.setdefault("round_every", max(options.steps // 10, 1))
         config = replace(self.pruning, keep_ratio=branch.keep, seed=branch.seed, **{**PLAIN, **choice})
@@ -246,24 +264,45 @@ class Bench:
             torch.cuda.synchronize()
         prune_s = time.perf_counter() - started
         self.trainer.pipeline.eval()
-        pruned = run.evaluate(self.trainer.pipeline)
+        return Pruned(branch, start_of(self.trainer), choice, before, run.evaluate(self.trainer.pipeline), prune_s)
+
+    def branch(self, branches: list[Branch]) -> list[dict[str, Any]]:
+        """Prune, evaluate, train, evaluate; several branches are trained by one step for all."""
+        steps = range(self.step + 1, self.step + 1 + self.options.steps)
+        pruned = [self.prune(branch) for branch in branches]
+        what = ", ".join(f"{branch.rule} {branch.keep:g}" for branch in branches)
+        run._set_random_seed(42 + branches[0].seed)  # the same backgrounds, whatever a prune has drawn
         started = time.perf_counter()
-        self._train(range(self.step + 1, self.step + 1 + options.steps), f"{branch.rule}, {branch.keep:g}")
+        together = Abreast(self.trainer, [p.start for p in pruned]) if len(pruned) > 1 else None
+        if together is None:
+            self._train(steps, what)
+        else:
+            together.train(steps, what)
         if torch.cuda.is_available():
             torch.cuda.synchronize()
         train_s = time.perf_counter() - started
         self.trainer.pipeline.eval()
-        tuned = run.evaluate(self.trainer.pipeline) if options.steps else pruned
+        lines = []
+        for number, one in enumerate(pruned):
+            if together is not None:
+                together.show(number)
+            tuned = run.evaluate(self.trainer.pipeline) if self.options.steps else one.quality
+            lines.append(self._line(one, tuned, train_s / len(pruned)))
+            if together is not None:
+                lines[-1]["abreast"] = len(pruned)
+        return lines
+
+    def _line(self, pruned: Pruned, tuned: dict[str, float], train_s: float) -> dict[str, Any]:
         return {
-            **key_of(options, branch, self.step),
-            "options": choice,
-            "before": before,
+            **key_of(self.options, pruned.branch, self.step),
+            "options": pruned.choice,
+            "before": pruned.before,
             "primitives": self.model.num_points,
-            "psnr_pruned": pruned["psnr"],
-            "ssim_pruned": pruned["ssim"],
+            "psnr_pruned": pruned.quality["psnr"],
+            "ssim_pruned": pruned.quality["ssim"],
             "psnr": tuned["psnr"],
             "ssim": tuned["ssim"],
-            "prune_s": prune_s,
+            "prune_s": pruned.prune_s,
             "train_s": train_s,
             "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
             "commit": run.commit(),
@@ -330,23 +369,37 @@ def finished(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
+def in_rounds(branch: Branch) -> bool:
+    return branch.options.get("rounds", 1) > 1
+
+
+def groups(branches: list[Branch], most: int) -> list[list[Branch]]:
+    """Branches that can be trained abreast: as many primitives, the same views, and no prune while they are trained."""
+    found = []
+    for (_, _, rounds), same in groupby(branches, lambda b: (b.keep, b.seed, in_rounds(b))):
+        own, size = list(same), 1 if rounds else max(most, 1)
+        found += [own[i : i + size] for i in range(0, len(own), size)]
+    return found
+
+
 def jobs_of(options: argparse.Namespace, wanted: list[Branch]) -> list[dict[str, Any]]:
-    """Jobs for ``jobs.py``, one a branch; all but the first wait for the warm-up, which the first makes if need be."""
+    """Jobs for ``jobs.py``; all but the first wait for the warm-up, which the first makes if need be."""
     step = schedule_of(options.method, warmup=options.warmup, finetune=None, scale=1.0).warmup
     rows = options.rows if str(options.rows) == "-" else options.rows.resolve()
     shared = ["--scene", options.scene, "--method", options.method, "--steps", str(options.steps), "--rows", str(rows)]
     for name in ("data", "out", "results"):
         shared += [f"--{name}", str(vars(options)[name].resolve())]
     shared += [] if options.warmup is None else ["--warmup", str(options.warmup)]
+    shared += [] if options.abreast == 1 else ["--abreast", str(options.abreast)]
     jobs: list[dict[str, Any]] = []
-    for number, branch in enumerate(wanted, start=2):
-        if not is_finished(options.results, key_of(options, branch, step)):
-            # The first of so many parts of a list of one is that one: each process has a folder of its own.
-            own = f"--rules {branch.rule} --keep {branch.keep:g} --seeds {branch.seed} --shard 0/{number}".split()
-            name = f"{options.scene}-{branch.keep:g}-{branch.rule}-{branch.seed}"
-            command = shlex.join([sys.executable, str(Path(__file__).resolve()), *shared, *own])
-            needs = [str(warm_up_of(options, step).resolve())] if jobs else []
-            jobs.append({"name": name, "command": command, "needs": needs})
+    missing = [branch for branch in wanted if not is_finished(options.results, key_of(options, branch, step))]
+    for group in groups(missing, options.abreast):
+        first, rules = group[0], [branch.rule for branch in group]
+        own = ["--rules", *rules, "--keep", f"{first.keep:g}", "--seeds", str(first.seed)]
+        name = f"{options.scene}-{first.keep:g}-{'+'.join(rules)}-{first.seed}"
+        command = shlex.join([sys.executable, str(Path(__file__).resolve()), *shared, *own])
+        needs = [str(warm_up_of(options, step).resolve())] if jobs else []
+        jobs.append({"name": name, "command": command, "needs": needs})
     return jobs
 
 
@@ -370,15 +423,14 @@ def main() -> None:
             print(json.dumps(job))
         return
     bench = Bench(options)
-    for branch in mine:
-        key = key_of(options, branch, bench.step)
-        if is_finished(options.results, key):
-            continue
-        line = bench.branch(branch)
-        append(options.results, line)
-        if str(options.rows) != "-":
-            append_row(options.rows, bench.row(line))
-        CONSOLE.print(f"{branch.rule}, {branch.keep:g}: {line['psnr_pruned']:.2f} then {line['psnr']:.2f} dB")
+    for group in groups(mine, options.abreast):
+        left = [branch for branch in group if not is_finished(options.results, key_of(options, branch, bench.step))]
+        for line in bench.branch(left) if left else []:
+            append(options.results, line)
+            if str(options.rows) != "-":
+                append_row(options.rows, bench.row(line))
+            what = f"{line['rule']}, {line['keep']:g}"
+            CONSOLE.print(f"{what}: {line['psnr_pruned']:.2f} then {line['psnr']:.2f} dB")
 
 
 if __name__ == "__main__":

@@ -134,6 +134,11 @@ def test_branches_without_a_line_are_jobs(
     assert [job["name"] for job in (first, *others)] == ["s-0.1-paper-0", "s-0.01-random-0", "s-0.01-paper-0"]
     assert first["needs"] == []
     assert all(job["needs"] == [str(tmp_path / "out" / "s" / "sundae-15000.ckpt")] for job in others)
+    # Those that can be are one job, where that is asked for.
+    monkeypatch.setattr(sys, "argv", ["rules.py", *options, "--abreast", "4"])
+    rules.main()
+    together = [json.loads(job) for job in capsys.readouterr().out.splitlines()]
+    assert [job["name"] for job in together] == ["s-0.1-paper-0", "s-0.01-random+paper-0"]
     # What a job runs is that branch and no other.
     monkeypatch.setattr(sys, "argv", others[0]["command"].split()[1:] + ["--list"])
     rules.main()
