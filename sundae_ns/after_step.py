@@ -58,8 +58,10 @@ def prune_if_due(model: SundaeModel, attributes: TrainingCallbackAttributes, ste
             attributes.trainer.save_checkpoint(step)
         raise
     refresh(model, optimizers)
-    last = model.schedule_step >= pruning.settled_at
-    pruned = last or (pruning.ends_growth_at is not None and model.pruning_state["num_prunes"] > 0)
+    last = model.schedule_step >= max(pruning.settled_at, model.head_starts_at)
+    pruned = model.schedule_step >= pruning.settled_at or (
+        pruning.ends_growth_at is not None and model.pruning_state["num_prunes"] > 0
+    )
     if model.budget is None and pruned:
         notify_pruned(optimizers.schedulers, step, last=last)
     if report is None:
@@ -73,29 +75,39 @@ def prune_if_due(model: SundaeModel, attributes: TrainingCallbackAttributes, ste
 
 def warn_if_too_short(model: SundaeModel, last_step: int) -> None:
     """Say so where a training that ends with this step does not come to its first prune, its last, or its head."""
-    pruning, ranks = model.config.pruning, 1 if model.shards is None else model.shards.ranks
-    first, done = pruning.first_prune, model.pruning_state["num_prunes"]
     # A warm start is pruned at once.
-    if first is None or last_step >= pruning.settled_at or model.config.warm_start is not None:
+    short = None if model.config.warm_start is not None else _short_of(model, last_step)
+    if short is None:
         return
-    begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "rounds")
-    head_waits, target = model.head is not None and model.config.head.start_at is None, pruning.target_primitives
-    and_head = ", and the head takes no part" if head_waits else ""
-    if last_step < first and not done:
-        what, due, option, found = "first prune", first, begins, "nothing is pruned" + and_head
-    elif last_step < pruning.last_due and not (done and target is not None and model.num_points <= target):
-        what, due, option = "last prune", pruning.last_due, ends
-        found = "more primitives are left than asked for" + and_head
-    elif head_waits:
-        what, due, option, found = "head", pruning.settled_at, ends, "it takes no part"
-    else:
-        return
+    what, due, option, found, mend = short
+    ranks = 1 if model.shards is None else model.shards.ranks
     # Steps of one picture, which options count by.
     CONSOLE.print(
         f"[yellow]Warning: training ends after {(last_step + 1) * ranks:,} steps, and the {what} needs more than "
-        f"{due * ranks:,} (pruning.{option}): {found}; train longer, or prune earlier",
+        f"{due * ranks:,} ({option}): {found}; train longer, or {mend}",
         soft_wrap=True,
     )
+
+
+def _short_of(model: SundaeModel, last_step: int) -> tuple[str, int, str, str, str] | None:
+    """What such a training does not come to, the step that it needs more than, its option, what becomes of it, the mend."""
+    pruning, start = model.config.pruning, None if model.head is None else model.config.head.start_at
+    first, done, target = pruning.first_prune, model.pruning_state["num_prunes"], pruning.target_primitives
+    begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "rounds")
+    earlier, no_part = "prune earlier", "it takes no part"
+    waits = model.head is not None and start is None
+    and_head = ", and the head takes no part" if waits else ""
+    if first is not None and last_step < pruning.settled_at:
+        if last_step < first and not done:
+            return "first prune", first, f"pruning.{begins}", "nothing is pruned" + and_head, earlier
+        if last_step < pruning.last_due and not (done and target is not None and model.num_points <= target):
+            found = "more primitives are left than asked for" + and_head
+            return "last prune", pruning.last_due, f"pruning.{ends}", found, earlier
+        if waits:
+            return "head", pruning.settled_at, f"pruning.{ends}", no_part, earlier
+    if start is not None and last_step < start and model.budget is None:
+        return "head", start, "head.start-at", no_part, "start it earlier"
+    return None
 
 
 def finish(model: SundaeModel, attributes: TrainingCallbackAttributes, step: int) -> None:

@@ -194,10 +194,13 @@ class SundaeModel(SplatfactoModel):
         """Whether the head takes part: it starts when pruning has ended, unless told otherwise, or when auto lets it."""
         if self.budget is not None:
             return self.head is not None and self.budget.search.head
+        return self.head is not None and self.schedule_step > self.head_starts_at
+
+    @property
+    def head_starts_at(self) -> int:
+        """Step of the schedule after which the head takes part, where no search for a budget decides."""
         start = self.config.head.start_at
-        return self.head is not None and self.schedule_step > (
-            self.config.pruning.settled_at if start is None else start
-        )
+        return self.config.pruning.settled_at if start is None else start
 
     @property
     def backend(self) -> Backend:

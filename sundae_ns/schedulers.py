@@ -58,7 +58,7 @@ class PruneAwareDecayConfig(SchedulerConfig):
     lr_restart: float | None = None
     """Learning rate right after the prune, from which the decay begins anew; None goes on as if nothing happened."""
     hold_until_prune: bool = False
-    """Whether the rate stays constant until the prune."""
+    """Whether the rate stays constant until pruning has ended and the head starts, which counts as the prune then."""
     warmup_steps: int = 0
     """Steps over which the rate rises after the prune."""
 
@@ -84,7 +84,7 @@ class PruneAwareDecay(Scheduler):
 def notify_pruned(schedulers: dict[str, LRScheduler], step: int, *, last: bool = True) -> None:
     """Tell every :class:`Decay` among ``schedulers`` that the field was pruned at ``step``; the first prune counts.
 
-    Where pruning goes on (``last`` is False), those that hold their rate until it ends are not told yet.
+    Where pruning goes on or the head does not take part yet (``last`` is False), those that hold their rate are not told.
     """
     for scheduler in schedulers.values():
         for multiplier in getattr(scheduler, "lr_lambdas", []):

@@ -13,6 +13,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from sundae_ns.initial_field import Start
 from sundae_ns.model import SundaeModel
+from sundae_ns.schedulers import Decay
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[..., Any]
@@ -88,6 +89,18 @@ def test_rounds_prune_to_the_count_and_the_head_waits_for_the_last(
     assert all(torch.isfinite(value).all() for value in training.model.gauss_params.values())
 
 
+def test_the_rate_of_a_head_that_starts_later_begins_with_it(build: Build, training_of: TrainingOf) -> None:
+    training = training_of(build(head={"start_at": 6}))
+    decays = {name: Decay(0.01, 20, 1.0, name == "compensation", 0) for name in ("means", "compensation")}
+    for name, decay in decays.items():
+        optimizer = training.optimizers.optimizers[name]
+        training.optimizers.schedulers[name] = torch.optim.lr_scheduler.LambdaLR(optimizer, decay)
+    for step in range(8):
+        training.step(step)
+        assert training.model.head_active == (step > 6)
+    assert {name: decay.pruned_at for name, decay in decays.items()} == {"means": 3, "compensation": 6}
+
+
 def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return [line for line in capsys.readouterr().out.splitlines() if " needs more than " in line]
 
@@ -123,6 +136,8 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
             {"start_at": 0},
             "5 (pruning.rounds): more primitives are left than asked for; train longer, or prune earlier",
         ),
+        ({"prune_at": 1}, {"start_at": 4}, "4 (head.start-at): it takes no part; train longer, or start it earlier"),
+        ({"mode": "off"}, {"start_at": 4}, "4 (head.start-at): it takes no part; train longer, or start it earlier"),
     ],
 )
 def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_after(
