@@ -71,8 +71,9 @@ class Abreast:
 
     def __init__(self, trainer: Any, starts: Sequence[Start]) -> None:
         self.data, self.model = trainer.pipeline.datamanager, trainer.pipeline.model
-        if self.model.head is not None or self.model.densifying:
-            raise SystemExit("fields that have a head or still grow cannot be trained abreast; leave --abreast out")
+        moved = self.model.config.camera_optimizer.mode != "off"
+        if self.model.head is not None or self.model.densifying or moved:
+            raise SystemExit("no head, growth or cameras can be trained abreast, only fields; leave --abreast out")
         self.rates = starts[0].rates
         self.fields = {
             name: torch.nn.Parameter(torch.stack([start.field[name] for start in starts])) for name in starts[0].field
@@ -96,7 +97,8 @@ class Abreast:
                 model.step = step
                 background = model._get_background_color()
                 target = model._target(batch, {"background": background})
-                pictures = draw(self.fields, model.view_of(camera), background, model._style)
+                view = model.view_of(camera, model._get_downscale_factor())
+                pictures = draw(self.fields, view, background, model._style)
                 losses = [picture_loss(p, target, model.ssim, model.config.ssim_lambda) for p in pictures]
                 torch.stack(losses).sum().backward()  # type: ignore[no-untyped-call]
                 for name, optimizer in self.optimizers.items():

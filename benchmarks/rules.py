@@ -9,7 +9,7 @@
 The warm-up is trained once and kept under ``--out``; of several processes the first makes it and the others wait. Branches
 that have a line already are passed over, so a run that was stopped goes on where it was. All branches train without a head,
 see the same views in the same order for the same seed, and let their rates decay over their own length. ``--abreast N`` trains
-up to N of them at a time by one step for all (``abreast.py``), which is faster than as many processes. ``--list`` shows
+up to N of them at a time by one step for all (``abreast.py``), and saves their lines when all have ended. ``--list`` shows
 the branches that would run, ``--missing`` those without a line as jobs for ``jobs.py``: the first makes the warm-up.
 """
 
@@ -100,7 +100,8 @@ class Pruned(NamedTuple):
     """A branch right after its prune."""
 
     branch: Branch
-    start: Start
+    start: Start | None
+    """None where it is trained alone."""
     choice: dict[str, Any]
     before: int
     quality: dict[str, float]
@@ -126,7 +127,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--rows", type=Path, default=run.RESULTS, help="CSV file of rows; - for none")
     parser.add_argument("--abreast", type=int, default=1, help="most branches that are trained by one step for all")
     parser.add_argument("--list", action="store_true", help="print the branches and stop")
-    parser.add_argument("--missing", action="store_true", help="print a job for each branch without a line, and stop")
+    parser.add_argument("--missing", action="store_true", help="print jobs of the branches without a line, and stop")
     options = parser.parse_args()
     if options.missing and options.sweep:
         parser.error("--missing lists rules, not the points of a sweep; leave one of the two out")
@@ -241,7 +242,7 @@ class Bench:
             self.weights[key] = self._measured(data)
         return self.weights[key]
 
-    def prune(self, branch: Branch) -> Pruned:
+    def prune(self, branch: Branch, *, alone: bool) -> Pruned:
         """Go back, prune, evaluate."""
         options = self.options
         self._rewind(branch.seed, options.steps)
@@ -264,16 +265,18 @@ class Bench:
             torch.cuda.synchronize()
         prune_s = time.perf_counter() - started
         self.trainer.pipeline.eval()
-        return Pruned(branch, start_of(self.trainer), choice, before, run.evaluate(self.trainer.pipeline), prune_s)
+        start = None if alone else start_of(self.trainer)
+        return Pruned(branch, start, choice, before, run.evaluate(self.trainer.pipeline), prune_s)
 
     def branch(self, branches: list[Branch]) -> list[dict[str, Any]]:
         """Prune, evaluate, train, evaluate; several branches are trained by one step for all."""
         steps = range(self.step + 1, self.step + 1 + self.options.steps)
-        pruned = [self.prune(branch) for branch in branches]
+        pruned = [self.prune(branch, alone=len(branches) == 1) for branch in branches]
         what = ", ".join(f"{branch.rule} {branch.keep:g}" for branch in branches)
         run._set_random_seed(42 + branches[0].seed)  # the same backgrounds, whatever a prune has drawn
         started = time.perf_counter()
-        together = Abreast(self.trainer, [p.start for p in pruned]) if len(pruned) > 1 else None
+        starts = [p.start for p in pruned if p.start is not None]
+        together = Abreast(self.trainer, starts) if starts else None
         if together is None:
             self._train(steps, what)
         else:
@@ -396,7 +399,10 @@ def jobs_of(options: argparse.Namespace, wanted: list[Branch]) -> list[dict[str,
     for group in groups(missing, options.abreast):
         first, rules = group[0], [branch.rule for branch in group]
         own = ["--rules", *rules, "--keep", f"{first.keep:g}", "--seeds", str(first.seed)]
-        name = f"{options.scene}-{first.keep:g}-{'+'.join(rules)}-{first.seed}"
+        # Also the name of a file.
+        name = f"{options.scene}-{first.keep:g}-{first.rule}-{first.seed}" + (
+            f"-and-{len(group) - 1}" if rules[1:] else ""
+        )
         command = shlex.join([sys.executable, str(Path(__file__).resolve()), *shared, *own])
         needs = [str(warm_up_of(options, step).resolve())] if jobs else []
         jobs.append({"name": name, "command": command, "needs": needs})

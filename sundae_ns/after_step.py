@@ -75,39 +75,45 @@ def prune_if_due(model: SundaeModel, attributes: TrainingCallbackAttributes, ste
 
 def warn_if_too_short(model: SundaeModel, last_step: int) -> None:
     """Say so where a training that ends with this step does not come to its first prune, its last, or its head."""
-    # A warm start is pruned at once.
-    short = None if model.config.warm_start is not None else _short_of(model, last_step)
+    short = _short_of(model, last_step)
     if short is None:
         return
-    what, due, option, found, mend = short
+    what, due, option, found = short
     ranks = 1 if model.shards is None else model.shards.ranks
+    mend = "start it" if option.startswith("head") else "prune"
     # Steps of one picture, which options count by.
     CONSOLE.print(
         f"[yellow]Warning: training ends after {(last_step + 1) * ranks:,} steps, and the {what} needs more than "
-        f"{due * ranks:,} ({option}): {found}; train longer, or {mend}",
+        f"{due * ranks:,} ({option}): {found}; train longer, or {mend} earlier",
         soft_wrap=True,
     )
 
 
-def _short_of(model: SundaeModel, last_step: int) -> tuple[str, int, str, str, str] | None:
-    """What such a training does not come to, the step that it needs more than, its option, what becomes of it, the mend."""
-    pruning, start = model.config.pruning, None if model.head is None else model.config.head.start_at
+def _short_of(model: SundaeModel, last_step: int) -> tuple[str, int, str, str] | None:
+    """What such a training does not come to, the step that it needs more than, its option, and what becomes of it."""
+    pruning, warm = model.config.pruning, model.config.warm_start is not None
+    offset = pruning.prune_at if warm else 0
     first, done, target = pruning.first_prune, model.pruning_state["num_prunes"], pruning.target_primitives
     begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "rounds")
-    earlier, no_part = "prune earlier", "it takes no part"
-    waits = model.head is not None and start is None
-    and_head = ", and the head takes no part" if waits else ""
-    if first is not None and last_step < pruning.settled_at:
+    ends = "prune-at" if ends == "rounds" and pruning.rounds == 1 else ends
+    idle = model.head is not None and model.budget is None and last_step + offset <= model.head_starts_at
+    and_head = ", and the head takes no part" if idle else ""
+    # A warm start is pruned at once.
+    if first is not None and not warm:
         if last_step < first and not done:
-            return "first prune", first, f"pruning.{begins}", "nothing is pruned" + and_head, earlier
-        if last_step < pruning.last_due and not (done and target is not None and model.num_points <= target):
-            found = "more primitives are left than asked for" + and_head
-            return "last prune", pruning.last_due, f"pruning.{ends}", found, earlier
-        if waits:
-            return "head", pruning.settled_at, f"pruning.{ends}", no_part, earlier
-    if start is not None and last_step < start and model.budget is None:
-        return "head", start, "head.start-at", no_part, "start it earlier"
-    return None
+            return "first prune", first, f"pruning.{begins}", "nothing is pruned" + and_head
+        if last_step < pruning.last_due and not (done and target is not None and model.total_points <= target):
+            return (
+                "last prune",
+                pruning.last_due,
+                f"pruning.{ends}",
+                "more primitives are left than asked for" + and_head,
+            )
+    if not idle:
+        return None
+    option = f"pruning.{ends}" if model.config.head.start_at is None else "head.start-at"
+    # It takes part in the steps after that one.
+    return "head", model.head_starts_at + 1 - offset, option, "it takes no part"
 
 
 def finish(model: SundaeModel, attributes: TrainingCallbackAttributes, step: int) -> None:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple, cast
 import torch
 from torch import Tensor
 
+from sundae_ns.errors import DataError, SundaeError
 from sundae_ns.nvrtc import Kernel
 
 WINDOW = 11
@@ -204,9 +205,16 @@ def fused_loss(picture: Tensor, target: Tensor, weight: float, launches: Launche
 
     Raises:
         BackendError: the kernels cannot be compiled or loaded here.
+        DataError: the pictures are not of one such shape, or not float32.
     """
+    alike = picture.shape == target.shape and picture.dtype == target.dtype == torch.float32
+    if not alike or picture.shape[2:] != (3,) or min(picture.shape[:2]) < WINDOW:
+        raise DataError(
+            f"a loss of {picture.dtype} {list(picture.shape)} against {target.dtype} {list(target.shape)}; "
+            f"give float32 [H, W, 3] of one size, {WINDOW} px or more a side"
+        )
     launches = compiled(picture.device) if launches is None else launches
-    return cast("Tensor", _Loss.apply(picture, target, weight, launches))
+    return cast("Tensor", _Loss.apply(picture, target.detach(), weight, launches))
 
 
 class _Loss(torch.autograd.Function):
@@ -227,6 +235,10 @@ class _Loss(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
+        if torch.is_grad_enabled():  # a graph of this pass is wanted, and would lack it
+            raise SundaeError(
+                "the kernel of the loss has no second derivative; take that of float64 pictures, which are convolved"
+            )
         picture, target, slopes = ctx.saved_tensors
         out = torch.empty_like(picture)
         height, width, _ = picture.shape

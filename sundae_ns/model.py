@@ -16,7 +16,7 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizer
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, resize_image
 from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerDropdown
@@ -523,23 +523,28 @@ class SundaeModel(SplatfactoModel):
 
     # --------------------------------------------------------------------------------------------- losses and metrics
 
-    def _target(self, batch: dict[str, Any], outputs: dict[str, Any]) -> Tensor:
+    def _target(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
+        """What a picture should be: of its window, over its background, and smaller by as much as it is by default now."""
         if NO_PICTURES in batch:
             raise without_pictures()
-        truth = cut(self.get_gt_img(batch["image"]), outputs.get("window"))
-        return self.composite_with_background(truth, outputs["background"])
+        image: Tensor = batch["image"]
+        image = image.float() / 255 if image.dtype == torch.uint8 else image
+        downscale = self._get_downscale_factor() if downscale is None else downscale
+        image = (image if downscale == 1 else resize_image(image, downscale)).to(self.device)
+        return self.composite_with_background(cut(image, outputs.get("window")), outputs["background"])
 
     def get_metrics_dict(  # type: ignore[override]
         self, outputs: dict[str, Any], batch: dict[str, Any]
     ) -> LazyOutputs:
         """PSNR with and without the head, and the number of primitives; computed when looked at, which few steps are."""
-        # Without what the picture was made from, whose memory is wanted for the next step.
-        rgb, base = outputs["rgb"].detach(), outputs["base_rgb"].detach()
-        cut_and_over = {"window": outputs.get("window"), "background": outputs["background"]}
+        # They may be looked at by the next step, and in the middle of a viewer's frame: what they read is told now, without
+        # what the pictures were made from, whose memory the next step wants.
+        rgb, base, downscale = outputs["rgb"].detach(), outputs["base_rgb"].detach(), self._get_downscale_factor()
+        target = partial(self._target, batch, {name: outputs.get(name) for name in ("window", "background")}, downscale)
         metrics = LazyOutputs(
             {
-                "psnr": Later(lambda: psnr(rgb.clamp(0, 1), self._target(batch, cut_and_over))),
-                "psnr_base": Later(lambda: psnr(base, self._target(batch, cut_and_over))),
+                "psnr": Later(lambda: psnr(rgb.clamp(0, 1), target())),
+                "psnr_base": Later(lambda: psnr(base, target())),
                 "gaussian_count": self.total_points,
             }
         )

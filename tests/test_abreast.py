@@ -18,9 +18,9 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 RULES = ["random", "contribution", "detail-merge"]
 
 
-@pytest.fixture
-def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Branches of 6 steps after a warm-up of 10 on a small made scene."""
+@pytest.fixture(params=["", "--pipeline.model.num-downscales 2"])
+def bench(request: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Branches of 6 steps after a warm-up of 10 on a small made scene, with pictures as they are or at a quarter."""
     monkeypatch.syspath_prepend(str(FOLDER))
     monkeypatch.setenv("BENCHMARK_COMMIT", "none")
     import rules
@@ -28,6 +28,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     write_scene(tmp_path / "scene", train_views=6, test_views=2, width=40, height=32, points=120)
     options = ["--scene", "made", "--data", str(tmp_path / "scene"), "--method", "sundae-tiny", "--warmup", "10"]
     options += ["--steps", "6", "--keep", "0.5", "--rules", *RULES, "--parser", "nerfstudio-data", "--rows", "-"]
+    options += ["--extra", request.param] if request.param else []
     options += ["--out", str(tmp_path / "out"), "--results", str(tmp_path / "rules.jsonl")]
     monkeypatch.setattr(sys, "argv", ["rules.py", *options])
     parsed = rules.parse()

@@ -1,4 +1,7 @@
-"""Loss and gradient in one kernel each: the kernels' very lines, compiled for the CPU, against pytorch_msssim."""
+"""Loss and gradient in one kernel each: the kernels' very lines, compiled for the CPU, against pytorch_msssim.
+
+A block has one thread on the CPU: what its threads share, and the sum over them, only the tests on a GPU see.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from torch import Tensor
 
 from sundae_ns import fused_loss as fused
 from sundae_ns import losses, nvrtc
-from sundae_ns.errors import BackendError
+from sundae_ns.errors import BackendError, DataError, SundaeError
 from sundae_ns.fused_loss import Launches, fused_loss
 from sundae_ns.losses import picture_loss
 
@@ -35,8 +38,9 @@ def pictures(height: int, width: int, seed: int = 0) -> tuple[Tensor, Tensor]:
 
 def exact(picture: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """Loss and gradient by convolutions in float64."""
-    picture = picture.double().requires_grad_()
-    loss = picture_loss(picture, target.double(), SSIM(data_range=1.0, channel=3).double(), weight)
+    picture, ssim = picture.double().requires_grad_(), SSIM(data_range=1.0, channel=3)
+    ssim.win = ssim.win.to(picture)  # moving the module leaves its window where it was
+    loss = picture_loss(picture, target.double(), ssim, weight)
     (gradient,) = torch.autograd.grad(loss, picture)
     return loss.detach(), gradient
 
@@ -103,8 +107,27 @@ def test_it_compiles_for_a_gpu() -> None:
     assert nvrtc.compile_cubin(fused.SOURCE, "sm_90", fused.definitions())
 
 
-def test_without_its_kernels_convolutions_do_it(
-    launches: Launches, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize(
+    "target", [torch.zeros(20, 30, 3), torch.zeros(40, 30, 4), torch.zeros(40, 30, 3).double(), torch.zeros(40, 30)]
+)
+def test_pictures_that_do_not_fit_are_refused(launches: Launches, target: Tensor) -> None:
+    for pair in ((torch.zeros(40, 30, 3), target), (target, target)):
+        if pair[0].shape != (20, 30, 3):
+            with pytest.raises(DataError, match=r"give float32 \[H, W, 3\] of one size"):
+                fused_loss(*pair, 0.2, launches)
+    with pytest.raises(DataError, match="11 px or more a side"):
+        fused_loss(torch.zeros(10, 30, 3), torch.zeros(10, 30, 3), 0.2, launches)
+
+
+def test_no_second_gradient_and_none_for_the_target(launches: Launches) -> None:
+    picture, target = (p.requires_grad_() for p in pictures(20, 30))
+    with pytest.raises(SundaeError, match="no second derivative"):
+        torch.autograd.grad(fused_loss(picture, target, 0.2, launches), picture, create_graph=True)
+    assert not fused_loss(picture.detach(), target, 0.2, launches).requires_grad
+
+
+def test_kernels_that_are_missing_are_told_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(_: torch.device) -> Launches:
         raise BackendError("NVRTC fails: update torch")
@@ -127,5 +150,9 @@ def test_on_a_gpu(size: tuple[int, int]) -> None:
     expected, slope = exact(picture.detach(), target, 0.2)
     assert loss.item() == pytest.approx(expected.item(), abs=2e-6)
     assert (gradient - slope).abs().max() < 2e-4 * slope.abs().max()
+    others = ((picture[:10], target[:10], 0.2), (picture, target, 0.0), (picture.double(), target.double(), 0.2))
+    for *pair, weight in others:  # too small, without SSIM, in another precision
+        elsewhere = picture_loss(*pair, SSIM(data_range=1.0, channel=3), weight)
+        assert "_Loss" not in type(elsewhere.grad_fn).__name__
     again = torch.autograd.grad(picture_loss(picture, target, SSIM(data_range=1.0, channel=3), 0.2), picture)[0]
     assert torch.equal(again, gradient)

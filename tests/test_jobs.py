@@ -138,7 +138,7 @@ def test_branches_without_a_line_are_jobs(
     monkeypatch.setattr(sys, "argv", ["rules.py", *options, "--abreast", "4"])
     rules.main()
     together = [json.loads(job) for job in capsys.readouterr().out.splitlines()]
-    assert [job["name"] for job in together] == ["s-0.1-paper-0", "s-0.01-random+paper-0"]
+    assert [job["name"] for job in together] == ["s-0.1-paper-0", "s-0.01-random-0-and-1"]
     # What a job runs is that branch and no other.
     monkeypatch.setattr(sys, "argv", others[0]["command"].split()[1:] + ["--list"])
     rules.main()

@@ -50,7 +50,7 @@ class HeadConfig:
     num_features: int = 13
     """Length F of the feature vector of each primitive. 1, 5, 13 and 29 splat without padding."""
     start_at: int | None = None
-    """Training step at which the head starts; by default it starts with the prune."""
+    """Training step after which the head takes part; by default the prune, or the last of them."""
     max_train_pixels: int = 2**22
     """Train on a random window of at most this many pixels where pictures are larger, once the head takes part; 0 for
     whole pictures."""

@@ -124,7 +124,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
         (
             {"mode": "continuous", "start": 1, "every": 5, "stop": 5},
             {},
-            "5 (pruning.stop): it takes no part; train longer, or prune earlier",
+            "6 (pruning.stop): it takes no part; train longer, or prune earlier",
         ),
         (
             {"mode": "continuous", "start": 1, "every": 5, "stop": 5, "max_primitives": 40},
@@ -136,8 +136,16 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
             {"start_at": 0},
             "5 (pruning.rounds): more primitives are left than asked for; train longer, or prune earlier",
         ),
-        ({"prune_at": 1}, {"start_at": 4}, "4 (head.start-at): it takes no part; train longer, or start it earlier"),
-        ({"mode": "off"}, {"start_at": 4}, "4 (head.start-at): it takes no part; train longer, or start it earlier"),
+        ({"prune_at": 1}, {"start_at": 4}, "5 (head.start-at): it takes no part; train longer, or start it earlier"),
+        ({"prune_at": 1}, {"start_at": 2}, "3 (head.start-at): it takes no part; train longer, or start it earlier"),
+        ({"mode": "off"}, {"start_at": 4}, "5 (head.start-at): it takes no part; train longer, or start it earlier"),
+        ({"mode": "off"}, {}, "4 (pruning.prune-at): it takes no part; train longer, or prune earlier"),
+        ({"prune_at": 2}, {}, "3 (pruning.prune-at): it takes no part; train longer, or prune earlier"),
+        (
+            {"prune_at": 3},
+            {"start_at": 9},
+            "3 (pruning.prune-at): nothing is pruned, and the head takes no part; train",
+        ),
     ],
 )
 def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_after(
@@ -163,12 +171,15 @@ def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_aft
 @pytest.mark.parametrize(
     "options",
     [
-        {"pruning": {"prune_at": 2}},
-        {"pruning": {"mode": "off"}},
-        {"pruning": {"mode": "continuous", "start": 1, "stop": 2}},
+        {"pruning": {"prune_at": 1}},
+        {"pruning": {"prune_at": 2}, "head": {"mode": "off"}},
+        {"pruning": {"mode": "off"}, "head": {"mode": "off"}},
+        {"pruning": {"mode": "off"}, "head": {"start_at": 1}},
+        {"pruning": {"mode": "continuous", "start": 1, "stop": 1}},
         {"pruning": {"mode": "continuous", "start": 1, "every": 5, "stop": 5}, "head": {"mode": "off"}},
-        {"pruning": {"prune_at": 1, "rounds": 2, "round_every": 1}},
+        {"pruning": {"prune_at": 0, "rounds": 2, "round_every": 1}},
         {"pruning": {"prune_at": 100}, "warm_start": Path("anything")},
+        {"pruning": {"prune_at": 100}, "head": {"start_at": 101}, "warm_start": Path("anything")},
     ],
 )
 def test_a_run_that_prunes_or_is_not_to_says_nothing(
@@ -180,6 +191,16 @@ def test_a_run_that_prunes_or_is_not_to_says_nothing(
     training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 2)
     training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN, 2)
     assert said(capsys) == []
+
+
+def test_a_warm_start_counts_from_the_prune(
+    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = build(pruning={"prune_at": 100}, head={"start_at": 102}, warm_start=Path("anything"))
+    model._start = Start()  # of a file that need not be there
+    training_of(model, SimpleNamespace(last_step=2))
+    (line,) = said(capsys)
+    assert "training ends after 3 steps, and the head needs more than 3 (head.start-at): it takes no part" in line
 
 
 def test_a_search_that_never_begins_says_so_once_at_each_end(

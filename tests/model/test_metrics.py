@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -57,6 +58,24 @@ def test_metrics_of_a_step_cost_nothing_until_they_are_looked_at(
     assert float(metrics["psnr"]) == pytest.approx(float(-10 * mse.log10()), abs=1e-4)
     assert metrics["psnr"] != metrics["psnr_base"]
     assert len(asked) == 2
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_late_metrics_are_of_the_step_they_were_asked_in(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, training: bool
+) -> None:
+    options = {"num_downscales": 2, "resolution_schedule": 3000, "background_color": "black"}
+    model = perturb(build(**options)).train(training)
+
+    def asked() -> Any:
+        with torch.no_grad():
+            return model.get_metrics_dict(model.get_outputs(camera()), batch())
+
+    at_once, later = asked(), asked()
+    expected = [float(at_once[name]) for name in ("psnr", "psnr_base")]
+    model.train(not training)  # a viewer's thread, or an evaluation, in between
+    model.step = 9000
+    assert [float(later[name]) for name in ("psnr", "psnr_base")] == expected
 
 
 def test_lpips_is_not_built_and_not_saved(build: Build, monkeypatch: pytest.MonkeyPatch) -> None:
