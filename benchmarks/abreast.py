@@ -17,8 +17,7 @@ from rich.progress import Progress
 from torch import Tensor
 
 from sundae_ns.losses import picture_loss
-from sundae_ns.model import SundaeModel
-from sundae_ns.rasterization.gsplat_backend import _without_zeros
+from sundae_ns.rasterization.gsplat_backend import project, square_lists
 from sundae_ns.rasterization.gsplat_tiles import TILE
 from sundae_ns.rendering import NEAR_PLANE, Style, colors_of, render
 from sundae_ns.views import View
@@ -28,28 +27,24 @@ Field = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class Start:
-    """A field, what its optimizers know of it, and their rates."""
+    """A field, and what its optimizers know of it."""
 
     field: Field
     moments: dict[str, dict[str, Tensor]]
-    rates: dict[str, Callable[[int], float]]
-    """Learning rate at a step of training."""
 
 
 def start_of(trainer: Any) -> Start:
     """What a trainer would go on from. Its tensors are copied."""
-    optimizers, schedulers = trainer.optimizers.optimizers, trainer.optimizers.schedulers
-    field: Field = {}
-    moments, rates = {}, {}
-    for name, value in trainer.pipeline.model.gauss_params.items():
-        if value.numel():
-            field[name] = value.detach().clone()
-            moments[name] = {key: kept.clone() for key, kept in optimizers[name].state[value].items()}
-            rates[name] = _rate(optimizers[name].param_groups[0], schedulers.get(name))
-    return Start(field, moments, rates)
+    params = {name: value for name, value in trainer.pipeline.model.gauss_params.items() if value.numel()}
+    states = {name: trainer.optimizers.optimizers[name].state[value] for name, value in params.items()}
+    return Start(
+        {name: value.detach().clone() for name, value in params.items()},
+        {name: {key: kept.clone() for key, kept in state.items()} for name, state in states.items()},
+    )
 
 
 def _rate(group: dict[str, Any], scheduler: Any) -> Callable[[int], float]:
+    """Learning rate as a function of the step."""
     now = float(group["lr"])
     if scheduler is None:
         return lambda _: now
@@ -62,7 +57,8 @@ class Abreast:
     """Fields that are trained together.
 
     Args:
-        trainer: gives views, options and the model; its own field is left alone until :meth:`show`.
+        trainer: right after the last of their prunes. It gives views, options, rates and the model; its own field is left
+            alone until :meth:`show`.
         starts: of fields of equal size.
 
     Raises:
@@ -74,13 +70,14 @@ class Abreast:
         moved = self.model.config.camera_optimizer.mode != "off"
         if self.model.head is not None or self.model.densifying or moved:
             raise SystemExit("no head, growth or cameras can be trained abreast, only fields; leave --abreast out")
-        self.rates = starts[0].rates
         self.fields = {
             name: torch.nn.Parameter(torch.stack([start.field[name] for start in starts])) for name in starts[0].field
         }
         self.optimizers: dict[str, torch.optim.Adam] = {}
+        self.rates: dict[str, Callable[[int], float]] = {}
         for name, value in self.fields.items():
             like = trainer.optimizers.optimizers[name]
+            self.rates[name] = _rate(like.param_groups[0], trainer.optimizers.schedulers.get(name))
             optimizer = torch.optim.Adam([value], **{key: like.defaults[key] for key in ("eps", "betas", "fused")})
             optimizer.state[value] = _stacked([start.moments[name] for start in starts])
             self.optimizers[name] = optimizer
@@ -109,14 +106,8 @@ class Abreast:
     @torch.no_grad()
     def show(self, number: int) -> None:
         """Give the model one of the fields."""
-        show_in(self.model, {name: value[number] for name, value in self.fields.items()})
-
-
-@torch.no_grad()
-def show_in(model: SundaeModel, field: Field) -> None:
-    """Give the model a field of the size that it has."""
-    for name, value in field.items():
-        model.gauss_params[name].copy_(value)
+        for name, value in self.fields.items():
+            self.model.gauss_params[name].copy_(value[number])
 
 
 def _stacked(moments: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
@@ -136,38 +127,24 @@ def draw(fields: Field, view: View, background: Tensor, style: Style) -> Sequenc
 
 
 def _draw_at_once(fields: Field, view: View, background: Tensor, style: Style) -> Tensor:
-    from gsplat import fully_fused_projection, isect_offset_encode, isect_tiles, rasterize_to_pixels
+    from gsplat import rasterize_to_pixels
 
-    count = len(fields["means"])
+    count, size = len(fields["means"]), (view.width, view.height)
     flat = {name: value.flatten(0, 1) for name, value in fields.items()}
-    projected = fully_fused_projection(
+    seen = project(
         flat["means"],
-        None,
-        _without_zeros(flat["quats"]),
+        flat["quats"],
         flat["scales"].exp(),
-        view.viewmat[None],
-        view.K[None],
-        view.width,
-        view.height,
+        flat["opacities"].sigmoid().squeeze(-1),
+        view.viewmat,
+        view.K,
+        *size,
         near_plane=NEAR_PLANE,
-        calc_compensations=style.antialiased,
+        antialiased=style.antialiased,
     )
-    opacities = flat["opacities"].sigmoid().squeeze(-1)
-    if style.antialiased:
-        opacities = opacities * projected[4][0]
     # One camera saw all fields; from here on each field is what a camera of its own has seen.
-    radii, means2d, depths, conics = (seen[0].unflatten(0, (count, -1)) for seen in projected[:4])
-    columns, rows = -(-view.width // TILE), -(-view.height // TILE)
-    _, pairs, primitives = isect_tiles(means2d, radii, depths, TILE, columns, rows)
-    colors, alpha = rasterize_to_pixels(
-        means2d.contiguous(),
-        conics.contiguous(),
-        colors_of(flat, view.center, style).unflatten(0, (count, -1)),
-        opacities.unflatten(0, (count, -1)),
-        view.width,
-        view.height,
-        TILE,
-        isect_offset_encode(pairs, count, columns, rows),
-        primitives,
-    )
+    radii, means2d, depths, conics, opacities = (part[0].unflatten(0, (count, -1)) for part in seen)
+    of_field = colors_of(flat, view.center, style).unflatten(0, (count, -1))
+    lists = square_lists(means2d, radii, depths, *size)
+    colors, alpha = rasterize_to_pixels(means2d, conics, of_field, opacities, *size, TILE, *lists)
     return (colors + (1 - alpha) * background).clamp(0.0, 1.0)

@@ -40,6 +40,7 @@ from sundae_ns import checkpoint
 from sundae_ns.cli.bench.plan import schedule_of
 from sundae_ns.evaluation import RunRow, append_row
 from sundae_ns.evaluation.records import wait_for_lock
+from sundae_ns.evaluation.timing import now
 from sundae_ns.measure import sizes
 from sundae_ns.model import SundaeModel
 from sundae_ns.pruning import field_graph, make_policy
@@ -173,9 +174,8 @@ class Bench:
         self.command = " ".join(["ns-train", options.method, "--data", options.scene, *arguments[3:], options.parser])
         config.pipeline.datamanager.data = config.data
         config.output_dir = options.out
-        config.experiment_name = (
-            f"{options.scene}-{os.getpid()}"  # processes that begin in the same second are told apart
-        )
+        # Processes that begin in the same second are told apart.
+        config.experiment_name = f"{options.scene}-{os.getpid()}"
         config.set_timestamp()
         config.vis = "tensorboard"
         config.pipeline.model.evaluate_prune = False
@@ -257,13 +257,11 @@ class Bench:
         self.model.config.pruning, self.model.policy = config, make_policy(config)
         self.model.contribution = self._contribution  # type: ignore[method-assign]
         before = self.model.num_points
-        started = time.perf_counter()
+        started = now(self.model.device)
         for callback in self.trainer.callbacks:
             if getattr(callback.func, "__name__", "") == "prune_if_due":
                 callback.run_callback(self.step)
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        prune_s = time.perf_counter() - started
+        prune_s = now(self.model.device) - started
         self.trainer.pipeline.eval()
         start = None if alone else start_of(self.trainer)
         return Pruned(branch, start, choice, before, run.evaluate(self.trainer.pipeline), prune_s)
@@ -274,16 +272,14 @@ class Bench:
         pruned = [self.prune(branch, alone=len(branches) == 1) for branch in branches]
         what = ", ".join(f"{branch.rule} {branch.keep:g}" for branch in branches)
         run._set_random_seed(42 + branches[0].seed)  # the same backgrounds, whatever a prune has drawn
-        started = time.perf_counter()
+        started = now(self.model.device)
         starts = [p.start for p in pruned if p.start is not None]
         together = Abreast(self.trainer, starts) if starts else None
         if together is None:
             self._train(steps, what)
         else:
             together.train(steps, what)
-        if torch.cuda.is_available():
-            torch.cuda.synchronize()
-        train_s = time.perf_counter() - started
+        train_s = now(self.model.device) - started
         self.trainer.pipeline.eval()
         lines = []
         for number, one in enumerate(pruned):

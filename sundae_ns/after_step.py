@@ -58,12 +58,10 @@ def prune_if_due(model: SundaeModel, attributes: TrainingCallbackAttributes, ste
             attributes.trainer.save_checkpoint(step)
         raise
     refresh(model, optimizers)
-    last = model.schedule_step >= max(pruning.settled_at, model.head_starts_at)
-    pruned = model.schedule_step >= pruning.settled_at or (
-        pruning.ends_growth_at is not None and model.pruning_state["num_prunes"] > 0
-    )
+    settled = model.schedule_step >= pruning.settled_at
+    pruned = settled or (pruning.ends_growth_at is not None and model.pruning_state["num_prunes"] > 0)
     if model.budget is None and pruned:
-        notify_pruned(optimizers.schedulers, step, last=last)
+        notify_pruned(optimizers.schedulers, step, last=settled and model.schedule_step >= model.head_starts_at)
     if report is None:
         return
     CONSOLE.log(report.summary())
@@ -94,8 +92,9 @@ def _short_of(model: SundaeModel, last_step: int) -> tuple[str, int, str, str] |
     pruning, warm = model.config.pruning, model.config.warm_start is not None
     offset = pruning.prune_at if warm else 0
     first, done, target = pruning.first_prune, model.pruning_state["num_prunes"], pruning.target_primitives
-    begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "rounds")
-    ends = "prune-at" if ends == "rounds" and pruning.rounds == 1 else ends
+    begins, ends = "prune-at", "rounds" if pruning.rounds > 1 else "prune-at"
+    if pruning.mode == "continuous":
+        begins, ends = "start", "stop"
     idle = model.head is not None and model.budget is None and last_step + offset <= model.head_starts_at
     and_head = ", and the head takes no part" if idle else ""
     # A warm start is pruned at once.
@@ -103,12 +102,8 @@ def _short_of(model: SundaeModel, last_step: int) -> tuple[str, int, str, str] |
         if last_step < first and not done:
             return "first prune", first, f"pruning.{begins}", "nothing is pruned" + and_head
         if last_step < pruning.last_due and not (done and target is not None and model.total_points <= target):
-            return (
-                "last prune",
-                pruning.last_due,
-                f"pruning.{ends}",
-                "more primitives are left than asked for" + and_head,
-            )
+            found = "more primitives are left than asked for" + and_head
+            return "last prune", pruning.last_due, f"pruning.{ends}", found
     if not idle:
         return None
     option = f"pruning.{ends}" if model.config.head.start_at is None else "head.start-at"

@@ -1,8 +1,7 @@
 """``lambda_1 L1 + lambda_2 (1 - SSIM)`` and its gradient in one kernel each, on a GPU.
 
-Made of convolutions, SSIM takes dozens of passes over the picture, and more time than splatting a pruned field and going back
-through it. Here a block of threads keeps a tile of both pictures in shared memory, filters it there by columns and by rows,
-and leaves only the three slopes that the way back filters once more.
+Made of convolutions, SSIM takes dozens of passes over the picture. Here a block of threads keeps a tile of both pictures in
+shared memory, filters it there by columns and by rows, and leaves only the three slopes that the way back filters once more.
 
 The source is plain C++ apart from the few words by which a thread finds its number, so that the tests run the very same
 lines on a CPU.
@@ -12,14 +11,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError, SundaeError
-from sundae_ns.nvrtc import Kernel
+from sundae_ns.nvrtc import Kernel, Launch
 
 WINDOW = 11
 """Side of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
@@ -164,8 +162,6 @@ extern "C" __global__ void compare_backward(int height, int width, const float* 
 }
 """
 
-Launch = Callable[[int, Sequence[Tensor | int | float]], None]
-
 
 class Launches(NamedTuple):
     """The kernels, on one device."""
@@ -217,6 +213,12 @@ def fused_loss(picture: Tensor, target: Tensor, weight: float, launches: Launche
     return cast("Tensor", _Loss.apply(picture, target.detach(), weight, launches))
 
 
+def _threads(picture: Tensor) -> int:
+    """A block for each tile."""
+    height, width = picture.shape[:2]
+    return -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT) * THREADS
+
+
 class _Loss(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, picture: Tensor, target: Tensor, weight: float, launches: Launches) -> Tensor:  # type: ignore[override]
@@ -225,9 +227,8 @@ class _Loss(torch.autograd.Function):
         windows = (height - WINDOW + 1) * (width - WINDOW + 1) * channels
         graded = bool(ctx.needs_input_grad[0])
         slopes = picture.new_empty(3 * windows if graded else 0)
-        tiles = -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT)
-        sums = picture.new_empty(tiles, 2)
-        launches.compare(tiles * THREADS, [height, width, picture, target, slopes, sums])
+        sums = picture.new_empty(_threads(picture) // THREADS, 2)
+        launches.compare(_threads(picture), [height, width, picture, target, slopes, sums])
         ctx.save_for_backward(picture, target, slopes)
         ctx.launches, ctx.shares = launches, ((1 - weight) / picture.numel(), -weight / windows)
         difference, similarity = sums.sum(dim=0, dtype=torch.float64)
@@ -242,6 +243,6 @@ class _Loss(torch.autograd.Function):
         picture, target, slopes = ctx.saved_tensors
         out = torch.empty_like(picture)
         height, width, _ = picture.shape
-        threads = -(-width // TILE_WIDTH) * -(-height // TILE_HEIGHT) * THREADS
-        ctx.launches.compare_backward(threads, [height, width, picture, target, slopes, gradient, *ctx.shares, out])
+        arguments = [height, width, picture, target, slopes, gradient, *ctx.shares, out]
+        ctx.launches.compare_backward(_threads(picture), arguments)
         return out, None, None, None

@@ -29,17 +29,20 @@ def picture_loss(picture: Tensor, target: Tensor, ssim: SSIM, weight: float) -> 
             same in one kernel for float32 on CUDA.
         weight: lambda_2; lambda_1 is the rest. Pictures smaller than SSIM's window are compared by L1 alone.
     """
-    small = min(target.shape[:2]) < WINDOW
+    if weight == 0 or min(target.shape[:2]) < WINDOW:
+        return (picture - target).abs().mean()
     single = picture.dtype == target.dtype == torch.float32
-    if not small and weight > 0 and single and picture.is_cuda and _fuses(picture.device):
+    if single and picture.is_cuda and _fuses(picture.device):
         return fused_loss(picture, target, weight)
-    l1 = (picture - target).abs().mean()
-    if small or weight == 0:
-        return l1
+    return convolved_loss(picture, target, ssim, weight)
+
+
+def convolved_loss(picture: Tensor, target: Tensor, ssim: SSIM, weight: float) -> Tensor:
+    """The same layer by layer, wherever torch runs."""
     ssim.win = ssim.win.to(target.device)  # once: it would be copied there, and waited for, each time
     # Contiguous planes: on the interleaved colours of a large picture the same convolutions take much longer.
     planes = (image.permute(2, 0, 1)[None].contiguous() for image in (target, picture))
-    return (1 - weight) * l1 + weight * (1 - ssim(*planes))
+    return (1 - weight) * (picture - target).abs().mean() + weight * (1 - ssim(*planes))
 
 
 @functools.cache

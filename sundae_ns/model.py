@@ -523,15 +523,18 @@ class SundaeModel(SplatfactoModel):
 
     # --------------------------------------------------------------------------------------------- losses and metrics
 
+    def get_gt_img(self, image: Tensor, downscale: int | None = None) -> Tensor:
+        """The truth as floats on the model's device, smaller by a factor; by default the one that pictures have now."""
+        image = image.float() / 255 if image.dtype == torch.uint8 else image
+        factor = self._get_downscale_factor() if downscale is None else downscale
+        smaller: Tensor = image if factor == 1 else resize_image(image, factor)
+        return smaller.to(self.device)
+
     def _target(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
-        """What a picture should be: of its window, over its background, and smaller by as much as it is by default now."""
         if NO_PICTURES in batch:
             raise without_pictures()
-        image: Tensor = batch["image"]
-        image = image.float() / 255 if image.dtype == torch.uint8 else image
-        downscale = self._get_downscale_factor() if downscale is None else downscale
-        image = (image if downscale == 1 else resize_image(image, downscale)).to(self.device)
-        return self.composite_with_background(cut(image, outputs.get("window")), outputs["background"])
+        truth = cut(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
+        return self.composite_with_background(truth, outputs["background"])
 
     def get_metrics_dict(  # type: ignore[override]
         self, outputs: dict[str, Any], batch: dict[str, Any]

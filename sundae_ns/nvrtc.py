@@ -6,13 +6,16 @@ Both libraries come with every CUDA build of torch and its driver; no nvcc and n
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from ctypes import byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_void_p
 
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
+
+Launch = Callable[[int, Sequence[Tensor | int | float]], None]
+"""Runs a kernel for so many threads, at least, with these arguments: see :meth:`Kernel.__call__`."""
 
 
 def compile_cubin(source: str, architecture: str, options: Sequence[str] = ()) -> bytes:

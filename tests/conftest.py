@@ -13,7 +13,9 @@ import pytest
 import torch
 from torch import Tensor
 
-Launch = Callable[[int, Sequence[Tensor | int | float]], None]
+from sundae_ns import nvrtc
+from sundae_ns.nvrtc import Launch
+
 CompileKernels = Callable[..., dict[str, Launch]]
 
 # What a GPU's compiler knows by itself, and a loop over the threads. A block has one thread here, so that what the threads
@@ -91,14 +93,9 @@ def compile_kernels(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKerne
     def compile_them(source: str, names: Sequence[str], options: Sequence[str] = ()) -> dict[str, Launch]:
         loaded = compile_for_cpu(source, options)
 
-        def as_c(argument: Tensor | int | float) -> ctypes.c_void_p | ctypes.c_int | ctypes.c_double:
-            if isinstance(argument, Tensor):
-                return ctypes.c_void_p(argument.data_ptr())
-            return ctypes.c_double(argument) if isinstance(argument, float) else ctypes.c_int(argument)
-
         def launch_of(name: str) -> Launch:
             def launch(threads: int, arguments: Sequence[Tensor | int | float]) -> None:
-                values = [as_c(a) for a in arguments]
+                values = [nvrtc._as_c(a, torch.device("cpu")) for a in arguments]
                 # More threads than asked for, as whole blocks have.
                 for block in range(threads + 3):
                     loaded.at(block)

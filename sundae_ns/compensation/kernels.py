@@ -11,13 +11,12 @@ lines on a CPU.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import torch
-from torch import Tensor
 
 from sundae_ns.compensation.unet import SLOPE, UNet
-from sundae_ns.nvrtc import Kernel
+from sundae_ns.nvrtc import Kernel, Launch
 
 PACK = 8
 """Channels that a thread moves at once, 16 bytes of them; pictures are padded to a multiple, which tensor cores want too."""
@@ -317,9 +316,6 @@ extern "C" __global__ void fold_backward(const T* __restrict__ to_folded, int nu
         }
 }
 """
-
-Launch = Callable[[int, list[Tensor | int | float]], None]
-"""Runs one kernel for so many threads, at least, with these arguments."""
 
 Launches = Mapping[str, Launch]
 """By the kernel's name."""

@@ -6,12 +6,11 @@ lines on a CPU.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor
 
 from sundae_ns.graphs.tree import BoxTree
+from sundae_ns.nvrtc import Launch
 
 KERNEL = "nearest"
 """Name of the kernel in :data:`SOURCE`."""
@@ -131,9 +130,6 @@ extern "C" __global__ void nearest(const REAL* __restrict__ points, const int* _
     }
 }
 """
-
-Launch = Callable[[int, list[Tensor | int | float]], None]
-"""Runs the kernel for so many threads, at least, with these arguments: integers are C ints, floats doubles."""
 
 
 def definitions(dtype: torch.dtype, k: int) -> tuple[str, ...]:

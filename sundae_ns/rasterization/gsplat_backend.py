@@ -54,7 +54,7 @@ class GsplatBackend:
         Raises:
             BackendError: The tensors are not float32 on a CUDA device.
         """
-        from gsplat import fully_fused_projection, rasterize_to_pixels
+        from gsplat import rasterize_to_pixels
 
         _check_kernels_take(means)
         if means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
@@ -74,21 +74,19 @@ class GsplatBackend:
                 absgrad=absgrad,
                 render_depth=render_depth,
             )
-        radii, means2d, depths, conics, compensations = fully_fused_projection(
+        radii, means2d, depths, conics, seen_opacities = project(
             means,
-            None,
-            _without_zeros(quats),
+            quats,
             scales,
-            viewmat[None],
-            K[None],
+            opacities,
+            viewmat,
+            K,
             width,
             height,
             near_plane=near_plane,
             far_plane=far_plane,
-            calc_compensations=antialiased,
-            **({"opacities": opacities} if _projection_takes_opacities() else {}),
+            antialiased=antialiased,
         )
-        seen_opacities = opacities[None] if compensations is None else opacities * compensations
         starts, primitives = self._lists(means2d, conics, seen_opacities, depths, radii, width, height)
         channels = torch.cat([colors, depths[0, :, None]], dim=1) if render_depth else colors
         # Each pass overwrites absgrad with that of its own channels, so with absgrad there must be one pass only.
@@ -132,14 +130,10 @@ class GsplatBackend:
         self, means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, radii: Tensor, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
         """Where the list of each tile begins, and the primitives of all lists."""
-        from gsplat import isect_offset_encode, isect_tiles
-
-        if self._room is not None:
-            lists = tile_lists(means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, room=self._room)
-            return lists.starts, lists.primitives
-        columns, rows = -(-width // TILE), -(-height // TILE)
-        _, pairs, primitives = isect_tiles(means2d, radii, depths, TILE, columns, rows)
-        return isect_offset_encode(pairs, 1, columns, rows), primitives
+        if self._room is None:
+            return square_lists(means2d, radii, depths, width, height)
+        lists = tile_lists(means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, room=self._room)
+        return lists.starts, lists.primitives
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``.
@@ -155,6 +149,66 @@ class GsplatBackend:
         if self._room is not None:
             return harmonics(degree, directions, coeffs)
         return spherical_harmonics(degree, directions, coeffs)
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float,
+    far_plane: float = 1e10,
+    antialiased: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """How primitives lie in a picture, as gsplat's projection has it; arguments are those of ``rasterize``.
+
+    Returns:
+        Radii ``[1, N]`` (``[1, N, 2]`` from gsplat 1.5 on), centres ``[1, N, 2]``, depths ``[1, N]``, conics ``[1, N, 3]``, and
+        the opacities that are blended ``[1, N]``.
+    """
+    from gsplat import fully_fused_projection
+
+    radii, means2d, depths, conics, compensations = fully_fused_projection(
+        means,
+        None,
+        _without_zeros(quats),
+        scales,
+        viewmat[None],
+        K[None],
+        width,
+        height,
+        near_plane=near_plane,
+        far_plane=far_plane,
+        calc_compensations=antialiased,
+        **({"opacities": opacities} if _projection_takes_opacities() else {}),
+    )
+    return radii, means2d, depths, conics, opacities[None] if compensations is None else opacities * compensations
+
+
+def square_lists(means2d: Tensor, radii: Tensor, depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """gsplat's own lists, of all tiles that a primitive's square touches.
+
+    Args:
+        means2d: centres in each of C pictures ``[C, N, 2]``, pixels.
+        radii: ``[C, N]``, or one for each axis ``[C, N, 2]``.
+        depths: camera z ``[C, N]``.
+        width: of the pictures, pixels.
+        height: likewise.
+
+    Returns:
+        Where the list of each tile begins ``[C, rows, columns]``, and the primitives of all lists, numbered through all
+        pictures.
+    """
+    from gsplat import isect_offset_encode, isect_tiles
+
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    _, pairs, primitives = isect_tiles(means2d, radii, depths, TILE, columns, rows)
+    return isect_offset_encode(pairs, len(means2d), columns, rows), primitives
 
 
 @functools.cache

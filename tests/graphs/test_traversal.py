@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import pytest
@@ -13,7 +13,7 @@ from torch import Tensor
 from sundae_ns import nvrtc
 from sundae_ns.errors import BackendError
 from sundae_ns.graphs import knn, radius_neighbors
-from sundae_ns.graphs.traversal import KERNEL, MAX_NEIGHBORS, OPTIONS, SOURCE, Launch, definitions, search_tree
+from sundae_ns.graphs.traversal import KERNEL, MAX_NEIGHBORS, OPTIONS, SOURCE, definitions, search_tree
 from sundae_ns.graphs.tree import LEAF, build_tree
 
 # A count of the points looked at, and a loop over the threads.
@@ -48,14 +48,9 @@ def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
         kernel = compile_for_cpu(source, ["-ffp-contract=off", *definitions(dtype, k)])
         counter = ctypes.c_longlong.in_dll(kernel, "looked_at")
 
-        def launch(threads: int, arguments: list[Tensor | int | float]) -> None:
-            values = []
-            for argument in arguments:
-                if isinstance(argument, Tensor):
-                    assert argument.is_contiguous()
-                    values.append(ctypes.c_void_p(argument.data_ptr()))
-                else:
-                    values.append(ctypes.c_int(argument) if isinstance(argument, int) else ctypes.c_double(argument))
+        def launch(threads: int, arguments: Sequence[Tensor | int | float]) -> None:
+            assert all(a.is_contiguous() for a in arguments if isinstance(a, Tensor))
+            values = [nvrtc._as_c(argument, torch.device("cpu")) for argument in arguments]
             counter.value = 0
             kernel.run(ctypes.c_int(threads), *values)
             if looked_at is not None:
