@@ -119,6 +119,11 @@ class CompensationHead(nn.Module):
         self._inference, self._training = FusedInference(self.net, residual), FusedTraining(self.net, residual)
         self._can_fuse = self.config.fused
 
+    def train(self, mode: bool = True) -> CompensationHead:
+        """Switch between training and evaluation, which no layer of it tells apart."""
+        # Trainers say so at each step; to go through all layers each time would be a hundredth of it.
+        return self if self.training == mode else super().train(mode)
+
     @torch.no_grad()
     def resize(self, config: HeadConfig) -> None:
         """Become the head of another size or feature width, with fresh weights.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from typing import cast
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 
 from sundae_ns import nvrtc
 from sundae_ns.compensation import CompensationHead, HeadConfig, fused, kernels
-from sundae_ns.compensation.fused_training import FusedTraining
+from sundae_ns.compensation.fused_training import FusedTraining, _Pass, network_backward
 from sundae_ns.cuda_graphs import MAX_SIZES
 from sundae_ns.errors import BackendError, SundaeError
 
@@ -152,6 +153,58 @@ def test_the_same_gradients_at_any_size(
     for found, expected in both:
         # By the norm: among so many pictures is one with an activation so near zero that rounding decides on its slope.
         assert float((found - expected).norm()) <= 2e-3 * max(float(expected.norm()), 1e-3)
+
+
+class Played:
+    """In place of a CUDA graph."""
+
+    def __init__(self, replay: Callable[[], None]) -> None:
+        self.replay = replay
+
+
+def as_recorded(head: CompensationHead, height: int, width: int, launches: kernels.Launches) -> _Pass:
+    """A pass whose results lie in the same place each time, as those of a recording do."""
+    net = head.net
+    weights = fused.Weights(net, torch.float32)
+    folded = fused.folded_room(net, height, width, torch.empty(0), torch.float32).zero_()
+    tape = fused.network(net, weights, folded, launches)
+    assert tape.last is not None
+    to_raw = torch.zeros_like(tape.last)
+    to_folded, to_parameters = network_backward(net, weights, tape, to_raw, launches)
+
+    def forward() -> None:
+        weights.refresh()
+        again = fused.network(net, weights, folded, launches)
+        for old, new in zip([*tape.inputs, *tape.coarse, tape.last], [*again.inputs, *again.coarse, again.last]):
+            if old is not folded:
+                old.copy_(new)  # type: ignore[union-attr, arg-type]
+
+    def backward() -> None:
+        found, gradients = network_backward(net, weights, tape, to_raw, launches)
+        to_folded.copy_(found)
+        for old, new in zip(to_parameters, gradients, strict=True):
+            old.copy_(new)
+
+    graphs = [cast("torch.cuda.CUDAGraph", Played(run)) for run in (forward, backward)]
+    return _Pass(weights, folded, tape, to_raw, to_folded, to_parameters, *graphs)
+
+
+def test_gradients_of_what_is_played_are_not_copied_and_add_up(compiled: Compile) -> None:
+    head = make()
+    training = FusedTraining(head.net, True, compiled(head))
+    made = as_recorded(head, 37, 50, compiled(head))
+    training._recorded[37, 50, torch.float32, head.net.out.weight.data_ptr()] = made
+    pictures, to_out = [splatted(37, 50, 5, seed=seed) for seed in range(3)], torch.randn(37, 50, 3)
+    expected = [of_layers(head, seen, to_out)[3:] for seen in pictures]
+    head.zero_grad()
+    for seen in pictures[:2]:
+        (training(seen[1].clone().requires_grad_(), seen[2], torch.float32) * to_out).sum().backward()
+    assert_same([p.grad for p in head.parameters() if p.grad is not None], [a + b for a, b in zip(*expected[:2])])
+    assert_same(of_kernels(head, pictures[2], to_out, training)[3:], expected[2])
+    assert made.to_parameters is not None
+    for parameter, gradient in zip(training._parameters, made.to_parameters):
+        assert parameter.grad is not None
+        assert parameter.grad.data_ptr() == gradient.data_ptr()
 
 
 def test_gradients_of_an_earlier_picture_are_refused(compiled: Compile) -> None:
