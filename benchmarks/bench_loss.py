@@ -52,7 +52,7 @@ def main() -> None:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     ways = {"convolutions": by_convolutions(ssim_in(torch.float32, device))}
     if device == "cuda":
-        ways = {"fused": lambda p, t: losses.fused_loss(p, t, WEIGHT), **ways}
+        ways = {"fused": lambda p, t: losses.fused_loss(p, t, WEIGHT)[0], **ways}
     oracle = by_convolutions(ssim_in(torch.float64, device))
     for size in options.sizes:
         height, width = (int(side) for side in size.split("x"))

@@ -211,6 +211,23 @@ class Clock:
             self.ms_step = (now(self.trainer.device) - self.started) / (last - self.first) * 1e3
 
 
+def profiled(trainer: Any, steps: range) -> dict[str, Any]:
+    """Milliseconds that the GPU works in a step, by kernel, and how many it is given; a few more steps are made for it."""
+    trainer.pipeline.train()
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+        for step in steps:
+            trainer.train_iteration(step)
+        now(trainer.device)
+    # Ranges that the optimizers mark have the time of the kernels in them, which are there already.
+    events = [event for event in profile.key_averages() if not event.key.startswith("Optimizer.")]
+    each = sorted(((event.self_device_time_total / len(steps) / 1e3, event.key) for event in events), reverse=True)
+    return {
+        "gpu_ms": sum(ms for ms, _ in each),
+        "launches": sum(event.count for event in events) / len(steps),
+        "kernels": {name[:100]: round(ms, 4) for ms, name in each[:20]},
+    }
+
+
 def after_each_step(trainer: Any, fn: Any) -> None:
     train_iteration = trainer.train_iteration
 
@@ -232,6 +249,7 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--seed", type=int, default=42)
     parser.add_argument("--out", type=Path, default=Path("outputs/branches"))
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--profile", type=int, default=0, help="steps more under a profiler, for GPU ms by kernel")
     parser.add_argument("--skip", type=int, help="channels passed to a branch at full resolution")
     parser.add_argument("--width", type=int, help="channels of the compact head's finest level")
     parser.add_argument("--flip", action="store_true", help="mirror pictures at random for the head")
@@ -251,7 +269,10 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     if "--" in own:
         cut = own.index("--")
         own, extra = own[:cut], own[cut + 1 :]
-    return parser.parse_args(own), extra
+    options = parser.parse_args(own)
+    if options.profile and not torch.cuda.is_available():
+        parser.error("--profile counts a GPU's milliseconds, and there is none here; leave it out")
+    return options, extra
 
 
 @torch.no_grad()
@@ -346,6 +367,8 @@ def main() -> None:
         "command": command.replace(str(options.field), "PRUNED"),
         "experiments": {key: getattr(options, key) for key in EXPERIMENTS},
     }
+    if options.profile:
+        line |= profiled(trainer, range(options.steps, options.steps + options.profile))
     options.results.parent.mkdir(parents=True, exist_ok=True)
     with open(options.results, "a") as file:
         file.write(json.dumps(line) + "\n")

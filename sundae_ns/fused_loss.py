@@ -1,4 +1,4 @@
-"""``lambda_1 L1 + lambda_2 (1 - SSIM)`` and its gradient in one kernel each, on a GPU.
+"""``lambda_1 L1 + lambda_2 (1 - SSIM)`` of a picture, L1 of another beside it, and their gradients: one kernel each, on a GPU.
 
 Made of convolutions, SSIM takes dozens of passes over the picture. Here a block of threads keeps a tile of both pictures in
 shared memory, filters it there by columns and by rows, and leaves only the three slopes that the way back filters once more.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -45,19 +45,20 @@ __device__ __forceinline__ float down(const float* along) {
     return sum;
 }
 
-// A block has one tile of the picture. Per tile: the sum of absolute differences of its pixels, and that of SSIM over the
-// windows whose first pixel it has. With slopes: derivatives of a window's SSIM by the means of x, x x and x y in it, a
-// plane for each and each channel.
+// A block has one tile of the pictures. Its share of the loss comes from the sum of absolute differences of its pixels, and
+// that of SSIM over the windows whose first pixel it has; its share of the base's loss from differences alone. With slopes:
+// derivatives of a window's SSIM by the means of x, x x and x y in it, a plane for each and each channel.
 extern "C" __global__ void compare(int height, int width, const float* __restrict__ picture,
-                                   const float* __restrict__ target, float* __restrict__ slopes,
-                                   float* __restrict__ sums) {
-    __shared__ float x[ROWS * COLUMNS], y[ROWS * COLUMNS], along[5][ROWS * TILE_WIDTH], found[2][THREADS];
+                                   const float* __restrict__ base, const float* __restrict__ target,
+                                   double of_nothing, double of_difference, double of_similarity, double of_base,
+                                   float* __restrict__ slopes, float* __restrict__ shares) {
+    __shared__ float x[ROWS * COLUMNS], y[ROWS * COLUMNS], along[5][ROWS * TILE_WIDTH], found[3][THREADS];
     const int across = (width + TILE_WIDTH - 1) / TILE_WIDTH, tile = blockIdx.x;
     if (tile >= across * ((height + TILE_HEIGHT - 1) / TILE_HEIGHT)) return;
     const int top = tile / across * TILE_HEIGHT, left = tile % across * TILE_WIDTH, me = threadIdx.x;
     const int windows_high = height - HALO, windows_wide = width - HALO;
     const long long plane = (long long)windows_high * windows_wide;
-    float difference = 0, similarity = 0;
+    float difference = 0, similarity = 0, beside = 0;
     for (int c = 0; c < 3; ++c) {
         for (int i = me; i < ROWS * COLUMNS; i += blockDim.x) {
             const int row = top + i / COLUMNS, column = left + i % COLUMNS;
@@ -65,7 +66,9 @@ extern "C" __global__ void compare(int height, int width, const float* __restric
             const long long at = ((long long)row * width + column) * 3 + c;
             x[i] = inside ? picture[at] : 0;
             y[i] = inside ? target[at] : 0;
-            if (i / COLUMNS < TILE_HEIGHT && i % COLUMNS < TILE_WIDTH) difference += fabsf(x[i] - y[i]);
+            if (i / COLUMNS >= TILE_HEIGHT || i % COLUMNS >= TILE_WIDTH) continue;
+            difference += fabsf(x[i] - y[i]);
+            if (base && inside) beside += fabsf(base[at] - y[i]);
         }
         __syncthreads();
         for (int i = me; i < ROWS * TILE_WIDTH; i += blockDim.x) {
@@ -107,29 +110,38 @@ extern "C" __global__ void compare(int height, int width, const float* __restric
     }
     found[0][me] = difference;
     found[1][me] = similarity;
+    found[2][me] = beside;
     __syncthreads();
     for (int half = blockDim.x / 2; half > 0; half /= 2) {
         if (me < half)
-            for (int s = 0; s < 2; ++s) found[s][me] += found[s][me + half];
+            for (int s = 0; s < 3; ++s) found[s][me] += found[s][me + half];
         __syncthreads();
     }
-    if (me == 0)
-        for (int s = 0; s < 2; ++s) sums[2 * tile + s] = found[s][0];
+    if (me) return;
+    shares[2 * tile] = (tile ? 0 : of_nothing) + of_difference * found[0][0] + of_similarity * found[1][0];
+    shares[2 * tile + 1] = of_base * found[2][0];
 }
 
-// The gradient with respect to the picture, from slopes and what the sums count for. A pixel is in the windows that begin up
-// to HALO rows above and columns to the left of it.
+__device__ __forceinline__ float sign_of(float difference) {
+    return difference > 0 ? 1.0f : difference < 0 ? -1.0f : difference;  // NaN stays NaN
+}
+
+// The gradients with respect to both pictures, from slopes and what the sums count for. A pixel is in the windows that begin
+// up to HALO rows above and columns to the left of it.
 extern "C" __global__ void compare_backward(int height, int width, const float* __restrict__ picture,
-                                            const float* __restrict__ target, const float* __restrict__ slopes,
-                                            const float* __restrict__ gradient, double of_difference,
-                                            double of_similarity, float* __restrict__ out) {
+                                            const float* __restrict__ base, const float* __restrict__ target,
+                                            double of_difference, double of_similarity, double of_base,
+                                            const float* __restrict__ slopes, const float* __restrict__ to_loss,
+                                            const float* __restrict__ to_base_loss, float* __restrict__ to_picture,
+                                            float* __restrict__ to_base) {
     __shared__ float slope[3][ROWS * COLUMNS], along[3][ROWS * TILE_WIDTH];
     const int across = (width + TILE_WIDTH - 1) / TILE_WIDTH, tile = blockIdx.x;
     if (tile >= across * ((height + TILE_HEIGHT - 1) / TILE_HEIGHT)) return;
     const int top = tile / across * TILE_HEIGHT, left = tile % across * TILE_WIDTH;
     const int windows_high = height - HALO, windows_wide = width - HALO;
     const long long plane = (long long)windows_high * windows_wide;
-    const float to_difference = gradient[0] * (float)of_difference, to_similarity = gradient[0] * (float)of_similarity;
+    const float to_difference = to_loss[0] * (float)of_difference, to_similarity = to_loss[0] * (float)of_similarity;
+    const float beside = base ? to_base_loss[0] * (float)of_base : 0;
     for (int c = 0; c < 3; ++c) {
         for (int i = threadIdx.x; i < ROWS * COLUMNS; i += blockDim.x) {
             const int row = top - HALO + i / COLUMNS, column = left - HALO + i % COLUMNS;
@@ -154,8 +166,8 @@ extern "C" __global__ void compare_backward(int height, int width, const float* 
             const long long at = ((long long)row * width + column) * 3 + c;
             const float a = picture[at], b = target[at];
             const float filtered = down(along[0] + i) + 2 * a * down(along[1] + i) + b * down(along[2] + i);
-            const float sign = a > b ? 1.0f : a < b ? -1.0f : a - b;
-            out[at] = to_similarity * filtered + to_difference * sign;
+            to_picture[at] = to_similarity * filtered + to_difference * sign_of(a - b);
+            if (base) to_base[at] = beside * sign_of(base[at] - b);
         }
         __syncthreads();
     }
@@ -188,8 +200,10 @@ def compiled(device: torch.device) -> Launches:
     return Launches(*(Kernel(SOURCE, name, device, definitions(), THREADS) for name in Launches._fields))
 
 
-def fused_loss(picture: Tensor, target: Tensor, weight: float, launches: Launches | None = None) -> Tensor:
-    """``(1 - weight) L1 + weight (1 - SSIM)``, a scalar, with a gradient for the picture.
+def fused_loss(
+    picture: Tensor, target: Tensor, weight: float, base: Tensor | None = None, launches: Launches | None = None
+) -> tuple[Tensor, Tensor | None]:
+    """``(1 - weight) L1 + weight (1 - SSIM)`` of a picture, and L1 of its base colours: two scalars with gradients for them.
 
     L1 is the mean over all values; SSIM pytorch_msssim's, with windows that lie inside of the picture and a data range of 1.
 
@@ -197,20 +211,23 @@ def fused_loss(picture: Tensor, target: Tensor, weight: float, launches: Launche
         picture: float32 on a CUDA device ``[H, W, 3]``, both sides of at least :data:`WINDOW`.
         target: likewise; no gradient reaches it.
         weight: in [0, 1].
+        base: another picture to compare with the target, likewise; None for none, and no second scalar.
         launches: kernels to take in place of those that are compiled for the device.
 
     Raises:
         BackendError: the kernels cannot be compiled or loaded here.
         DataError: the pictures are not of one such shape, or not float32.
     """
-    alike = picture.shape == target.shape and picture.dtype == target.dtype == torch.float32
-    if not alike or picture.shape[2:] != (3,) or min(picture.shape[:2]) < WINDOW:
-        raise DataError(
-            f"a loss of {picture.dtype} {list(picture.shape)} against {target.dtype} {list(target.shape)}; "
-            f"give float32 [H, W, 3] of one size, {WINDOW} px or more a side"
-        )
+    for one in (picture,) if base is None else (picture, base):
+        alike = one.shape == target.shape and one.dtype == target.dtype == torch.float32
+        if not alike or one.shape[2:] != (3,) or min(one.shape[:2]) < WINDOW:
+            raise DataError(
+                f"a loss of {one.dtype} {list(one.shape)} against {target.dtype} {list(target.shape)}; "
+                f"give float32 [H, W, 3] of one size, {WINDOW} px or more a side"
+            )
     launches = compiled(picture.device) if launches is None else launches
-    return cast("Tensor", _Loss.apply(picture, target.detach(), weight, launches))
+    loss, of_base = _Loss.apply(picture, base, target.detach(), weight, launches)
+    return loss, None if base is None else of_base
 
 
 def _threads(picture: Tensor) -> int:
@@ -221,28 +238,35 @@ def _threads(picture: Tensor) -> int:
 
 class _Loss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, picture: Tensor, target: Tensor, weight: float, launches: Launches) -> Tensor:  # type: ignore[override]
+    def forward(  # type: ignore[override]
+        ctx: Any, picture: Tensor, base: Tensor | None, target: Tensor, weight: float, launches: Launches
+    ) -> tuple[Tensor, Tensor]:
         picture, target = picture.contiguous(), target.contiguous()
+        nothing = picture.new_empty(0)  # to the kernels a null pointer
+        base = nothing if base is None else base.contiguous()
         height, width, channels = picture.shape
         windows = (height - WINDOW + 1) * (width - WINDOW + 1) * channels
-        graded = bool(ctx.needs_input_grad[0])
-        slopes = picture.new_empty(3 * windows if graded else 0)
-        sums = picture.new_empty(_threads(picture) // THREADS, 2)
-        launches.compare(_threads(picture), [height, width, picture, target, slopes, sums])
-        ctx.save_for_backward(picture, target, slopes)
-        ctx.launches, ctx.shares = launches, ((1 - weight) / picture.numel(), -weight / windows)
-        difference, similarity = sums.sum(dim=0, dtype=torch.float64)
-        return (weight + ctx.shares[0] * difference + ctx.shares[1] * similarity).float()
+        graded = any(ctx.needs_input_grad)
+        slopes = picture.new_empty(3 * windows) if graded else nothing
+        shares = picture.new_empty(_threads(picture) // THREADS, 2)
+        worth = ((1 - weight) / picture.numel(), -weight / windows, 1 / picture.numel())
+        launches.compare(
+            _threads(picture), [height, width, picture, base, target, float(weight), *worth, slopes, shares]
+        )
+        ctx.save_for_backward(picture, base, target, slopes)
+        ctx.launches, ctx.worth = launches, worth
+        loss, of_base = shares.sum(dim=0).unbind()
+        return loss, of_base
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, to_loss: Tensor, to_base_loss: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         if torch.is_grad_enabled():  # a graph of this pass is wanted, and would lack it
             raise SundaeError(
                 "the kernel of the loss has no second derivative; take that of float64 pictures, which are convolved"
             )
-        picture, target, slopes = ctx.saved_tensors
-        out = torch.empty_like(picture)
+        picture, base, target, slopes = ctx.saved_tensors
+        to_picture, to_base = torch.empty_like(picture), torch.empty_like(base)
         height, width, _ = picture.shape
-        arguments = [height, width, picture, target, slopes, gradient, *ctx.shares, out]
-        ctx.launches.compare_backward(_threads(picture), arguments)
-        return out, None, None, None
+        arguments = [height, width, picture, base, target, *ctx.worth, slopes, to_loss, to_base_loss]
+        ctx.launches.compare_backward(_threads(picture), [*arguments, to_picture, to_base])
+        return to_picture, to_base if base.numel() else None, None, None, None

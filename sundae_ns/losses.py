@@ -29,12 +29,21 @@ def picture_loss(picture: Tensor, target: Tensor, ssim: SSIM, weight: float) -> 
             same in one kernel for float32 on CUDA.
         weight: lambda_2; lambda_1 is the rest. Pictures smaller than SSIM's window are compared by L1 alone.
     """
-    if weight == 0 or min(target.shape[:2]) < WINDOW:
-        return (picture - target).abs().mean()
+    return picture_losses(picture, None, target, ssim, weight)[0]
+
+
+def picture_losses(
+    picture: Tensor, base: Tensor | None, target: Tensor, ssim: SSIM, weight: float
+) -> tuple[Tensor, Tensor | None]:
+    """The loss of a picture, see :func:`picture_loss`, and L1 of base colours ``[H, W, 3]``, if there are any."""
     single = picture.dtype == target.dtype == torch.float32
-    if single and picture.is_cuda and _fuses(picture.device):
-        return fused_loss(picture, target, weight)
-    return convolved_loss(picture, target, ssim, weight)
+    large = min(target.shape[:2]) >= WINDOW
+    if weight > 0 and large and single and picture.is_cuda and _fuses(picture.device):
+        return fused_loss(picture, target, weight, base)
+    of_base = None if base is None else (base - target).abs().mean()
+    if weight == 0 or not large:
+        return (picture - target).abs().mean(), of_base
+    return convolved_loss(picture, target, ssim, weight), of_base
 
 
 def convolved_loss(picture: Tensor, target: Tensor, ssim: SSIM, weight: float) -> Tensor:

@@ -35,7 +35,7 @@ from sundae_ns.errors import ConfigError, out_of_memory
 from sundae_ns.evaluation import Later, LazyOutputs, Lpips, psnr, ssim
 from sundae_ns.initial_field import Start, initial_field
 from sundae_ns.late_outputs import OUTPUTS, FieldKey, ShownResponse, empty_outputs, late_outputs
-from sundae_ns.losses import chain_losses, picture_loss
+from sundae_ns.losses import chain_losses, picture_losses
 from sundae_ns.preview import Preview, in_viewer
 from sundae_ns.pruning import PruningConfig, PruningPolicy, make_policy
 from sundae_ns.rasterization import Backend, Rasterization, select_backend
@@ -562,9 +562,11 @@ class SundaeModel(SplatfactoModel):
         if "mask" in batch:
             mask = cut(self._downscale_if_required(batch["mask"]).to(self.device), outputs.get("window"))
             target, rgb, base = target * mask, rgb * mask, base * mask
-        losses = {"main_loss": picture_loss(rgb, target, self.ssim, self.config.ssim_lambda)}
-        if self.head_active and self.config.base_loss_weight > 0:
-            losses["base_loss"] = self.config.base_loss_weight * (base - target).abs().mean()
+        compared = base if self.head_active and self.config.base_loss_weight > 0 else None
+        main_loss, base_loss = picture_losses(rgb, compared, target, self.ssim, self.config.ssim_lambda)
+        losses = {"main_loss": main_loss}
+        if base_loss is not None:
+            losses["base_loss"] = self.config.base_loss_weight * base_loss
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
             if self.config.warmup == "mcmc" and self.densifying:

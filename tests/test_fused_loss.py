@@ -17,7 +17,7 @@ from sundae_ns import fused_loss as fused
 from sundae_ns import losses, nvrtc
 from sundae_ns.errors import BackendError, DataError, SundaeError
 from sundae_ns.fused_loss import Launches, fused_loss
-from sundae_ns.losses import picture_loss
+from sundae_ns.losses import picture_loss, picture_losses
 
 SIZES = [(11, 11), (11, 300), (12, 43), (26, 42), (27, 43), (64, 97)]
 
@@ -47,7 +47,7 @@ def exact(picture: Tensor, target: Tensor, weight: float) -> tuple[Tensor, Tenso
 
 def found(picture: Tensor, target: Tensor, weight: float, launches: Launches) -> tuple[Tensor, Tensor]:
     picture = picture.clone().requires_grad_()
-    loss = fused_loss(picture, target, weight, launches)
+    loss, _ = fused_loss(picture, target, weight, launches=launches)
     (gradient,) = torch.autograd.grad(loss, picture)
     return loss.detach(), gradient
 
@@ -62,16 +62,45 @@ def test_the_loss_and_its_gradient(launches: Launches, size: tuple[int, int], we
     assert (gradient - slope).abs().max() < 2e-4 * slope.abs().max()
 
 
+@pytest.mark.parametrize("size", SIZES)
+def test_base_colours_beside_it(launches: Launches, size: tuple[int, int]) -> None:
+    picture, target = pictures(*size)
+    base = pictures(*size, seed=1)[0].permute(1, 0, 2).contiguous().permute(1, 0, 2)
+    expected, slope = found(picture, target, 0.2, launches)
+    leaves = picture.clone().requires_grad_(), base.clone().requires_grad_()
+    loss, of_base = fused_loss(leaves[0], target, 0.2, leaves[1], launches)
+    assert of_base is not None
+    assert torch.equal(loss, expected)
+    assert of_base.item() == pytest.approx((base - target).abs().mean().item(), rel=1e-5)
+    to_picture, to_base = torch.autograd.grad(2 * loss + 0.3 * of_base, leaves)
+    torch.testing.assert_close(to_picture, 2 * slope)
+    torch.testing.assert_close(to_base, 0.3 * (base - target).sign() / base.numel())
+
+
+def test_base_colours_of_another_size_or_with_a_hole(launches: Launches) -> None:
+    picture, target = pictures(30, 47)
+    with pytest.raises(DataError, match="of one size"):
+        fused_loss(picture, target, 0.2, picture[1:], launches)
+    base = target.clone()
+    base[20, 30, 2] = torch.nan
+    loss, of_base = fused_loss(picture, target, 0.2, base.requires_grad_(), launches)
+    assert of_base is not None
+    assert loss.isfinite()
+    assert of_base.isnan()
+    (gradient,) = torch.autograd.grad(of_base, base)
+    assert gradient.isnan().sum() == 1
+
+
 def test_strides_and_what_comes_after_it_do_not_matter(launches: Launches) -> None:
     picture, target = pictures(40, 50)
     turned = picture.permute(1, 0, 2).contiguous().permute(1, 0, 2)
     expected, slope = found(picture, target, 0.2, launches)
     assert not turned.is_contiguous()
     turned.requires_grad_()
-    (gradient,) = torch.autograd.grad(3 * fused_loss(turned, target.flip(0).flip(0), 0.2, launches), turned)
+    (gradient,) = torch.autograd.grad(3 * fused_loss(turned, target.flip(0).flip(0), 0.2, launches=launches)[0], turned)
     torch.testing.assert_close(gradient, 3 * slope)
     with torch.no_grad():
-        assert torch.equal(fused_loss(picture, target, 0.2, launches), expected)
+        assert torch.equal(fused_loss(picture, target, 0.2, launches=launches)[0], expected)
 
 
 def test_the_same_picture_twice_loses_nothing(launches: Launches) -> None:
@@ -114,16 +143,16 @@ def test_pictures_that_do_not_fit_are_refused(launches: Launches, target: Tensor
     for pair in ((torch.zeros(40, 30, 3), target), (target, target)):
         if pair[0].shape != (20, 30, 3):
             with pytest.raises(DataError, match=r"give float32 \[H, W, 3\] of one size"):
-                fused_loss(*pair, 0.2, launches)
+                fused_loss(*pair, 0.2, launches=launches)
     with pytest.raises(DataError, match="11 px or more a side"):
-        fused_loss(torch.zeros(10, 30, 3), torch.zeros(10, 30, 3), 0.2, launches)
+        fused_loss(torch.zeros(10, 30, 3), torch.zeros(10, 30, 3), 0.2, launches=launches)
 
 
 def test_no_second_gradient_and_none_for_the_target(launches: Launches) -> None:
     picture, target = (p.requires_grad_() for p in pictures(20, 30))
     with pytest.raises(SundaeError, match="no second derivative"):
-        torch.autograd.grad(fused_loss(picture, target, 0.2, launches), picture, create_graph=True)
-    assert not fused_loss(picture.detach(), target, 0.2, launches).requires_grad
+        torch.autograd.grad(fused_loss(picture, target, 0.2, launches=launches)[0], picture, create_graph=True)
+    assert not fused_loss(picture.detach(), target, 0.2, launches=launches)[0].requires_grad
 
 
 def test_kernels_that_are_missing_are_told_once(
@@ -150,6 +179,14 @@ def test_on_a_gpu(size: tuple[int, int]) -> None:
     expected, slope = exact(picture.detach(), target, 0.2)
     assert loss.item() == pytest.approx(expected.item(), abs=2e-6)
     assert (gradient - slope).abs().max() < 2e-4 * slope.abs().max()
+    base = pictures(*size, seed=1)[0].cuda().requires_grad_()
+    both = picture_losses(picture, base, target, SSIM(data_range=1.0, channel=3), 0.2)
+    assert both[1] is not None
+    assert torch.equal(both[0], loss)
+    assert both[1].item() == pytest.approx((base - target).abs().mean().item(), rel=1e-5)
+    slopes = torch.autograd.grad(both[0] + both[1], (picture, base))
+    assert torch.equal(slopes[0], gradient)
+    torch.testing.assert_close(slopes[1], (base - target).sign() / base.numel())
     others = ((picture[:10], target[:10], 0.2), (picture, target, 0.0), (picture.double(), target.double(), 0.2))
     for *pair, weight in others:  # too small, without SSIM, in another precision
         elsewhere = picture_loss(*pair, SSIM(data_range=1.0, channel=3), weight)
