@@ -198,10 +198,16 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             self._order = (epoch, indices)
         return self._order[1][position]
 
-    def training_cameras(self) -> Iterator[Cameras]:
-        """Every training camera that is not held back, on the CPU, each of shape ``(1,)``."""
+    def training_views(self) -> Iterator[tuple[Cameras, torch.Tensor | None]]:
+        """Every training view that is not held back: camera, on the CPU and of shape ``(1,)``, and the pixels to learn from.
+
+        These are bool ``[H, W, 1]``; None for all of them.
+        """
+        masked = self.config.pictures and self.train_dataparser_outputs.mask_filenames is not None
         for index in self.train_indices:
-            yield self.train_dataset.cameras[index : index + 1]
+            # First the mask: what undistorts it changes the camera.
+            mask = self.cached_train[index].get("mask") if masked else None
+            yield self.train_dataset.cameras[index : index + 1], mask
 
     def holdout_views(self) -> Iterator[tuple[Cameras, dict[str, torch.Tensor]]]:
         """Held-back views as (camera, batch) pairs, in the form that nerfstudio's evaluation takes; one is loaded at a time."""

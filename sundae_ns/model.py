@@ -488,7 +488,7 @@ class SundaeModel(SplatfactoModel):
 
     @torch.no_grad()
     def contribution(self, datamanager: SundaeDatamanager, pruning: PruningConfig | None = None) -> Tensor:
-        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``.
+        """Blending weight of each primitive, summed over the pixels of all training views ``[N]``, but for masked ones.
 
         Where the score asks for it, pixels count by the detail of the rendering, for as many cells as primitives seen in it
         are going to be kept.
@@ -499,16 +499,20 @@ class SundaeModel(SplatfactoModel):
         """
         pruning = pruning or self.config.pruning
         share = pruning.share(self.total_points) if pruning.uses_detail else None
-        cameras = list(datamanager.training_cameras())
+        views = list(datamanager.training_views())
         if self.shards is not None:
-            return self.shards.contribution(self, cameras, share)
+            return self.shards.contribution(self, views, share)
         total = torch.zeros(self.num_points, device=self.device)
-        for camera in track(cameras, description="Contribution of primitives", transient=True, console=CONSOLE):
-            total += self.weights_of(self.view_of(camera), share)
+        for camera, mask in track(views, description="Contribution of primitives", transient=True, console=CONSOLE):
+            total += self.weights_of(self.view_of(camera), share, mask=mask)
         return total
 
     def weights_of(
-        self, view: View, keep_ratio: float | None = None, field: Mapping[str, Tensor] | None = None
+        self,
+        view: View,
+        keep_ratio: float | None = None,
+        field: Mapping[str, Tensor] | None = None,
+        mask: Tensor | None = None,
     ) -> Tensor:
         """Blending weight of each primitive, summed over the pixels of one view ``[N]``.
 
@@ -516,10 +520,11 @@ class SundaeModel(SplatfactoModel):
             view: the camera.
             keep_ratio: share of the primitives that will stay; given, pixels count by the detail that so many can show.
             field: the primitives, if not those of this process.
+            mask: the pixels that count at all, bool ``[H, W, 1]``; None for all.
         """
         # Not the background of training, which may be random: the choice is to be the same from run to run.
         params = self.gaussians if field is None else field
-        return weights_of(params, view, self.background_color, self._style, keep_ratio)
+        return weights_of(params, view, self.background_color, self._style, keep_ratio, mask)
 
     # --------------------------------------------------------------------------------------------- losses and metrics
 

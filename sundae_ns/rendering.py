@@ -151,7 +151,12 @@ def render(
 
 
 def weights_of(
-    params: Mapping[str, Tensor], view: View, background: Tensor, style: Style, keep_ratio: float | None = None
+    params: Mapping[str, Tensor],
+    view: View,
+    background: Tensor,
+    style: Style,
+    keep_ratio: float | None = None,
+    mask: Tensor | None = None,
 ) -> Tensor:
     """Blending weight of each primitive, summed over the pixels of one view ``[N]``.
 
@@ -161,10 +166,14 @@ def weights_of(
         background: ``[3]`` colour behind everything.
         style: how pictures are made.
         keep_ratio: share of the primitives that will stay; given, pixels count by the detail that so many can show.
+        mask: the pixels that count at all, bool ``[H, W, 1]``; None for all.
     """
     pixels = None
     if keep_ratio is not None:
         background = background.to(params["means"].device)
         pictures, splatted = render(params, view, background, style, depth=False, compensate=False)
         pixels = pixel_detail(pictures["base_rgb"], keep_ratio * float((splatted.radii > 0).sum()))
+    if mask is not None:
+        counts = mask[..., 0].to(params["means"])
+        pixels = counts if pixels is None else pixels * counts
     return blending_weights(pixels=pixels, **_pass(params, view, style))

@@ -79,7 +79,7 @@ def test_held_out_views_are_never_trained_on(capture: Path) -> None:
     assert made.holdout_indices == [2, 5]
     assert made.train_indices == [0, 1, 3, 4, 6]
     assert {made.view_of_step(step) for step in range(50)} == {0, 1, 3, 4, 6}
-    assert len(list(made.training_cameras())) == 5
+    assert len(list(made.training_views())) == 5
     held_back = list(made.holdout_views())
     assert [batch["image_idx"] for _, batch in held_back] == [2, 5]
     camera, batch = held_back[0]
@@ -103,10 +103,31 @@ def test_nothing_is_held_back_unless_asked_for(capture: Path) -> None:
     made = manager(capture)
     assert made.holdout_indices == []
     assert list(made.holdout_views()) == []
-    cameras = list(made.training_cameras())
+    cameras, masks = zip(*made.training_views(), strict=True)
+    assert masks == (None,) * VIEWS
     assert all(camera.shape == (1,) for camera in cameras)
     poses = torch.cat([camera.camera_to_worlds for camera in cameras])
     assert torch.equal(poses, made.train_dataset.cameras.camera_to_worlds)
+
+
+def test_masks_come_with_the_views_that_they_belong_to(own_copy: Path) -> None:
+    meta = json.loads((own_copy / "transforms.json").read_text())
+    for number, frame in enumerate(meta["frames"]):
+        frame["mask_path"] = f"masks/{number}.png"
+        mask = Image.new("L", (20, 16))
+        mask.paste(255, (0, 0, number + 1, 16))
+        (own_copy / "masks").mkdir(exist_ok=True)
+        mask.save(own_copy / frame["mask_path"])
+    edit(own_copy, frames=meta["frames"])
+    made = manager(own_copy, holdout_every=3)
+    widths = [int(made.cached_train[index]["mask"][0].sum()) for index in made.train_indices]
+    found = [(camera, mask) for camera, mask in made.training_views() if mask is not None]
+    assert [tuple(mask.shape) for _, mask in found] == [(16, 20, 1)] * 5
+    assert [int(mask[0].sum()) for _, mask in found] == widths
+    assert len(set(widths)) == 5
+    assert [float(c.camera_to_worlds.sum()) for c, _ in found] == [
+        float(made.train_dataset.cameras.camera_to_worlds[index].sum()) for index in made.train_indices
+    ]
 
 
 @pytest.mark.parametrize("every", [1, -2])

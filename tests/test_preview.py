@@ -42,9 +42,9 @@ class Views:
     eval_dataset = None
     asked = 0
 
-    def training_cameras(self) -> Iterator[Cameras]:
+    def training_views(self) -> Iterator[tuple[Cameras, None]]:
         self.asked += 1
-        yield from (camera(-0.5), camera(0.5))
+        yield from ((camera(-0.5), None), (camera(0.5), None))
 
 
 def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:

@@ -88,11 +88,11 @@ class Run(NamedTuple):
 
     def weights(self, keep_ratio: float | None = None) -> Iterator[tuple[View, Tensor]]:
         """Some training views, evenly chosen, and the blending weights of the primitives in each ``[N]``."""
-        cameras = list(self.datamanager.training_cameras())
-        stride = -(-len(cameras) // MAX_VIEWS)
-        for camera in cameras[::stride]:
+        views = list(self.datamanager.training_views())
+        stride = -(-len(views) // MAX_VIEWS)
+        for camera, mask in views[::stride]:
             view = self.model.view_of(camera)
-            yield view, self.model.weights_of(view, keep_ratio)
+            yield view, self.model.weights_of(view, keep_ratio, mask=mask)
 
     @torch.no_grad()
     def contribution(self, keep_ratio: float | None = None) -> Tensor:

@@ -308,23 +308,24 @@ class Shards:
         state["peak"] = peak
 
     @torch.no_grad()
-    def contribution(self, model: SundaeModel, cameras: Sequence[Any], share: float | None) -> Tensor:
+    def contribution(self, model: SundaeModel, views: Sequence[Any], share: float | None) -> Tensor:
         """Blending weights of this rank's primitives, summed over all views in their order ``[N_r]``. Collective.
 
         Args:
             model: the model.
-            cameras: every training camera; each rank draws one of every R.
+            views: every training view, camera and mask; each rank draws one of every R.
             share: see :meth:`sundae_ns.model.SundaeModel.weights_of`.
         """
         sums = torch.zeros(self.counts[self.rank], device=self.device)
-        rounds = range(0, len(cameras), self.ranks)
+        rounds = range(0, len(views), self.ranks)
         for first in track(rounds, description="Contribution of primitives", transient=True, console=CONSOLE):
             # Where views run out the last is drawn again, since all ranks have to take part, and not counted.
-            view = model.view_of(cameras[min(first + self.rank, len(cameras) - 1)])
+            camera, mask = views[min(first + self.rank, len(views) - 1)]
+            view = model.view_of(camera)
             arrived = model.arrivals(model.gaussians, view)
-            weights = give_back(model.weights_of(view, share, arrived)[:, None], arrived.route)[:, 0]
+            weights = give_back(model.weights_of(view, share, arrived, mask)[:, None], arrived.route)[:, 0]
             by_view = zip(arrived.route.ids.split(arrived.route.sent), weights.split(arrived.route.sent))
-            for ids, added in list(by_view)[: len(cameras) - first]:
+            for ids, added in list(by_view)[: len(views) - first]:
                 sums[ids] += added
         return sums
 

@@ -68,8 +68,11 @@ class FakeDatamanager:
 
     eval_dataset = None
 
-    def training_cameras(self) -> Iterator[Cameras]:
-        yield from (_camera(shift=shift) for shift in (-0.5, 0.0, 0.5))
+    mask: Tensor | None = None
+    """Of each view."""
+
+    def training_views(self) -> Iterator[tuple[Cameras, Tensor | None]]:
+        yield from ((_camera(shift=shift), self.mask) for shift in (-0.5, 0.0, 0.5))
 
 
 def _batch(width: int = 40, height: int = 32, channels: int = 3) -> dict[str, Tensor]:

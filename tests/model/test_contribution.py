@@ -31,8 +31,26 @@ def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: A
     assert total[4] == 0
     model.eval()
     with torch.no_grad():
-        alphas = [model.get_outputs_for_camera(view)["accumulation"] for view in datamanager.training_cameras()]
+        alphas = [model.get_outputs_for_camera(view)["accumulation"] for view, _ in datamanager.training_views()]
     assert float(total.sum()) == pytest.approx(float(torch.stack(alphas).sum()), rel=1e-4)
+
+
+@pytest.mark.parametrize("score", ["contribution", "detail-contribution"])
+def test_what_masks_leave_out_of_training_asks_for_no_primitives(build: Build, datamanager: Any, score: str) -> None:
+    """All of a picture is what one half shows and what the other does; many primitives have nothing in one of the two."""
+    model = build(pruning={"score": score})
+    model.gauss_params["scales"].data[:] = -4.0
+    whole = model.contribution(datamanager)
+    left = torch.zeros(32, 40, 1, dtype=torch.bool)
+    left[:, :20] = True
+    parts = []
+    for datamanager.mask in (left, ~left):
+        parts.append(model.contribution(datamanager))
+    torch.testing.assert_close(parts[0] + parts[1], whole)
+    for only, other in (parts, parts[::-1]):
+        assert ((only == 0) & (other > 0)).any()
+    datamanager.mask = torch.ones_like(left)
+    torch.testing.assert_close(model.contribution(datamanager), whole)
 
 
 def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(build: Build, datamanager: Any) -> None:
@@ -54,9 +72,9 @@ def test_a_round_weighs_detail_for_what_it_keeps(
     training = training_of(build(pruning={"rounds": 2, "round_every": 2, "keep_ratio": 0.25}))
     asked, weights_of = [], training.model.weights_of
 
-    def spy(view: Any, keep_ratio: float | None = None) -> Tensor:
+    def spy(view: Any, keep_ratio: float | None = None, mask: Tensor | None = None) -> Tensor:
         asked.append(keep_ratio)
-        return weights_of(view, keep_ratio)
+        return weights_of(view, keep_ratio, mask=mask)
 
     monkeypatch.setattr(training.model, "weights_of", spy)
     counts = []
