@@ -208,6 +208,7 @@ class FusedTraining:
                 made = _Pass(Weights(net, dtype), folded, Tape(), Tensor())
         fold(splatted, alpha, net.pixel_unshuffle, self.residual, made.folded, launches)
         if made.forward is not None:
+            self._leave(made)
             made.forward.replay()
         else:
             made.tape = network(net, made.weights, made.folded, launches)
@@ -227,7 +228,6 @@ class FusedTraining:
         if made.backward is not None:
             assert made.to_folded is not None
             assert made.to_parameters is not None
-            self._leave(made.to_parameters)
             made.backward.replay()
             # As tensors that nobody else holds: autograd makes those the parameters' gradients without a copy.
             to_folded, to_parameters = made.to_folded, [gradient.detach() for gradient in made.to_parameters]
@@ -248,13 +248,9 @@ class FusedTraining:
         )
         return to_splatted, to_alpha, [*to_parameters, *to_last]
 
-    def _leave(self, gradients: list[Tensor]) -> None:
-        """Copy what parameters still have of an earlier pass where this one is going to write.
-
-        Args:
-            gradients: of the first of the parameters, as the earlier pass left them.
-        """
-        for parameter, gradient in zip(self._parameters, gradients, strict=False):
+    def _leave(self, made: _Pass) -> None:
+        """Copy what parameters still have of an earlier pass: both directions are going to write where it lies."""
+        for parameter, gradient in zip(self._parameters, made.to_parameters or (), strict=False):
             if parameter.grad is not None and parameter.grad.data_ptr() == gradient.data_ptr():
                 parameter.grad = parameter.grad.clone()
 

@@ -173,6 +173,8 @@ def as_recorded(head: CompensationHead, height: int, width: int, launches: kerne
     to_folded, to_parameters = network_backward(net, weights, tape, to_raw, launches)
 
     def forward() -> None:
+        for gradient in to_parameters:
+            gradient.fill_(torch.nan)  # the two graphs share their memory
         weights.refresh()
         again = fused.network(net, weights, folded, launches)
         for old, new in zip([*tape.inputs, *tape.coarse, tape.last], [*again.inputs, *again.coarse, again.last]):
