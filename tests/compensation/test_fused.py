@@ -314,3 +314,20 @@ def test_training_on_a_gpu_is_that_of_the_layers(mode: str) -> None:
         error, allowed, whole = table.unbind(1)
         assert (error <= 4 * allowed + slack * whole).all(), (error, allowed, whole)
     assert len(quick._training._recorded) == MAX_SIZES
+
+
+@pytest.mark.gpu
+def test_gradients_of_several_pictures_add_up_on_a_gpu() -> None:
+    """Recorded passes leave the parameters' gradients where the next ones write."""
+    head = make(size="compact", num_features=13).cuda()
+    parts, sizes = [], [(33, 40), (48, 64), (33, 40), (33, 40)]
+    shown = [tuple(picture.cuda() for picture in splatted(*size, 13, seed=n)) for n, size in enumerate(sizes)]
+    for pictures in shown:
+        parts.append(of_layers(head, pictures, torch.ones(3, device="cuda"))[3:])
+    assert len(head._training._recorded) == 2
+    head.zero_grad()
+    for base, *leaves in shown:
+        head(base, *(leaf.clone().requires_grad_() for leaf in leaves)).sum().backward()
+    for parameter, *of_each in zip(head.parameters(), *parts, strict=True):
+        assert parameter.grad is not None
+        torch.testing.assert_close(parameter.grad, torch.stack(of_each).sum(dim=0), rtol=1e-4, atol=1e-4)
