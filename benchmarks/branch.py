@@ -218,8 +218,9 @@ def profiled(trainer: Any, steps: range) -> dict[str, Any]:
         for step in steps:
             trainer.train_iteration(step)
         now(trainer.device)
-    # Ranges that the optimizers mark have the time of the kernels in them, which are there already.
-    events = [event for event in profile.key_averages() if not event.key.startswith("Optimizer.")]
+    # Not the host's calls, nor ranges that somebody marked, whose kernels are there already.
+    on_gpu = torch.autograd.DeviceType.CUDA
+    events = [e for e in profile.key_averages() if e.device_type == on_gpu and not e.is_user_annotation]
     each = sorted(((event.self_device_time_total / len(steps) / 1e3, event.key) for event in events), reverse=True)
     return {
         "gpu_ms": sum(ms for ms, _ in each),

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras
+from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -114,8 +114,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     Beyond the stock datamanager: it caches images on machines without CUDA; the view of a step is a function of seed and
     step, so that a resumed run continues the same order; it can hold back training views; and it lists the training
-    cameras for the pass that measures each primitive's contribution. Training cameras stay on the CPU, where reading
-    their sizes does not wait for the GPU.
+    views, with their masks, for the pass that measures each primitive's contribution. Training cameras stay on the CPU,
+    where reading their sizes does not wait for the GPU.
     """
 
     config: SundaeDatamanagerConfig
@@ -203,7 +203,10 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
         These are bool ``[H, W, 1]``; None for all of them.
         """
-        masked = self.config.pictures and self.train_dataparser_outputs.mask_filenames is not None
+        outputs = self.train_dataparser_outputs
+        # nerfstudio masks what lies outside of this lens by itself.
+        round_lens = (outputs.cameras.camera_type == CameraType.FISHEYE624.value).any()
+        masked = self.config.pictures and (outputs.mask_filenames is not None or bool(round_lens))
         for index in self.train_indices:
             # First the mask: what undistorts it changes the camera.
             mask = self.cached_train[index].get("mask") if masked else None

@@ -46,19 +46,20 @@ __device__ __forceinline__ float down(const float* along) {
 }
 
 // A block has one tile of the pictures. Its share of the loss comes from the sum of absolute differences of its pixels, and
-// that of SSIM over the windows whose first pixel it has; its share of the base's loss from differences alone. With slopes:
-// derivatives of a window's SSIM by the means of x, x x and x y in it, a plane for each and each channel.
+// that of 1 - SSIM over the windows whose first pixel it has; its share of the base's loss from differences alone. With
+// slopes: derivatives of a window's SSIM by the means of x, x x and x y in it, a plane for each and each channel.
 extern "C" __global__ void compare(int height, int width, const float* __restrict__ picture,
                                    const float* __restrict__ base, const float* __restrict__ target,
-                                   double of_nothing, double of_difference, double of_similarity, double of_base,
-                                   float* __restrict__ slopes, float* __restrict__ shares) {
+                                   double of_difference, double of_dissimilarity, double of_base,
+                                   float* __restrict__ slopes, float* __restrict__ shares,
+                                   float* __restrict__ base_shares) {
     __shared__ float x[ROWS * COLUMNS], y[ROWS * COLUMNS], along[5][ROWS * TILE_WIDTH], found[3][THREADS];
     const int across = (width + TILE_WIDTH - 1) / TILE_WIDTH, tile = blockIdx.x;
     if (tile >= across * ((height + TILE_HEIGHT - 1) / TILE_HEIGHT)) return;
     const int top = tile / across * TILE_HEIGHT, left = tile % across * TILE_WIDTH, me = threadIdx.x;
     const int windows_high = height - HALO, windows_wide = width - HALO;
     const long long plane = (long long)windows_high * windows_wide;
-    float difference = 0, similarity = 0, beside = 0;
+    float difference = 0, dissimilarity = 0, beside = 0;
     for (int c = 0; c < 3; ++c) {
         for (int i = me; i < ROWS * COLUMNS; i += blockDim.x) {
             const int row = top + i / COLUMNS, column = left + i % COLUMNS;
@@ -98,7 +99,7 @@ extern "C" __global__ void compare(int height, int width, const float* __restric
             const float light = 2 * both + C1, shape = 2 * (down(along[4] + i) - both) + C2;
             const float light_most = squares + C1, shape_most = down(along[2] + i) + down(along[3] + i) - squares + C2;
             const float least = 1 / (light_most * shape_most), value = light * shape * least;
-            similarity += value;
+            dissimilarity += 1 - value;
             if (!slopes) continue;
             float* slope = slopes + c * plane + (long long)row * windows_wide + column;
             // Covariances are means of products less products of means: a mean moves both.
@@ -109,7 +110,7 @@ extern "C" __global__ void compare(int height, int width, const float* __restric
         __syncthreads();
     }
     found[0][me] = difference;
-    found[1][me] = similarity;
+    found[1][me] = dissimilarity;
     found[2][me] = beside;
     __syncthreads();
     for (int half = blockDim.x / 2; half > 0; half /= 2) {
@@ -118,8 +119,8 @@ extern "C" __global__ void compare(int height, int width, const float* __restric
         __syncthreads();
     }
     if (me) return;
-    shares[2 * tile] = (tile ? 0 : of_nothing) + of_difference * found[0][0] + of_similarity * found[1][0];
-    shares[2 * tile + 1] = of_base * found[2][0];
+    shares[tile] = of_difference * found[0][0] + of_dissimilarity * found[1][0];
+    if (base) base_shares[tile] = of_base * found[2][0];
 }
 
 __device__ __forceinline__ float sign_of(float difference) {
@@ -130,7 +131,7 @@ __device__ __forceinline__ float sign_of(float difference) {
 // up to HALO rows above and columns to the left of it.
 extern "C" __global__ void compare_backward(int height, int width, const float* __restrict__ picture,
                                             const float* __restrict__ base, const float* __restrict__ target,
-                                            double of_difference, double of_similarity, double of_base,
+                                            double of_difference, double of_dissimilarity, double of_base,
                                             const float* __restrict__ slopes, const float* __restrict__ to_loss,
                                             const float* __restrict__ to_base_loss, float* __restrict__ to_picture,
                                             float* __restrict__ to_base) {
@@ -140,7 +141,7 @@ extern "C" __global__ void compare_backward(int height, int width, const float* 
     const int top = tile / across * TILE_HEIGHT, left = tile % across * TILE_WIDTH;
     const int windows_high = height - HALO, windows_wide = width - HALO;
     const long long plane = (long long)windows_high * windows_wide;
-    const float to_difference = to_loss[0] * (float)of_difference, to_similarity = to_loss[0] * (float)of_similarity;
+    const float to_difference = to_loss[0] * (float)of_difference, to_similarity = -to_loss[0] * (float)of_dissimilarity;
     const float beside = base ? to_base_loss[0] * (float)of_base : 0;
     for (int c = 0; c < 3; ++c) {
         for (int i = threadIdx.x; i < ROWS * COLUMNS; i += blockDim.x) {
@@ -211,8 +212,11 @@ def fused_loss(
         picture: float32 on a CUDA device ``[H, W, 3]``, both sides of at least :data:`WINDOW`.
         target: likewise; no gradient reaches it.
         weight: in [0, 1].
-        base: another picture to compare with the target, likewise; None for none, and no second scalar.
+        base: another picture to compare with the target, likewise; None for none.
         launches: kernels to take in place of those that are compiled for the device.
+
+    Returns:
+        The loss, and that of the base, None without one; float32 ``[]`` each.
 
     Raises:
         BackendError: the kernels cannot be compiled or loaded here.
@@ -248,15 +252,14 @@ class _Loss(torch.autograd.Function):
         windows = (height - WINDOW + 1) * (width - WINDOW + 1) * channels
         graded = any(ctx.needs_input_grad)
         slopes = picture.new_empty(3 * windows) if graded else nothing
-        shares = picture.new_empty(_threads(picture) // THREADS, 2)
-        worth = ((1 - weight) / picture.numel(), -weight / windows, 1 / picture.numel())
-        launches.compare(
-            _threads(picture), [height, width, picture, base, target, float(weight), *worth, slopes, shares]
-        )
+        tiles = _threads(picture) // THREADS
+        shares, base_shares = picture.new_empty(tiles), picture.new_empty(tiles if base.numel() else 0)
+        worth = ((1 - weight) / picture.numel(), weight / windows, 1 / picture.numel())
+        pictures: tuple[Tensor, ...] = (picture, base, target)
+        launches.compare(_threads(picture), [height, width, *pictures, *worth, slopes, shares, base_shares])
         ctx.save_for_backward(picture, base, target, slopes)
         ctx.launches, ctx.worth = launches, worth
-        loss, of_base = shares.sum(dim=0).unbind()
-        return loss, of_base
+        return shares.sum(), base_shares.sum()
 
     @staticmethod
     def backward(ctx: Any, to_loss: Tensor, to_base_loss: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]

@@ -35,8 +35,16 @@ def picture_loss(picture: Tensor, target: Tensor, ssim: SSIM, weight: float) -> 
 def picture_losses(
     picture: Tensor, base: Tensor | None, target: Tensor, ssim: SSIM, weight: float
 ) -> tuple[Tensor, Tensor | None]:
-    """The loss of a picture, see :func:`picture_loss`, and L1 of base colours ``[H, W, 3]``, if there are any."""
-    single = picture.dtype == target.dtype == torch.float32
+    """The loss of a picture, see :func:`picture_loss`, and beside it L1 of its base colours.
+
+    Args:
+        picture, target, ssim, weight: as there.
+        base: base colours ``[H, W, 3]``, which a gradient reaches; None for none.
+
+    Returns:
+        Both losses, the second None without base colours.
+    """
+    single = all(one.dtype == torch.float32 for one in (picture, target, base) if one is not None)
     large = min(target.shape[:2]) >= WINDOW
     if weight > 0 and large and single and picture.is_cuda and _fuses(picture.device):
         return fused_loss(picture, target, weight, base)

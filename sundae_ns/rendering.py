@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, over_phases, plan, resize
 from sundae_ns.distributed import Arrived
+from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.parameters import sh_degree
 from sundae_ns.pruning import pixel_detail
@@ -167,7 +168,15 @@ def weights_of(
         style: how pictures are made.
         keep_ratio: share of the primitives that will stay; given, pixels count by the detail that so many can show.
         mask: the pixels that count at all, bool ``[H, W, 1]``; None for all.
+
+    Raises:
+        DataError: the mask has another size than the view.
     """
+    if mask is not None and tuple(mask.shape) != (view.height, view.width, 1):
+        raise DataError(
+            f"a mask is {list(mask.shape)} where its view is {view.width} x {view.height} px; "
+            "make masks of their pictures' sizes"
+        )
     pixels = None
     if keep_ratio is not None:
         background = background.to(params["means"].device)

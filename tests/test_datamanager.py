@@ -130,6 +130,26 @@ def test_masks_come_with_the_views_that_they_belong_to(own_copy: Path) -> None:
     ]
 
 
+def test_masks_of_lenses_fit_the_cameras_that_nerfstudio_makes_of_them(own_copy: Path) -> None:
+    meta = json.loads((own_copy / "transforms.json").read_text())
+    mask = Image.new("L", (20, 16), 255)
+    mask.save(own_copy / "mask.png")
+    edit(own_copy, k1=0.3, k2=0.1, frames=[{**frame, "mask_path": "mask.png"} for frame in meta["frames"]])
+    # Before anything else has read the pictures.
+    for camera, mask_of in manager(own_copy).training_views():
+        assert mask_of is not None
+        assert mask_of.shape == (int(camera.height), int(camera.width), 1)
+        assert mask_of.shape != (16, 20, 1), "undistortion cuts nothing off"
+
+
+def test_a_round_lens_has_masks_of_its_own(own_copy: Path) -> None:
+    edit(own_copy, camera_model="FISHEYE624", distortion_params=[0.01] + [0.0] * 11, fisheye_crop_radius=7.0)
+    for camera, mask in manager(own_copy).training_views():
+        assert mask is not None
+        assert mask.shape == (int(camera.height), int(camera.width), 1)
+        assert not mask.all()
+
+
 @pytest.mark.parametrize("every", [1, -2])
 def test_impossible_holdout(capture: Path, every: int) -> None:
     with pytest.raises(ConfigError, match="holdout-every"):

@@ -70,6 +70,7 @@ def test_base_colours_beside_it(launches: Launches, size: tuple[int, int]) -> No
     leaves = picture.clone().requires_grad_(), base.clone().requires_grad_()
     loss, of_base = fused_loss(leaves[0], target, 0.2, leaves[1], launches)
     assert of_base is not None
+    assert not loss._is_view()
     assert torch.equal(loss, expected)
     assert of_base.item() == pytest.approx((base - target).abs().mean().item(), rel=1e-5)
     to_picture, to_base = torch.autograd.grad(2 * loss + 0.3 * of_base, leaves)
@@ -108,6 +109,16 @@ def test_the_same_picture_twice_loses_nothing(launches: Launches) -> None:
         loss, gradient = found(picture, picture.clone(), 0.5, launches)
         assert abs(loss) < 1e-6
         assert gradient.abs().max() < 1e-5
+
+
+def test_what_is_left_of_a_small_loss(launches: Launches) -> None:
+    """Not the difference of two large sums."""
+    picture, target = pictures(64, 97)
+    near = target + 1e-3 * (picture - target)
+    loss, _ = found(near, target, 1.0, launches)
+    expected, _ = exact(near, target, 1.0)
+    assert 0 < expected < 1e-4
+    assert loss.item() == pytest.approx(expected.item(), rel=0.02)
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e2, 1e4])

@@ -87,7 +87,7 @@ class Run(NamedTuple):
     # ------------------------------------------------------------------------------------------------------- views
 
     def weights(self, keep_ratio: float | None = None) -> Iterator[tuple[View, Tensor]]:
-        """Some training views, evenly chosen, and the blending weights of the primitives in each ``[N]``."""
+        """Some training views, evenly chosen, and the primitives' blending weights in each, but for masked pixels ``[N]``."""
         views = list(self.datamanager.training_views())
         stride = -(-len(views) // MAX_VIEWS)
         for camera, mask in views[::stride]:

@@ -32,16 +32,6 @@ from sundae_ns.cuda_graphs import MAX_SIZES, aside, record
 from sundae_ns.errors import SundaeError
 
 
-def summed(picture: Tensor) -> Tensor:
-    """Sum over all pixels of ``[1, C, h, w]`` channels last: float32 ``[C]``.
-
-    A product with ones for each row, and then the rows: torch's own sum over pixels takes twice as long on such a picture.
-    """
-    rows = picture[0].permute(1, 2, 0)
-    ones = rows.new_ones(len(rows), 1, rows.shape[1])
-    return torch.bmm(ones, rows)[:, 0].sum(dim=0, dtype=torch.float32)
-
-
 def network_backward(
     net: UNet, weights: Weights, tape: Tape, gradient: Tensor, launches: Launches
 ) -> tuple[Tensor, list[Tensor]]:
@@ -63,7 +53,7 @@ def network_backward(
 
     def convolved(number: int, to_raw: Tensor) -> Tensor:
         x, weight = tape.inputs[number], weights.cast[number]
-        to_bias = summed(to_raw)
+        to_bias = to_raw.sum(dim=(0, 2, 3), dtype=torch.float32)
         to_x, to_weight, _ = torch.ops.aten.convolution_backward(
             to_raw, x, weight, None, [1, 1], [1, 1], [1, 1], False, [0, 0], 1, [True, True, False]
         )
@@ -159,7 +149,8 @@ class FusedTraining:
     """Corrections of a network, with gradients for what was splatted and for its parameters.
 
     A plain object that refers to the network, so that recordings stay out of checkpoints. A correction's gradients must be
-    taken before the next one is asked for: recorded passes share their buffers.
+    taken before the next one is asked for: recorded passes share their buffers. The gradient of a parameter lies in one of
+    these until the next pass, which copies it first; what ``torch.autograd.grad`` returned is overwritten by then.
 
     Args:
         net: the network; its parameters must stay the same tensors while they stay on their device.
@@ -228,6 +219,7 @@ class FusedTraining:
         if made.backward is not None:
             assert made.to_folded is not None
             assert made.to_parameters is not None
+            self._leave(made)  # of an earlier backward pass over the same picture
             made.backward.replay()
             # As tensors that nobody else holds: autograd makes those the parameters' gradients without a copy.
             to_folded, to_parameters = made.to_folded, [gradient.detach() for gradient in made.to_parameters]

@@ -121,7 +121,7 @@ class CompensationHead(nn.Module):
 
     def train(self, mode: bool = True) -> CompensationHead:
         """Switch between training and evaluation, which no layer of it tells apart."""
-        # Trainers say so at each step; to go through all layers each time would be a hundredth of it.
+        # Trainers say so at each step: nothing need be told to all layers that they know.
         return self if self.training == mode else super().train(mode)
 
     @torch.no_grad()

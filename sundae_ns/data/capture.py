@@ -7,6 +7,7 @@ functions of files; they read text and the headers of pictures, no pixels.
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -155,6 +156,8 @@ def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: C
     for key, count in extras.items():
         if count not in (0, len(frames)):
             raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it for all or for none")
+    if models == {"FISHEYE624"}:
+        _check_round_lens(meta, extras["mask_path"] > 0, path.name)
     _check_splits(meta, names, splits, path.name)
     _check_frame_of_capture(meta, path.name)
 
@@ -175,6 +178,18 @@ def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -
             raise DataError(f"{where}: distortion_params must be a list of 4, 6 or 12 numbers")
         for value in values:
             number(value, "distortion_params", where)
+
+
+def _check_round_lens(meta: Mapping[str, Any], masked: bool, where: str) -> None:
+    """Check what nerfstudio makes the masks of a FISHEYE624 camera from."""
+    radius = meta.get("fisheye_crop_radius")
+    if not isinstance(radius, float) or not 0 < radius < math.inf:
+        raise DataError(
+            f"{where}: fisheye_crop_radius is {_short(radius)}; a FISHEYE624 camera needs it, a positive number of "
+            "pixels with a decimal point"
+        )
+    if masked:
+        raise DataError(f"{where}: pictures of a FISHEYE624 camera get masks of their own; leave mask_path out")
 
 
 def _check_splits(meta: Mapping[str, Any], names: set[str], splits: Sequence[str], where: str) -> None:

@@ -203,6 +203,14 @@ def test_gradients_of_what_is_played_are_not_copied_and_add_up(compiled: Compile
         (training(seen[1].clone().requires_grad_(), seen[2], torch.float32) * to_out).sum().backward()
     assert_same([p.grad for p in head.parameters() if p.grad is not None], [a + b for a, b in zip(*expected[:2])])
     assert_same(of_kernels(head, pictures[2], to_out, training)[3:], expected[2])
+    head.zero_grad()
+    out = training(pictures[0][1].clone().requires_grad_(), pictures[0][2], torch.float32)
+    other = torch.randn(37, 50, 3)
+    (out * to_out).sum().backward(retain_graph=True)
+    (out * other).sum().backward()
+    twice = [p.grad.clone() for p in head.parameters() if p.grad is not None]
+    assert_same(twice, of_layers(head, pictures[0], to_out + other)[3:])
+    assert_same(of_kernels(head, pictures[2], to_out, training)[3:], expected[2])
     assert made.to_parameters is not None
     for parameter, gradient in zip(training._parameters, made.to_parameters):
         assert parameter.grad is not None

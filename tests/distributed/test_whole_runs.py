@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from typing import Any
 import pytest
 import torch
 import torch.distributed as dist
+from PIL import Image
 
 from sundae_ns import checkpoint, distributed
 from sundae_ns.data import write_scene
@@ -66,10 +68,14 @@ def configured(folder: Path, name: str) -> SundaeTrainerConfig:
 
 
 def frozen(folder: Path, name: str) -> SundaeTrainerConfig:
-    """One step at rates of 0 from the saved warm-up, and a prune: the field that is pruned is the same for any ranks."""
+    """One step at rates of 0 from the saved warm-up, and a prune: the field that is pruned is the same for any ranks.
+
+    Half of each picture is masked: what does not look there keeps other primitives.
+    """
     config = configured(folder, name)
     config.max_num_iterations = 1
     config.steps_per_eval_image = 1000
+    config.pipeline.datamanager.data = folder / "masked"
     model: Any = config.pipeline.model
     model.warm_start = folder / "train" / "sundae-tiny" / "now" / "nerfstudio_models" / f"step-{SAVED_AT:09d}.ckpt"
     model.evaluate_prune = False
@@ -191,6 +197,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: RunRanks) -> Pat
     """Where two ranks have trained, once for all tests."""
     folder = tmp_path_factory.mktemp("ranks")
     write_scene(folder / "scene", train_views=7, test_views=2, width=40, height=32, points=150)
+    shutil.copytree(folder / "scene", folder / "masked")
+    meta = json.loads((folder / "masked" / "transforms.json").read_text())
+    mask = Image.new("L", (40, 32))
+    mask.paste(255, (0, 0, 20, 32))
+    mask.save(folder / "masked" / "mask.png")
+    meta["frames"] = [{**frame, "mask_path": "mask.png"} for frame in meta["frames"]]
+    (folder / "masked" / "transforms.json").write_text(json.dumps(meta))
     run_ranks(__file__, folder)
     return folder
 

@@ -162,6 +162,18 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     "no frames": (_top(frames=[]), "no frames"),
     "frames that are none": (_top(frames=[1, 2]), "frame 0"),
     "an unknown camera": (_top(camera_model="BRAIN"), "camera_model is 'BRAIN'; use one of SIMPLE_PINHOLE"),
+    "a round lens without a radius": (
+        _top(camera_model="FISHEYE624"),
+        "fisheye_crop_radius is None; .*a positive number",
+    ),
+    "a round lens of a whole number": (_top(camera_model="FISHEYE624", fisheye_crop_radius=7), "with a decimal point"),
+    "a round lens and masks": (
+        lambda meta: (
+            meta.update(camera_model="FISHEYE624", fisheye_crop_radius=7.0),
+            [frame.update(mask_path="images/frame_00001.png") for frame in meta["frames"]],
+        ),
+        "leave mask_path out",
+    ),
     "distortion NaN": (_top(k1=float("nan")), "k1 is nan"),
     "distortion of 3 numbers": (_top(distortion_params=[0, 0, 0]), "4, 6 or 12"),
     "a split of other pictures": (_frame(file_path="images/none.png"), "which is the file_path of no frame"),

@@ -412,6 +412,21 @@ def test_what_masks_leave_out_of_training_judges_nothing(make: Make, monkeypatch
         measured(torch.zeros_like(left))
 
 
+def test_what_masks_leave_out_of_training_asks_for_nothing(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = searched(make())
+    cameras = [camera for camera, _ in run.datamanager.training_views()]
+    whole = run.contribution()
+    left = torch.zeros(24, 24, 1, dtype=torch.bool)
+    left[:, :12] = True
+    parts = []
+    for mask in (left, ~left):
+        shown = [(camera, mask) for camera in cameras]
+        monkeypatch.setattr(run.datamanager, "training_views", lambda shown=shown: iter(shown))
+        parts.append(run.contribution())
+    assert not torch.equal(parts[0], whole)
+    torch.testing.assert_close(parts[0] + parts[1], whole)
+
+
 def test_a_view_that_is_masked_whole_is_passed_over(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     run = searched(make())
     first, *others = run.datamanager.holdout_views()

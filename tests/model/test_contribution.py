@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from sundae_ns.errors import DataError
 from sundae_ns.model import SundaeModel
 
 Build = Callable[..., SundaeModel]
@@ -51,6 +52,9 @@ def test_what_masks_leave_out_of_training_asks_for_no_primitives(build: Build, d
         assert ((only == 0) & (other > 0)).any()
     datamanager.mask = torch.ones_like(left)
     torch.testing.assert_close(model.contribution(datamanager), whole)
+    for datamanager.mask in (left[:-1], left[..., 0], left[:1]):
+        with pytest.raises(DataError, match="where its view is 40 x 32 px"):
+            model.contribution(datamanager)
 
 
 def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(build: Build, datamanager: Any) -> None:
