@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -230,8 +230,7 @@ def fused_loss(
                 f"give float32 [H, W, 3] of one size, {WINDOW} px or more a side"
             )
     launches = compiled(picture.device) if launches is None else launches
-    loss, of_base = _Loss.apply(picture, base, target.detach(), weight, launches)
-    return loss, None if base is None else of_base
+    return cast("tuple[Tensor, Tensor | None]", _Loss.apply(picture, base, target.detach(), weight, launches))
 
 
 def _threads(picture: Tensor) -> int:
@@ -244,7 +243,7 @@ class _Loss(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any, picture: Tensor, base: Tensor | None, target: Tensor, weight: float, launches: Launches
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor | None]:
         picture, target = picture.contiguous(), target.contiguous()
         nothing = picture.new_empty(0)  # to the kernels a null pointer
         base = nothing if base is None else base.contiguous()
@@ -259,10 +258,12 @@ class _Loss(torch.autograd.Function):
         launches.compare(_threads(picture), [height, width, *pictures, *worth, slopes, shares, base_shares])
         ctx.save_for_backward(picture, base, target, slopes)
         ctx.launches, ctx.worth = launches, worth
-        return shares.sum(), base_shares.sum()
+        return shares.sum(), base_shares.sum() if base.numel() else None
 
     @staticmethod
-    def backward(ctx: Any, to_loss: Tensor, to_base_loss: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(  # type: ignore[override]
+        ctx: Any, to_loss: Tensor, to_base_loss: Tensor | None
+    ) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # a graph of this pass is wanted, and would lack it
             raise SundaeError(
                 "the kernel of the loss has no second derivative; take that of float64 pictures, which are convolved"
@@ -270,6 +271,8 @@ class _Loss(torch.autograd.Function):
         picture, base, target, slopes = ctx.saved_tensors
         to_picture, to_base = torch.empty_like(picture), torch.empty_like(base)
         height, width, _ = picture.shape
-        arguments = [height, width, picture, base, target, *ctx.worth, slopes, to_loss, to_base_loss]
-        ctx.launches.compare_backward(_threads(picture), [*arguments, to_picture, to_base])
+        # Without a base there is no gradient of its loss: a null pointer as well.
+        gradients = (to_loss, base if to_base_loss is None else to_base_loss, to_picture, to_base)
+        arguments = [height, width, picture, base, target, *ctx.worth, slopes, *gradients]
+        ctx.launches.compare_backward(_threads(picture), arguments)
         return to_picture, to_base if base.numel() else None, None, None, None
