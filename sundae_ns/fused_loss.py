@@ -245,20 +245,18 @@ class _Loss(torch.autograd.Function):
         ctx: Any, picture: Tensor, base: Tensor | None, target: Tensor, weight: float, launches: Launches
     ) -> tuple[Tensor, Tensor | None]:
         picture, target = picture.contiguous(), target.contiguous()
-        nothing = picture.new_empty(0)  # to the kernels a null pointer
-        base = nothing if base is None else base.contiguous()
+        base = None if base is None else base.contiguous()
         height, width, channels = picture.shape
         windows = (height - WINDOW + 1) * (width - WINDOW + 1) * channels
-        graded = any(ctx.needs_input_grad)
-        slopes = picture.new_empty(3 * windows) if graded else nothing
-        tiles = _threads(picture) // THREADS
-        shares, base_shares = picture.new_empty(tiles), picture.new_empty(tiles if base.numel() else 0)
+        slopes = picture.new_empty(3 * windows) if any(ctx.needs_input_grad) else None
+        shares = picture.new_empty(_threads(picture) // THREADS)
+        base_shares = None if base is None else torch.empty_like(shares)
         worth = ((1 - weight) / picture.numel(), weight / windows, 1 / picture.numel())
-        pictures: tuple[Tensor, ...] = (picture, base, target)
-        launches.compare(_threads(picture), [height, width, *pictures, *worth, slopes, shares, base_shares])
+        arguments = [height, width, picture, base, target, *worth, slopes, shares, base_shares]
+        launches.compare(_threads(picture), arguments)
         ctx.save_for_backward(picture, base, target, slopes)
         ctx.launches, ctx.worth = launches, worth
-        return shares.sum(), base_shares.sum() if base.numel() else None
+        return shares.sum(), None if base_shares is None else base_shares.sum()
 
     @staticmethod
     def backward(  # type: ignore[override]
@@ -269,10 +267,8 @@ class _Loss(torch.autograd.Function):
                 "the kernel of the loss has no second derivative; take that of float64 pictures, which are convolved"
             )
         picture, base, target, slopes = ctx.saved_tensors
-        to_picture, to_base = torch.empty_like(picture), torch.empty_like(base)
+        to_picture, to_base = torch.empty_like(picture), None if base is None else torch.empty_like(base)
         height, width, _ = picture.shape
-        # Without a base there is no gradient of its loss: a null pointer as well.
-        gradients = (to_loss, base if to_base_loss is None else to_base_loss, to_picture, to_base)
-        arguments = [height, width, picture, base, target, *ctx.worth, slopes, *gradients]
-        ctx.launches.compare_backward(_threads(picture), arguments)
-        return to_picture, to_base if base.numel() else None, None, None, None
+        arguments = [height, width, picture, base, target, *ctx.worth, slopes, to_loss, to_base_loss]
+        ctx.launches.compare_backward(_threads(picture), [*arguments, to_picture, to_base])
+        return to_picture, to_base, None, None, None

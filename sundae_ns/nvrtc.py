@@ -14,7 +14,8 @@ from torch import Tensor
 
 from sundae_ns.errors import BackendError
 
-Launch = Callable[[int, Sequence[Tensor | int | float]], None]
+Argument = Tensor | int | float | None
+Launch = Callable[[int, Sequence[Argument]], None]
 """Runs a kernel for so many threads, at least, with these arguments: see :meth:`Kernel.__call__`."""
 
 
@@ -81,13 +82,13 @@ class Kernel:
             self._check(self._driver.cuModuleLoadData(byref(module), code))
             self._check(self._driver.cuModuleGetFunction(byref(self._function), module, name.encode()))
 
-    def __call__(self, threads: int, arguments: Sequence[Tensor | int | float]) -> None:
+    def __call__(self, threads: int, arguments: Sequence[Argument]) -> None:
         """Start the kernel on the current stream, for at least so many threads.
 
         Args:
             threads: threads in one row of blocks.
             arguments: tensors on the kernel's device as pointers to their first value, of whose strides the kernel has to
-                know; integers as C ints, floats as doubles.
+                know; None as a null pointer; integers as C ints, floats as doubles.
 
         Raises:
             BackendError: a tensor is elsewhere, or the driver refuses the call.
@@ -112,7 +113,9 @@ class Kernel:
             raise BackendError(f"a CUDA kernel does not run ({reason}): update the driver")
 
 
-def _as_c(argument: Tensor | int | float, device: torch.device) -> ctypes.c_void_p | ctypes.c_int | ctypes.c_double:
+def _as_c(argument: Argument, device: torch.device) -> ctypes.c_void_p | ctypes.c_int | ctypes.c_double:
+    if argument is None:
+        return c_void_p()
     if isinstance(argument, Tensor):
         if argument.device != device:
             raise BackendError(f"a kernel on {device} was given a tensor on {argument.device}: pass ones there")

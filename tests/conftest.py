@@ -11,10 +11,9 @@ from collections.abc import Callable, Sequence
 
 import pytest
 import torch
-from torch import Tensor
 
 from sundae_ns import nvrtc
-from sundae_ns.nvrtc import Launch
+from sundae_ns.nvrtc import Argument, Launch
 
 CompileKernels = Callable[..., dict[str, Launch]]
 
@@ -94,7 +93,7 @@ def compile_kernels(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKerne
         loaded = compile_for_cpu(source, options)
 
         def launch_of(name: str) -> Launch:
-            def launch(threads: int, arguments: Sequence[Tensor | int | float]) -> None:
+            def launch(threads: int, arguments: Sequence[Argument]) -> None:
                 values = [nvrtc._as_c(a, torch.device("cpu")) for a in arguments]
                 # More threads than asked for, as whole blocks have.
                 for block in range(threads + 3):

@@ -183,8 +183,7 @@ def convolutions(net: UNet) -> list[nn.Conv2d]:
 def last_layers(net: UNet) -> tuple[Tensor, Tensor, Tensor]:
     """Bias of the last 3 x 3 convolution, weights ``[C, width]`` and bias of the 1 x 1 convolution after it."""
     weight = net.out.weight.detach().reshape(len(net.out.weight), -1).contiguous()
-    last = cast("nn.Conv2d", cast("nn.Sequential", net.decoder[-1])[2])
-    return bias_of(last), weight, bias_of(net.out)
+    return bias_of(convolutions(net)[-1]), weight, bias_of(net.out)
 
 
 def bias_of(conv: nn.Conv2d) -> Tensor:

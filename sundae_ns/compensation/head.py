@@ -121,7 +121,7 @@ class CompensationHead(nn.Module):
 
     def train(self, mode: bool = True) -> CompensationHead:
         """Switch between training and evaluation, which no layer of it tells apart."""
-        # Trainers say so at each step: nothing need be told to all layers that they know.
+        # Trainers say so at each step; the layers need not be told one by one what they know.
         return self if self.training == mode else super().train(mode)
 
     @torch.no_grad()

@@ -48,7 +48,7 @@ def compiled(compile_for_cpu: Callable[..., ctypes.CDLL]) -> Compile:
         kernel = compile_for_cpu(source, ["-ffp-contract=off", *definitions(dtype, k)])
         counter = ctypes.c_longlong.in_dll(kernel, "looked_at")
 
-        def launch(threads: int, arguments: Sequence[Tensor | int | float]) -> None:
+        def launch(threads: int, arguments: Sequence[Argument]) -> None:
             assert all(a.is_contiguous() for a in arguments if isinstance(a, Tensor))
             values = [nvrtc._as_c(argument, torch.device("cpu")) for argument in arguments]
             counter.value = 0
