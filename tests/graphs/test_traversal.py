@@ -15,6 +15,7 @@ from sundae_ns.errors import BackendError
 from sundae_ns.graphs import knn, radius_neighbors
 from sundae_ns.graphs.traversal import KERNEL, MAX_NEIGHBORS, OPTIONS, SOURCE, definitions, search_tree
 from sundae_ns.graphs.tree import LEAF, build_tree
+from sundae_ns.nvrtc import Argument, Launch
 
 # A count of the points looked at, and a loop over the threads.
 SHIM = """
