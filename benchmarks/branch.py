@@ -250,6 +250,7 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--seed", type=int, default=42)
     parser.add_argument("--out", type=Path, default=Path("outputs/branches"))
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--save", action="store_true", help="keep the final checkpoint, and config.yml for other tools")
     parser.add_argument("--profile", type=int, default=0, help="steps more under a profiler, for GPU ms by kernel")
     parser.add_argument("--skip", type=int, help="channels passed to a branch at full resolution")
     parser.add_argument("--width", type=int, help="channels of the compact head's finest level")
@@ -332,7 +333,10 @@ def main() -> None:
     run._set_random_seed(options.seed)
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    trainer.save_checkpoint = lambda step: None
+    save = trainer.save_checkpoint
+    trainer.save_checkpoint = lambda step: save(step) if options.save and step == options.steps - 1 else None
+    if options.save:
+        config.save_config()
     averaged = None if options.average is None else Averaged(trainer.pipeline.model, options.average)
     if averaged is not None:
         after_each_step(trainer, averaged.update)
