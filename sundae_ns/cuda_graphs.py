@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
@@ -9,6 +10,8 @@ from contextlib import contextmanager
 from typing import Generic, TypeVar
 
 import torch
+
+from sundae_ns.errors import BackendError
 
 MAX_SIZES = 4
 """Recordings kept at a time: each holds its own pictures and activations."""
@@ -46,6 +49,18 @@ def _recording() -> Iterator[None]:
         _thread.recording = before
 
 
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Python collects no garbage meanwhile: a graph among it would be destroyed, and what is being recorded with it."""
+    before = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if before:
+            gc.enable()
+
+
 def _side_stream(device: torch.device) -> torch.cuda.Stream:
     # One for all recordings, because memory that torch keeps for one stream does not serve another; of each thread, because
     # what another one does on a stream would be recorded with it.
@@ -67,14 +82,28 @@ def record(
 
     Returns:
         The graph, and what ``run`` returned: tensors that the graph writes whenever it is played.
+
+    Raises:
+        BackendError: it cannot be recorded. Nothing was done then, and what is done next is done as before.
     """
     graph = torch.cuda.CUDAGraph()
     # A training loop beside a viewer may allocate meanwhile; only this thread's work belongs to the recording.
     pool = None if shares is None else shares.pool()
     # On a stream of this device: torch's own belongs to whichever device was the current one at its first recording.
-    with _one_at_a_time, torch.cuda.device(device), _recording():
-        with torch.cuda.graph(graph, pool=pool, stream=_side_stream(device), capture_error_mode="thread_local"):
-            result = run()
+    side = _side_stream(device)
+    with _one_at_a_time, torch.cuda.device(device), _recording(), _uncollected():
+        try:
+            # Torch does not leave the stream of a recording that fails; all later work would go there, unordered with gsplat's.
+            with torch.cuda.stream(side):
+                with torch.cuda.graph(graph, pool=pool, stream=side, capture_error_mode="thread_local"):
+                    result = run()
+        except torch.OutOfMemoryError:
+            raise
+        except RuntimeError as error:
+            cause = str(error).partition("\n")[0]
+            raise BackendError(
+                f"{device} cannot record this as a CUDA graph ({cause}); it is done kernel by kernel"
+            ) from error
     return graph, result
 
 

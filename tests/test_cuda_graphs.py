@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+import pytest
+import torch
+
 from sundae_ns import cuda_graphs
-from sundae_ns.cuda_graphs import MAX_SIZES, RECORD_AT, Kept, recording
+from sundae_ns.cuda_graphs import MAX_SIZES, RECORD_AT, Kept, aside, record, recording
+from sundae_ns.errors import BackendError
+
+
+@pytest.fixture
+def eager_collector() -> Iterator[None]:
+    """Python looks for garbage at almost every allocation."""
+    before = gc.get_threshold()
+    gc.set_threshold(1, 1, 1)
+    yield
+    gc.set_threshold(*before)
 
 
 def test_what_comes_often_enough_in_a_row_is_recorded_once() -> None:
@@ -13,7 +28,11 @@ def test_what_comes_often_enough_in_a_row_is_recorded_once() -> None:
     made: list[str] = []
 
     def get(key: str) -> str | None:
-        return kept.get(key, lambda: made.append(key) or f"graph of {key}")
+        def make() -> str:
+            made.append(key)
+            return f"graph of {key}"
+
+        return kept.get(key, make)
 
     for key in "abababab":
         assert get(key) is None
@@ -51,3 +70,66 @@ def test_a_recording_keeps_what_it_calls_from_recording() -> None:
         with ThreadPoolExecutor(1) as pool:
             assert not pool.submit(recording).result()
     assert not recording()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+@pytest.mark.parametrize("enabled", [True, False])
+def test_no_garbage_is_collected_during_a_recording(enabled: bool, fails: bool) -> None:
+    try:
+        if not enabled:
+            gc.disable()
+        try:
+            with cuda_graphs._uncollected():
+                assert not gc.isenabled()
+                if fails:
+                    raise ValueError
+        except ValueError:
+            assert fails
+        assert gc.isenabled() == enabled
+    finally:
+        gc.enable()
+
+
+@pytest.mark.gpu
+def test_a_graph_among_the_garbage_does_no_harm_to_a_recording(eager_collector: None) -> None:
+    device, values = torch.device("cuda"), torch.arange(8.0, device="cuda")
+
+    def plus(summand: float) -> torch.Tensor:
+        return values + summand
+
+    with aside(device):
+        plus(1.0)
+    others = [record(lambda: plus(1.0), device)]
+
+    def run() -> torch.Tensor:
+        ring: list[object] = [others.pop()]
+        ring.append(ring)
+        del ring
+        assert len([[] for _ in range(1000)]) == 1000  # what the collector counts
+        return plus(2.0)
+
+    graph, made = record(run, device)
+    graph.replay()
+    assert torch.equal(made, values + 2)
+
+
+@pytest.mark.gpu
+def test_after_a_recording_that_failed_all_is_as_before() -> None:
+    device, values = torch.device("cuda"), torch.arange(8.0, device="cuda")
+    before = torch.cuda.current_stream()
+
+    def total() -> torch.Tensor:
+        return (values + 1).sum()
+
+    with aside(device):
+        total()
+    for _ in range(3):
+        with pytest.raises(BackendError, match="cannot record this as a CUDA graph"):
+            record(lambda: float(total()), device)  # waits for the device
+        assert torch.cuda.current_stream() == before
+        assert not recording()
+    graph, made = record(total, device)
+    values += 1
+    graph.replay()
+    assert float(made) == float(total())
+    assert torch.cuda.current_stream() == before
