@@ -97,7 +97,7 @@ def record(
             with torch.cuda.stream(side):
                 with torch.cuda.graph(graph, pool=pool, stream=side, capture_error_mode="thread_local"):
                     result = run()
-        except torch.OutOfMemoryError:
+        except torch.cuda.OutOfMemoryError:
             raise
         except RuntimeError as error:
             cause = str(error).partition("\n")[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 
 import pytest
 import torch
@@ -88,6 +89,42 @@ def test_no_garbage_is_collected_during_a_recording(enabled: bool, fails: bool) 
         assert gc.isenabled() == enabled
     finally:
         gc.enable()
+
+
+def test_a_failed_recording_leaves_the_stream_that_torch_stays_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    current = "main"
+
+    @contextmanager
+    def stream(side: str) -> Iterator[None]:
+        nonlocal current
+        before, current = current, side
+        try:
+            yield
+        finally:
+            current = before
+
+    class Capture:
+        """As torch's: what fails at its end leaves the stream as it is."""
+
+        def __init__(self, graph: object, *, stream: str, **_: object) -> None:
+            self.stream = stream
+
+        def __enter__(self) -> None:
+            nonlocal current
+            current = self.stream
+
+        def __exit__(self, *_: object) -> None:
+            assert not gc.isenabled()
+            raise RuntimeError("operation failed due to a previous error during capture\nand more lines")
+
+    for name, stand_in in {"stream": stream, "graph": Capture, "CUDAGraph": object, "device": nullcontext}.items():
+        monkeypatch.setattr(torch.cuda, name, stand_in)
+    monkeypatch.setattr(cuda_graphs, "_side_stream", lambda device: "side")
+    with pytest.raises(BackendError, match=r"previous error during capture\); it is done kernel by kernel$"):
+        record(lambda: current, torch.device("cuda"))
+    assert current == "main"
+    assert gc.isenabled()
+    assert not recording()
 
 
 @pytest.mark.gpu
