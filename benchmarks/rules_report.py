@@ -43,9 +43,9 @@ def tables(groups: Groups) -> None:
         print(f"\n**{scene}**, {steps:,} steps after the prune\n")
         print("| rule | " + " | ".join(f"{k:.0%}: pruned | tuned" for k in keeps) + " |")
         print("|---|" + "---|---|" * len(keeps))
-        last = keeps[-1]
-        order = sorted(by_rule, key=lambda r: -mean([line["psnr"] for line in by_rule[r][last]] or [0.0]))
-        for rule in order:
+        # By how far a rule is above the mean of all at a budget, over the budgets that it was tried at.
+        level = {k: mean(line["psnr"] for line in lines if line["keep"] == k) for k in keeps}
+        for rule in sorted(by_rule, key=lambda r: -mean(mean(_of(by_rule[r][k])) - level[k] for k in by_rule[r])):
             cells = [cell(by_rule[rule][k], c) for k in keeps for c in ("psnr_pruned", "psnr")]
             print(f"| {rule} | " + " | ".join(cells) + " |")
 
@@ -89,8 +89,8 @@ def dots(groups: Groups, path: Path) -> None:
     _save(figure, path)
 
 
-def _of(lines: list[dict[str, Any]], rule: str) -> list[float]:
-    return [line["psnr"] for line in lines if line["rule"] == rule]
+def _of(lines: list[dict[str, Any]], rule: str | None = None) -> list[float]:
+    return [line["psnr"] for line in lines if rule in (None, line["rule"])]
 
 
 def sweeps(lines: list[dict[str, Any]], path: Path) -> None:
