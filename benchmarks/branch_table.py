@@ -1,12 +1,51 @@
-"""Print the branches as a Markdown table, scenes side by side: python benchmarks/branch_table.py [STEPS]."""
+"""Print the branches as a Markdown table, scenes side by side: python benchmarks/branch_table.py [STEPS].
+
+A cell is the mean over seeds, with half the range between them where there are several. Gains are over the branches without a
+head from the same pruned field.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
+from collections import defaultdict
 from pathlib import Path
+from statistics import mean
+from typing import Any
 
 BRANCHES = Path(__file__).parent / "results" / "branches.jsonl"
+AGAIN = re.compile(r"-(15000|seed-\d+)$")
+"""Ends of names that tell runs of one kind apart."""
+
+Lines = list[dict[str, Any]]
+
+
+def is_plain(line: dict[str, Any]) -> bool:
+    """Whether it has no head, and is trained as the others are."""
+    experiments = {**line["experiments"], "rates": None if line["experiments"]["rates"] == 1.0 else 1}
+    return "head.mode off" in line["command"] and not any(experiments.values())
+
+
+def gained(line: dict[str, Any], lines: Lines) -> float | None:
+    """PSNR over that without a head, of the same field; None where there is no such branch."""
+    of_field = [x for x in lines if (x["scene"], x["primitives"]) == (line["scene"], line["primitives"])]
+    plain = [x["psnr"] for x in of_field if is_plain(x)]
+    return line["psnr"] - mean(plain) if plain else None
+
+
+def cells(runs: Lines, lines: Lines) -> list[str]:
+    if not runs:
+        return [""] * 4
+    values = [run["psnr"] for run in runs]
+    spread = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
+    gains = [gain for run in runs if (gain := gained(run, lines)) is not None]
+    gained_so = f" ({mean(gains):+.2f})" if gains else ""
+    others = [f"{mean(run[key] for run in runs):.{digits}f}" for key, digits in OTHERS.items()]
+    return [f"{mean(values):.2f}{spread}{gained_so}", *others]
+
+
+OTHERS = {"ssim": 4, "psnr_base": 2, "train_psnr": 2}
 
 
 def main() -> None:
@@ -18,23 +57,17 @@ def main() -> None:
         parser.error(f"there are no branches of {steps} steps; give one of {', '.join(map(str, known))}")
     lines = [line for line in lines if line["steps"] == steps]
     scenes = list(dict.fromkeys(line["scene"] for line in lines))
-    by_name: dict[str, dict[str, dict[str, float]]] = {}
+    by_name: dict[str, dict[str, Lines]] = defaultdict(lambda: defaultdict(list))
     for line in lines:
-        by_name.setdefault(line["name"], {})[line["scene"]] = line
-    plain = by_name["no head"]
+        by_name[AGAIN.sub("", line["name"])][line["scene"]].append(line)
     print("| variant | " + " | ".join(f"{s}: PSNR (gain) | SSIM | head off | training views" for s in scenes) + " |")
     print("|---|" + "---|" * (4 * len(scenes)))
-    first = scenes[0]
-    for name, runs in sorted(by_name.items(), key=lambda item: -item[1].get(first, plain[first])["psnr"]):
-        cells = []
-        for scene in scenes:
-            if scene not in runs:
-                cells += ["", "", "", ""]
-                continue
-            run, gain = runs[scene], runs[scene]["psnr"] - plain[scene]["psnr"]
-            cells += [f"{run['psnr']:.2f} ({gain:+.2f})", f"{run['ssim']:.4f}"]
-            cells += [f"{run['psnr_base']:.2f}", f"{run['train_psnr']:.2f}"]
-        print(f"| {name} | " + " | ".join(cells) + " |")
+
+    def order(name: str) -> list[float]:
+        return [-mean(run["psnr"] for run in by_name[name][s]) if by_name[name][s] else 0.0 for s in scenes]
+
+    for name in sorted(by_name, key=order):
+        print(f"| {name} | " + " | ".join(cell for s in scenes for cell in cells(by_name[name][s], lines)) + " |")
 
 
 if __name__ == "__main__":
