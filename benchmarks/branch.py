@@ -1,4 +1,4 @@
-"""Compare variants of the head, or of training after the prune, from one pruned field; append a JSON line for each.
+"""Compare variants of the head, or of training after the prune, from one pruned field; append a JSON line and a row for each.
 
     python benchmarks/run.py sundae --scene fox --data DIR --steps 15001 --save-pruned     # makes the pruned field once
     python benchmarks/branch.py compact --scene fox --data DIR --field RUN/nerfstudio_models --steps 4000
@@ -29,10 +29,12 @@ from torch.optim.lr_scheduler import LambdaLR
 from sundae_ns import rendering
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.compensation.head import SIZES
-from sundae_ns.evaluation import psnr
+from sundae_ns.evaluation import RunRow, append_row, psnr
 from sundae_ns.evaluation.timing import now
 from sundae_ns.losses import picture_loss
+from sundae_ns.measure import sizes
 from sundae_ns.model import SundaeModel
+from sundae_ns.storage import Sizes
 
 RESULTS = Path(__file__).parent / "results" / "branches.jsonl"
 FIELD = ("features_dc", "features_rest", "opacities", "scales", "quats", "features")
@@ -250,6 +252,7 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--seed", type=int, default=42)
     parser.add_argument("--out", type=Path, default=Path("outputs/branches"))
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--rows", default=str(run.RESULTS), help="CSV to append a row to, or - for none")
     parser.add_argument("--save", action="store_true", help="keep the final checkpoint, and config.yml for other tools")
     parser.add_argument("--profile", type=int, default=0, help="steps more under a profiler, for GPU ms by kernel")
     parser.add_argument("--skip", type=int, help="channels passed to a branch at full resolution")
@@ -289,6 +292,33 @@ def training_views(pipeline: Any, count: int = 16) -> dict[str, float]:
         sums["train_psnr"] += float(psnr(outputs["rgb"], target)) / len(chosen)
         sums["train_psnr_base"] += float(psnr(outputs["base_rgb"], target)) / len(chosen)
     return sums
+
+
+def row(line: dict[str, Any], bytes_: Sizes, resolution: str) -> RunRow:
+    """What ``runs.csv`` has of a branch: its share is not known, nor is a frame timed."""
+    changed = {key: value for key, value in line["experiments"].items() if value not in (None, False, 1.0)}
+    flags = [f"--{key.replace('_', '-')}" + ("" if value is True else f" {value}") for key, value in changed.items()]
+    return RunRow(
+        **{key: line[key] for key in ("scene", "seed", "steps", "primitives", "gpu", "commit")},
+        **{key: line[key] for key in ("psnr", "ssim", "psnr_base", "ssim_base")},
+        method="sundae",
+        variant=f"branch: {line['name']}",
+        keep_ratio=None,
+        lpips=None,
+        lpips_net="",
+        bytes_primitives=bytes_.primitives,
+        bytes_head=bytes_.head,
+        bytes_total=bytes_.total,
+        ms_frame=None,
+        ms_splat=None,
+        ms_head=None,
+        train_s=line.get("train_s"),
+        prune_s=None,
+        peak_primitives=None,
+        peak_vram_mib=None,
+        resolution=resolution,
+        command=line["command"] + (f" (branch.py {' '.join(flags)})" if flags else ""),
+    )
 
 
 def main() -> None:
@@ -377,6 +407,10 @@ def main() -> None:
     options.results.parent.mkdir(parents=True, exist_ok=True)
     with open(options.results, "a") as file:
         file.write(json.dumps(line) + "\n")
+    if options.rows != "-":
+        camera = trainer.pipeline.datamanager.eval_dataset.cameras[0]
+        resolution = f"{int(camera.width)}x{int(camera.height)}"
+        append_row(Path(options.rows), row(line, sizes(trainer.pipeline.model), resolution))
     print("branch:", line)
 
 
