@@ -50,7 +50,9 @@ class HeadConfig:
     num_features: int = 13
     """Length F of the feature vector of each primitive. 1, 5, 13 and 29 splat without padding."""
     start_at: int | None = None
-    """Training step after which the head takes part; by default the prune, or the last of them."""
+    """Training step after which the head takes part; by default the prune, or the last of them. Some thousand steps before the
+    end, base colours stay those of a field without a head, and what flickers and what overfits few views is less; where a head
+    gains much, it gains less."""
     max_train_pixels: int = 2**22
     """Train on a random window of at most this many pixels where pictures are larger, once the head takes part; 0 for
     whole pictures."""
