@@ -74,13 +74,18 @@ def main() -> None:
         decide(params, config, lambda: weight)  # kernels are compiled by the first
         torch.cuda.reset_peak_memory_stats()
     before = _memory(on_cpu)
-    timed("graph of centres", lambda: field_graph(params, replace(config, edges="centres")))
-    graph = timed("graph with appearance", lambda: field_graph(params, config))
-    count = round(options.keep * options.points)
-    mask = timed("selection", lambda: select_systematic(weight, count, neighbor_order(params["means"]), 0))
-    heir = timed("heirs", lambda: heirs(graph, mask))
-    timed("heirs and merge", lambda: merged(params, graph, mask, weight))
-    del graph
+
+    def parts() -> float:
+        """Share of primitives without an heir. The graph is gone when the whole is measured."""
+        timed("graph of centres", lambda: field_graph(params, replace(config, edges="centres")))
+        graph = timed("graph with appearance", lambda: field_graph(params, config))
+        count = round(options.keep * options.points)
+        mask = timed("selection", lambda: select_systematic(weight, count, neighbor_order(params["means"]), 0))
+        heir = timed("heirs", lambda: heirs(graph, mask))
+        timed("heirs and merge", lambda: merged(params, graph, mask, weight))
+        return float((heir < 0).double().mean())
+
+    without_heir = parts()
     timed("decision, whole", lambda: decide(params, config, lambda: weight))
     line = {
         "points": options.points,
@@ -88,7 +93,7 @@ def main() -> None:
         "device": options.device if on_cpu else torch.cuda.get_device_name(),
         "threads": torch.get_num_threads(),
         "field": options.checkpoint.name,
-        "without_heir": float((heir < 0).double().mean()),
+        "without_heir": without_heir,
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "ratio": {name: round(value / seconds["graph of centres"], 2) for name, value in seconds.items()},
         "extra_mib": round(_memory(on_cpu) - before),
