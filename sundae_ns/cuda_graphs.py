@@ -21,6 +21,9 @@ RECORD_AT = 3
 
 Result = TypeVar("Result")
 
+_failed: list[torch.cuda.CUDAGraph] = []
+"""Recordings that were not finished: torch's allocator goes on asking them whether an allocation is theirs."""
+
 _thread = threading.local()
 _one_at_a_time = threading.Lock()
 
@@ -92,6 +95,8 @@ def record(
     # On a stream of this device: torch's own belongs to whichever device was the current one at its first recording.
     side = _side_stream(device)
     with _one_at_a_time, torch.cuda.device(device), _recording(), _uncollected():
+        generator = torch.cuda.default_generators[torch.cuda.current_device()]
+        before = generator.clone_state() if hasattr(generator, "clone_state") else None  # not in torch 2.1
         try:
             # Torch does not leave the stream of a recording that fails; all later work would go there, unordered with gsplat's.
             with torch.cuda.stream(side):
@@ -100,6 +105,10 @@ def record(
         except torch.cuda.OutOfMemoryError:
             raise
         except RuntimeError as error:
+            # Nor do its random numbers: they would be refused as of a recording that is not there.
+            if before is not None:
+                generator.graphsafe_set_state(before)
+            _failed.append(graph)
             cause = str(error).partition("\n")[0]
             raise BackendError(
                 f"{device} cannot record this as a CUDA graph ({cause}); it is done kernel by kernel"

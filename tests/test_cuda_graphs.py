@@ -117,12 +117,28 @@ def test_a_failed_recording_leaves_the_stream_that_torch_stays_on(monkeypatch: p
             assert not gc.isenabled()
             raise RuntimeError("operation failed due to a previous error during capture\nand more lines")
 
-    for name, stand_in in {"stream": stream, "graph": Capture, "CUDAGraph": object, "device": nullcontext}.items():
+    class Generator:
+        """As torch's: a recording that fails leaves it refusing to draw, and its copies from before do not."""
+
+        def __init__(self) -> None:
+            self.drawn_from = "now"
+
+        def clone_state(self) -> str:
+            return "before"
+
+        def graphsafe_set_state(self, state: str) -> None:
+            self.drawn_from = state
+
+    generator = Generator()
+    stand_ins = {"stream": stream, "graph": Capture, "CUDAGraph": object, "device": nullcontext}
+    stand_ins |= {"default_generators": (generator,), "current_device": lambda: 0}
+    for name, stand_in in stand_ins.items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(cuda_graphs, "_side_stream", lambda device: "side")
     with pytest.raises(BackendError, match=r"previous error during capture\); it is done kernel by kernel$"):
         record(lambda: current, torch.device("cuda"))
     assert current == "main"
+    assert generator.drawn_from == "before"
     assert gc.isenabled()
     assert not recording()
 
@@ -165,6 +181,10 @@ def test_after_a_recording_that_failed_all_is_as_before() -> None:
             record(lambda: float(total()), device)  # waits for the device
         assert torch.cuda.current_stream() == before
         assert not recording()
+        torch.manual_seed(1)
+        drawn = torch.rand(3, device="cuda")
+        torch.manual_seed(1)
+        assert torch.equal(drawn, torch.rand(3, device="cuda"))
     graph, made = record(total, device)
     values += 1
     graph.replay()
