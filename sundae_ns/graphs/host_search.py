@@ -21,6 +21,9 @@ Ints = NDArray[np.int64]
 CHUNK_ELEMENTS = 2**17
 """Most candidates of a thread at a time: 2 MiB of indices and distances, which stay in the cache."""
 
+ASKED_AGAIN = 4
+"""So many times as many neighbours show where a tie ends, but for those of a point that is very far away."""
+
 HASHED = 2**15
 """Points that a thread hashes at a time."""
 
@@ -188,20 +191,61 @@ def _settled(
 ) -> Iterator[tuple[Ints, Ints, Floats]]:
     """For positions with ties, by squared distance and index: rows, and the first ``width`` points of each.
 
-    Asks for more and more neighbours until the last of them lies clearly behind the last one needed.
+    The last neighbour that was found has to lie clearly behind the last one needed; where it does not, the tree is asked for
+    more. Seen from very far away a whole field is one tie in float64: then all positions are looked at, because the tree
+    would do so each time that it is asked.
     """
-    while True:
-        needed = lengths[:, min(width, found.shape[1]) - 1, None] * (1 + ROUNDING)
-        done = (lengths[:, -1:] > needed).ravel() | (found.shape[1] == tree.n)
-        if done.any():
-            near, ready = found[done], rows[done]
-            taken = np.where(lengths[done] <= needed[done], np.minimum(positions.counts[near], width), 0)
-            for part in _parts(np.arange(len(ready)), int(taken.sum(axis=1).max())):
-                yield ready[part], *_sorted_members(positions, ready[part], near[part], taken[part], width)
-        rows = rows[~done]
-        if not len(rows):
-            return
-        found, lengths = _query(tree, rows, asked=2 * found.shape[1])
+    done = _is_settled(tree, found, lengths, width)
+    yield from _nearest_of(positions, rows[done], found[done], lengths[done], width)
+    asked = ASKED_AGAIN * found.shape[1]
+    for part in _parts(rows[~done], asked):
+        found, lengths = _query(tree, part, asked)
+        done = _is_settled(tree, found, lengths, width)
+        yield from _nearest_of(positions, part[done], found[done], lengths[done], width)
+        if not done.all():
+            yield part[~done], *_nearest_of_all(positions, part[~done], width)
+
+
+def _last_needed(lengths: Floats, width: int) -> Floats:
+    """What lies no farther may be needed ``[R, 1]``."""
+    return lengths[:, min(width, lengths.shape[1]) - 1, None] * (1 + ROUNDING)
+
+
+def _is_settled(tree: cKDTree, found: Ints, lengths: Floats, width: int) -> NDArray[np.bool_]:
+    """Whether all that can be among the first ``width`` has been found ``[R]``."""
+    return (lengths[:, -1:] > _last_needed(lengths, width)).ravel() | (found.shape[1] == tree.n)
+
+
+def _nearest_of(
+    positions: _Positions, rows: Ints, found: Ints, lengths: Floats, width: int
+) -> Iterator[tuple[Ints, Ints, Floats]]:
+    """In parts, the first ``width`` points of those at the positions found."""
+    if not len(rows):
+        return
+    taken = np.where(lengths <= _last_needed(lengths, width), np.minimum(positions.counts[found], width), 0)
+    for part in _parts(np.arange(len(rows)), int(taken.sum(axis=1).max())):
+        yield rows[part], *_sorted_members(positions, rows[part], found[part], taken[part], width)
+
+
+def _nearest_of_all(positions: _Positions, rows: Ints, width: int) -> tuple[Ints, Floats]:
+    """The first ``width`` points of all, as :func:`_sorted_members` has them, a row at a time."""
+    wanted, last = min(width, len(positions.members)), min(width, len(positions.coordinates)) - 1
+    points, lengths = np.empty((len(rows), wanted), np.int64), np.empty((len(rows), wanted))
+    for place, row in enumerate(rows):
+        x, y, z = (positions.coordinates - positions.coordinates[row]).T
+        squared = x * x + y * y + z * z
+        limit = np.partition(squared, last)[last]
+        near, tied = np.flatnonzero(squared < limit), np.flatnonzero(squared == limit)
+        if len(tied) > wanted:
+            # Points come by rising index at each position: none but the first positions have one of the first points.
+            tied = tied[np.argpartition(positions.members[positions.starts[tied]], wanted - 1)[:wanted]]
+        near = np.concatenate([near, tied])
+        taken = np.minimum(positions.counts[near], width)
+        _, found = _written_out(positions, near, taken)
+        distances = np.repeat(squared[near], taken)
+        first = np.lexsort((found, distances))[:wanted]
+        points[place], lengths[place] = found[first], np.sqrt(distances[first])
+    return points, lengths
 
 
 def _sorted_members(positions: _Positions, rows: Ints, found: Ints, taken: Ints, width: int) -> tuple[Ints, Floats]:
@@ -244,7 +288,7 @@ def _written_out(positions: _Positions, found: Ints, taken: Ints) -> tuple[Ints,
 
 def _parts(rows: Ints, columns: int) -> list[Ints]:
     """Rows in parts of not many more than :data:`CHUNK_ELEMENTS` elements."""
-    return np.array_split(rows, min(len(rows), -(-len(rows) * columns // CHUNK_ELEMENTS)))
+    return np.array_split(rows, min(len(rows), -(-len(rows) * columns // CHUNK_ELEMENTS))) if len(rows) else []
 
 
 def _drop_far(coordinates: Floats, indices: Ints, distances: Floats, limit: float, rows: Ints) -> None:
