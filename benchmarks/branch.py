@@ -7,7 +7,7 @@
 
 All branches share the warm-up and the prune, so that they differ in nothing but what is compared; rates decay over the
 branch. Everything after ``--`` goes to ``ns-train``'s parser. The other options are experiments that the product has no
-option for, because they lost: their figures are the reason.
+option for: those that have figures lost (``results/branches.jsonl``); ``--window`` and ``--halved`` have not been run.
 """
 
 from __future__ import annotations
@@ -296,7 +296,8 @@ def training_views(pipeline: Any, count: int = 16) -> dict[str, float]:
 
 def row(line: dict[str, Any], bytes_: Sizes, resolution: str) -> RunRow:
     """What ``runs.csv`` has of a branch: its share is not known, nor is a frame timed."""
-    changed = {key: value for key, value in line["experiments"].items() if value not in (None, False, 1.0)}
+    given = {key: value for key, value in line["experiments"].items() if value is not None and value is not False}
+    changed = {key: value for key, value in given.items() if (key, value) != ("rates", 1.0)}
     flags = [f"--{key.replace('_', '-')}" + ("" if value is True else f" {value}") for key, value in changed.items()]
     return RunRow(
         **{key: line[key] for key in ("scene", "seed", "steps", "primitives", "gpu", "commit")},

@@ -33,9 +33,11 @@ def aside(device: torch.device) -> Iterator[None]:
     """Run once what is going to be recorded: it allocates and chooses kernels, neither of which can be recorded."""
     side = _side_stream(device)
     side.wait_stream(torch.cuda.current_stream(device))
-    with torch.cuda.stream(side), _recording():
-        yield
-    torch.cuda.current_stream(device).wait_stream(side)
+    try:
+        with torch.cuda.stream(side), _recording():
+            yield
+    finally:
+        torch.cuda.current_stream(device).wait_stream(side)
 
 
 def recording() -> bool:

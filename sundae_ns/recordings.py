@@ -115,7 +115,12 @@ class Recordings:
         if head is not None:
             # The network itself, not its number, which a later one might be given; and where its weights lie.
             lie = tuple(value.data_ptr() for value in head.net.parameters())
-            of_head = (head.net, lie, astuple(head.config), *plan(view.focal, style.trained_focal))
+            of_head = (
+                head.net,
+                lie,
+                astuple(head.config),
+                *plan(view.focal, style.trained_focal, view.width * view.height),
+            )
         degree = degree_in_use(field["features_rest"], style.most_bands)
         return view.width, view.height, style.antialiased, style.logits, degree, of_head
 

@@ -129,10 +129,14 @@ def render(
     base = (blended + (1 - splatted.alpha) * background).clamp(0.0, 1.0)
     rgb = base
     if head is not None:
-        zoom, weight = (1.0, 1.0) if style.training else plan(view.focal, style.trained_focal)
+        pixels = view.width * view.height
+        zoom, weight = (1.0, 1.0) if style.training else plan(view.focal, style.trained_focal, pixels)
         if zoom == 1.0:
             seen = (base, splatted.colors, splatted.alpha)
             rgb = head(*seen) if style.training else over_phases(head, *seen)
+            if head.config.mode == "features":
+                # It knows neither background nor accumulation, and would show something where nothing is.
+                rgb = splatted.alpha * rgb + (1 - splatted.alpha) * background
         elif weight > 0:
             at_scale, _ = render(field, view.zoomed(zoom), background, style, depth=False)
             correction = at_scale["rgb"] - at_scale["base_rgb"]

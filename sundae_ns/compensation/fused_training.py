@@ -164,7 +164,8 @@ class FusedTraining:
         self.launches = launches
         self._parameters = tuple(_parameters(net))
         self._recorded: dict[tuple[object, ...], _Pass] = {}
-        self._current: _Pass | None = None
+        self._passes = 0
+        """So many pictures were made; recorded passes of one size share their buffers, and only the number tells them apart."""
 
     def __call__(self, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
         """One correction, times accumulation; or one picture, where the network makes it by itself.
@@ -185,8 +186,10 @@ class FusedTraining:
             launches = compiled(splatted.device, dtype, definitions(self.net, self.residual), FORWARD + BACKWARD)
         return cast("Tensor", _Correction.apply(splatted, alpha, self, dtype, launches, *self._parameters))
 
-    def forward(self, splatted: Tensor, alpha: Tensor, dtype: torch.dtype, launches: Launches) -> tuple[Tensor, _Pass]:
-        """The correction, and the pass that made it."""
+    def forward(
+        self, splatted: Tensor, alpha: Tensor, dtype: torch.dtype, launches: Launches
+    ) -> tuple[Tensor, _Pass, int]:
+        """The correction, the pass that made it, and its number."""
         net = self.net
         height, width = splatted.shape[:2]
         key = (height, width, dtype, net.out.weight.data_ptr())
@@ -204,15 +207,15 @@ class FusedTraining:
         else:
             made.tape = network(net, made.weights, made.folded, launches)
             made.to_raw = torch.empty_like(_last(made.tape))
-        self._current = made
+        self._passes += 1
         nothing = splatted.new_zeros(height, width, 3)
-        return unfold(net, _last(made.tape), nothing, alpha, launches), made
+        return unfold(net, _last(made.tape), nothing, alpha, launches), made, self._passes
 
     def backward(
-        self, made: _Pass, gradient: Tensor, splatted_channels: int, alpha: Tensor, launches: Launches
+        self, made: _Pass, number: int, gradient: Tensor, splatted_channels: int, alpha: Tensor, launches: Launches
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
         """With respect to what was splatted ``[H, W, 3 + F]``, accumulation ``[H, W, 1]`` and the parameters."""
-        if made is not self._current:
+        if number != self._passes:
             raise SundaeError("the head's gradients were asked for after its next picture: call backward() before that")
         net = self.net
         to_alpha, *to_last = unfold_backward(net, _last(made.tape), gradient, alpha, made.to_raw, launches)
@@ -276,7 +279,7 @@ class _Correction(torch.autograd.Function):
         launches: Launches,
         *parameters: Tensor,
     ) -> Tensor:
-        out, ctx.made = training.forward(splatted, alpha, dtype, launches)
+        out, ctx.made, ctx.number = training.forward(splatted, alpha, dtype, launches)
         ctx.training, ctx.launches, ctx.channels = training, launches, splatted.shape[2]
         ctx.save_for_backward(alpha)
         return out
@@ -285,7 +288,7 @@ class _Correction(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         (alpha,) = ctx.saved_tensors
         to_splatted, to_alpha, to_parameters = ctx.training.backward(
-            ctx.made, gradient, ctx.channels, alpha, ctx.launches
+            ctx.made, ctx.number, gradient, ctx.channels, alpha, ctx.launches
         )
         return to_splatted, to_alpha, None, None, None, *to_parameters
 

@@ -60,7 +60,8 @@ class HeadConfig:
     """Pictures that are only looked at: mean over so many places of the head's grid of pixels. More take as many times the
     head's time, and flicker less as a camera moves."""
     precision: Literal["fp32", "bf16", "fp16"] = "bf16"
-    """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is meant for inference: it trains unscaled."""
+    """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is for pictures that are only looked at: its range is too
+    small to train in, which fp16 does in bf16."""
     fused: bool = True
     """On CUDA, in bf16 and fp16: run through our own kernels between the convolutions, and as one CUDA graph for each picture
     size, both while training and for pictures that are only looked at. Otherwise layer by layer."""
@@ -153,7 +154,7 @@ class CompensationHead(nn.Module):
         Returns:
             ``[H, W, 3]`` float32, not clamped. Where nothing was splatted the residual head returns ``base``.
         """
-        dtype = PRECISIONS[self.config.precision] if base.is_cuda else torch.float32
+        dtype = self._dtype(base.is_cuda)
         if self._can_fuse and dtype != torch.float32:
             try:
                 return self._fused(base, splatted, alpha, dtype)
@@ -168,6 +169,11 @@ class CompensationHead(nn.Module):
             # Activations beyond its 65504 are infinite, and NaN in the next layer: no correction there.
             out = out.nan_to_num(0.0, 0.0, 0.0)
         return base + alpha * out.float() if residual else out.float()
+
+    def _dtype(self, on_cuda: bool) -> torch.dtype:
+        dtype = PRECISIONS[self.config.precision] if on_cuda else torch.float32
+        # What overflows is left out of a picture, but would be NaN in the gradients of all that lies before it.
+        return torch.bfloat16 if dtype == torch.float16 and torch.is_grad_enabled() else dtype
 
     def _fused(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
         if not torch.is_grad_enabled():

@@ -17,6 +17,10 @@ FADE = (4.0, 2.0)
 """Pictures shrunk by more than the first factor are shown without the head, those by less than the second with all of it:
 a thumbnail should not cost a whole picture, nor the head appear at once while one zooms."""
 
+MOST_PIXELS = (2**25, 2**24)
+"""The same for pictures that would have more pixels than these at the trained scale, as wide views may: 33 million of them
+take two gigabytes beside the picture that is asked for."""
+
 
 class ScalePlan(NamedTuple):
     """How to compensate a picture."""
@@ -27,12 +31,13 @@ class ScalePlan(NamedTuple):
     """Share of the correction that is added; 0 means that the head need not run."""
 
 
-def plan(focal: float, trained: tuple[float, float] | None) -> ScalePlan:
-    """How to compensate a picture of a focal length.
+def plan(focal: float, trained: tuple[float, float] | None, pixels: int) -> ScalePlan:
+    """How to compensate a picture.
 
     Args:
         focal: focal length of the picture, pixels.
         trained: shortest and longest focal length of the training pictures; None where they are not known.
+        pixels: how many the picture has.
     """
     if trained is None:
         return ScalePlan(1.0, 1.0)
@@ -40,8 +45,13 @@ def plan(focal: float, trained: tuple[float, float] | None) -> ScalePlan:
     zoom = nearest / focal
     if 1 / TOLERANCE <= zoom <= TOLERANCE:
         return ScalePlan(1.0, 1.0)
-    off, full = FADE
-    return ScalePlan(zoom, min(max((off - zoom) / (off - full), 0.0), 1.0))
+    weight = min(_fading(zoom, *FADE), _fading(pixels * zoom**2, *MOST_PIXELS))
+    return ScalePlan(zoom, weight)
+
+
+def _fading(value: float, off: float, full: float) -> float:
+    """1 up to ``full``, and from there straight down to 0 at ``off``."""
+    return min(max((off - value) / (off - full), 0.0), 1.0)
 
 
 def resize(image: Tensor, height: int, width: int) -> Tensor:

@@ -227,6 +227,19 @@ def test_gradients_of_an_earlier_picture_are_refused(compiled: Compile) -> None:
     outs[1].sum().backward()
 
 
+def test_late_gradients_of_what_is_played_are_refused(compiled: Compile) -> None:
+    """Two pictures of one size lie in the same buffers."""
+    head = make()
+    training = FusedTraining(head.net, True, compiled(head))
+    recorded = as_recorded(head, 16, 16, compiled(head))
+    training._recorded[16, 16, torch.float32, head.net.out.weight.data_ptr()] = recorded
+    pictures = [splatted(16, 16, 5, seed=seed) for seed in range(2)]
+    outs = [training(seen[1].clone().requires_grad_(), seen[2], torch.float32) for seen in pictures]
+    with pytest.raises(SundaeError, match=r"before that$"):
+        outs[0].sum().backward()
+    outs[1].sum().backward()
+
+
 def test_kernels_compile_for_gpus_that_have_the_types() -> None:
     try:
         nvrtc._library("nvrtc")

@@ -125,6 +125,16 @@ def test_training_ten_times_too_fast_may_be_bad_but_not_broken(mode: str) -> Non
     assert all(torch.isfinite(module(*picture)).all() for picture in pictures)
 
 
+def test_fp16_trains_in_bf16() -> None:
+    """What overflows in fp16 would be NaN in the gradients of all layers before."""
+    module = head(precision="fp16")
+    assert module._dtype(on_cuda=True) == torch.bfloat16
+    assert module._dtype(on_cuda=False) == torch.float32
+    with torch.no_grad():
+        assert module._dtype(on_cuda=True) == torch.float16
+    assert head(precision="fp32")._dtype(on_cuda=True) == torch.float32
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("kind", WILD)
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
@@ -139,6 +149,7 @@ def test_half_precision_of_wild_inputs_is_finite(precision: str, kind: str) -> N
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
+@torch.no_grad()
 def test_half_precision_is_close(precision: str) -> None:
     tensors = [t.cuda() for t in inputs(features=5)]
     module = head(precision=precision).cuda()

@@ -8,35 +8,47 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sundae_ns.compensation import plan, resize
-from sundae_ns.compensation.scale import FADE, TOLERANCE
+from sundae_ns.compensation.scale import FADE, MOST_PIXELS, TOLERANCE
 
 FOCAL = st.floats(1.0, 1e5)
 
 
 @pytest.mark.parametrize("focal", [500.0, 1.0])
 def test_unknown_scale_is_taken_as_it_is(focal: float) -> None:
-    assert plan(focal, None) == (1.0, 1.0)
+    assert plan(focal, None, 10**9) == (1.0, 1.0)
 
 
 @given(FOCAL, FOCAL, FOCAL)
 def test_the_head_runs_near_its_own_scale(focal: float, a: float, b: float) -> None:
     low, high = min(a, b), max(a, b)
-    zoom, weight = plan(focal, (low, high))
+    zoom, weight = plan(focal, (low, high), 100)
     assert 0 <= weight <= 1
     assert low / (TOLERANCE + 1e-6) <= focal * zoom <= high * (TOLERANCE + 1e-6)
     if low <= focal <= high:
         assert (zoom, weight) == (1.0, 1.0)
-    assert plan(focal * zoom, (low, high)) == (1.0, 1.0)  # a picture made for the head is not remade
+    assert plan(focal * zoom, (low, high), 10**9) == (1.0, 1.0)  # a picture made for the head is not remade
 
 
 def test_thumbnails_fade_out_without_a_jump() -> None:
     shrinks = torch.linspace(1.3, 5, 200).tolist()
-    weights = [plan(1000 / shrink, (1000.0, 1000.0)).weight for shrink in shrinks]
+    weights = [plan(1000 / shrink, (1000.0, 1000.0), 100).weight for shrink in shrinks]
     assert weights[0] == 1
     assert weights[-1] == 0
     assert all(a >= b for a, b in zip(weights, weights[1:], strict=False))
     assert max(a - b for a, b in zip(weights, weights[1:], strict=False)) < 0.02
-    assert plan(1000 / FADE[0], (1000.0, 1000.0)).weight == 0
+    assert plan(1000 / FADE[0], (1000.0, 1000.0), 100).weight == 0
+
+
+def test_a_wide_view_is_not_made_anew_with_more_pixels_than_fit() -> None:
+    """At one and a half times the size of a picture there are more than twice as many."""
+    sizes = torch.linspace(2**20, 2**25, 400).tolist()
+    weights = [plan(1000.0, (1500.0, 1500.0), int(pixels)).weight for pixels in sizes]
+    assert weights[0] == 1
+    assert weights[-1] == 0
+    assert all(a >= b for a, b in zip(weights, weights[1:], strict=False))
+    assert max(a - b for a, b in zip(weights, weights[1:], strict=False)) < 0.02
+    assert all(weight == 0 for weight, pixels in zip(weights, sizes, strict=True) if 1.5**2 * pixels >= MOST_PIXELS[0])
+    assert plan(1000.0, (250.0, 250.0), 4000 * 3000).weight == 1  # a large picture that is made anew as a smaller one
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 64), (31, 90)])

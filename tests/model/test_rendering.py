@@ -127,13 +127,20 @@ def test_viewer_may_switch_modes_between_frames(build: Build, perturb: Perturb, 
     assert torch.equal(model.get_outputs_for_camera(camera())["rgb"], expected)
 
 
+@pytest.mark.parametrize("mode", ["residual", "features"])
+@pytest.mark.parametrize("factor", [1.0, 3.0])
 @torch.no_grad()
-def test_background_shows_where_nothing_is(build: Build, camera: MakeCamera) -> None:
-    model = build().eval()
+def test_background_shows_where_nothing_is(
+    build: Build, perturb: Perturb, camera: MakeCamera, mode: str, factor: float
+) -> None:
+    """Whatever the head has learnt, at its own scale and at another one."""
+    model = perturb(build(head={"mode": mode})).eval()
+    model.step, model.trained_focal = 10_000, (30.0, 30.0)
+    assert model.head_active
     model.set_background(torch.tensor([0.2, 0.4, 0.6]))
     model.gauss_params["means"].data += 100.0
-    outputs = model.get_outputs_for_camera(camera())
-    torch.testing.assert_close(outputs["rgb"], torch.tensor([0.2, 0.4, 0.6]).expand(32, 40, 3))
+    picture = model.get_outputs_for_camera(at_focal(camera, factor))["rgb"]
+    torch.testing.assert_close(picture, torch.tensor([0.2, 0.4, 0.6]).expand_as(picture))
 
 
 def at_focal(camera: MakeCamera, factor: float) -> Cameras:
