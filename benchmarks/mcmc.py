@@ -7,7 +7,8 @@ nerfstudio 1.1.5 knows the default strategy only, so gsplat's ``MCMCStrategy`` i
 same data, rates and losses as the other rows, and with what its paper adds: Gaussians start at opacity 0.5 and a tenth of
 their width, opacities and scales are regularised by 0.01 each, and noise is added to positions in every step ("3D Gaussian
 Splatting as Markov Chain Monte Carlo", Kheradmand et al., 2024). Needs CUDA, for gsplat's relocation is a CUDA kernel. One
-line for each count goes to the file that ``rules.py`` writes; ``steps`` there is the length of the whole run less the warm-up.
+line and one row for each count go to the files that ``rules.py`` writes; ``steps`` of a line is the length of the whole run
+less the warm-up.
 """
 
 from __future__ import annotations
@@ -28,7 +29,9 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from torch import Tensor
 
 from sundae_ns.densification import start_of_chain
+from sundae_ns.evaluation import append_row
 from sundae_ns.losses import chain_losses
+from sundae_ns.measure import sizes
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 
 
@@ -82,6 +85,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--extra", default="")
     parser.add_argument("--out", type=Path, default=Path("outputs/rules"))
     parser.add_argument("--results", type=Path, default=rules.RESULTS)
+    parser.add_argument("--rows", type=Path, default=run.RESULTS, help="CSV file of rows; - for none")
     return parser.parse_args()
 
 
@@ -95,7 +99,8 @@ def count_of(options: argparse.Namespace, keep: float) -> int:
     raise SystemExit(f"no branch of {options.scene} keeps {keep}: run rules.py first, or give --count")
 
 
-def train(options: argparse.Namespace, keep: float, seed: int, count: int) -> dict[str, Any]:
+def train(options: argparse.Namespace, keep: float, seed: int, count: int) -> tuple[dict[str, Any], int, str]:
+    """What a line has of a run; the bytes of its primitives, and the size of its pictures."""
     arguments = [options.method, "--data", str(options.data), "--machine.seed", str(42 + seed)]
     arguments += ["--pipeline.model.head.mode", "off", "--pipeline.model.pruning.mode", "off"]
     steps = options.warmup + options.steps
@@ -122,13 +127,15 @@ def train(options: argparse.Namespace, keep: float, seed: int, count: int) -> di
     train_s = time.perf_counter() - started
     trainer.pipeline.eval()
     quality = run.evaluate(trainer.pipeline)
-    return {
+    camera = trainer.pipeline.datamanager.eval_dataset.cameras[0]
+    measured = {
         "psnr": quality["psnr"],
         "ssim": quality["ssim"],
         "primitives": trainer.pipeline.model.num_points,
         "train_s": train_s,
         "command": " ".join(["ns-train", options.method, "--data", options.scene, *arguments[3:], options.parser]),
     }
+    return measured, sizes(trainer.pipeline.model).primitives, f"{int(camera.width)}x{int(camera.height)}"
 
 
 def main() -> None:
@@ -139,6 +146,7 @@ def main() -> None:
             key = rules.key_of(options, branch, options.warmup)
             if rules.is_finished(options.results, key):
                 continue
+            measured, bytes_primitives, resolution = train(options, keep, seed, count_of(options, keep))
             line = {
                 **key,
                 "options": {},
@@ -146,11 +154,14 @@ def main() -> None:
                 "psnr_pruned": None,
                 "ssim_pruned": None,
                 "prune_s": None,
-                **train(options, keep, seed, count_of(options, keep)),
+                **measured,
                 "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
                 "commit": run.commit(),
             }
             rules.append(options.results, line)
+            if str(options.rows) != "-":
+                command = f"{line['command']} (mcmc.py --count {line['primitives']})"
+                append_row(options.rows, rules.row(line, bytes_primitives, resolution, command))
             print("mcmc:", line)
 
 

@@ -309,37 +309,42 @@ class Bench:
         }
 
     def row(self, line: dict[str, Any]) -> RunRow:
-        bytes_, camera = sizes(self.model), self.trainer.pipeline.datamanager.eval_dataset.cameras[0]
-        flags = [f"--pipeline.model.pruning.{k.replace('_', '-')} {v}" for k, v in (PLAIN | line["options"]).items()]
-        return RunRow(
-            scene=line["scene"],
-            method=line["method"],
-            variant=line["rule"],
-            keep_ratio=line["keep"],
-            seed=line["seed"],
-            steps=line["warmup"] + line["steps"],
-            primitives=line["primitives"],
-            psnr=line["psnr"],
-            ssim=line["ssim"],
-            psnr_base=line["psnr"],
-            ssim_base=line["ssim"],
-            lpips=None,
-            lpips_net="",
-            bytes_primitives=bytes_.primitives,
-            bytes_head=0,
-            bytes_total=bytes_.total,
-            ms_frame=None,
-            ms_splat=None,
-            ms_head=None,
-            train_s=line["train_s"],
-            prune_s=line["prune_s"],
-            peak_primitives=None,
-            peak_vram_mib=None,
-            gpu=line["gpu"],
-            resolution=f"{int(camera.width)}x{int(camera.height)}",
-            commit=line["commit"],
-            command=" ".join([line["command"], f"--pipeline.model.pruning.keep-ratio {line['keep']}", *flags]),
-        )
+        camera = self.trainer.pipeline.datamanager.eval_dataset.cameras[0]
+        command = command_of(line, self.options.parser)
+        return row(line, sizes(self.model).primitives, f"{int(camera.width)}x{int(camera.height)}", command)
+
+
+def command_of(line: dict[str, Any], parser: str) -> str:
+    """A run that makes what a branch does, with a warm-up of its own."""
+    options = {"keep_ratio": line["keep"], "seed": line["seed"], **PLAIN, **line["options"]}
+    flags = [f"--pipeline.model.pruning.{k.replace('_', '-')} {v}" for k, v in options.items()]
+    steps = f"--max-num-iterations {line['warmup'] + line['steps']}"
+    return " ".join([line["command"].removesuffix(parser).strip(), steps, *flags, parser])
+
+
+def row(line: dict[str, Any], bytes_primitives: int, resolution: str, command: str) -> RunRow:
+    """What ``runs.csv`` has of a branch; no frame of it is timed."""
+    return RunRow(
+        **{key: line[key] for key in ("scene", "method", "seed", "primitives", "psnr", "ssim", "gpu", "commit")},
+        **{key: line[key] for key in ("train_s", "prune_s")},
+        variant=line["rule"],
+        keep_ratio=line["keep"],
+        steps=line["warmup"] + line["steps"],
+        psnr_base=line["psnr"],
+        ssim_base=line["ssim"],
+        lpips=None,
+        lpips_net="",
+        bytes_primitives=bytes_primitives,
+        bytes_head=0,
+        bytes_total=bytes_primitives,
+        ms_frame=None,
+        ms_splat=None,
+        ms_head=None,
+        peak_primitives=None,
+        peak_vram_mib=None,
+        resolution=resolution,
+        command=command,
+    )
 
 
 def key_of(options: argparse.Namespace, branch: Branch, warmup: int) -> dict[str, Any]:
