@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import copy
+import math
 import os
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
@@ -36,6 +36,7 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.opening import Opened
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
+from sundae_ns.views import zoomed
 
 
 @dataclass(frozen=True)
@@ -140,20 +141,18 @@ def frame_figures(
         warmup, repeats: as for :func:`frame_times`.
 
     Raises:
-        ConfigError: the factor is not above zero, or phases are not of :data:`PHASES`.
+        ConfigError: the factor is not above zero or not finite, or phases are not of :data:`PHASES`.
         BackendError: half precision is asked for on a CPU.
     """
     model = run.model
-    if not factor > 0:
-        raise ConfigError(f"pictures {factor} times their size have no pixels; give a factor above 0")
+    if not 0 < factor < math.inf:
+        raise ConfigError(f"no picture is {factor} times the size of another; give a factor above 0")
     on_cpu = model.device.type == "cpu"
     precision = precision or ("fp32" if on_cpu or model.head is None else model.head.config.precision)
     if on_cpu and precision != "fp32":
         raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
     phases = phases or (1 if model.head is None else model.head.config.phases)
-    cameras = [copy.deepcopy(camera) for camera in run.cameras]
-    for camera in cameras:
-        camera.rescale_output_resolution(factor, scale_rounding_mode="ceil")
+    cameras = [zoomed(camera, factor) for camera in run.cameras]
     with _head_as(model, precision=precision, phases=phases):
         times = frame_times(model, cameras, warmup=warmup, repeats=repeats)
         errors = dict.fromkeys(("psnr", "ssim", "psnr_base", "ssim_base"), 0.0)

@@ -13,6 +13,7 @@ import yaml
 from nerfstudio.configs.method_configs import method_configs
 
 from sundae_ns.cli import main
+from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import psnr
 from sundae_ns.measure import compensation, frame_figures, frame_times, sizes
@@ -47,9 +48,29 @@ def test_frames_are_judged_as_they_are_timed(tiny: Any) -> None:
         expected = [float(psnr(picture[name], truth)) for picture, truth in zip(shown, run.truths, strict=True)]
         assert found == pytest.approx(sum(expected) / 2, abs=1e-4)
     half = frame_figures(run, factor=0.5, warmup=0, repeats=1)
-    assert (half.width, half.height) == (-(-whole.width // 2), -(-whole.height // 2))
+    assert (half.width, half.height) == (whole.width // 2, whole.height // 2)
     # The cameras of the run are as they were.
     assert int(run.cameras[0].width) == whole.width
+
+
+@pytest.mark.parametrize("factor", [0.4, 1.3])
+@torch.no_grad()
+def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> None:
+    run = load_run(tiny.config)
+    model = run.model
+    found = frame_figures(run, factor=factor, warmup=0, repeats=1)
+    height, width = (round(factor * side) for side in run.truths[0].shape[:2])
+    assert (found.width, found.height) == (width, height)
+    assert width != pytest.approx(factor * run.truths[0].shape[1], abs=0.1)  # or nothing would be rounded
+    background, expected = model._get_background_color(), []
+    for camera, truth in zip(run.cameras, run.truths, strict=True):
+        view = model.view_of(camera)
+        # Edges on edges: pixels are those that the whole picture is cut into.
+        K = view.K * torch.tensor([[width / view.width], [height / view.height], [1.0]])
+        view = view._replace(K=K, width=width, height=height)
+        shown, _ = model.render(model.gaussians, view, background, depth=False, compensate=False)
+        expected.append(float(psnr(shown["base_rgb"], resize(truth, height, width))))
+    assert found.psnr_base == pytest.approx(sum(expected) / len(expected), abs=1e-3)
 
 
 def test_switching_the_head_off_for_a_while(tiny: Any) -> None:
@@ -72,8 +93,9 @@ def test_switching_the_head_off_for_a_while(tiny: Any) -> None:
     ("options", "error", "match"),
     [
         ({"precision": "fp16"}, BackendError, "a CPU runs the head in fp32"),
-        ({"factor": 0.0}, ConfigError, "no pixels"),
-        ({"factor": float("nan")}, ConfigError, "no pixels"),
+        ({"factor": 0.0}, ConfigError, "no picture is 0.0 times"),
+        ({"factor": float("nan")}, ConfigError, "no picture is nan times"),
+        ({"factor": float("inf")}, ConfigError, "no picture is inf times"),
     ],
 )
 def test_frames_that_cannot_be_measured(tiny: Any, options: dict[str, Any], error: type, match: str) -> None:
