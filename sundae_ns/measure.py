@@ -17,7 +17,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sundae_ns.compensation import over_phases, resize
+from sundae_ns.compensation import over_phases, plan, resize
 from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.evaluation import (
     HEAD_OFF,
@@ -49,7 +49,8 @@ class FrameTimes:
     splat: float
     """The same without the head, and so without features."""
     head: float
-    """The head alone; 0 without one."""
+    """The head alone, on what it sees of the frame; 0 where it does not run. Pictures of another scale than the trained one are
+    splatted at that one too, with features, which is in ``frame`` only."""
 
 
 @contextmanager
@@ -87,12 +88,14 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
         for on, times in ((True, frames), (False, splats)):
             with compensation(model, on):
                 times.append(milliseconds(partial(show, camera)))
-        if model.head is not None and model.head_active:
-            pictures, splat = model.render(model.gaussians, model.view_of(camera), background, depth=False)
-            heads.append(
-                milliseconds(partial(over_phases, model.head, pictures["base_rgb"], splat.colors, splat.alpha))
-            )
-    return FrameTimes(median(frames), median(splats), median(heads) if heads else 0.0)
+        view = model.view_of(camera)
+        zoom, weight = plan(view.focal, model.trained_focal)
+        if model.head is None or not model.head_active or weight == 0:
+            heads.append(0.0)
+            continue
+        pictures, splat = model.render(model.gaussians, view.zoomed(zoom), background, depth=False)
+        heads.append(milliseconds(partial(over_phases, model.head, pictures["base_rgb"], splat.colors, splat.alpha)))
+    return FrameTimes(median(frames), median(splats), median(heads))
 
 
 def sizes(model: SundaeModel) -> Sizes:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import psnr
 from sundae_ns.measure import compensation, frame_figures, frame_times, sizes
 from sundae_ns.opening import load_run
+from sundae_ns.views import zoomed
 
 
 def test_figures_of_a_run(tiny: Any) -> None:
@@ -71,6 +74,26 @@ def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> N
         shown, _ = model.render(model.gaussians, view, background, depth=False, compensate=False)
         expected.append(float(psnr(shown["base_rgb"], resize(truth, height, width))))
     assert found.psnr_base == pytest.approx(sum(expected) / len(expected), abs=1e-3)
+
+
+@torch.no_grad()
+def test_the_head_is_timed_on_what_it_sees_of_the_frame(tiny: Any) -> None:
+    run = load_run(tiny.config)
+    model, whole = run.model, tuple(run.truths[0].shape[:2])
+    seen: list[tuple[int, ...]] = []
+    model.head.register_forward_pre_hook(lambda _, arguments: seen.append(tuple(arguments[0].shape[:2])))
+
+    def sizes_seen(fn: Callable[[], Any]) -> set[tuple[int, ...]]:
+        seen.clear()
+        fn()
+        return set(seen)
+
+    # Of its own scale, near to it, halves and doubles, which are corrected at that scale, and thumbnails, which are not.
+    for factor, expected in ((1.0, {whole}), (0.875, {(42, 42)}), (0.5, {whole}), (2.0, {whole}), (0.25, set())):
+        camera = zoomed(run.cameras[0], factor)
+        assert sizes_seen(partial(model.get_outputs_for_camera, camera)) == expected
+        assert sizes_seen(partial(frame_times, model, [camera], warmup=0, repeats=1)) == expected
+    assert frame_times(model, [camera], warmup=0, repeats=1).head == 0
 
 
 def test_switching_the_head_off_for_a_while(tiny: Any) -> None:
