@@ -142,6 +142,22 @@ def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixt
     assert "PSNR off" in capsys.readouterr().out
 
 
+def test_bench_frame_prints_null_for_what_is_not_defined(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--load-config", str(tiny.config), "--views", "1", "--repeats", "1", "--factors", "0.2", "0.25"]
+    with pytest.raises(SystemExit) as caught:
+        main(["bench", "frame", *arguments, "--json"])
+    assert caught.value.code == 0
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"JSON has no {constant}")
+
+    small, larger = (json.loads(line, parse_constant=refuse) for line in capsys.readouterr().out.splitlines())
+    # 10 pixels are less than the window of SSIM.
+    assert (small["width"], small["ssim"], small["ssim_base"]) == (10, None, None)
+    assert larger["width"] == 12
+    assert 0 < min(small["psnr"], larger["psnr"], larger["ssim"])
+
+
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="does not exist"):
         load_run(tmp_path / "config.yml")
