@@ -2,8 +2,9 @@
 
     python benchmarks/scales.py --load-config RUN/config.yml
 
-For each factor: PSNR of base colours, of the head as it is shown (at the trained scale, its correction resized), and of the
-head run on the picture itself. Writes results/scales.json.
+For each factor, means over the test views: PSNR of base colours, of the head as it is shown (at the trained scale, its
+correction resized), and of the head run on the picture itself; SSIM of the first two. And how single views fare: the least
+gain of what is shown over base colours in dB, and how many views lose. Writes results/scales.json.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+from statistics import mean
 
 import torch
 
 from sundae_ns.compensation import resize
-from sundae_ns.evaluation import psnr
+from sundae_ns.evaluation import psnr, ssim, without_nan
 from sundae_ns.opening import load_run
 
 RESULTS = Path(__file__).parent / "results" / "scales.json"
@@ -33,19 +35,32 @@ def main() -> None:
     background, trained = model._get_background_color(), model.trained_focal
     lines = []
     for factor in FACTORS:
-        sums = dict.fromkeys(("base", "shown", "on_the_picture"), 0.0)
+        found: dict[str, list[float]] = {
+            name: [] for name in ("base", "shown", "on_the_picture", "ssim_base", "ssim_shown")
+        }
         for camera, truth in zip(cameras, truths, strict=True):
             view = model.view_of(camera).zoomed(factor)
             target = truth if factor == 1 else resize(truth, view.height, view.width)
-            for name, focal in (("shown", trained), ("on_the_picture", None)):
+            for name, focal in (("on_the_picture", None), ("shown", trained)):  # what is shown last, for SSIM
                 model.trained_focal = focal
                 pictures, _ = model.render(model.gaussians, view, background, depth=False)
-                sums[name] += float(psnr(pictures["rgb"], target)) / len(cameras)
-            sums["base"] += float(psnr(pictures["base_rgb"], target)) / len(cameras)
-        model.trained_focal = trained
-        lines.append({"factor": factor, "width": view.width, "height": view.height, **sums})
+                found[name].append(float(psnr(pictures["rgb"], target)))
+            found["base"].append(float(psnr(pictures["base_rgb"], target)))
+            found["ssim_base"].append(float(ssim(pictures["base_rgb"], target)))
+            found["ssim_shown"].append(float(ssim(pictures["rgb"], target)))
+        gains = [shown - base for shown, base in zip(found["shown"], found["base"], strict=True)]
+        line = {
+            "factor": factor,
+            "width": view.width,
+            "height": view.height,
+            **{name: mean(values) for name, values in found.items()},
+            "worst_gain": min(gains),
+            "worse_views": sum(gain < 0 for gain in gains),
+            "views": len(gains),
+        }
+        lines.append(without_nan(line))
         print(lines[-1], flush=True)
-    options.out.write_text(json.dumps(lines, indent=2) + "\n")
+    options.out.write_text(json.dumps(lines, indent=2, allow_nan=False) + "\n")
 
 
 if __name__ == "__main__":

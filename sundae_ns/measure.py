@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import copy
+import math
 import os
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
@@ -17,7 +17,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sundae_ns.compensation import over_phases, resize
+from sundae_ns.compensation import over_phases, plan, resize
 from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.evaluation import (
     HEAD_OFF,
@@ -36,6 +36,7 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.opening import Opened
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
+from sundae_ns.views import zoomed
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,8 @@ class FrameTimes:
     splat: float
     """The same without the head, and so without features."""
     head: float
-    """The head alone; 0 without one."""
+    """The head alone, on what it sees of the frame; 0 where it does not run. Pictures of another scale than the trained one are
+    splatted at that one too, with features, which is in ``frame`` only."""
 
 
 @contextmanager
@@ -86,12 +88,14 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
         for on, times in ((True, frames), (False, splats)):
             with compensation(model, on):
                 times.append(milliseconds(partial(show, camera)))
-        if model.head is not None and model.head_active:
-            pictures, splat = model.render(model.gaussians, model.view_of(camera), background, depth=False)
-            heads.append(
-                milliseconds(partial(over_phases, model.head, pictures["base_rgb"], splat.colors, splat.alpha))
-            )
-    return FrameTimes(median(frames), median(splats), median(heads) if heads else 0.0)
+        view = model.view_of(camera)
+        zoom, weight = plan(view.focal, model.trained_focal, view.width * view.height)
+        if model.head is None or not model.head_active or weight == 0:
+            heads.append(0.0)
+            continue
+        pictures, splat = model.render(model.gaussians, view.zoomed(zoom), background, depth=False)
+        heads.append(milliseconds(partial(over_phases, model.head, pictures["base_rgb"], splat.colors, splat.alpha)))
+    return FrameTimes(median(frames), median(splats), median(heads))
 
 
 def sizes(model: SundaeModel) -> Sizes:
@@ -140,20 +144,18 @@ def frame_figures(
         warmup, repeats: as for :func:`frame_times`.
 
     Raises:
-        ConfigError: the factor is not above zero, or phases are not of :data:`PHASES`.
+        ConfigError: the factor is not above zero or not finite, or phases are not of :data:`PHASES`.
         BackendError: half precision is asked for on a CPU.
     """
     model = run.model
-    if not factor > 0:
-        raise ConfigError(f"pictures {factor} times their size have no pixels; give a factor above 0")
+    if not 0 < factor < math.inf:
+        raise ConfigError(f"no picture is {factor} times the size of another; give a factor above 0")
     on_cpu = model.device.type == "cpu"
     precision = precision or ("fp32" if on_cpu or model.head is None else model.head.config.precision)
     if on_cpu and precision != "fp32":
         raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
     phases = phases or (1 if model.head is None else model.head.config.phases)
-    cameras = [copy.deepcopy(camera) for camera in run.cameras]
-    for camera in cameras:
-        camera.rescale_output_resolution(factor, scale_rounding_mode="ceil")
+    cameras = [zoomed(camera, factor) for camera in run.cameras]
     with _head_as(model, precision=precision, phases=phases):
         times = frame_times(model, cameras, warmup=warmup, repeats=repeats)
         errors = dict.fromkeys(("psnr", "ssim", "psnr_base", "ssim_base"), 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -33,7 +34,7 @@ class View(NamedTuple):
 
     def zoomed(self, factor: float) -> View:
         """The camera that sees the same in a picture whose sides are ``factor`` times as long."""
-        width, height = (max(round(side * factor), 1) for side in (self.width, self.height))
+        width, height = _zoomed_size(self.width, self.height, factor)
         # By what rounding made of the factor, so that the pictures' edges agree. Row by row, for numbers in a tensor would
         # have to be copied to the device, and waited for.
         K = torch.stack([self.K[0] * (width / self.width), self.K[1] * (height / self.height), self.K[2]])
@@ -45,6 +46,26 @@ class View(NamedTuple):
         K[0, 2] -= window.left
         K[1, 2] -= window.top
         return View(self.viewmat, K, window.width, window.height, self.focal)
+
+
+def zoomed(camera: Cameras, factor: float) -> Cameras:
+    """Nerfstudio's camera of shape ``(1,)`` that sees the same in a picture whose sides are ``factor`` times as long.
+
+    Its view has the size and the intrinsics of :meth:`View.zoomed`. Nerfstudio's own method rounds the sides and not the
+    intrinsics, after which the picture's edges lie elsewhere than those of the truth resized.
+    """
+    before = int(camera.width), int(camera.height)
+    width, height = _zoomed_size(*before, factor)
+    x, y = width / before[0], height / before[1]
+    result = copy.deepcopy(camera)
+    result.fx, result.cx, result.fy, result.cy = camera.fx * x, camera.cx * x, camera.fy * y, camera.cy * y
+    result.width, result.height = torch.full_like(camera.width, width), torch.full_like(camera.height, height)
+    return result
+
+
+def _zoomed_size(width: int, height: int, factor: float) -> tuple[int, int]:
+    """Width and height of a picture whose sides are ``factor`` times as long, in whole pixels."""
+    return max(round(width * factor), 1), max(round(height * factor), 1)
 
 
 def view_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None = None, downscale: int = 1) -> View:

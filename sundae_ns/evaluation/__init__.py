@@ -5,7 +5,7 @@ from sundae_ns.evaluation.flicker import Change, Frame, change
 from sundae_ns.evaluation.flip import flip, flip_available
 from sundae_ns.evaluation.lazy import Later, LazyOutputs
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
-from sundae_ns.evaluation.measured import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality
+from sundae_ns.evaluation.measured import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality, without_nan
 from sundae_ns.evaluation.memory import peak_memory
 from sundae_ns.evaluation.metrics import psnr, ssim
 from sundae_ns.evaluation.picture import ComparisonRow, comparison_sheet, save_comparison, side_by_side
@@ -62,4 +62,5 @@ __all__ = [
     "save_comparison",
     "side_by_side",
     "ssim",
+    "without_nan",
 ]

@@ -139,14 +139,15 @@ class Measured:
         plain["bytes_total"] = self.bytes_total
         for configuration, own in zip(self.configurations, plain["configurations"], strict=True):
             own["mean"] = {metric: configuration.mean(metric) for metric in ("psnr", "ssim", "flip", "lpips")}
-        return _without_nan(plain)
+        return without_nan(plain)
 
 
-def _without_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
+    """Plain values as JSON can hold them: numbers that are not finite become None."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: _without_nan(inner) for key, inner in value.items()}
+        return {key: without_nan(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_without_nan(inner) for inner in value]
+        return [without_nan(inner) for inner in value]
     return value

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,12 @@ import yaml
 from nerfstudio.configs.method_configs import method_configs
 
 from sundae_ns.cli import main
+from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import psnr
 from sundae_ns.measure import compensation, frame_figures, frame_times, sizes
 from sundae_ns.opening import load_run
+from sundae_ns.views import zoomed
 
 
 def test_figures_of_a_run(tiny: Any) -> None:
@@ -47,9 +51,49 @@ def test_frames_are_judged_as_they_are_timed(tiny: Any) -> None:
         expected = [float(psnr(picture[name], truth)) for picture, truth in zip(shown, run.truths, strict=True)]
         assert found == pytest.approx(sum(expected) / 2, abs=1e-4)
     half = frame_figures(run, factor=0.5, warmup=0, repeats=1)
-    assert (half.width, half.height) == (-(-whole.width // 2), -(-whole.height // 2))
+    assert (half.width, half.height) == (whole.width // 2, whole.height // 2)
     # The cameras of the run are as they were.
     assert int(run.cameras[0].width) == whole.width
+
+
+@pytest.mark.parametrize("factor", [0.4, 1.3])
+@torch.no_grad()
+def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> None:
+    run = load_run(tiny.config)
+    model = run.model
+    found = frame_figures(run, factor=factor, warmup=0, repeats=1)
+    height, width = (round(factor * side) for side in run.truths[0].shape[:2])
+    assert (found.width, found.height) == (width, height)
+    assert width != pytest.approx(factor * run.truths[0].shape[1], abs=0.1)  # or nothing would be rounded
+    background, expected = model._get_background_color(), []
+    for camera, truth in zip(run.cameras, run.truths, strict=True):
+        view = model.view_of(camera)
+        # Edges on edges: pixels are those that the whole picture is cut into.
+        K = view.K * torch.tensor([[width / view.width], [height / view.height], [1.0]])
+        view = view._replace(K=K, width=width, height=height)
+        shown, _ = model.render(model.gaussians, view, background, depth=False, compensate=False)
+        expected.append(float(psnr(shown["base_rgb"], resize(truth, height, width))))
+    assert found.psnr_base == pytest.approx(sum(expected) / len(expected), abs=1e-3)
+
+
+@torch.no_grad()
+def test_the_head_is_timed_on_what_it_sees_of_the_frame(tiny: Any) -> None:
+    run = load_run(tiny.config)
+    model, whole = run.model, tuple(run.truths[0].shape[:2])
+    seen: list[tuple[int, ...]] = []
+    model.head.register_forward_pre_hook(lambda _, arguments: seen.append(tuple(arguments[0].shape[:2])))
+
+    def sizes_seen(fn: Callable[[], Any]) -> set[tuple[int, ...]]:
+        seen.clear()
+        fn()
+        return set(seen)
+
+    # Of its own scale, near to it, halves and doubles, which are corrected at that scale, and thumbnails, which are not.
+    for factor, expected in ((1.0, {whole}), (0.875, {(42, 42)}), (0.5, {whole}), (2.0, {whole}), (0.25, set())):
+        camera = zoomed(run.cameras[0], factor)
+        assert sizes_seen(partial(model.get_outputs_for_camera, camera)) == expected
+        assert sizes_seen(partial(frame_times, model, [camera], warmup=0, repeats=1)) == expected
+    assert frame_times(model, [camera], warmup=0, repeats=1).head == 0
 
 
 def test_switching_the_head_off_for_a_while(tiny: Any) -> None:
@@ -72,8 +116,9 @@ def test_switching_the_head_off_for_a_while(tiny: Any) -> None:
     ("options", "error", "match"),
     [
         ({"precision": "fp16"}, BackendError, "a CPU runs the head in fp32"),
-        ({"factor": 0.0}, ConfigError, "no pixels"),
-        ({"factor": float("nan")}, ConfigError, "no pixels"),
+        ({"factor": 0.0}, ConfigError, "no picture is 0.0 times"),
+        ({"factor": float("nan")}, ConfigError, "no picture is nan times"),
+        ({"factor": float("inf")}, ConfigError, "no picture is inf times"),
     ],
 )
 def test_frames_that_cannot_be_measured(tiny: Any, options: dict[str, Any], error: type, match: str) -> None:
@@ -95,6 +140,22 @@ def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixt
     with pytest.raises(SystemExit):
         main(["bench", "frame", *arguments[2:], "--load-config", str(tiny.folder)])
     assert "PSNR off" in capsys.readouterr().out
+
+
+def test_bench_frame_prints_null_for_what_is_not_defined(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--load-config", str(tiny.config), "--views", "1", "--repeats", "1", "--factors", "0.2", "0.25"]
+    with pytest.raises(SystemExit) as caught:
+        main(["bench", "frame", *arguments, "--json"])
+    assert caught.value.code == 0
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"JSON has no {constant}")
+
+    small, larger = (json.loads(line, parse_constant=refuse) for line in capsys.readouterr().out.splitlines())
+    # 10 pixels are less than the window of SSIM.
+    assert (small["width"], small["ssim"], small["ssim_base"]) == (10, None, None)
+    assert larger["width"] == 12
+    assert 0 < min(small["psnr"], larger["psnr"], larger["ssim"])
 
 
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.model import SundaeModel
+from sundae_ns.views import zoomed
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -39,6 +41,22 @@ def test_view_of_downscales_and_leaves_the_camera_alone(build: Build, camera: Ma
     assert int(shown.width) == 41
     assert float(shown.fx) == 30.0
     torch.testing.assert_close(view.viewmat @ torch.tensor([0.0, 0.1, 3.0, 1.0]), torch.tensor([0.0, 0, 0, 1]))
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.4, 1.0, 1.37])
+@torch.no_grad()
+def test_a_zoomed_camera_has_the_zoomed_view(build: Build, camera: MakeCamera, factor: float) -> None:
+    """Of a picture whose sides are rounded by unlike shares."""
+    model, given = build().eval(), camera(41, 33)
+    expected, found = model.view_of(given).zoomed(factor), model.view_of(zoomed(given, factor))
+    assert (found.width, found.height) == (expected.width, expected.height)
+    torch.testing.assert_close(found.K, expected.K)
+    # The same is seen from edge to edge.
+    sides = torch.tensor([[found.width], [found.height], [1.0]])
+    torch.testing.assert_close(found.K / sides, model.view_of(given).K / torch.tensor([[41.0], [33.0], [1.0]]))
+    assert torch.equal(found.viewmat, expected.viewmat)
+    # What is given stays as it is.
+    assert (int(given.width), int(given.height), float(given.fx), float(given.cy)) == (41, 33, 30.0, 16.5)
 
 
 def test_lower_resolution_at_first(build: Build, camera: MakeCamera, training_of: TrainingOf) -> None:

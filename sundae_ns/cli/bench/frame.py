@@ -15,6 +15,7 @@ from rich.progress import track
 from rich.table import Table
 
 from sundae_ns.errors import ConfigError
+from sundae_ns.evaluation import without_nan
 from sundae_ns.measure import FrameFigures, frame_figures
 from sundae_ns.opening import load_run
 
@@ -52,7 +53,9 @@ def run_frame(
         if json:
             line = {"config": str(load_config), "device": device, "primitives": run.model.num_points}
             rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(found[-1]).items()}
-            print(jsonlib.dumps({**line, "factor": factor, "repeats": repeats, **rounded}), flush=True)
+            line |= {"factor": factor, "repeats": repeats, **rounded}
+            # Pictures that are smaller than its window have no SSIM.
+            print(jsonlib.dumps(without_nan(line), allow_nan=False), flush=True)
     if not json:
         Console().print(_table(found, f"{run.model.num_points:,} primitives, {device}, {len(run.cameras)} test views"))
     return 0
