@@ -89,6 +89,16 @@ def test_radius_neighbors_match_brute_force_and_are_padded() -> None:
     assert torch.equal(found.indices == own, missing)
 
 
+@pytest.mark.parametrize("radius", [1e-150, 1e-170, 5e-324])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_clones_lie_within_a_radius_whose_square_underflows(radius: float, dtype: torch.dtype) -> None:
+    points = torch.cat([torch.zeros(4, 3, dtype=dtype), torch.full((1, 3), 1e-30, dtype=dtype)])
+    found = radius_neighbors(points, radius, 2)
+    assert found.indices.tolist() == [[1, 2], [0, 2], [0, 1], [0, 1], [4, 4]]
+    assert (found.distances[:4] == 0).all()
+    assert found.distances[4].isinf().all()
+
+
 @pytest.mark.parametrize("n", [0, 1])
 def test_radius_neighbors_of_almost_nothing(n: int) -> None:
     found = radius_neighbors(torch.zeros(n, 3), 1.0, 4)
