@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -131,9 +132,16 @@ def test_radius_is_exclusive_and_ties_at_the_cap_go_to_the_lower_index(cloud: Ca
     assert torch.equal(found.indices, torch.where(inside, everyone[:, :8], torch.arange(300)[:, None]))
 
 
-def test_two_positions_of_one_hash_are_not_mixed_up(monkeypatch: pytest.MonkeyPatch, truth: Callable) -> None:
-    points = torch.randn(50, 3).repeat(3, 1)
-    monkeypatch.setattr(host_search, "_hash", lambda bits: bits[:, 0] % 7)
+@pytest.mark.parametrize("copies", [1, 3])
+@pytest.mark.parametrize("alike", [2, 50])
+def test_two_positions_of_one_hash_are_not_mixed_up(
+    monkeypatch: pytest.MonkeyPatch, truth: Callable, copies: int, alike: int
+) -> None:
+    points = torch.randn(50, 3).repeat(copies, 1)
+    hashed = host_search._hash
+    shared = np.sort(hashed(points.double().numpy().view(np.uint64)))[::copies][:alike]
+    # Without a copy, too, these look like clones until they are compared.
+    monkeypatch.setattr(host_search, "_hash", lambda bits: np.where(np.isin(h := hashed(bits), shared), 0, h))
     assert torch.equal(knn(points, 6).indices, truth(points, 6)[0])
 
 
