@@ -69,7 +69,9 @@ def bandwidth(
     if sigma is None:
         sigma = _robust_sigma(distances) if rule == "robust" else _variance(distances)
     if tau is None:
-        tau = (CUTOFF * sigma) ** 2 if rule == "robust" else _ten_times_smallest(distances)
+        reach = CUTOFF * sigma
+        # A power that overflows is an error in Python, a product is infinite: without a threshold, as for an infinite sigma.
+        tau = reach * reach if rule == "robust" else _ten_times_smallest(distances)
     return Bandwidth(float(tau), float(sigma))
 
 

@@ -75,8 +75,9 @@ def nearest(coordinates: Floats, k: int, limit: float, dtype: DTypeLike) -> tupl
     def search(rows: Ints) -> None:
         # One more than needed shows whether the last one taken ties with the first one left out.
         found, lengths = _query(tree, rows, k + 2)
-        if tree.n == n:
-            # Nothing else lies where a point lies, so it is the first of its own neighbours.
+        if positions.singles == n:
+            # Nothing else lies where a point lies, so it is the first of its own neighbours; and no position has moved, as
+            # those do that only look like clones.
             indices[rows, :width] = found[:, 1 : k + 1]
             distances[rows, :width] = lengths[:, 1 : k + 1]
         else:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -89,7 +90,8 @@ def radius_neighbors(points: Tensor, radius: float, max_neighbors: int) -> Neigh
     if len(points) == 0:
         shape = (0, max_neighbors)
         return Neighbors(torch.empty(shape, dtype=torch.int64, device=points.device), points.new_empty(shape))
-    return _search(points, max_neighbors, radius * radius)
+    # The square of a radius below 1.5e-162 is 0, and nothing is closer than that; clones are closer than the next number.
+    return _search(points, max_neighbors, max(radius * radius, math.ulp(0.0)))
 
 
 def _search(points: Tensor, k: int, limit: float) -> Neighbors:

@@ -12,11 +12,11 @@ Result = TypeVar("Result")
 
 
 def for_each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """What ``work`` makes of each part, in their order, on as many threads as there are cores.
+    """What ``work`` makes of each part, in their order, on as many threads as there are :func:`cores`.
 
     No part may write where another one reads or writes.
     """
-    threads = min(_cores(), len(parts))
+    threads = min(cores(), len(parts))
     if threads <= 1:
         return [work(part) for part in parts]
     with ThreadPoolExecutor(threads) as pool:
@@ -28,6 +28,6 @@ def slices(count: int, size: int) -> list[slice]:
     return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
 
-def _cores() -> int:
-    """Cores that this process may use."""
+def cores() -> int:
+    """Cores that this process may use: ``taskset`` says which, not ``OMP_NUM_THREADS``, which is for torch."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

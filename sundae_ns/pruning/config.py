@@ -8,6 +8,7 @@ from typing import Literal, get_args
 import tyro
 
 from sundae_ns.errors import ConfigError
+from sundae_ns.graphs.neighbors import MOST_EXTENT
 
 Mode = Literal["one-shot", "continuous", "auto", "off"]
 ScoreName = Literal[
@@ -206,6 +207,9 @@ class PruningConfig:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ConfigError(f"{name} is {value}: use a positive number, or leave it out for the bandwidth rule")
+        # An infinite tau joins all within the list of neighbours; a width has to have a reach that float64 can hold.
+        if self.sigma is not None and self.sigma > MOST_EXTENT:
+            raise ConfigError(f"sigma is {self.sigma}: use a width of at most {MOST_EXTENT:g} scene units")
         self._validate_budgets()
 
     def _validate_budgets(self) -> None:

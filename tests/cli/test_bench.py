@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,11 @@ import pytest
 import torch
 
 from sundae_ns.cli import main
-from sundae_ns.cli.bench.graph import count_mismatches
+from sundae_ns.cli.bench.graph import compare_with_float64, count_mismatches
 from sundae_ns.cli.bench.points import draw
 from sundae_ns.errors import ConfigError
-from sundae_ns.graphs import knn
+from sundae_ns.filters import high_pass
+from sundae_ns.graphs import build_graph, knn
 from sundae_ns.storage import write_ply
 
 
@@ -38,6 +40,7 @@ def test_one_line_of_json(bench_graph: Callable[..., dict[str, Any]], distributi
     assert found["distribution"] == distribution
     assert found["index_mismatches"] == 0
     assert 0 < found["response_rel_error"] < 1e-5
+    assert found["isolation_mismatches"] == 0
     assert found["seconds"] > 0
     assert found["speedup"] == pytest.approx(found["reference_seconds"] / found["seconds"], rel=0.01)
     assert found["peak_mib"] >= 0
@@ -46,6 +49,14 @@ def test_one_line_of_json(bench_graph: Callable[..., dict[str, Any]], distributi
 def test_without_the_reference_its_fields_are_empty(bench_graph: Callable[..., dict[str, Any]]) -> None:
     found = bench_graph("--points", 500, "--reference", "false")
     assert found["reference_seconds"] is found["speedup"] is found["index_mismatches"] is None
+
+
+def test_the_peak_holds_the_results_also_after_earlier_runs(bench_graph: Callable[..., dict[str, Any]]) -> None:
+    # Indices, weights, degrees and the response of 100,000 points.
+    results = 100_000 * (16 * (8 + 4) + 4 + 3 * 4)
+    for _ in range(2):
+        found = bench_graph("--points", 100_000, "--neighbors", 16, "--reference", "false")
+        assert found["peak_mib"] >= results / 2**20
 
 
 def test_positions_of_a_file(bench_graph: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
@@ -70,6 +81,32 @@ def test_mismatches_are_counted_and_ties_are_not() -> None:
         wrong[row] = torch.tensor(neighbours)
         assert count_mismatches(points, wrong, true.distances.numpy()) == 1
     assert count_mismatches(points, found, np.zeros((5, 2))) == 5
+
+
+def test_a_node_that_is_isolated_in_one_precision_only_is_counted() -> None:
+    # The last one has no neighbour within reach, in either.
+    points = torch.cat([torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), torch.full((1, 3), 1e4)])
+    response = high_pass(build_graph(points, num_neighbors=5), points)
+    assert response[-1].isnan().all()
+    error, differing = compare_with_float64(points, 5, response)
+    assert 0 < error < 1e-5
+    assert differing == 0
+    response[3] = torch.nan
+    response[-1] = 0
+    without, differing = compare_with_float64(points, 5, response)
+    assert without < 1e-5
+    assert differing == 2
+
+
+@pytest.mark.parametrize(
+    ("torchs", "printed"), [(3, "CPU, 3 threads"), (1, "CPU, 3 threads for neighbours, 1 for torch")]
+)
+def test_the_threads_are_those_of_the_search_and_of_torch(
+    bench_graph: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch, torchs: int, printed: str
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 4, 5}, raising=False)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: torchs)
+    assert bench_graph("--points", 100, "--reference", "false")["device_name"] == printed
 
 
 def test_what_is_drawn() -> None:

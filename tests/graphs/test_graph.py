@@ -77,6 +77,7 @@ def test_literal_rule_is_the_papers_and_fails_as_noted_on_clones() -> None:
 def test_overrides_replace_the_rule() -> None:
     distances = torch.rand(10, 4)
     assert bandwidth(distances, "robust", sigma=2.0) == (36.0, 2.0)
+    assert bandwidth(distances, "robust", sigma=1e200) == (math.inf, 1e200)
     assert bandwidth(distances, "robust", tau=0.5).tau == 0.5
     assert bandwidth(distances, "literal", tau=0.5, sigma=0.25) == (0.5, 0.25)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -89,6 +90,16 @@ def test_radius_neighbors_match_brute_force_and_are_padded() -> None:
     assert torch.equal(found.indices == own, missing)
 
 
+@pytest.mark.parametrize("radius", [1e-150, 1e-170, 5e-324])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_clones_lie_within_a_radius_whose_square_underflows(radius: float, dtype: torch.dtype) -> None:
+    points = torch.cat([torch.zeros(4, 3, dtype=dtype), torch.full((1, 3), 1e-30, dtype=dtype)])
+    found = radius_neighbors(points, radius, 2)
+    assert found.indices.tolist() == [[1, 2], [0, 2], [0, 1], [0, 1], [4, 4]]
+    assert (found.distances[:4] == 0).all()
+    assert found.distances[4].isinf().all()
+
+
 @pytest.mark.parametrize("n", [0, 1])
 def test_radius_neighbors_of_almost_nothing(n: int) -> None:
     found = radius_neighbors(torch.zeros(n, 3), 1.0, 4)
@@ -121,9 +132,16 @@ def test_radius_is_exclusive_and_ties_at_the_cap_go_to_the_lower_index(cloud: Ca
     assert torch.equal(found.indices, torch.where(inside, everyone[:, :8], torch.arange(300)[:, None]))
 
 
-def test_two_positions_of_one_hash_are_not_mixed_up(monkeypatch: pytest.MonkeyPatch, truth: Callable) -> None:
-    points = torch.randn(50, 3).repeat(3, 1)
-    monkeypatch.setattr(host_search, "_hash", lambda bits: bits[:, 0] % 7)
+@pytest.mark.parametrize("copies", [1, 3])
+@pytest.mark.parametrize("alike", [2, 50])
+def test_two_positions_of_one_hash_are_not_mixed_up(
+    monkeypatch: pytest.MonkeyPatch, truth: Callable, copies: int, alike: int
+) -> None:
+    points = torch.randn(50, 3).repeat(copies, 1)
+    hashed = host_search._hash
+    shared = np.sort(hashed(points.double().numpy().view(np.uint64)))[::copies][:alike]
+    # Without a copy, too, these look like clones until they are compared.
+    monkeypatch.setattr(host_search, "_hash", lambda bits: np.where(np.isin(h := hashed(bits), shared), 0, h))
     assert torch.equal(knn(points, 6).indices, truth(points, 6)[0])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
@@ -103,6 +104,14 @@ def test_kernel_within_a_radius(compiled: Compile, cloud: Callable) -> None:
         indices, distances = search_tree(build_tree(points), 16, radius * radius, compiled(torch.float32, 16))
         assert torch.equal(indices, found.indices)
         assert torch.equal(distances, found.distances)
+
+
+def test_kernel_takes_the_smallest_number_as_a_radius(compiled: Compile) -> None:
+    points = torch.cat([torch.zeros(4, 3), torch.full((1, 3), 1e-30)])
+    found = radius_neighbors(points, 1e-170, 2)
+    indices, distances = search_tree(build_tree(points), 2, math.ulp(0.0), compiled(torch.float32, 2))
+    assert torch.equal(indices, found.indices)
+    assert torch.equal(distances, found.distances)
 
 
 def test_tree_holds_every_point_once_and_its_boxes_are_tight(cloud: Callable) -> None:

@@ -66,6 +66,19 @@ def test_configuration(name: str) -> None:
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader) == config
 
 
+PRUNING = ("score", "selection", "redistribution", "edges", "signal")
+"""What a rule is made of, in the order of docs/rules.md."""
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_rule_of_pruning(name: str) -> None:
+    pruning = ours()[name].config.pipeline.model.pruning
+    default = ("detail-contribution", "systematic", "merge", "appearance", "attributes")
+    paper = ("response", "band", "none", "centres", "positions")
+    expected = paper if name == "sundae-paper" else default
+    assert tuple(getattr(pruning, option) for option in PRUNING) == expected
+
+
 def test_methods_share_no_objects() -> None:
     def parts(value: Any, seen: set[int]) -> set[int]:
         if hasattr(value, "__dataclass_fields__") and not isinstance(value, type) and id(value) not in seen:

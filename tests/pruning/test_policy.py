@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import fields, replace
 from typing import Any
 
@@ -13,6 +14,7 @@ from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
 from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.graphs import build_graph
 from sundae_ns.pruning import (
     ContinuousPruning,
     NoPruning,
@@ -279,6 +281,16 @@ def test_report_is_one_line_of_plain_numbers() -> None:
     assert "sigma" not in unscored.summary()
 
 
+@pytest.mark.parametrize("edge", [{"tau": 5e-324}, {"tau": math.inf}, {"sigma": 5e-324}, {"sigma": 1e150}])
+def test_the_smallest_and_largest_edges_that_work(edge: dict[str, float]) -> None:
+    config = replace(PruningConfig(), **edge)  # type: ignore[arg-type]
+    config.validate()
+    graph = build_graph(torch.randn(50, 3), tau=config.tau, sigma=config.sigma)
+    assert not graph.weights.isnan().any()
+    if config.sigma is not None:
+        assert math.isfinite(graph.tau)
+
+
 def test_the_last_options_that_work() -> None:
     edge = {"num_neighbors": 1, "every": 1, "start": 4, "stop": 4, "max_primitives": 1, "keep_ratio": 1.0, "gamma": 1.0}
     PruningConfig(mode="continuous", **edge).validate()  # type: ignore[arg-type]
@@ -338,7 +350,11 @@ def test_mode_names_the_policy(mode: Any, kind: type[PruningPolicy]) -> None:
         {"prune_at": -1},
         {"start": 5, "stop": 4, "mode": "continuous"},
         {"tau": 0.0},
+        {"tau": math.nan},
         {"sigma": -1.0},
+        {"sigma": 1e200},
+        {"sigma": math.inf},
+        {"sigma": math.nan},
         {"max_primitives": 0, "mode": "continuous"},
         {"max_primitives": 100},
     ],

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import json as jsonlib
 import statistics
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +21,7 @@ from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.evaluation.timing import now
 from sundae_ns.filters import high_pass
 from sundae_ns.graphs import NeighborGraph, build_graph
+from sundae_ns.graphs.threads import cores
 
 ROUNDING = 1e-12
 """Relative difference of two float64 distances that counts as a tie."""
@@ -59,7 +62,7 @@ def run_graph(
         "points": len(positions),
         "neighbors": neighbors,
         "device": device,
-        "device_name": torch.cuda.get_device_name() if device == "cuda" else f"CPU, {torch.get_num_threads()} threads",
+        "device_name": torch.cuda.get_device_name() if device == "cuda" else _threads(),
         "distribution": distribution if field is None else str(field),
         **measure(positions, neighbors, device, repeats, reference),
         "torch": torch.__version__,
@@ -104,6 +107,7 @@ def measure(positions: Tensor, neighbors: int, device: str, repeats: int, refere
         graphs.append(stages["graph"])
         responses.append(stages["response"])
     (found, response), peak = _with_peak(run, device)
+    error, differing = compare_with_float64(placed, neighbors, response)
     result: dict[str, Any] = {
         "seconds": significant(statistics.median(times)),
         "graph_seconds": significant(statistics.median(graphs)),
@@ -111,7 +115,8 @@ def measure(positions: Tensor, neighbors: int, device: str, repeats: int, refere
         "reference_seconds": None,
         "speedup": None,
         "index_mismatches": None,
-        "response_rel_error": significant(_response_error(placed, neighbors, response), 3),
+        "response_rel_error": significant(error, 3),
+        "isolation_mismatches": differing,
         "peak_mib": round(peak / 2**20, 1),
     }
     if reference:
@@ -157,13 +162,25 @@ def _reference(positions: Tensor, neighbors: int) -> tuple[float, np.ndarray]:
     return time.perf_counter() - started, distances[:, 1:]
 
 
-def _response_error(placed: Tensor, neighbors: int, response: Tensor) -> float:
-    """Norm of the difference between float32 and float64 over the norm in float64, of nodes with neighbours."""
+def compare_with_float64(placed: Tensor, neighbors: int, response: Tensor) -> tuple[float, int]:
+    """How far the response is from that of the same positions in float64.
+
+    Args:
+        placed: positions ``[N, 3]``.
+        neighbors: neighbours of each point.
+        response: high-pass response, NaN where a node is isolated ``[N, 3]``.
+
+    Returns:
+        Norm of the difference over the norm in float64, of nodes with neighbours in both; and how many nodes have
+        neighbours in one of the two only, which no norm would show.
+    """
     double = placed.double()
     exact = high_pass(build_graph(double, num_neighbors=neighbors), double)
-    known = ~(exact.isnan() | response.isnan())
-    norm = float(exact[known].norm())
-    return float((response.double() - exact)[known].norm()) / norm if norm > 0 else 0.0
+    known, found = ~exact.isnan().any(dim=1), ~response.isnan().any(dim=1)
+    both = known & found
+    norm = float(exact[both].norm())
+    error = float((response.double() - exact)[both].norm()) / norm if norm > 0 else 0.0
+    return error, int((known != found).sum())
 
 
 def _with_peak(run: Callable[[], Any], device: str) -> tuple[Any, int]:
@@ -175,6 +192,7 @@ def _with_peak(run: Callable[[], Any], device: str) -> tuple[Any, int]:
         result = run()
         return result, torch.cuda.max_memory_allocated() - before
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    _give_back()
     try:
         # Linux: 5 makes the peak of the resident memory start anew.
         reset.write_text("5")
@@ -183,6 +201,25 @@ def _with_peak(run: Callable[[], Any], device: str) -> tuple[Any, int]:
         return result, _resident(status, "VmHWM") - before
     except OSError as error:
         raise BackendError(f"memory cannot be measured here ({error}): use Linux") from error
+
+
+def _give_back() -> None:
+    """Return freed memory to the system, where glibc would keep it.
+
+    What earlier runs have freed stays resident otherwise, the next run takes it from there, and it would seem to need
+    next to nothing beside what was there before.
+    """
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # no other C library has it
+        if trim is not None:
+            trim(0)
+
+
+def _threads() -> str:
+    """The processor's threads: those of the search, and torch's, which have the weights and the response."""
+    if cores() == torch.get_num_threads():
+        return f"CPU, {cores()} threads"
+    return f"CPU, {cores()} threads for neighbours, {torch.get_num_threads()} for torch"
 
 
 def _resident(status: Path, name: str) -> int:
