@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import resize
 from sundae_ns.errors import MemoryExhaustedError
+from sundae_ns.method_configs import sundae
 from sundae_ns.model import SundaeModel
 
 Build = Callable[..., SundaeModel]
@@ -235,3 +236,19 @@ def test_the_head_runs_as_often_as_the_viewer_asks_and_once_in_training(
     assert torch.equal(trained, trained_too)
     assert (steadied - shown).abs().max() > 1e-4
     assert (steadied - shown).abs().mean() < 0.05
+
+
+@pytest.mark.parametrize("mode", ["residual", "features"])
+def test_a_model_trained_ten_times_too_fast_may_be_bad_but_not_broken(
+    build: Build, camera: MakeCamera, training_of: TrainingOf, mode: str
+) -> None:
+    """Field and head together, each by ten times its rate in the method."""
+    model = build(head={"mode": mode, "start_at": 0}, pruning={"prune_at": 10})
+    training = training_of(model)
+    for name, optimizer in training.optimizers.optimizers.items():
+        optimizer.param_groups[0]["lr"] = 10 * sundae.config.optimizers[name]["optimizer"].lr
+    for step in range(1000):
+        training.step(step)
+    outputs = model.eval().get_outputs_for_camera(camera())
+    assert all(torch.isfinite(outputs[name]).all() for name in ("rgb", "base_rgb", "accumulation"))
+    assert all(torch.isfinite(value).all() for value in model.parameters())
