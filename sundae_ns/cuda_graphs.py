@@ -112,9 +112,7 @@ def record(
                 generator.graphsafe_set_state(before)
             _failed.append(graph)
             cause = str(error).partition("\n")[0]
-            raise BackendError(
-                f"{device} cannot record this as a CUDA graph ({cause}); it is done kernel by kernel"
-            ) from error
+            raise BackendError(f"{device} cannot record this as a CUDA graph: {cause}") from error
     return graph, result
 
 
