@@ -6,7 +6,7 @@ import gc
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Generic, TypeVar
 
 import torch
@@ -90,12 +90,14 @@ def record(
 
     Raises:
         BackendError: it cannot be recorded. Nothing was done then, and what is done next is done as before.
+        torch.cuda.OutOfMemoryError: there is no room for what it makes.
     """
     graph = torch.cuda.CUDAGraph()
     # A training loop beside a viewer may allocate meanwhile; only this thread's work belongs to the recording.
-    pool = None if shares is None else shares.pool()
+    pool = torch.cuda.graph_pool_handle() if shares is None else shares.pool()
     # On a stream of this device: torch's own belongs to whichever device was the current one at its first recording.
     side = _side_stream(device)
+    errors: list[RuntimeError] = []
     with _one_at_a_time, torch.cuda.device(device), _recording(), _uncollected():
         generator = torch.cuda.default_generators[torch.cuda.current_device()]
         before = generator.clone_state() if hasattr(generator, "clone_state") else None  # not in torch 2.1
@@ -103,16 +105,26 @@ def record(
             # Torch does not leave the stream of a recording that fails; all later work would go there, unordered with gsplat's.
             with torch.cuda.stream(side):
                 with torch.cuda.graph(graph, pool=pool, stream=side, capture_error_mode="thread_local"):
-                    result = run()
-        except torch.cuda.OutOfMemoryError:
-            raise
+                    try:
+                        result = run()
+                    except RuntimeError as error:
+                        errors.append(error)
+                        raise
         except RuntimeError as error:
-            # Nor do its random numbers: they would be refused as of a recording that is not there.
-            if before is not None:
-                generator.graphsafe_set_state(before)
-            _failed.append(graph)
-            cause = str(error).partition("\n")[0]
-            raise BackendError(f"{device} cannot record this as a CUDA graph: {cause}") from error
+            if error not in errors:
+                # It was not ended either. Random numbers would be refused as of a recording that is not there,
+                errors.append(error)
+                if before is not None:
+                    generator.graphsafe_set_state(before)
+                # and the allocator would give nothing back, and go on asking the graph whether an allocation is its own.
+                with suppress(AttributeError, RuntimeError):
+                    torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), pool)
+                _failed.append(graph)
+            first = errors[0]
+            if isinstance(first, torch.cuda.OutOfMemoryError):
+                raise first from None
+            cause = str(first).partition("\n")[0]
+            raise BackendError(f"{device} cannot record this as a CUDA graph: {cause}") from first
     return graph, result
 
 

@@ -131,18 +131,30 @@ def test_a_failed_recording_leaves_the_stream_that_torch_stays_on(monkeypatch: p
 
     generator = Generator()
     stand_ins = {"stream": stream, "graph": Capture, "CUDAGraph": object, "device": nullcontext}
-    stand_ins |= {"default_generators": (generator,), "current_device": lambda: 0}
+    stand_ins |= {"default_generators": (generator,), "current_device": lambda: 0, "graph_pool_handle": lambda: "pool"}
     for name, stand_in in stand_ins.items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(cuda_graphs, "_side_stream", lambda device: "side")
+    monkeypatch.setattr(cuda_graphs, "_failed", failed := [])
+    ended: list[object] = []
+    monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", lambda *of: ended.append(of), raising=False)
     with pytest.raises(
         BackendError, match=r"as a CUDA graph: operation failed due to a previous error during capture$"
     ):
         record(lambda: current, torch.device("cuda"))
     assert current == "main"
     assert generator.drawn_from == "before"
+    assert ended == [(0, "pool")]
+    assert len(failed) == 1
     assert gc.isenabled()
     assert not recording()
+
+    def too_much() -> None:
+        raise torch.cuda.OutOfMemoryError("no room")
+
+    with pytest.raises(torch.cuda.OutOfMemoryError, match="no room"):  # not what came of it
+        record(too_much, torch.device("cuda"))
+    assert len(ended) == len(failed) == 2
 
 
 @pytest.mark.gpu
@@ -185,6 +197,11 @@ def test_after_a_recording_that_failed_all_is_as_before() -> None:
         assert not recording()
         torch.manual_seed(1)
         drawn = torch.rand(3, device="cuda")
+        large = torch.empty(2**28, device="cuda")
+        held = torch.cuda.memory_reserved()
+        del large
+        torch.cuda.empty_cache()
+        assert torch.cuda.memory_reserved() <= held - 2**30, "the allocator gives back what is free"
         torch.manual_seed(1)
         assert torch.equal(drawn, torch.rand(3, device="cuda"))
     graph, made = record(total, device)

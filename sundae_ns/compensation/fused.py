@@ -6,6 +6,7 @@ picture size that stays. Gradients are the business of :mod:`sundae_ns.compensat
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,6 +19,9 @@ from torch import Tensor, nn
 from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.cuda_graphs import Kept, aside, record, recording
+from sundae_ns.errors import BackendError
+
+_log = logging.getLogger(__name__)
 
 
 class Weights:
@@ -229,6 +233,7 @@ class FusedInference:
         self.net = net
         self.residual = residual
         self._recorded: Kept[_Recording] = Kept()
+        self._can_record = True
 
     def __call__(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
         """One picture.
@@ -250,7 +255,13 @@ class FusedInference:
         height, width = base.shape[:2]
         key = (height, width, dtype, net.out.weight.data_ptr())
         room = partial(folded_room, net, height, width, base, dtype)
-        kept = None if recording() else self._recorded.get(key, lambda: self._record(room().zero_(), launches))
+        kept = None
+        if self._can_record and not recording():
+            try:
+                kept = self._recorded.get(key, lambda: self._record(room().zero_(), launches))
+            except BackendError as error:
+                _log.warning("the head is shown kernel by kernel: %s", error)
+                self._can_record = False
         folded = room() if kept is None else kept.folded
         fold(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
         if kept is None:

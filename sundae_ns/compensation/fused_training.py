@@ -6,6 +6,7 @@ launching a hundred small kernels one by one from Python would take longer than 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
@@ -29,7 +30,9 @@ from sundae_ns.compensation.fused import (
 from sundae_ns.compensation.kernels import BACKWARD, FORWARD, PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.cuda_graphs import MAX_SIZES, aside, record
-from sundae_ns.errors import SundaeError
+from sundae_ns.errors import BackendError, SundaeError
+
+_log = logging.getLogger(__name__)
 
 
 def network_backward(
@@ -164,6 +167,7 @@ class FusedTraining:
         self.launches = launches
         self._parameters = tuple(_parameters(net))
         self._recorded: dict[tuple[object, ...], _Pass] = {}
+        self._can_record = True
         self._passes = 0
         """So many pictures were made; recorded passes of one size share their buffers, and only the number tells them apart."""
 
@@ -196,9 +200,13 @@ class FusedTraining:
         made = self._recorded.get(key)
         if made is None:
             folded = folded_room(net, height, width, splatted, dtype)
-            if splatted.is_cuda and len(self._recorded) < MAX_SIZES:
-                made = self._recorded[key] = self._record(folded.zero_(), launches)
-            else:
+            if splatted.is_cuda and self._can_record and len(self._recorded) < MAX_SIZES:
+                try:
+                    made = self._recorded[key] = self._record(folded.zero_(), launches)
+                except BackendError as error:
+                    _log.warning("the head trains kernel by kernel: %s", error)
+                    self._can_record = False
+            if made is None:
                 made = _Pass(Weights(net, dtype), folded, Tape(), Tensor())
         fold(splatted, alpha, net.pixel_unshuffle, self.residual, made.folded, launches)
         if made.forward is not None:

@@ -41,7 +41,7 @@ class HeadConfig:
 
     mode: Literal["residual", "features", "off"] = "residual"
     """residual: the head adds a correction to the spherical-harmonics picture, which stays valid by itself.
-    features: the paper's way, the head alone makes the picture from splatted features. off: no head."""
+    features: the paper's way, the head alone makes the picture from splatted features, over the background. off: no head."""
     size: Literal["tiny", "compact", "small", "regular", "large"] = "compact"
     """Width of the U-Net: 0.5, 2, 7.8, 31 or 124 MB in fp32. The last three are the paper's, which takes regular;
     compact is small with at most 64 channels a level."""
@@ -61,7 +61,7 @@ class HeadConfig:
     head's time, and flicker less as a camera moves."""
     precision: Literal["fp32", "bf16", "fp16"] = "bf16"
     """Arithmetic of the U-Net on CUDA; a CPU always takes fp32. fp16 is for pictures that are only looked at: its range is too
-    small to train in, which fp16 does in bf16."""
+    small to train in, which fp16 does in bf16, or in fp32 on GPUs before Ampere."""
     fused: bool = True
     """On CUDA, in bf16 and fp16: run through our own kernels between the convolutions, and as one CUDA graph for each picture
     size, both while training and for pictures that are only looked at. Otherwise layer by layer."""
@@ -154,7 +154,7 @@ class CompensationHead(nn.Module):
         Returns:
             ``[H, W, 3]`` float32, not clamped. Where nothing was splatted the residual head returns ``base``.
         """
-        dtype = self._dtype(base.is_cuda)
+        dtype = self._dtype(base.device)
         if self._can_fuse and dtype != torch.float32:
             try:
                 return self._fused(base, splatted, alpha, dtype)
@@ -170,10 +170,12 @@ class CompensationHead(nn.Module):
             out = out.nan_to_num(0.0, 0.0, 0.0)
         return base + alpha * out.float() if residual else out.float()
 
-    def _dtype(self, on_cuda: bool) -> torch.dtype:
-        dtype = PRECISIONS[self.config.precision] if on_cuda else torch.float32
+    def _dtype(self, device: torch.device) -> torch.dtype:
+        dtype = PRECISIONS[self.config.precision] if device.type == "cuda" else torch.float32
+        if dtype != torch.float16 or not torch.is_grad_enabled():
+            return dtype
         # What overflows is left out of a picture, but would be NaN in the gradients of all that lies before it.
-        return torch.bfloat16 if dtype == torch.float16 and torch.is_grad_enabled() else dtype
+        return torch.bfloat16 if torch.cuda.get_device_capability(device) >= (8, 0) else torch.float32
 
     def _fused(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
         if not torch.is_grad_enabled():

@@ -17,9 +17,9 @@ FADE = (4.0, 2.0)
 """Pictures shrunk by more than the first factor are shown without the head, those by less than the second with all of it:
 a thumbnail should not cost a whole picture, nor the head appear at once while one zooms."""
 
-MOST_PIXELS = (2**25, 2**24)
-"""The same for pictures that would have more pixels than these at the trained scale, as wide views may: 33 million of them
-take two gigabytes beside the picture that is asked for."""
+MOST_PIXELS = 2**24
+"""A picture that would have more pixels than this at the trained scale, as a wide view may, fades the head out as well, up to
+twice as many; but for those that are compensated as they are, whatever their size. 33 million pixels take two gigabytes."""
 
 
 class ScalePlan(NamedTuple):
@@ -45,8 +45,8 @@ def plan(focal: float, trained: tuple[float, float] | None, pixels: int) -> Scal
     zoom = nearest / focal
     if 1 / TOLERANCE <= zoom <= TOLERANCE:
         return ScalePlan(1.0, 1.0)
-    weight = min(_fading(zoom, *FADE), _fading(pixels * zoom**2, *MOST_PIXELS))
-    return ScalePlan(zoom, weight)
+    most = max(MOST_PIXELS, TOLERANCE**2 * pixels)
+    return ScalePlan(zoom, min(_fading(zoom, *FADE), _fading(pixels * zoom**2, 2 * most, most)))
 
 
 def _fading(value: float, off: float, full: float) -> float:

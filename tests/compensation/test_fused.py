@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from sundae_ns import nvrtc
 from sundae_ns.compensation import CompensationHead, HeadConfig, fused, kernels
 from sundae_ns.compensation.fused_training import FusedTraining, _Pass, network_backward
-from sundae_ns.cuda_graphs import MAX_SIZES
+from sundae_ns.cuda_graphs import MAX_SIZES, RECORD_AT
 from sundae_ns.errors import BackendError, SundaeError
 
 PICTURES_OF_FLOATS = """
@@ -225,6 +225,24 @@ def test_gradients_of_an_earlier_picture_are_refused(compiled: Compile) -> None:
     with pytest.raises(SundaeError, match=r"before that$"):
         outs[0].sum().backward()
     outs[1].sum().backward()
+
+
+@torch.no_grad()
+def test_a_head_that_cannot_be_recorded_is_shown_by_its_kernels(
+    compiled: Compile, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(*_: object) -> None:
+        raise BackendError("no recordings today")
+
+    head = make()
+    pictures = splatted(16, 16, 5)
+    expected = head(*pictures)
+    launches = compiled(head)
+    monkeypatch.setattr(fused, "compiled", lambda *_: launches)
+    monkeypatch.setattr(head._inference, "_record", refuse)
+    for _ in range(RECORD_AT + 2):
+        torch.testing.assert_close(head._inference(*pictures, torch.float32), expected, rtol=1e-4, atol=1e-5)
+    assert caplog.text.count("kernel by kernel: no recordings today") == 1
 
 
 def test_late_gradients_of_what_is_played_are_refused(compiled: Compile) -> None:

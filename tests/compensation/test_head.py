@@ -125,14 +125,16 @@ def test_training_ten_times_too_fast_may_be_bad_but_not_broken(mode: str) -> Non
     assert all(torch.isfinite(module(*picture)).all() for picture in pictures)
 
 
-def test_fp16_trains_in_bf16() -> None:
+@pytest.mark.parametrize(("capability", "dtype"), [((9, 0), torch.bfloat16), ((7, 5), torch.float32)])
+def test_fp16_does_not_train(monkeypatch: pytest.MonkeyPatch, capability: tuple[int, int], dtype: torch.dtype) -> None:
     """What overflows in fp16 would be NaN in the gradients of all layers before."""
-    module = head(precision="fp16")
-    assert module._dtype(on_cuda=True) == torch.bfloat16
-    assert module._dtype(on_cuda=False) == torch.float32
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    module, gpu = head(precision="fp16"), torch.device("cuda")
+    assert module._dtype(gpu) == dtype
+    assert module._dtype(torch.device("cpu")) == torch.float32
     with torch.no_grad():
-        assert module._dtype(on_cuda=True) == torch.float16
-    assert head(precision="fp32")._dtype(on_cuda=True) == torch.float32
+        assert module._dtype(gpu) == torch.float16
+    assert head(precision="bf16")._dtype(gpu) == torch.bfloat16
 
 
 @pytest.mark.gpu

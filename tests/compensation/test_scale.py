@@ -40,15 +40,24 @@ def test_thumbnails_fade_out_without_a_jump() -> None:
 
 
 def test_a_wide_view_is_not_made_anew_with_more_pixels_than_fit() -> None:
-    """At one and a half times the size of a picture there are more than twice as many."""
-    sizes = torch.linspace(2**20, 2**25, 400).tolist()
-    weights = [plan(1000.0, (1500.0, 1500.0), int(pixels)).weight for pixels in sizes]
+    """At almost twice the size of a picture there are almost four times as many."""
+    sizes = torch.linspace(2**18, 1.1 * 2**23, 400).tolist()
+    weights = [plan(1000.0, (1950.0, 1950.0), int(pixels)).weight for pixels in sizes]
     assert weights[0] == 1
     assert weights[-1] == 0
     assert all(a >= b for a, b in zip(weights, weights[1:], strict=False))
     assert max(a - b for a, b in zip(weights, weights[1:], strict=False)) < 0.02
-    assert all(weight == 0 for weight, pixels in zip(weights, sizes, strict=True) if 1.5**2 * pixels >= MOST_PIXELS[0])
     assert plan(1000.0, (250.0, 250.0), 4000 * 3000).weight == 1  # a large picture that is made anew as a smaller one
+
+
+@given(st.integers(1, 10**9), st.floats(0.1, 5.0))
+def test_the_head_does_not_appear_at_once_whatever_the_size(pixels: int, zoom: float) -> None:
+    weight = plan(1000.0, (1000 * zoom, 1000 * zoom), pixels).weight
+    assert abs(weight - plan(1000.0, (1010 * zoom, 1010 * zoom), pixels).weight) < 0.08
+    if zoom <= TOLERANCE:
+        assert weight == 1
+    elif pixels * zoom**2 > 2 * max(MOST_PIXELS, TOLERANCE**2 * pixels):
+        assert weight == 0
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 5), (40, 64), (31, 90)])
