@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -275,6 +276,8 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
         cut = own.index("--")
         own, extra = own[:cut], own[cut + 1 :]
     options = parser.parse_args(own)
+    if options.save and options.average is not None:
+        parser.error("--save keeps what was trained, and --average evaluates a mean of it; leave one of the two out")
     if options.profile and not torch.cuda.is_available():
         parser.error("--profile counts a GPU's milliseconds, and there is none here; leave it out")
     return options, extra
@@ -295,7 +298,8 @@ def training_views(pipeline: Any, count: int = 16) -> dict[str, float]:
 
 
 def row(line: dict[str, Any], bytes_: Sizes, resolution: str) -> RunRow:
-    """What ``runs.csv`` has of a branch: its share is not known, nor is a frame timed."""
+    """What ``runs.csv`` has of a branch: no frame of it is timed, and its share is that of a prune of its own, if any."""
+    share = re.search(r"pruning\.keep-ratio (\S+)", line["command"])
     given = {key: value for key, value in line["experiments"].items() if value is not None and value is not False}
     changed = {key: value for key, value in given.items() if (key, value) != ("rates", 1.0)}
     flags = [f"--{key.replace('_', '-')}" + ("" if value is True else f" {value}") for key, value in changed.items()]
@@ -304,7 +308,7 @@ def row(line: dict[str, Any], bytes_: Sizes, resolution: str) -> RunRow:
         **{key: line[key] for key in ("psnr", "ssim", "psnr_base", "ssim_base")},
         method="sundae",
         variant=f"branch: {line['name']}",
-        keep_ratio=None,
+        keep_ratio=None if share is None else float(share[1]),
         lpips=None,
         lpips_net="",
         bytes_primitives=bytes_.primitives,

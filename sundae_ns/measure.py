@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
@@ -37,6 +36,9 @@ from sundae_ns.model import SundaeModel
 from sundae_ns.opening import Opened
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
 from sundae_ns.views import zoomed
+
+MOST_ZOOM = 1000
+"""Pictures of so many times their size have more pixels than fit into any memory."""
 
 
 @dataclass(frozen=True)
@@ -144,12 +146,14 @@ def frame_figures(
         warmup, repeats: as for :func:`frame_times`.
 
     Raises:
-        ConfigError: the factor is not above zero or not finite, or phases are not of :data:`PHASES`.
+        ConfigError: the factor is not above zero or too large, or phases are not of :data:`PHASES`.
         BackendError: half precision is asked for on a CPU.
     """
     model = run.model
-    if not 0 < factor < math.inf:
-        raise ConfigError(f"no picture is {factor} times the size of another; give a factor above 0")
+    if not 0 < factor < MOST_ZOOM:
+        raise ConfigError(
+            f"no picture is {factor} times the size of another; give a factor above 0, and below {MOST_ZOOM}"
+        )
     on_cpu = model.device.type == "cpu"
     precision = precision or ("fp32" if on_cpu or model.head is None else model.head.config.precision)
     if on_cpu and precision != "fp32":

@@ -144,6 +144,23 @@ def test_background_shows_where_nothing_is(
     torch.testing.assert_close(picture, torch.tensor([0.2, 0.4, 0.6]).expand_as(picture))
 
 
+@torch.no_grad()
+def test_what_features_make_lies_over_the_background(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    """Once, by accumulation: between two backgrounds the picture differs by what shines through."""
+    model = perturb(build(head={"mode": "features"})).eval()
+    model.step = 10_000
+    model.gauss_params["opacities"].data -= 3.0
+    pictures = []
+    for value in (0.25, 0.75):
+        model.set_background(torch.full((3,), value))
+        outputs = model.get_outputs_for_camera(camera())
+        pictures.append((outputs["rgb"], outputs["accumulation"]))
+    (dark, alpha), (light, _) = pictures
+    inside = ((dark > 0) & (light < 1)).all(dim=-1, keepdim=True) & (alpha > 0.01) & (alpha < 0.99)
+    assert inside.sum() > 50
+    torch.testing.assert_close((light - dark)[inside[..., 0]], (0.5 * (1 - alpha))[inside].expand(3, -1).T)
+
+
 def at_focal(camera: MakeCamera, factor: float) -> Cameras:
     """The test camera, its picture magnified."""
     small = camera()
