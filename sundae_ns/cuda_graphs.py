@@ -22,7 +22,7 @@ RECORD_AT = 3
 Result = TypeVar("Result")
 
 _failed: list[torch.cuda.CUDAGraph] = []
-"""Recordings that were not finished: torch's allocator goes on asking them whether an allocation is theirs."""
+"""Recordings that were not finished, kept for what torch may still ask them."""
 
 _thread = threading.local()
 _one_at_a_time = threading.Lock()
@@ -111,21 +111,26 @@ def record(
                         errors.append(error)
                         raise
         except RuntimeError as error:
-            if error not in errors:
-                # It was not ended either. Random numbers would be refused as of a recording that is not there,
+            if error not in errors:  # it was not ended either
                 errors.append(error)
+                _abandon(graph, pool)
                 if before is not None:
+                    # Or random numbers would be refused, as of a recording that is not there.
                     generator.graphsafe_set_state(before)
-                # and the allocator would give nothing back, and go on asking the graph whether an allocation is its own.
-                with suppress(AttributeError, RuntimeError):
-                    torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), pool)
-                _failed.append(graph)
             first = errors[0]
             if isinstance(first, torch.cuda.OutOfMemoryError):
                 raise first from None
             cause = str(first).partition("\n")[0]
             raise BackendError(f"{device} cannot record this as a CUDA graph: {cause}") from first
     return graph, result
+
+
+def _abandon(graph: torch.cuda.CUDAGraph, pool: tuple[int, int]) -> None:
+    """Tell torch's allocator that a recording is over which could not be ended: it would give no memory back."""
+    # Torch has no public way; where this one is missing, it goes on asking the graph whether an allocation is its own.
+    with suppress(AttributeError, RuntimeError):
+        torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), pool)
+    _failed.append(graph)
 
 
 class Kept(Generic[Result]):
