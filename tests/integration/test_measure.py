@@ -156,6 +156,11 @@ def test_bench_frame_prints_null_for_what_is_not_defined(tiny: Any, capsys: pyte
     assert (small["width"], small["ssim"], small["ssim_base"]) == (10, None, None)
     assert larger["width"] == 12
     assert 0 < min(small["psnr"], larger["psnr"], larger["ssim"])
+    with pytest.raises(SystemExit):
+        main(["bench", "frame", *arguments])
+    shown = capsys.readouterr().out
+    assert "nan" not in shown
+    assert "10x" in shown
 
 
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as jsonlib
+import math
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -66,7 +67,11 @@ def _table(figures: Sequence[FrameFigures], title: str) -> Table:
     for column in ("size", "head in", "runs", "frame", "splat", "head", "PSNR", "SSIM", "PSNR off", "SSIM off"):
         table.add_column(column, justify="right", no_wrap=True)
     for f in figures:
-        times = (f"{value:.2f}" for value in (f.ms_frame, f.ms_splat, f.ms_head))
-        errors = (f"{f.psnr:.2f}", f"{f.ssim:.4f}", f"{f.psnr_base:.2f}", f"{f.ssim_base:.4f}")
+        times = (_shown(value, 2) for value in (f.ms_frame, f.ms_splat, f.ms_head))
+        errors = (_shown(f.psnr, 2), _shown(f.ssim, 4), _shown(f.psnr_base, 2), _shown(f.ssim_base, 4))
         table.add_row(f"{f.width}x{f.height}", f.precision, str(f.phases), *times, *errors)
     return table
+
+
+def _shown(value: float, digits: int) -> str:
+    return "-" if math.isnan(value) else f"{value:.{digits}f}"
