@@ -16,7 +16,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sundae_ns.compensation import over_phases, plan, resize
+from sundae_ns.compensation import over_phases, resize
 from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.evaluation import (
     HEAD_OFF,
@@ -34,6 +34,7 @@ from sundae_ns.evaluation import (
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.opening import Opened
+from sundae_ns.rendering import plan_of
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
 from sundae_ns.views import zoomed
 
@@ -91,7 +92,7 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
             with compensation(model, on):
                 times.append(milliseconds(partial(show, camera)))
         view = model.view_of(camera)
-        zoom, weight = plan(view.focal, model.trained_focal, view.width * view.height)
+        zoom, weight = plan_of(view, model.trained_focal)
         if model.head is None or not model.head_active or weight == 0:
             heads.append(0.0)
             continue

@@ -17,11 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.compensation import plan
 from sundae_ns.cuda_graphs import Kept, aside, record
 from sundae_ns.errors import BackendError
 from sundae_ns.rasterization import GsplatBackend, Room
-from sundae_ns.rendering import Style, degree_in_use, render
+from sundae_ns.rendering import Style, degree_in_use, plan_of, render
 from sundae_ns.views import View
 
 SPARE = 1.5
@@ -115,12 +114,7 @@ class Recordings:
         if head is not None:
             # The network itself, not its number, which a later one might be given; and where its weights lie.
             lie = tuple(value.data_ptr() for value in head.net.parameters())
-            of_head = (
-                head.net,
-                lie,
-                astuple(head.config),
-                *plan(view.focal, style.trained_focal, view.width * view.height),
-            )
+            of_head = (head.net, lie, astuple(head.config), *plan_of(view, style.trained_focal))
         degree = degree_in_use(field["features_rest"], style.most_bands)
         return view.width, view.height, style.antialiased, style.logits, degree, of_head
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from sundae_ns.compensation import CompensationHead, over_phases, plan, resize
+from sundae_ns.compensation import CompensationHead, ScalePlan, over_phases, plan, resize
 from sundae_ns.distributed import Arrived
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES
@@ -96,6 +96,11 @@ def splat(params: Mapping[str, Tensor], view: View, channels: Tensor, style: Sty
     return rasterize(colors=channels, **_pass(params, view, style), **options)
 
 
+def plan_of(view: View, trained_focal: tuple[float, float] | None) -> ScalePlan:
+    """How a view's picture is compensated by a head that was trained at these focal lengths."""
+    return plan(view.focal, trained_focal, view.width * view.height)
+
+
 def render(
     params: Mapping[str, Tensor],
     view: View,
@@ -129,8 +134,7 @@ def render(
     base = (blended + (1 - splatted.alpha) * background).clamp(0.0, 1.0)
     rgb = base
     if head is not None:
-        pixels = view.width * view.height
-        zoom, weight = (1.0, 1.0) if style.training else plan(view.focal, style.trained_focal, pixels)
+        zoom, weight = ScalePlan(1.0, 1.0) if style.training else plan_of(view, style.trained_focal)
         if zoom == 1.0:
             seen = (base, splatted.colors, splatted.alpha)
             rgb = head(*seen) if style.training else over_phases(head, *seen)
