@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import Any
 
 from sundae_ns.budget.run import Run
 from sundae_ns.budget.sizes import bytes_of, chosen_head
 from sundae_ns.compensation import HeadConfig
+from sundae_ns.evaluation import without_nan
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.pruning.search import Point, Search
 from sundae_ns.storage.atomic import write_text
@@ -68,17 +67,8 @@ def write(run: Run, config: PruningConfig, search: Search) -> None:
     }
     folder = trainer.base_dir
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / "budget.json", json.dumps(_plain(content), indent=2, allow_nan=False))
+    write_text(folder / "budget.json", json.dumps(without_nan(content), indent=2, allow_nan=False))
     write_text(folder / "budget.txt", curve_text(search.curve, search.target) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    """The same with None in place of what is no number, which JSON cannot say."""
-    if isinstance(value, dict):
-        return {name: _plain(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [_plain(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def curve_text(points: Sequence[Point], target: float, width: int = 40) -> str:

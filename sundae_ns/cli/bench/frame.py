@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json as jsonlib
-import math
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -17,6 +16,7 @@ from rich.table import Table
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.evaluation import without_nan
+from sundae_ns.evaluation.document import number
 from sundae_ns.measure import FrameFigures, frame_figures
 from sundae_ns.opening import load_run
 
@@ -67,11 +67,7 @@ def _table(figures: Sequence[FrameFigures], title: str) -> Table:
     for column in ("size", "head in", "runs", "frame", "splat", "head", "PSNR", "SSIM", "PSNR off", "SSIM off"):
         table.add_column(column, justify="right", no_wrap=True)
     for f in figures:
-        times = (_shown(value, 2) for value in (f.ms_frame, f.ms_splat, f.ms_head))
-        errors = (_shown(f.psnr, 2), _shown(f.ssim, 4), _shown(f.psnr_base, 2), _shown(f.ssim_base, 4))
+        times = (number(value, 2) for value in (f.ms_frame, f.ms_splat, f.ms_head))
+        errors = (number(f.psnr, 2), number(f.ssim, 4), number(f.psnr_base, 2), number(f.ssim_base, 4))
         table.add_row(f"{f.width}x{f.height}", f.precision, str(f.phases), *times, *errors)
     return table
-
-
-def _shown(value: float, digits: int) -> str:
-    return "-" if math.isnan(value) else f"{value:.{digits}f}"
