@@ -300,27 +300,18 @@ def training_views(pipeline: Any, count: int = 16) -> dict[str, float]:
 def row(line: dict[str, Any], bytes_: Sizes, resolution: str) -> RunRow:
     """What ``runs.csv`` has of a branch: no frame of it is timed, and its share is that of a prune of its own, if any."""
     share = re.search(r"pruning\.keep-ratio (\S+)", line["command"])
-    given = {key: value for key, value in line["experiments"].items() if value is not None and value is not False}
-    changed = {key: value for key, value in given.items() if (key, value) != ("rates", 1.0)}
-    flags = [f"--{key.replace('_', '-')}" + ("" if value is True else f" {value}") for key, value in changed.items()]
+    changed = [(key, value) for key, value in line["experiments"].items() if value and (key, value) != ("rates", 1.0)]
+    flags = [f"--{key.replace('_', '-')}" + ("" if value is True else f" {value}") for key, value in changed]
     return RunRow(
         **{key: line[key] for key in ("scene", "seed", "steps", "primitives", "gpu", "commit")},
         **{key: line[key] for key in ("psnr", "ssim", "psnr_base", "ssim_base")},
         method="sundae",
         variant=f"branch: {line['name']}",
         keep_ratio=None if share is None else float(share[1]),
-        lpips=None,
-        lpips_net="",
         bytes_primitives=bytes_.primitives,
         bytes_head=bytes_.head,
         bytes_total=bytes_.total,
-        ms_frame=None,
-        ms_splat=None,
-        ms_head=None,
         train_s=line.get("train_s"),
-        prune_s=None,
-        peak_primitives=None,
-        peak_vram_mib=None,
         resolution=resolution,
         command=line["command"] + (f" (branch.py {' '.join(flags)})" if flags else ""),
     )
@@ -413,9 +404,7 @@ def main() -> None:
     with open(options.results, "a") as file:
         file.write(json.dumps(line) + "\n")
     if options.rows != "-":
-        camera = trainer.pipeline.datamanager.eval_dataset.cameras[0]
-        resolution = f"{int(camera.width)}x{int(camera.height)}"
-        append_row(Path(options.rows), row(line, sizes(trainer.pipeline.model), resolution))
+        append_row(Path(options.rows), row(line, sizes(trainer.pipeline.model), run.resolution(trainer.pipeline)))
     print("branch:", line)
 
 

@@ -14,17 +14,22 @@ from pathlib import Path
 from statistics import mean
 from typing import Any
 
+from tables import with_spread
+
 BRANCHES = Path(__file__).parent / "results" / "branches.jsonl"
 AGAIN = re.compile(r"-(15000|seed-\d+)$")
 """Ends of names that tell runs of one kind apart."""
+
+OTHERS = {"ssim": 4, "psnr_base": 2, "train_psnr": 2}
+"""Columns after PSNR, and their decimals."""
 
 Lines = list[dict[str, Any]]
 
 
 def is_plain(line: dict[str, Any]) -> bool:
     """Whether it has no head, and is trained as the others are."""
-    experiments = {**line["experiments"], "rates": None if line["experiments"]["rates"] == 1.0 else 1}
-    return "head.mode off" in line["command"] and not any(experiments.values())
+    changed = any(value and (name, value) != ("rates", 1.0) for name, value in line["experiments"].items())
+    return "head.mode off" in line["command"] and not changed
 
 
 def gained(line: dict[str, Any], lines: Lines) -> float | None:
@@ -37,15 +42,10 @@ def gained(line: dict[str, Any], lines: Lines) -> float | None:
 def cells(runs: Lines, lines: Lines) -> list[str]:
     if not runs:
         return [""] * 4
-    values = [run["psnr"] for run in runs]
-    spread = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
     gains = [gain for run in runs if (gain := gained(run, lines)) is not None]
-    gained_so = f" ({mean(gains):+.2f})" if gains else ""
+    over_plain = f" ({mean(gains):+.2f})" if gains else ""
     others = [f"{mean(run[key] for run in runs):.{digits}f}" for key, digits in OTHERS.items()]
-    return [f"{mean(values):.2f}{spread}{gained_so}", *others]
-
-
-OTHERS = {"ssim": 4, "psnr_base": 2, "train_psnr": 2}
+    return [with_spread([run["psnr"] for run in runs]) + over_plain, *others]
 
 
 def main() -> None:

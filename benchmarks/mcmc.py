@@ -127,7 +127,6 @@ def train(options: argparse.Namespace, keep: float, seed: int, count: int) -> tu
     train_s = time.perf_counter() - started
     trainer.pipeline.eval()
     quality = run.evaluate(trainer.pipeline)
-    camera = trainer.pipeline.datamanager.eval_dataset.cameras[0]
     measured = {
         "psnr": quality["psnr"],
         "ssim": quality["ssim"],
@@ -135,7 +134,7 @@ def train(options: argparse.Namespace, keep: float, seed: int, count: int) -> tu
         "train_s": train_s,
         "command": " ".join(["ns-train", options.method, "--data", options.scene, *arguments[3:], options.parser]),
     }
-    return measured, sizes(trainer.pipeline.model).primitives, f"{int(camera.width)}x{int(camera.height)}"
+    return measured, sizes(trainer.pipeline.model).primitives, run.resolution(trainer.pipeline)
 
 
 def main() -> None:

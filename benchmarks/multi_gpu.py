@@ -157,7 +157,6 @@ def record(
     command: str,
 ) -> None:
     model, config = trainer.pipeline.model, options
-    camera = trainer.pipeline.datamanager.eval_dataset.cameras[0]
     reports = trainer.base_dir / "prune.json"
     pruned = json.loads(reports.read_text()) if reports.exists() else []
     command += f" --machine.num-devices {clock.ranks}"
@@ -177,20 +176,15 @@ def record(
             ssim=quality["ssim"],
             psnr_base=quality["psnr_base"],
             ssim_base=quality["ssim_base"],
-            lpips=None,
-            lpips_net="",
             bytes_primitives=bytes_.primitives if bytes_ else 0,
             bytes_head=bytes_.head if bytes_ else 0,
             bytes_total=bytes_.total if bytes_ else 0,
-            ms_frame=None,
-            ms_splat=None,
-            ms_head=None,
             train_s=clock.seconds,
             prune_s=sum(report["seconds"] for report in pruned),
             peak_primitives=model.pruning_state["peak"],
             peak_vram_mib=max(memory),
             gpu=gpu,
-            resolution=f"{int(camera.width.item())}x{int(camera.height.item())}",
+            resolution=run.resolution(trainer.pipeline),
             commit=run.commit(),
             command=f"{ours} ({command})",
         ),

@@ -309,9 +309,8 @@ class Bench:
         }
 
     def row(self, line: dict[str, Any]) -> RunRow:
-        camera = self.trainer.pipeline.datamanager.eval_dataset.cameras[0]
         command = command_of(line, self.options.parser)
-        return row(line, sizes(self.model).primitives, f"{int(camera.width)}x{int(camera.height)}", command)
+        return row(line, sizes(self.model).primitives, run.resolution(self.trainer.pipeline), command)
 
 
 def command_of(line: dict[str, Any], parser: str) -> str:
@@ -332,16 +331,9 @@ def row(line: dict[str, Any], bytes_primitives: int, resolution: str, command: s
         steps=line["warmup"] + line["steps"],
         psnr_base=line["psnr"],
         ssim_base=line["ssim"],
-        lpips=None,
-        lpips_net="",
         bytes_primitives=bytes_primitives,
         bytes_head=0,
         bytes_total=bytes_primitives,
-        ms_frame=None,
-        ms_splat=None,
-        ms_head=None,
-        peak_primitives=None,
-        peak_vram_mib=None,
         resolution=resolution,
         command=command,
     )

@@ -19,6 +19,7 @@ import rules
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.lines import Line2D
+from tables import with_spread
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 SWEPT = re.compile(r"^(?P<rule>.+) (?P<what>gamma|reach|k) x?(?P<value>[\d.]+)$")
@@ -28,10 +29,7 @@ Groups = dict[tuple[str, int], list[dict[str, Any]]]
 
 def cell(lines: list[dict[str, Any]], column: str) -> str:
     values = [line[column] for line in lines if line[column] is not None]
-    if not values:
-        return ""
-    spread = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
-    return f"{mean(values):.2f}{spread}"
+    return with_spread(values) if values else ""
 
 
 def tables(groups: Groups) -> None:

@@ -111,6 +111,12 @@ def evaluate(pipeline: Any) -> dict[str, float]:
     return {name: total / len(views) for name, total in sums.items()}
 
 
+def resolution(pipeline: Any) -> str:
+    """Width x height of the first test view, pixels."""
+    camera = pipeline.datamanager.eval_dataset.cameras[0]
+    return f"{int(camera.width)}x{int(camera.height)}"
+
+
 def commit() -> str:
     """The revision measured; a figure without one is not taken."""
     found = revision()
@@ -186,8 +192,6 @@ def main() -> None:
         ssim=quality["ssim"],
         psnr_base=quality["psnr_base"],
         ssim_base=quality["ssim_base"],
-        lpips=None,
-        lpips_net=None,
         bytes_primitives=bytes_.primitives,
         bytes_head=bytes_.head,
         bytes_total=bytes_.total,
@@ -199,7 +203,7 @@ def main() -> None:
         peak_primitives=counts.peak,
         peak_vram_mib=peak,
         gpu=torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
-        resolution=f"{int(cameras.width[0])}x{int(cameras.height[0])}",
+        resolution=resolution(pipeline),
         commit=commit(),
         command=command,
     )

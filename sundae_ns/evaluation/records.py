@@ -17,7 +17,7 @@ with contextlib.suppress(ImportError):  # Windows has none.
     import fcntl
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunRow:
     """One run. The fields are the columns, in order; None, an empty cell, is what was not measured.
 
@@ -35,19 +35,19 @@ class RunRow:
     ssim: float | None
     psnr_base: float | None
     ssim_base: float | None
-    lpips: float | None
-    lpips_net: str
+    lpips: float | None = None
+    lpips_net: str = ""
     bytes_primitives: int
     bytes_head: int
     bytes_total: int
-    ms_frame: float | None
-    ms_splat: float | None
-    ms_head: float | None
+    ms_frame: float | None = None
+    ms_splat: float | None = None
+    ms_head: float | None = None
     train_s: float | None
-    prune_s: float | None
-    peak_primitives: int | None
+    prune_s: float | None = None
+    peak_primitives: int | None = None
     """Most primitives at any time during training, between growing and culling too."""
-    peak_vram_mib: float | None
+    peak_vram_mib: float | None = None
     """Most memory that torch held on the GPU during training."""
     gpu: str
     resolution: str
