@@ -74,9 +74,7 @@ def main() -> None:
                 "commit": run.commit(),
             }
             print(json.dumps(line))
-            options.results.parent.mkdir(parents=True, exist_ok=True)
-            with open(options.results, "a") as file:
-                file.write(json.dumps(line) + "\n")
+            run.append_line(options.results, line)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ option for: those that have figures lost (``results/branches.jsonl``); ``--windo
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import sys
 from dataclasses import dataclass, field, replace
@@ -400,9 +399,7 @@ def main() -> None:
     }
     if options.profile:
         line |= profiled(trainer, range(options.steps, options.steps + options.profile))
-    options.results.parent.mkdir(parents=True, exist_ok=True)
-    with open(options.results, "a") as file:
-        file.write(json.dumps(line) + "\n")
+    run.append_line(options.results, line)
     if options.rows != "-":
         append_row(Path(options.rows), row(line, sizes(trainer.pipeline.model), run.resolution(trainer.pipeline)))
     print("branch:", line)

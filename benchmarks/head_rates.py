@@ -1,10 +1,13 @@
-"""Does a head of several ranks burst at its learning rate? Trained alone on a finished run's field, in batches of pictures.
+"""At which learning rate does a head burst? Trained alone on the still field of a finished run, on a CPU too.
 
-    python benchmarks/head_rates.py --load-config RUN/config.yml --rate 2e-3 --batch 4 --power 4    # four ranks, scaled
-    python benchmarks/head_rates.py --load-config RUN/config.yml --rate 1e-3 --batch 4 --power 1    # as one GPU has it
+    python benchmarks/head_rates.py --load-config RUN/config.yml --seeds 1 2 3 4 5 6
+    python benchmarks/head_rates.py --load-config RUN/config.yml --betas 0.9 0.999 --full-rate-inputs 100000     # plain Adam
+    python benchmarks/head_rates.py --load-config RUN/config.yml --size regular --pixel-unshuffle 1 --steps 300 --rise 100
 
-A fresh head learns on the still field, on windows of 160 pixels a side, on any device. ``--power`` is that of Adam's two
-betas. A line goes to ``results/head_rates.jsonl``: the mean loss of each stretch of 50 steps, and the longest gradient in it.
+A fresh head learns on random windows of the training views, at a rate that rises and then stays, which is harder than the
+decay of ns-train. A sixth of the views is held back. A line for each seed goes to ``results/head_rates.jsonl``: steps whose
+loss is more than 1.3 times that of base colours (``bursts``), the loss over that of base colours and the longest gradient in
+each tenth of the steps, and the gain in PSNR over base colours on the views held back.
 """
 
 from __future__ import annotations
@@ -13,69 +16,123 @@ import argparse
 import json
 from pathlib import Path
 from statistics import mean
-from typing import Any
+from typing import NamedTuple
 
+import run
 import torch
+from pytorch_msssim import SSIM
 from rich.progress import track
+from torch import Tensor
 
-from sundae_ns import model as model_module
-from sundae_ns.compensation import CompensationHead, Window
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.evaluation import psnr
+from sundae_ns.losses import picture_loss
 from sundae_ns.opening import open_pipeline
+from sundae_ns.optimizers import NetworkAdamConfig
 
 RESULTS = Path(__file__).parent / "results" / "head_rates.jsonl"
-SIDE, STRETCH, WARMUP = 160, 50, 500
+BURST = 1.3
+HELD_BACK = 6
+
+
+class Seen(NamedTuple):
+    """A training view of the still field."""
+
+    base: Tensor
+    splatted: Tensor
+    alpha: Tensor
+    truth: Tensor
+
+    def window(self, left: int, top: int, side: int) -> Seen:
+        return Seen(*(picture[top : top + side, left : left + side].contiguous() for picture in self))
+
+    def compensated(self, head: CompensationHead) -> Tensor:
+        return head(self.base, self.splatted, self.alpha)
+
+
+@torch.no_grad()
+def training_views(path: Path, count: int) -> list[Seen]:
+    opened = open_pipeline(path)
+    model, data = opened.model, opened.pipeline.datamanager
+    opened.pipeline.eval()
+    cameras = list(data.training_views())
+    views = []
+    for i in torch.linspace(0, len(cameras) - 1, count).round().long().unique().tolist():
+        view, background = model.view_of(cameras[i][0]), model._get_background_color()
+        pictures, splatted = model.render(model.gaussians, view, background, depth=False)
+        truth = model.composite_with_background(model.get_gt_img(data.cached_train[i]["image"]), background)
+        views.append(Seen(pictures["base_rgb"], splatted.colors, splatted.alpha, truth))
+    return views
+
+
+def train(views: list[Seen], options: argparse.Namespace, seed: int) -> dict[str, object]:
+    held_back = views[HELD_BACK - 1 :: HELD_BACK]
+    views = [view for i, view in enumerate(views) if i % HELD_BACK != HELD_BACK - 1]
+    torch.manual_seed(seed)
+    features = views[0].splatted.shape[2] - 3
+    config = HeadConfig(size=options.size, pixel_unshuffle=options.pixel_unshuffle, num_features=features)
+    head = CompensationHead(config).to(views[0].base.device)
+    adam = NetworkAdamConfig(
+        lr=options.rate, eps=1e-8, betas=tuple(options.betas), full_rate_inputs=options.full_rate_inputs
+    )
+    optimizer = adam.setup(head.parameters())
+    highest = [group["lr"] for group in optimizer.param_groups]
+    ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+    chance = torch.Generator().manual_seed(seed)
+    losses, norms = [], []
+    for step in track(range(options.steps), description=f"Seed {seed}", transient=True):
+        for group, rate in zip(optimizer.param_groups, highest, strict=True):
+            group["lr"] = rate * min((step + 1) / (options.rise + 1), 1.0)
+        optimizer.zero_grad()
+        loss = of_base = 0.0
+        for _ in range(options.batch):
+            i, u, v = (torch.rand(3, generator=chance) * (1 - 1e-6)).tolist()
+            height, width = views[0].base.shape[:2]
+            left, top = int(u * (width - options.side + 1)), int(v * (height - options.side + 1))
+            seen = views[int(i * len(views))].window(left, top, options.side)
+            found = picture_loss(seen.compensated(head), seen.truth, ssim, 0.2) / options.batch
+            found.backward()
+            loss += float(found.detach())
+            of_base += float(picture_loss(seen.base, seen.truth, ssim, 0.2)) / options.batch
+        losses.append(loss / of_base)
+        norms.append(float(torch.cat([p.grad.flatten() for p in head.parameters() if p.grad is not None]).norm()))
+        optimizer.step()
+    with torch.no_grad():
+        gains = [float(psnr(v.compensated(head).clamp(0, 1), v.truth) - psnr(v.base, v.truth)) for v in held_back]
+    stretch = max(options.steps // 10, 1)
+    starts = range(0, options.steps, stretch)
+    return {
+        "seed": seed,
+        "bursts": sum(loss > BURST for loss in losses),
+        "gain": round(mean(gains), 3),
+        "loss": [round(mean(losses[start : start + stretch]), 3) for start in starts],
+        "longest_gradient": [round(max(norms[start : start + stretch]), 2) for start in starts],
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--load-config", type=Path, required=True)
-    parser.add_argument("--rate", type=float, required=True)
-    parser.add_argument("--batch", type=int, default=4, help="pictures of a step, as many as there would be ranks")
-    parser.add_argument("--power", type=int, default=1)
-    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--size", default="compact")
+    parser.add_argument("--pixel-unshuffle", type=int, default=2)
+    parser.add_argument("--rate", type=float, default=1e-3)
+    parser.add_argument("--betas", type=float, nargs=2, default=NetworkAdamConfig.betas)
+    parser.add_argument("--full-rate-inputs", type=int, default=NetworkAdamConfig.full_rate_inputs)
+    parser.add_argument("--batch", type=int, default=1, help="pictures of a step")
+    parser.add_argument("--steps", type=int, default=2500)
+    parser.add_argument("--rise", type=int, default=500, help="steps over which the rate rises")
+    parser.add_argument("--side", type=int, default=96, help="of the windows, pixels")
+    parser.add_argument("--views", type=int, default=64, help="training views, evenly chosen")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--results", type=Path, default=RESULTS)
     options = parser.parse_args()
-    opened = open_pipeline(options.load_config, data=None, test_mode="val")
-    pipeline, model = opened.pipeline, opened.model
-    assert model.head is not None
-    torch.manual_seed(0)
-    model.head.load_state_dict(CompensationHead(model.head.config).state_dict())
-    corners = torch.Generator().manual_seed(0)
-
-    def window(width: int, height: int, *_: Any, **__: Any) -> Window:
-        u, v = torch.rand(2, generator=corners).tolist()
-        return Window(int(u * (width - SIDE)), int(v * (height - SIDE)), SIDE, SIDE)
-
-    model_module.training_window = window
-    pipeline.train()
-    for value in model.gauss_params.values():
-        value.requires_grad_(False)
-    betas = (0.9**options.power, 0.999**options.power)
-    optimizer = torch.optim.Adam(model.head.parameters(), lr=options.rate, betas=betas, eps=1e-8)
-    losses, norms = [], []
-    for step in track(range(options.steps), description="Steps"):
-        optimizer.param_groups[0]["lr"] = options.rate * min((step + 1) / (WARMUP // options.batch + 1), 1.0)
-        optimizer.zero_grad()
-        total = 0.0
-        for picture in range(options.batch):
-            model.step = opened.step + 1 + step * options.batch + picture
-            loss = pipeline.get_train_loss_dict(model.step)[1]["main_loss"] / options.batch
-            loss.backward()
-            total += loss.item()
-        grads = [value.grad.flatten() for value in model.head.parameters() if value.grad is not None]
-        losses.append(total)
-        norms.append(float(torch.cat(grads).norm()))
-        optimizer.step()
-    starts = range(0, options.steps, STRETCH)
-    line = {
-        "run": opened.config.experiment_name,
-        **{name: getattr(options, name) for name in ("rate", "batch", "power", "steps")},
-        "loss": [round(mean(losses[start : start + STRETCH]), 4) for start in starts],
-        "longest_gradient": [round(max(norms[start : start + STRETCH]), 3) for start in starts],
-    }
-    with options.results.open("a") as file:
-        file.write(json.dumps(line) + "\n")
-    print(line)
+    views = training_views(options.load_config, options.views)
+    said = "size pixel_unshuffle rate betas full_rate_inputs batch steps rise side".split()
+    for seed in options.seeds:
+        line = {"run": options.load_config.parents[2].name, **{name: getattr(options, name) for name in said}}
+        line |= train(views, options, seed)
+        run.append_line(options.results, line)
+        print(json.dumps(line), flush=True)
 
 
 if __name__ == "__main__":

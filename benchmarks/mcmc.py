@@ -157,7 +157,7 @@ def main() -> None:
                 "gpu": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "",
                 "commit": run.commit(),
             }
-            rules.append(options.results, line)
+            run.append_line(options.results, line)
             if str(options.rows) != "-":
                 command = f"{line['command']} (mcmc.py --count {line['primitives']})"
                 append_row(options.rows, rules.row(line, bytes_primitives, resolution, command))

@@ -204,8 +204,7 @@ def record(
         "commit": run.commit(),
         "command": ours,
     }
-    with LINES.open("a") as file:
-        file.write(json.dumps(line) + "\n")
+    run.append_line(LINES, line)
 
 
 def main() -> None:

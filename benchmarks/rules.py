@@ -402,13 +402,6 @@ def jobs_of(options: argparse.Namespace, wanted: list[Branch]) -> list[dict[str,
     return jobs
 
 
-def append(path: Path, line: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "a") as file:
-        wait_for_lock(file.fileno())
-        file.write(json.dumps(line) + "\n")
-
-
 def main() -> None:
     options = parse()
     number, of = (int(part) for part in options.shard.split("/"))
@@ -425,7 +418,7 @@ def main() -> None:
     for group in groups(mine, options.abreast):
         left = [branch for branch in group if not is_finished(options.results, key_of(options, branch, bench.step))]
         for line in bench.branch(left) if left else []:
-            append(options.results, line)
+            run.append_line(options.results, line)
             if str(options.rows) != "-":
                 append_row(options.rows, bench.row(line))
             what = f"{line['rule']}, {line['keep']:g}"

@@ -23,6 +23,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 
 from sundae_ns.evaluation import RunRow, append_row, median_ms, psnr, ssim
+from sundae_ns.evaluation.records import wait_for_lock
 from sundae_ns.evaluation.timing import now
 from sundae_ns.measure import frame_times, revision, sizes
 from sundae_ns.model import SundaeModel
@@ -115,6 +116,14 @@ def resolution(pipeline: Any) -> str:
     """Width x height of the first test view, pixels."""
     camera = pipeline.datamanager.eval_dataset.cameras[0]
     return f"{int(camera.width)}x{int(camera.height)}"
+
+
+def append_line(path: Path, line: dict[str, Any]) -> None:
+    """A line of JSON at the end of a file that several processes write to."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with open(path, "a") as file:
+        wait_for_lock(file.fileno())
+        file.write(json.dumps(line) + "\n")
 
 
 def commit() -> str:

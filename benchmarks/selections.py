@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import run
 import torch
 from rich.progress import track
 from rules import PLAIN, RULES
@@ -111,9 +112,8 @@ def main() -> None:
     if not torch.cuda.is_available():
         parser.error("there is no CUDA device to compare the CPU with; sundae doctor says more")
     for path in options.configs:
-        lines = compare(path, options)
-        with options.results.open("a") as file:
-            file.writelines(json.dumps(line) + "\n" for line in lines)
+        for line in compare(path, options):
+            run.append_line(options.results, line)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.model import SundaeModelConfig
-from sundae_ns.optimizers import FusedAdamConfig
+from sundae_ns.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.schedulers import PruneAwareDecayConfig
 from sundae_ns.trainer import SundaeTrainerConfig
@@ -49,7 +49,7 @@ def optimizers(steps: int, *, means_restart: float | None = 1.6e-4) -> dict[str,
         "features": _constant(0.0025),
         "compensation": {
             # The usual eps: with 3DGS's tiny one, weights whose gradient is all but zero would take full steps.
-            "optimizer": _adam(1e-3, eps=1e-8),
+            "optimizer": NetworkAdamConfig(lr=1e-3, eps=1e-8),
             "scheduler": PruneAwareDecayConfig(
                 lr_final=1e-5, max_steps=steps, lr_restart=1e-3, hold_until_prune=True, warmup_steps=500
             ),

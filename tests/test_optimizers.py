@@ -6,7 +6,9 @@ import pytest
 import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 
-from sundae_ns.optimizers import FusedAdamConfig
+from method_configs import sundae
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.optimizers import FusedAdamConfig, NetworkAdamConfig
 
 
 def trained(config: AdamOptimizerConfig, device: str = "cpu") -> torch.Tensor:
@@ -30,6 +32,43 @@ def test_options_arrive_and_a_generator_of_parameters_will_do() -> None:
     group = optimizer.param_groups[0]
     assert (group["lr"], group["eps"], group["weight_decay"], group["fused"]) == (0.03, 1e-12, 0.01, False)
     assert len(group["params"]) == 2
+
+
+def step_at_a_long_gradient(config: AdamOptimizerConfig) -> float:
+    """How far a weight moves, in rates, by the first long gradient after thousands of short ones."""
+    value = torch.nn.Parameter(torch.zeros(1))
+    optimizer = config.setup([value])
+    for step in range(5000):
+        value.grad = torch.full((1,), 1e-4 * (-1) ** step)
+        optimizer.step()
+    before, value.grad = value.item(), torch.ones(1)
+    optimizer.step()
+    return abs(value.item() - before) / config.lr
+
+
+def test_a_long_gradient_moves_a_networks_weights_by_less_than_the_rate() -> None:
+    assert step_at_a_long_gradient(FusedAdamConfig(lr=1e-3)) > 3
+    assert step_at_a_long_gradient(NetworkAdamConfig(lr=1e-3)) < 0.5
+
+
+def test_weights_of_many_inputs_have_smaller_rates() -> None:
+    head = CompensationHead(HeadConfig(size="regular", pixel_unshuffle=1))
+    optimizer = NetworkAdamConfig(lr=1e-3, full_rate_inputs=1152).setup(head.parameters())
+    rates = {value: group["lr"] for group in optimizer.param_groups for value in group["params"]}
+    assert len(rates) == len(list(head.parameters()))
+    for conv in (module for module in head.modules() if isinstance(module, torch.nn.Conv2d)):
+        inputs = conv.in_channels * conv.kernel_size[0] ** 2
+        assert rates[conv.weight] == pytest.approx(1e-3 * min(1, 1152 / inputs))
+        assert conv.bias is not None
+        assert rates[conv.bias] == 1e-3
+    assert min(rates.values()) == pytest.approx(1e-3 / 6)  # 3 x 3 of 512 + 256 channels
+
+
+def test_the_default_head_has_one_rate_and_the_method_bears_it() -> None:
+    config = sundae.config.optimizers["compensation"]["optimizer"]
+    assert isinstance(config, NetworkAdamConfig)
+    optimizer = config.setup(CompensationHead(HeadConfig()).parameters())
+    assert [(group["lr"], group["betas"]) for group in optimizer.param_groups] == [(config.lr, config.betas)]
 
 
 @pytest.mark.gpu

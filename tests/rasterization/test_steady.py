@@ -1,4 +1,4 @@
-"""The reference rasteriser on hard scenes: finite values and gradients, and float32 close to float64.
+"""Rasterisers on hard scenes: finite values and gradients, and the reference's in float32 close to float64.
 
 Scenes are given before activation, as they are trained, and rounded to float32 before they are rendered in float64: the
 differences are those of the arithmetic. They are norms of the difference over the norm in float64.
@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.rasterization import Rasterization, rasterize, select_backend
+from sundae_ns.rasterization import Backend, Rasterization, rasterize, select_backend
 
 REFERENCE = select_backend("reference", "cpu")
 NEAR = 2.0**-6
@@ -34,17 +34,19 @@ def scene(n: int = 300, seed: int = 0) -> Scene:
     }
 
 
-def render(made: Scene, dtype: torch.dtype, size: int, antialiased: bool) -> tuple[Rasterization, Scene]:
+def render(
+    made: Scene, dtype: torch.dtype, size: int, antialiased: bool, *, backend: Backend = REFERENCE, device: str = "cpu"
+) -> tuple[Rasterization, Scene]:
     """The rendering, and the gradients of a sum over it with fixed random weights."""
-    leaves = {name: value.to(dtype, copy=True).requires_grad_() for name, value in made.items()}
-    K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]], dtype=dtype)
+    leaves = {name: value.to(device, dtype, copy=True).requires_grad_() for name, value in made.items()}
+    K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]], dtype=dtype, device=device)
     rendered = rasterize(
         leaves["means"],
         leaves["quats"],
         leaves["scales"].exp(),
         leaves["opacities"].sigmoid(),
         leaves["colors"],
-        torch.eye(4, dtype=dtype),
+        torch.eye(4, dtype=dtype, device=device),
         K,
         size,
         size,
@@ -52,11 +54,11 @@ def render(made: Scene, dtype: torch.dtype, size: int, antialiased: bool) -> tup
         antialiased=antialiased,
         absgrad=True,
         render_depth=True,
-        backend=REFERENCE,
+        backend=backend,
     )
     assert rendered.depth is not None
     picture = torch.cat([rendered.colors, rendered.alpha, rendered.depth], dim=2)
-    weights = torch.randn(picture.shape, generator=torch.Generator().manual_seed(9)).to(dtype)
+    weights = torch.randn(picture.shape, generator=torch.Generator().manual_seed(9)).to(picture)
     (picture * weights).sum().backward()
     gradients = {name: leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for name, leaf in leaves.items()}
     return rendered, gradients
@@ -158,3 +160,15 @@ def test_finite_and_close_to_float64(name: str, antialiased: bool) -> None:
     print(f"{name}: image {image_error:.1e}, gradients", {key: f"{value:.1e}" for key, value in errors.items()})
     assert image_error <= image_bound
     assert max(errors.values()) <= gradient_bound
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
+@pytest.mark.parametrize("name", CASES)
+def test_gsplat_is_finite(name: str, antialiased: bool) -> None:
+    make, size, _, _ = CASES[name]
+    gsplat = select_backend("gsplat", "cuda")
+    found, gradients = render(make(), torch.float32, size, antialiased, backend=gsplat, device="cuda")
+    for value in (found.colors, found.alpha, *gradients.values()):
+        assert value.isfinite().all()
+    assert ((found.alpha >= 0) & (found.alpha <= 1)).all()
