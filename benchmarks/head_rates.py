@@ -1,13 +1,13 @@
 """At which learning rate does a head burst? Trained alone on the still field of a finished run, on a CPU too.
 
     python benchmarks/head_rates.py --load-config RUN/config.yml --seeds 1 2 3 4 5 6
-    python benchmarks/head_rates.py --load-config RUN/config.yml --betas 0.9 0.999 --full-rate-inputs 100000     # plain Adam
+    python benchmarks/head_rates.py --load-config RUN/config.yml --betas 0.9 0.999 --full-rate-inputs 1000000    # plain Adam
     python benchmarks/head_rates.py --load-config RUN/config.yml --size regular --pixel-unshuffle 1 --steps 300 --rise 100
 
 A fresh head learns on random windows of the training views, at a rate that rises and then stays, which is harder than the
 decay of ns-train. A sixth of the views is held back. A line for each seed goes to ``results/head_rates.jsonl``: steps whose
-loss is more than 1.3 times that of base colours (``bursts``), the loss over that of base colours and the longest gradient in
-each tenth of the steps, and the gain in PSNR over base colours on the views held back.
+loss is more than 1.3 times that of base colours (``steps_above``), the loss over that of base colours and the longest gradient
+in each tenth of the steps, and the gain in PSNR over base colours on the views held back.
 """
 
 from __future__ import annotations
@@ -87,9 +87,10 @@ def train(views: list[Seen], options: argparse.Namespace, seed: int) -> dict[str
         loss = of_base = 0.0
         for _ in range(options.batch):
             i, u, v = (torch.rand(3, generator=chance) * (1 - 1e-6)).tolist()
-            height, width = views[0].base.shape[:2]
-            left, top = int(u * (width - options.side + 1)), int(v * (height - options.side + 1))
-            seen = views[int(i * len(views))].window(left, top, options.side)
+            whole = views[int(i * len(views))]
+            height, width = whole.base.shape[:2]
+            side = min(options.side, height, width)
+            seen = whole.window(int(u * (width - side + 1)), int(v * (height - side + 1)), side)
             found = picture_loss(seen.compensated(head), seen.truth, ssim, 0.2) / options.batch
             found.backward()
             loss += float(found.detach())
@@ -103,7 +104,7 @@ def train(views: list[Seen], options: argparse.Namespace, seed: int) -> dict[str
     starts = range(0, options.steps, stretch)
     return {
         "seed": seed,
-        "bursts": sum(loss > BURST for loss in losses),
+        "steps_above": sum(loss > BURST for loss in losses),
         "gain": round(mean(gains), 3),
         "loss": [round(mean(losses[start : start + stretch]), 3) for start in starts],
         "longest_gradient": [round(max(norms[start : start + stretch]), 2) for start in starts],
@@ -126,11 +127,16 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--results", type=Path, default=RESULTS)
     options = parser.parse_args()
+    if options.views < HELD_BACK:
+        parser.error(f"every {HELD_BACK}th of the views is held back; give --views {HELD_BACK} or more")
     views = training_views(options.load_config, options.views)
+    if len(views) < HELD_BACK:
+        parser.error(f"every {HELD_BACK}th of the views is held back, and the capture has {len(views)}; take another")
+    device = torch.cuda.get_device_name() if views[0].base.is_cuda else "cpu"
     said = "size pixel_unshuffle rate betas full_rate_inputs batch steps rise side".split()
     for seed in options.seeds:
         line = {"run": options.load_config.parents[2].name, **{name: getattr(options, name) for name in said}}
-        line |= train(views, options, seed)
+        line |= {**train(views, options, seed), "device": device, "commit": run.commit()}
         run.append_line(options.results, line)
         print(json.dumps(line), flush=True)
 

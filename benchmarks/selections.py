@@ -95,6 +95,7 @@ def compare(path: Path, options: argparse.Namespace) -> list[dict[str, Any]]:
                 "height": views[0].height,
                 "cpu_rasterizer": type(elsewhere.backend).__name__,
                 "gpu": torch.cuda.get_device_name(),
+                "commit": run.commit(),
             }
             print(json.dumps(line), flush=True)
             lines.append(line)

@@ -28,13 +28,14 @@ def _constant(lr: float) -> dict[str, Any]:
     return {"optimizer": _adam(lr), "scheduler": None}
 
 
-def optimizers(steps: int, *, means_restart: float | None = 1.6e-4) -> dict[str, Any]:
+def optimizers(steps: int, *, means_restart: float | None = 1.6e-4, head_rate: float = 1e-3) -> dict[str, Any]:
     """A fresh set of optimizers for a run of ``steps`` steps: splatfacto's rates, and those of features and head.
 
     Args:
         steps: length of the run, where decaying rates reach their final value.
         means_restart: rate of the centres right after the prune, from which its decay begins anew, so that the kept
             primitives can move into the gaps that the others left; None: the decay goes on.
+        head_rate: highest rate of the head.
     """
     return {
         "means": {
@@ -49,9 +50,13 @@ def optimizers(steps: int, *, means_restart: float | None = 1.6e-4) -> dict[str,
         "features": _constant(0.0025),
         "compensation": {
             # The usual eps: with 3DGS's tiny one, weights whose gradient is all but zero would take full steps.
-            "optimizer": NetworkAdamConfig(lr=1e-3, eps=1e-8),
+            "optimizer": NetworkAdamConfig(lr=head_rate, eps=1e-8),
             "scheduler": PruneAwareDecayConfig(
-                lr_final=1e-5, max_steps=steps, lr_restart=1e-3, hold_until_prune=True, warmup_steps=500
+                lr_final=1e-5,
+                max_steps=steps,
+                lr_restart=head_rate,
+                hold_until_prune=True,
+                warmup_steps=min(500, steps // 12),
             ),
         },
         "camera_opt": {
@@ -69,6 +74,7 @@ def method(
     head: HeadConfig | None = None,
     steps: int = 30000,
     means_restart: float | None = 1.6e-4,
+    head_rate: float = 1e-3,
     trainer: dict[str, Any] | None = None,
     datamanager: dict[str, Any] | None = None,
     **model: Any,
@@ -81,7 +87,7 @@ def method(
         pruning: when and what to prune.
         head: the compensation head.
         steps: length of the run.
-        means_restart: see :func:`optimizers`.
+        means_restart, head_rate: see :func:`optimizers`.
         trainer: more options of the trainer.
         datamanager: more options of the datamanager.
         model: more options of the model.
@@ -108,7 +114,7 @@ def method(
                 **model,
             ),
         ),
-        optimizers=optimizers(steps, means_restart=means_restart),
+        optimizers=optimizers(steps, means_restart=means_restart, head_rate=head_rate),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",
     )
@@ -172,6 +178,7 @@ sundae_tiny = method(
     pruning=PruningConfig(keep_ratio=0.25, prune_at=600),
     head=HeadConfig(size="tiny", pixel_unshuffle=1, num_features=5),
     steps=1200,
+    head_rate=2e-3,  # of few channels, and with no time to lose
     trainer={"vis": "tensorboard", "steps_per_save": 400, "steps_per_eval_all_images": 10000},
     num_downscales=0,
     sh_degree=2,

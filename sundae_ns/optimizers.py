@@ -34,18 +34,20 @@ class FusedAdamConfig(AdamOptimizerConfig):
 class NetworkAdamConfig(FusedAdamConfig):
     """Adam for a network without normalisation layers, which bursts at a rate that others bear.
 
-    Its output is a product of its layers, so that one step of all weights in the direction that they agree upon can multiply
-    it. Two things keep such a step short. The mean of squares forgets as fast as to follow gradients that suddenly grow: with
-    the usual betas a weight moves by 3.2 times the rate at the first long gradient after short ones, with these by 0.4 times.
-    And weights of layers with many inputs move by less, since what they add up to grows with the inputs (Yang et al. 2022,
-    "Tensor Programs V").
+    Its output is a product of its layers, so that steps of all weights in the direction that they agree upon can multiply it.
+    Two things keep such steps short. The mean of squares forgets so fast that it follows gradients that suddenly grow: with the
+    usual betas a weight moves by 3.2 times the rate at the first long gradient after short ones, and by up to 7.3 while they
+    grow; with these by 0.4 and by up to 1.2 (``sundae_ns.distributed.ahead.longest_step``). And weights of layers with many
+    inputs move by less, since what they add up to grows with the inputs (Yang et al. 2022, "Tensor Programs V").
+
+    Rates are those of the shapes at setup: a head that a search makes smaller keeps those of the larger one.
     """
 
     betas: tuple[float, float] = (0.9, 0.95)
     """Decay of the means of gradients and of their squares, a step."""
     full_rate_inputs: int = 1152
-    """The rate of weights that sum up more inputs than this is smaller by as much; 1152 is 3 x 3 of 128 channels, the most that
-    the compact head has, which the rate is known for."""
+    """Weights that sum up more inputs than this have a smaller rate, in proportion. 1152 is 3 x 3 of 128 channels, the most in
+    the default head, for which the rate is known."""
 
     def _groups(self, params: list[torch.Tensor]) -> list[dict[str, Any]]:
         by_rate: dict[float, list[torch.Tensor]] = {}

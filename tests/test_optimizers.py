@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -9,6 +11,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from method_configs import sundae
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.optimizers import FusedAdamConfig, NetworkAdamConfig
+from sundae_ns.schedulers import PruneAwareDecayConfig, notify_pruned
 
 
 def trained(config: AdamOptimizerConfig, device: str = "cpu") -> torch.Tensor:
@@ -64,11 +67,35 @@ def test_weights_of_many_inputs_have_smaller_rates() -> None:
     assert min(rates.values()) == pytest.approx(1e-3 / 6)  # 3 x 3 of 512 + 256 channels
 
 
-def test_the_default_head_has_one_rate_and_the_method_bears_it() -> None:
+def test_the_default_head_has_one_rate() -> None:
     config = sundae.config.optimizers["compensation"]["optimizer"]
-    assert isinstance(config, NetworkAdamConfig)
     optimizer = config.setup(CompensationHead(HeadConfig()).parameters())
-    assert [(group["lr"], group["betas"]) for group in optimizer.param_groups] == [(config.lr, config.betas)]
+    assert [(group["lr"], group["betas"]) for group in optimizer.param_groups] == [(1e-3, (0.9, 0.95))]
+
+
+def test_rates_of_all_layers_decay_alike_and_come_back_from_a_checkpoint() -> None:
+    def made() -> tuple[torch.optim.Optimizer, Any]:
+        head = CompensationHead(HeadConfig(size="small"))
+        optimizer = NetworkAdamConfig(lr=1e-3).setup(head.parameters())
+        config = PruneAwareDecayConfig(lr_final=1e-5, max_steps=100, lr_restart=1e-3, hold_until_prune=True)
+        return optimizer, config.setup().get_scheduler(optimizer, 1e-3)
+
+    optimizer, scheduler = made()
+    highest = [group["lr"] for group in optimizer.param_groups]
+    assert len(highest) > 1
+    notify_pruned({"compensation": scheduler}, 0)
+    for _ in range(50):
+        optimizer.step()
+        scheduler.step()
+    rates = [group["lr"] for group in optimizer.param_groups]
+    assert rates == pytest.approx([0.1 * rate for rate in highest])
+    again, schedule = made()
+    again.load_state_dict(optimizer.state_dict())
+    schedule.load_state_dict(scheduler.state_dict())
+    for each in (optimizer, scheduler, again, schedule):
+        each.step()
+    assert [group["lr"] for group in again.param_groups] == [group["lr"] for group in optimizer.param_groups]
+    assert optimizer.param_groups[0]["lr"] < rates[0]
 
 
 @pytest.mark.gpu

@@ -46,7 +46,7 @@ def scale_rates(optimizers: Optimizers, names: Iterable[str], ranks: int) -> Non
     """Adapt Adam to batches of ``ranks`` pictures: rates by the square root, both betas to that power.
 
     Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024. It is a rule for primitives, each of
-    which few pictures see. A head with all weights in every picture bursts at twice its rate (``docs/distributed.md``).
+    which few pictures see. A head, whose weights all take part in every picture, keeps its own (``docs/distributed.md``).
 
     Args:
         optimizers: by name of the group.

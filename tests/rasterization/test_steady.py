@@ -169,6 +169,7 @@ def test_gsplat_is_finite(name: str, antialiased: bool) -> None:
     make, size, _, _ = CASES[name]
     gsplat = select_backend("gsplat", "cuda")
     found, gradients = render(make(), torch.float32, size, antialiased, backend=gsplat, device="cuda")
-    for value in (found.colors, found.alpha, *gradients.values()):
+    assert found.depth is not None
+    for value in (found.colors, found.alpha, found.depth, *gradients.values()):
         assert value.isfinite().all()
     assert ((found.alpha >= 0) & (found.alpha <= 1)).all()
