@@ -19,6 +19,7 @@ from torch import Tensor
 from sundae_ns.errors import CheckpointError, ConfigError, out_of_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.opening import open_pipeline
+from sundae_ns.optimizers import NetworkAdamConfig
 from sundae_ns.packed_run import is_unpacked
 from sundae_ns.run_config import load_config
 from sundae_ns.run_folder import config_of
@@ -178,5 +179,7 @@ def _place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
 def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> torch.optim.Optimizer:
     groups = [{"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()]
     if head:
-        groups.append({"params": list(head.values()), "lr": RATES["head"], "eps": 1e-8})
+        groups.append(
+            {"params": list(head.values()), "lr": RATES["head"], "eps": 1e-8, "betas": NetworkAdamConfig.betas}
+        )
     return torch.optim.Adam(groups, fused=all(value.is_cuda for value in field.values()))
