@@ -15,6 +15,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import run
 import torch
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
@@ -80,8 +81,7 @@ def main() -> None:
                 line[f"ms_{name}_{height}x{width}"] = median_ms(step, device=picture.device).median_ms
             line["parameters"] = sum(p.numel() for p in head.parameters())
         print(json.dumps(line))
-        with open(options.results, "a") as file:
-            file.write(json.dumps(line) + "\n")
+        run.append_line(options.results, line)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import run
 import torch
 from torch import Tensor
 
@@ -99,8 +100,7 @@ def main() -> None:
         "extra_mib": round(_memory(on_cpu) - before),
     }
     print(json.dumps(line, indent=2))
-    with options.results.open("a") as file:
-        file.write(json.dumps(line) + "\n")
+    run.append_line(options.results, line)
 
 
 def _memory(on_cpu: bool) -> float:
