@@ -4,7 +4,7 @@
     python benchmarks/kill_and_resume.py --kills 3 --seed 1
 
 Every run is nerfstudio's own training command on the embedded scene, in a process of its own: it is forked off one that has
-nerfstudio imported, so that a start takes no ten seconds. Exits with 1 if any resumed run ended differently.
+nerfstudio imported and no threads, so that a start takes no ten seconds. Exits with 1 if any resumed run ended differently.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import multiprocessing
 import os
 import random
 import shutil
@@ -22,6 +23,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from copy import deepcopy
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,13 @@ from sundae_ns.data import write_scene
 from sundae_ns.errors import CheckpointError
 
 STEPS, SAVE_EVERY, PRUNE_AT = 70, 12, 36
+LONGEST = 600.0
+"""Seconds after which a run of some ten hangs."""
+
+# Forked off this process, which has threads (a progress bar's, torch's), a run could wait for ever for what one of them held.
+SERVER = multiprocessing.get_context("forkserver")
+SERVER.set_forkserver_preload(["nerfstudio.scripts.train", "sundae_ns.model", "sundae_ns.trainer"])
+
 OPTIONS = f"""
 --experiment-name e --timestamp t --max-num-iterations {STEPS} --steps-per-save {SAVE_EVERY} --vis tensorboard
 --viewer.quit-on-train-completion True --steps-per-eval-image 25 --pipeline.model.pruning.prune-at {PRUNE_AT}
@@ -114,40 +123,43 @@ def plan(kills: int, rng: random.Random) -> list[str]:
     return places
 
 
-def start(config: TrainerConfig, log: Path, prepare: Callable[[], None] | None = None) -> int:
-    """Train in a new process, its output in ``log``; the process id."""
-    child = os.fork()
-    if child:
-        return child
+def train_here(config: TrainerConfig, log: Path, place: str | None, nth: int) -> None:
+    """What a process of its own does: train, its output in ``log``, and die at the ``nth`` time at ``place``."""
+    torch.set_num_threads(1)
     with open(log, "a") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    code = 1
-    try:
-        if prepare is not None:
-            prepare()
-        train.main(config)
-        code = 0
-    except BaseException:
-        import traceback
-
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+    if place is not None:
+        PLACES[place](nth)
+    train.main(config)
 
 
-def finish(child: int, log: Path) -> None:
-    _, status = os.waitpid(child, 0)
-    if status != 0:
-        raise SystemExit(f"a run failed with status {status}; it ended so:\n{log.read_text()[-3000:]}")
+def start(config: TrainerConfig, log: Path, place: str | None = None, nth: int = 1) -> BaseProcess:
+    """Train in a new process."""
+    child = SERVER.Process(target=train_here, args=(config, log, place, nth))
+    child.start()
+    return child
 
 
-def was_killed(child: int) -> bool:
+def ended(child: BaseProcess, log: Path) -> int:
+    """Wait for a process; its exit code, negative for the signal that ended it."""
+    child.join(LONGEST)
+    if child.exitcode is None:
+        child.kill()
+        child.join()
+        raise SystemExit(f"a run did not end within {LONGEST} s; it came so far:\n{log.read_text()[-3000:]}")
+    return child.exitcode
+
+
+def finish(child: BaseProcess, log: Path) -> None:
+    code = ended(child, log)
+    if code != 0:
+        raise SystemExit(f"a run failed with exit code {code}; it ended so:\n{log.read_text()[-3000:]}")
+
+
+def was_killed(child: BaseProcess, log: Path) -> bool:
     """Wait for a process, and say whether it was killed."""
-    _, status = os.waitpid(child, 0)
-    return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+    return ended(child, log) == -signal.SIGKILL
 
 
 def kill_at_any_time(config: TrainerConfig, log: Path, seconds: float, rng: random.Random) -> bool:
@@ -155,8 +167,8 @@ def kill_at_any_time(config: TrainerConfig, log: Path, seconds: float, rng: rand
     for _ in range(10):
         child = start(config, log)
         time.sleep(rng.uniform(0.0, seconds))
-        os.kill(child, signal.SIGKILL)  # the process is not waited for yet, so the number is its own
-        if was_killed(child):
+        child.kill()
+        if was_killed(child, log):
             return True
         shutil.rmtree(run_folder(config))
         seconds *= 0.8  # the machine has less to do than it had
@@ -190,7 +202,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder to work in; a temporary one by default")
     options = parser.parse_args()
     rng = random.Random(options.seed)
-    torch.set_num_threads(1)
     root = options.out or Path(tempfile.mkdtemp(prefix="kill-and-resume-"))
     root.mkdir(parents=True, exist_ok=True)
     log = root / "log"
@@ -221,7 +232,7 @@ def main() -> None:
         if place == ANY:
             killed = kill_at_any_time(config, log, seconds, rng)
         else:
-            killed = was_killed(start(config, log, lambda place=place, nth=nth: PLACES[place](nth)))
+            killed = was_killed(start(config, log, place, nth), log)
         tally["killed"] += killed
         tally[f"at {place}"] += killed
         try:
