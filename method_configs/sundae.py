@@ -16,7 +16,7 @@ from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.pruning import PruningConfig
-from sundae_ns.schedulers import PruneAwareDecayConfig
+from sundae_ns.schedulers import PruneAwareDecayConfig, Shape
 from sundae_ns.trainer import SundaeTrainerConfig
 
 
@@ -28,14 +28,16 @@ def _constant(lr: float) -> dict[str, Any]:
     return {"optimizer": _adam(lr), "scheduler": None}
 
 
-def optimizers(steps: int, *, means_restart: float | None = 1.6e-4, head_rate: float = 1e-3) -> dict[str, Any]:
+def optimizers(
+    steps: int, *, means_restart: float | None = 1.6e-4, head_decay: Shape = "exponential"
+) -> dict[str, Any]:
     """A fresh set of optimizers for a run of ``steps`` steps: splatfacto's rates, and those of features and head.
 
     Args:
         steps: length of the run, where decaying rates reach their final value.
         means_restart: rate of the centres right after the prune, from which its decay begins anew, so that the kept
             primitives can move into the gaps that the others left; None: the decay goes on.
-        head_rate: highest rate of the head.
+        head_decay: how the rate of the head falls. A cosine teaches it more, which pays where steps are few.
     """
     return {
         "means": {
@@ -50,13 +52,14 @@ def optimizers(steps: int, *, means_restart: float | None = 1.6e-4, head_rate: f
         "features": _constant(0.0025),
         "compensation": {
             # The usual eps: with 3DGS's tiny one, weights whose gradient is all but zero would take full steps.
-            "optimizer": NetworkAdamConfig(lr=head_rate, eps=1e-8),
+            "optimizer": NetworkAdamConfig(lr=1e-3, eps=1e-8),
             "scheduler": PruneAwareDecayConfig(
                 lr_final=1e-5,
                 max_steps=steps,
-                lr_restart=head_rate,
+                lr_restart=1e-3,
                 hold_until_prune=True,
                 warmup_steps=min(500, steps // 12),
+                shape=head_decay,
             ),
         },
         "camera_opt": {
@@ -74,7 +77,7 @@ def method(
     head: HeadConfig | None = None,
     steps: int = 30000,
     means_restart: float | None = 1.6e-4,
-    head_rate: float = 1e-3,
+    head_decay: Shape = "exponential",
     trainer: dict[str, Any] | None = None,
     datamanager: dict[str, Any] | None = None,
     **model: Any,
@@ -87,7 +90,7 @@ def method(
         pruning: when and what to prune.
         head: the compensation head.
         steps: length of the run.
-        means_restart, head_rate: see :func:`optimizers`.
+        means_restart, head_decay: see :func:`optimizers`.
         trainer: more options of the trainer.
         datamanager: more options of the datamanager.
         model: more options of the model.
@@ -114,7 +117,7 @@ def method(
                 **model,
             ),
         ),
-        optimizers=optimizers(steps, means_restart=means_restart, head_rate=head_rate),
+        optimizers=optimizers(steps, means_restart=means_restart, head_decay=head_decay),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",
     )
@@ -178,7 +181,7 @@ sundae_tiny = method(
     pruning=PruningConfig(keep_ratio=0.25, prune_at=600),
     head=HeadConfig(size="tiny", pixel_unshuffle=1, num_features=5),
     steps=1200,
-    head_rate=2e-3,  # of few channels, and with no time to lose
+    head_decay="cosine",
     trainer={"vis": "tensorboard", "steps_per_save": 400, "steps_per_eval_all_images": 10000},
     num_downscales=0,
     sh_degree=2,

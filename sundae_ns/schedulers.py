@@ -1,4 +1,4 @@
-"""Learning rates of SUNDAE: exponential decay that can begin anew at the prune.
+"""Learning rates of SUNDAE: decay, exponential or along a cosine, that can begin anew at the prune.
 
 nerfstudio's own exponential decay leaves numpy numbers in its state, and checkpoints that hold them cannot be read with
 plain ``torch.load`` from torch 2.6 on. This one deals in Python floats only.
@@ -6,29 +6,40 @@ plain ``torch.load`` from torch 2.6 on. This one deals in Python floats only.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
+Shape = Literal["exponential", "cosine"]
+
 
 class Decay:
     """Multiplier of the learning rate as a function of the step; picklable state, plain numbers only.
 
-    Before the prune the rate decays exponentially from 1 to ``final`` over ``max_steps``, or stays at 1 where
-    ``hold_until_prune`` is set. The prune may restart it: from ``restart`` at the prune down to ``final`` at ``max_steps``,
-    after rising for ``warmup_steps``.
+    Before the prune the rate decays from 1 to ``final`` over ``max_steps``, or stays at 1 where ``hold_until_prune`` is set.
+    The prune may restart it: from ``restart`` at the prune down to ``final`` at ``max_steps``, after rising for
+    ``warmup_steps``. ``shape`` is an exponential, or half a cosine (Loshchilov & Hutter 2017, "SGDR"), whose mean is higher.
     """
 
     def __init__(
-        self, final: float, max_steps: int, restart: float | None, hold_until_prune: bool, warmup_steps: int
+        self,
+        final: float,
+        max_steps: int,
+        restart: float | None,
+        hold_until_prune: bool,
+        warmup_steps: int,
+        shape: Shape = "exponential",
     ) -> None:
         self.final = final
         self.max_steps = max_steps
         self.restart = restart
         self.hold_until_prune = hold_until_prune
         self.warmup_steps = warmup_steps
+        self.shape = shape
         self.pruned_at: int | None = None
 
     def __call__(self, step: int) -> float:
@@ -42,12 +53,14 @@ class Decay:
             rise = min((step - begin + 1) / (self.warmup_steps + 1), 1.0)
         t = (step - begin) / max(self.max_steps - begin, 1)
         t = min(max(t, 0.0), 1.0)
+        if self.shape == "cosine":
+            return float(rise * (self.final + (start - self.final) * (1.0 + math.cos(math.pi * t)) / 2.0))
         return float(rise * start ** (1.0 - t) * self.final**t)
 
 
 @dataclass
 class PruneAwareDecayConfig(SchedulerConfig):
-    """Exponential decay that the prune can restart."""
+    """Decay that the prune can restart."""
 
     _target: type = field(default_factory=lambda: PruneAwareDecay)
     """target class to instantiate"""
@@ -61,6 +74,8 @@ class PruneAwareDecayConfig(SchedulerConfig):
     """Whether the rate stays constant until pruning has ended and the head starts, which counts as the prune then."""
     warmup_steps: int = 0
     """Steps over which the rate rises after the prune."""
+    shape: Shape = "exponential"
+    """How it decays: exponential, or cosine, half a wave of it."""
 
 
 class PruneAwareDecay(Scheduler):
@@ -77,6 +92,7 @@ class PruneAwareDecay(Scheduler):
             restart,
             self.config.hold_until_prune,
             self.config.warmup_steps,
+            self.config.shape,
         )
         return LambdaLR(optimizer, lr_lambda=decay)
 

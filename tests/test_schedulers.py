@@ -40,6 +40,19 @@ def test_exponential_from_first_to_last() -> None:
     assert found[129] == pytest.approx(1e-4)
 
 
+def test_half_a_cosine_from_first_to_last() -> None:
+    found = rates(scheduler(shape="cosine"), 130)
+    assert found[0] == pytest.approx(1e-2)
+    assert found[25] == pytest.approx(1e-4 + 0.99e-2 * (1 + 0.5**0.5) / 2)
+    assert found[50] == pytest.approx((1e-2 + 1e-4) / 2)
+    assert found[100] == found[129] == pytest.approx(1e-4)
+    restarted = rates(scheduler(shape="cosine", lr_restart=4e-3, warmup_steps=4), 130, prune_at=40)
+    assert restarted[:41] == pytest.approx(found[:41])
+    assert restarted[42] == pytest.approx(3 / 5 * 4e-3, rel=0.01)
+    assert restarted[70] == pytest.approx((4e-3 + 1e-4) / 2)
+    assert restarted[100] == pytest.approx(1e-4)
+
+
 def test_prune_restarts_the_decay() -> None:
     found = rates(scheduler(lr_restart=4e-3), 130, prune_at=40)
     plain = rates(scheduler(), 130)
@@ -76,9 +89,10 @@ def test_only_the_first_prune_counts_and_others_are_left_alone() -> None:
     assert decay.pruned_at == 10
 
 
+@pytest.mark.parametrize("shape", ["exponential", "cosine"])
 @pytest.mark.parametrize("prune_at", [None, 30])
-def test_a_resumed_scheduler_goes_on_the_same(prune_at: int | None) -> None:
-    options = {"lr_restart": 5e-3, "hold_until_prune": True, "warmup_steps": 20}
+def test_a_resumed_scheduler_goes_on_the_same(prune_at: int | None, shape: str) -> None:
+    options = {"lr_restart": 5e-3, "hold_until_prune": True, "warmup_steps": 20, "shape": shape}
     whole, first, second = scheduler(**options), scheduler(**options), scheduler(**options)
     expected = rates(whole, 90, prune_at)
     rates(first, 45, prune_at)
