@@ -43,7 +43,8 @@ def cells(runs: Lines, lines: Lines) -> list[str]:
     if not runs:
         return [""] * 4
     gains = [gain for run in runs if (gain := gained(run, lines)) is not None]
-    over_plain = f" ({mean(gains):+.2f})" if gains else ""
+    # Adding zero takes the minus from a rounded -0.
+    over_plain = f" ({round(mean(gains), 2) + 0.0:+.2f})" if gains else ""
     others = [f"{mean(run[key] for run in runs):.{digits}f}" for key, digits in OTHERS.items()]
     return [with_spread([run["psnr"] for run in runs]) + over_plain, *others]
 
