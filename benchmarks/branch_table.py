@@ -1,4 +1,4 @@
-"""Print the branches as a Markdown table, scenes side by side: python benchmarks/branch_table.py [STEPS] [--commits C ...].
+"""Print the branches as a Markdown table, scenes side by side: python benchmarks/branch_table.py [STEPS] [--results FILE].
 
 A cell is the mean over seeds, with half the range between them where there are several. Gains are over the branches without a
 head from the same pruned field.
@@ -53,9 +53,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("steps", type=int, nargs="?", default=4000, help="length of the fine-tunes to show")
     parser.add_argument("--commits", nargs="+", help="only branches that these made; by default all")
+    parser.add_argument("--results", type=Path, default=BRANCHES)
     options = parser.parse_args()
     steps = options.steps
-    lines = [json.loads(line) for line in BRANCHES.read_text().splitlines()]
+    lines = [json.loads(line) for line in options.results.read_text().splitlines()]
     if steps not in (known := sorted({line["steps"] for line in lines})):
         parser.error(f"there are no branches of {steps} steps; give one of {', '.join(map(str, known))}")
     lines = [line for line in lines if line["steps"] == steps]

@@ -248,7 +248,9 @@ def main() -> None:
             raise SystemExit(f"{name}: the tests fail on the code as it is")
         survivors = []
         console = Console(stderr=True)
-        for number in track(sample, description=f"Changing and testing {name}", transient=True, console=console):
+        # Without a thread that refreshes it: what it held when a child is forked off, the child would wait for.
+        doing = f"Changing and testing {name}"
+        for number in track(sample, doing, transient=True, auto_refresh=False, console=console):
             path, index, kind = every[number]
             tree = deepcopy(trees[path])
             what = change(tree, index, kind)
