@@ -26,7 +26,8 @@ RESULTS = Path(__file__).parent / "results" / "heads.jsonl"
 HEADS = (
     HeadConfig(size="tiny"),
     HeadConfig(size="compact", num_features=5),
-    HeadConfig(),
+    HeadConfig(size="compact"),
+    HeadConfig(size="wide"),
     HeadConfig(size="small", num_features=5),
     HeadConfig(size="small"),
     HeadConfig(pixel_unshuffle=4),

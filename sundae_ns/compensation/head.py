@@ -17,6 +17,7 @@ from sundae_ns.errors import BackendError, ConfigError
 SIZES: dict[str, tuple[int, int | None]] = {
     "tiny": (8, None),
     "compact": (32, 64),
+    "wide": (64, 64),
     "small": (32, None),
     "regular": (64, None),
     "large": (128, None),
@@ -42,9 +43,9 @@ class HeadConfig:
     mode: Literal["residual", "features", "off"] = "residual"
     """residual: the head adds a correction to the spherical-harmonics picture, which stays valid by itself.
     features: the paper's way, the head alone makes the picture from splatted features, over the background. off: no head."""
-    size: Literal["tiny", "compact", "small", "regular", "large"] = "compact"
-    """Width of the U-Net: 0.5, 2, 7.8, 31 or 124 MB in fp32. The last three are the paper's, which takes regular;
-    compact is small with at most 64 channels a level."""
+    size: Literal["tiny", "compact", "wide", "small", "regular", "large"] = "compact"
+    """Width of the U-Net: 0.5, 2, 2.5, 7.8, 31 or 124 MB in fp32. The last three are the paper's, which takes regular;
+    compact is small with at most 64 channels a level, wide has 64 on each."""
     pixel_unshuffle: int = 2
     """Fold blocks of this many pixels a side into channels before the U-Net: 1 is the paper's, 2 is faster."""
     num_features: int = 13

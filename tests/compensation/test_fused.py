@@ -84,7 +84,7 @@ def test_at_any_size(compiled: Compile, height: int, width: int, num_features: i
 
 @torch.no_grad()
 def test_compact_levels_and_wide_ones(compiled: Compile) -> None:
-    for size in ("compact", "small"):
+    for size in ("compact", "wide", "small"):
         head = make(size=size, num_features=13)
         pictures = splatted(20, 33, 13)
         torch.testing.assert_close(by_kernels(head, pictures, compiled), head(*pictures), rtol=1e-4, atol=1e-5)
