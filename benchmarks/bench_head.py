@@ -30,7 +30,7 @@ HEADS = (
     HeadConfig(size="wide"),
     HeadConfig(size="small", num_features=5),
     HeadConfig(size="small"),
-    HeadConfig(pixel_unshuffle=4),
+    HeadConfig(size="compact", pixel_unshuffle=4),
     *(HeadConfig(size=size, pixel_unshuffle=1) for size in ("small", "regular", "large")),  # the paper's
 )
 PICTURES = ((824, 1240), (1893, 1061), (533, 800))

@@ -260,7 +260,7 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser.add_argument("--save", action="store_true", help="keep the final checkpoint, and config.yml for other tools")
     parser.add_argument("--profile", type=int, default=0, help="steps more under a profiler, for GPU ms by kernel")
     parser.add_argument("--skip", type=int, help="channels passed to a branch at full resolution")
-    parser.add_argument("--width", type=int, help="channels of the compact head's finest level")
+    parser.add_argument("--width", type=int, help="channels of the wide head's finest level")
     parser.add_argument("--flip", action="store_true", help="mirror pictures at random for the head")
     parser.add_argument("--rates", type=float, default=1.0, help="factor on the field's learning rates")
     parser.add_argument("--cooldown", type=float, help="share of the branch over which the field's rates fall")
@@ -333,7 +333,7 @@ def main() -> None:
         if options.cooldown is not None:
             config.optimizers[name]["scheduler"] = CooldownConfig(steps=options.steps, share=options.cooldown)
     if options.width is not None:
-        SIZES["compact"] = (options.width, SIZES["compact"][1])
+        SIZES["wide"] = (options.width, SIZES["wide"][1])
     if options.flip:
         CompensationHead._layers = flipped(CompensationHead._layers)  # type: ignore[method-assign]
     if options.picture_loss_on_base:

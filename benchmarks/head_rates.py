@@ -114,7 +114,7 @@ def train(views: list[Seen], options: argparse.Namespace, seed: int) -> dict[str
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--load-config", type=Path, required=True)
-    parser.add_argument("--size", default="compact")
+    parser.add_argument("--size", default=HeadConfig.size)
     parser.add_argument("--pixel-unshuffle", type=int, default=2)
     parser.add_argument("--rate", type=float, default=1e-3)
     parser.add_argument("--betas", type=float, nargs=2, default=NetworkAdamConfig.betas)

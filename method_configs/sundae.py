@@ -16,7 +16,7 @@ from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.pruning import PruningConfig
-from sundae_ns.schedulers import PruneAwareDecayConfig, Shape
+from sundae_ns.schedulers import PruneAwareDecayConfig
 from sundae_ns.trainer import SundaeTrainerConfig
 
 
@@ -28,16 +28,13 @@ def _constant(lr: float) -> dict[str, Any]:
     return {"optimizer": _adam(lr), "scheduler": None}
 
 
-def optimizers(
-    steps: int, *, means_restart: float | None = 1.6e-4, head_decay: Shape = "exponential"
-) -> dict[str, Any]:
+def optimizers(steps: int, *, means_restart: float | None = 1.6e-4) -> dict[str, Any]:
     """A fresh set of optimizers for a run of ``steps`` steps: splatfacto's rates, and those of features and head.
 
     Args:
         steps: length of the run, where decaying rates reach their final value.
         means_restart: rate of the centres right after the prune, from which its decay begins anew, so that the kept
             primitives can move into the gaps that the others left; None: the decay goes on.
-        head_decay: how the rate of the head falls. A cosine teaches it more, which pays where steps are few.
     """
     return {
         "means": {
@@ -59,7 +56,7 @@ def optimizers(
                 lr_restart=1e-3,
                 hold_until_prune=True,
                 warmup_steps=min(500, steps // 12),
-                shape=head_decay,
+                shape="cosine",
             ),
         },
         "camera_opt": {
@@ -77,7 +74,6 @@ def method(
     head: HeadConfig | None = None,
     steps: int = 30000,
     means_restart: float | None = 1.6e-4,
-    head_decay: Shape = "exponential",
     trainer: dict[str, Any] | None = None,
     datamanager: dict[str, Any] | None = None,
     **model: Any,
@@ -90,7 +86,7 @@ def method(
         pruning: when and what to prune.
         head: the compensation head.
         steps: length of the run.
-        means_restart, head_decay: see :func:`optimizers`.
+        means_restart: see :func:`optimizers`.
         trainer: more options of the trainer.
         datamanager: more options of the datamanager.
         model: more options of the model.
@@ -117,7 +113,7 @@ def method(
                 **model,
             ),
         ),
-        optimizers=optimizers(steps, means_restart=means_restart, head_decay=head_decay),
+        optimizers=optimizers(steps, means_restart=means_restart),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",
     )
@@ -181,7 +177,6 @@ sundae_tiny = method(
     pruning=PruningConfig(keep_ratio=0.25, prune_at=600),
     head=HeadConfig(size="tiny", pixel_unshuffle=1, num_features=5),
     steps=1200,
-    head_decay="cosine",
     trainer={"vis": "tensorboard", "steps_per_save": 400, "steps_per_eval_all_images": 10000},
     num_downscales=0,
     sh_degree=2,

@@ -217,10 +217,10 @@ def check_model_state(
         per_primitive = name.startswith(_PREFIX)
         theirs, ours = state[name].shape, value.shape
         if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
-            raise CheckpointError(
-                f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; "
-                "load it with the options that it was trained with"
-            )
+            mend = "load it with the options that it was trained with"
+            if name.startswith("head."):
+                mend += ", such as --pipeline.model.head.size compact, which was the default before wide"
+            raise CheckpointError(f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {mend}")
     rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
     if len(rows) != 1 or (rows[0] == 0 and not shard):
         raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")

@@ -43,7 +43,7 @@ class HeadConfig:
     mode: Literal["residual", "features", "off"] = "residual"
     """residual: the head adds a correction to the spherical-harmonics picture, which stays valid by itself.
     features: the paper's way, the head alone makes the picture from splatted features, over the background. off: no head."""
-    size: Literal["tiny", "compact", "wide", "small", "regular", "large"] = "compact"
+    size: Literal["tiny", "compact", "wide", "small", "regular", "large"] = "wide"
     """Width of the U-Net: 0.5, 2, 2.5, 7.8, 31 or 124 MB in fp32. The last three are the paper's, which takes regular;
     compact is small with at most 64 channels a level, wide has 64 on each."""
     pixel_unshuffle: int = 2

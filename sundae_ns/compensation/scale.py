@@ -11,15 +11,19 @@ from typing import NamedTuple
 import torch.nn.functional as F
 from torch import Tensor
 
-TOLERANCE = 1.25
-"""Ratio of focal lengths within which the head is used as it is."""
+TOLERANCE = 1.01
+"""Ratio of focal lengths within which the head is used as it is: what test cameras differ by from those trained on. A picture
+2% larger or smaller is better off with the correction of the trained scale (``docs/results.md``)."""
 FADE = (4.0, 2.0)
 """Pictures shrunk by more than the first factor are shown without the head, those by less than the second with all of it:
 a thumbnail should not cost a whole picture, nor the head appear at once while one zooms."""
 
 MOST_PIXELS = 2**24
 """A picture that would have more pixels than this at the trained scale, as a wide view may, fades the head out as well, up to
-twice as many; but for those that are compensated as they are, whatever their size. 33 million pixels take two gigabytes."""
+twice as many; but for those that are larger themselves. 33 million pixels take two gigabytes."""
+
+ROOM = 1.25
+"""Pictures of any size are compensated at a scale that is larger by so much."""
 
 
 class ScalePlan(NamedTuple):
@@ -45,7 +49,7 @@ def plan(focal: float, trained: tuple[float, float] | None, pixels: int) -> Scal
     zoom = nearest / focal
     if 1 / TOLERANCE <= zoom <= TOLERANCE:
         return ScalePlan(1.0, 1.0)
-    most = max(MOST_PIXELS, TOLERANCE**2 * pixels)
+    most = max(MOST_PIXELS, ROOM**2 * pixels)
     return ScalePlan(zoom, min(_fading(zoom, *FADE), _fading(pixels * zoom**2, 2 * most, most)))
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sundae_ns.compensation import plan, resize
-from sundae_ns.compensation.scale import FADE, MOST_PIXELS, TOLERANCE
+from sundae_ns.compensation.scale import FADE, MOST_PIXELS, ROOM, TOLERANCE
 
 FOCAL = st.floats(1.0, 1e5)
 
@@ -27,6 +27,12 @@ def test_the_head_runs_near_its_own_scale(focal: float, a: float, b: float) -> N
     if low <= focal <= high:
         assert (zoom, weight) == (1.0, 1.0)
     assert plan(focal * zoom, (low, high), 10**9) == (1.0, 1.0)  # a picture made for the head is not remade
+
+
+def test_a_size_near_the_trained_one_gets_the_correction_of_that() -> None:
+    assert plan(1000.0, (1000.0, 1000.0), 100) == (1.0, 1.0)
+    for focal in (900.0, 980.0, 1020.0, 1100.0):
+        assert plan(focal, (1000.0, 1000.0), 100) == (1000.0 / focal, 1.0)
 
 
 def test_thumbnails_fade_out_without_a_jump() -> None:
@@ -54,9 +60,9 @@ def test_a_wide_view_is_not_made_anew_with_more_pixels_than_fit() -> None:
 def test_the_head_does_not_appear_at_once_whatever_the_size(pixels: int, zoom: float) -> None:
     weight = plan(1000.0, (1000 * zoom, 1000 * zoom), pixels).weight
     assert abs(weight - plan(1000.0, (1010 * zoom, 1010 * zoom), pixels).weight) < 0.08
-    if zoom <= TOLERANCE:
+    if zoom <= ROOM:
         assert weight == 1
-    elif pixels * zoom**2 > 2 * max(MOST_PIXELS, TOLERANCE**2 * pixels):
+    elif pixels * zoom**2 > 2 * max(MOST_PIXELS, ROOM**2 * pixels):
         assert weight == 0
 
 

@@ -598,7 +598,7 @@ def test_a_head_that_does_not_pay_goes_again(make: Make, small_head: dict[str, A
 
 @pytest.mark.parametrize(
     ("primitives", "row", "expected"),
-    [(10**6, 236, ("compact", 13)), (40_000, 236, ("compact", 13)), (20_000, 236, ("tiny", 13)), (20_000, 152, ("tiny", 5)),
+    [(10**6, 236, ("wide", 13)), (40_000, 236, ("compact", 13)), (20_000, 236, ("tiny", 13)), (20_000, 152, ("tiny", 5)),
      (60_000, 56, ("tiny", 1)), (3_000, 236, None)],
 )  # fmt: skip
 def test_the_head_that_suits_a_field(primitives: int, row: int, expected: tuple[str, int] | None) -> None:
