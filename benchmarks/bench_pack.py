@@ -31,8 +31,8 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr
-from sundae_ns.opening import load_run
-from sundae_ns.packed_run import scene_of_run, write_run
+from sundae_ns.opening import load_run, open_pipeline, open_scene
+from sundae_ns.packed_run import scene_of_run
 from sundae_ns.packing_finetune import finetune
 from sundae_ns.storage.packing import (
     FINETUNED,
@@ -105,9 +105,10 @@ def sizes(report: PackReport) -> dict[str, Any]:
 
 
 @torch.no_grad()
-def quality(run: Path, file: Path, folder: Path, views: int) -> dict[str, Any]:
-    before = load_run(run / "config.yml")
-    after = load_run(write_run(read_scene(file), folder, "packed")).model
+def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
+    config = run / "config.yml"
+    before = load_run(config)
+    after = open_scene(file, data=open_pipeline(config).capture).model
     chosen = torch.linspace(0, len(before.cameras) - 1, min(views, len(before.cameras))).round().long().tolist()
     names = ("psnr", "psnr_packed", "psnr_between")
     sums = {name + suffix: 0.0 for name in names for suffix in ("", "_base")}
@@ -176,7 +177,7 @@ def main() -> None:
             result["s_finetune"] = round(tuning, 1)
             result["loss_first_last_tenth"] = [round(mean(part), 5) for part in (losses[:tenth], losses[-tenth:])]
         if options.run is not None:
-            result |= quality(options.run, file, Path(name), options.views)
+            result |= quality(options.run, file, options.views)
     print(json.dumps(result))
 
 

@@ -55,7 +55,7 @@ def pack(
         feature_bits: bits of each feature, 4 to 16; by default 7, 6 with a fine-tune.
         feature_books: residual codebooks of the feature vectors instead, up to 32.
         head: weights of the head.
-        head_bits: bits of each weight of an int8 head, 3 to 8; by default 8, 6 with a fine-tune.
+        head_bits: bits of each weight of an int8 head, 3 to 8; by default 7, 6 with a fine-tune.
         level: effort of the entropy coder, 1 to 22; unpacking is as fast at all of them.
     """
     from rich.console import Console

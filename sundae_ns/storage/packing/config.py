@@ -40,7 +40,7 @@ class PackConfig:
     """Residual codebooks of the feature vectors, up to 32; 0: each feature by itself, with feature-bits."""
     head: HeadFormat = "int8"
     """Weights of the head: int8 with a step for each output channel, or fp16."""
-    head_bits: int = 8
+    head_bits: int = 7
     """Bits of each weight of an int8 head, 3 to 8: fewer are stored in fewer bytes."""
     level: int = 19
     """Effort of the entropy coder (zstandard), 1 to 22; unpacking is as fast at all of them."""

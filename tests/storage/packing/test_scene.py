@@ -81,7 +81,8 @@ def test_everything_comes_back_within_the_stated_bounds(tmp_path: Path, config: 
     assert torch.equal(scene.head["net.a.bias"], head()["net.a.bias"])
     off = (scene.head["net.a.weight"] - head()["net.a.weight"]).abs().reshape(4, -1)
     largest = head()["net.a.weight"].reshape(4, -1).abs().amax(dim=1, keepdim=True)
-    assert (off <= largest / 127 / 2 * 1.001 if config.head == "int8" else off <= largest * 2.0**-11).all()
+    levels = 2 ** (config.head_bits - 1) - 1
+    assert (off <= largest / levels / 2 * 1.001 if config.head == "int8" else off <= largest * 2.0**-11).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 17])
