@@ -89,7 +89,7 @@ def _without(name: str) -> dict[str, Any]:
         (model_state(format=99), "format 99"),
         (model_state(num_features=13), "length 13.*length 5.*num-features 13"),
         (_without("head.weight"), "no head.weight"),
-        ({**model_state(), "head.weight": torch.zeros(8, 4)}, r"head.weight is \[8, 4\].*\[4, 4\]"),
+        ({**model_state(), "head.weight": torch.zeros(8, 4)}, r"head.weight is \[8, 4\].*\[4, 4\].*head.size compact"),
         (model_state(degree=2), r"features_rest is \[6, 8, 3\].*\[6, 15, 3\]"),
     ],
 )
