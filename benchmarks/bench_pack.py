@@ -31,7 +31,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr
-from sundae_ns.opening import load_run, open_pipeline, open_scene
+from sundae_ns.opening import load_run, open_scene
 from sundae_ns.packed_run import scene_of_run
 from sundae_ns.packing_finetune import finetune
 from sundae_ns.storage.packing import (
@@ -106,9 +106,8 @@ def sizes(report: PackReport) -> dict[str, Any]:
 
 @torch.no_grad()
 def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
-    config = run / "config.yml"
-    before = load_run(config)
-    after = open_scene(file, data=open_pipeline(config).capture).model
+    before = load_run(run / "config.yml")
+    after = open_scene(file, data=before.capture).model
     chosen = torch.linspace(0, len(before.cameras) - 1, min(views, len(before.cameras))).round().long().tolist()
     names = ("psnr", "psnr_packed", "psnr_between")
     sums = {name + suffix: 0.0 for name in names for suffix in ("", "_base")}

@@ -73,8 +73,9 @@ def main() -> None:
             for name, x, y in zip(names, places, gains):
                 size, features, _ = VARIANTS[name]
                 default = (size, features) == (HeadConfig.size, HeadConfig.num_features)
-                own = panel is by_time and GPU not in timed[VARIANTS[name]]["gpu"]
-                text = f"{size}, {features}" + ", default" * default + " (H200)" * own
+                gpu = timed[VARIANTS[name]]["gpu"]
+                other = f" ({gpu.split()[1]})" if panel is by_time and GPU not in gpu else ""
+                text = f"{size}, {features}" + ", default" * default + other
                 left = (size, features) == ("compact", 13)
                 offset = (-5, 4) if left else (6, 5 if default else -11)
                 panel.annotate(

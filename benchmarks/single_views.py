@@ -13,39 +13,19 @@ import argparse
 import json
 from pathlib import Path
 from statistics import mean
-from typing import Any
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from rich.progress import track
 from torch import Tensor
 from torchvision.transforms.functional import gaussian_blur
 
 from sundae_ns.evaluation import psnr
-from sundae_ns.opening import open_pipeline
+from sundae_ns.opening import open_pipeline, views_to_test
+from sundae_ns.rasterization import Rasterization
 
 RESULTS = Path(__file__).parent / "results" / "single_views.json"
 SIGMAS = (1, 2, 4, 8, 16)
-
-
-class Inputs:
-    """Sees what the head is given, and clamps it where there are bounds."""
-
-    def __init__(self, head: torch.nn.Module) -> None:
-        self.splatted: Tensor | None = None
-        self.bounds: tuple[Tensor, Tensor] | None = None
-        head.register_forward_pre_hook(self._hook)
-
-    def _hook(self, _: torch.nn.Module, inputs: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        base, splatted, alpha = inputs
-        self.splatted = splatted.detach()
-        return inputs if self.bounds is None else (base, splatted.clamp(*self.bounds), alpha)
-
-    @property
-    def pixels(self) -> Tensor:
-        """``[H W, C]`` of the last picture."""
-        if self.splatted is None:
-            raise SystemExit("the head was not asked; was the run saved before its head took part?")
-        return self.splatted.flatten(0, 1)
 
 
 def low_frequencies(picture: Tensor, sigma: int) -> Tensor:
@@ -64,29 +44,27 @@ def main() -> None:
     opened = open_pipeline(options.load_config)
     model, data = opened.model, opened.pipeline.datamanager
     opened.pipeline.eval()
-    if model.head is None:
-        raise SystemExit("this run has no head")
-    inputs, background = Inputs(model.head), model._get_background_color()
+    if model.head is None or model.head.config.mode != "residual":
+        raise SystemExit("this run has no head that corrects base colours; give one with head.mode residual")
+    background = model._get_background_color()
 
-    def rendered(camera: Any) -> tuple[Tensor, Tensor]:
-        pictures, _ = model.render(model.gaussians, model.view_of(camera.to(model.device)), background, depth=False)
-        return pictures["base_rgb"], pictures["rgb"].clamp(0, 1)
+    def rendered(camera: Cameras) -> tuple[Tensor, Tensor, Rasterization]:
+        """Base colours, the picture with the head, and what it saw ``[H, W, C]``."""
+        view = model.view_of(camera.to(model.device))
+        pictures, splatted = model.render(model.gaussians, view, background, depth=False)
+        return pictures["base_rgb"], pictures["rgb"].clamp(0, 1), splatted
 
     lows, highs = [], []
-    cameras = data.train_dataset.cameras
-    for i in track(range(len(cameras)), description="Training views"):
-        rendered(cameras[i : i + 1])
-        lows.append(inputs.pixels.amin(0))
-        highs.append(inputs.pixels.amax(0))
+    for camera, _ in track(list(data.training_views()), description="Training views"):
+        pixels = rendered(camera)[2].colors.flatten(0, 1)
+        lows.append(pixels.amin(0))
+        highs.append(pixels.amax(0))
     low, high = torch.stack(lows).amin(0), torch.stack(highs).amax(0)
     views = []
-    for camera, batch in track(data.fixed_indices_eval_dataloader, description="Test views"):
-        truth = model.composite_with_background(model.get_gt_img(batch["image"]), background)
-        base, shown = rendered(camera)
-        beyond = ((inputs.pixels < low) | (inputs.pixels > high)).any(dim=1)
-        inputs.bounds = low, high
-        clamped = rendered(camera)[1]
-        inputs.bounds = None
+    for camera, truth in track(list(zip(*views_to_test(model, data), strict=True)), description="Test views"):
+        base, shown, splatted = rendered(camera)
+        beyond = ((splatted.colors < low) | (splatted.colors > high)).any(dim=-1)
+        clamped = model.head(base, splatted.colors.clamp(low, high), splatted.alpha).clamp(0, 1)
         line = {
             "base": float(psnr(base, truth)),
             "shown": float(psnr(shown, truth)),

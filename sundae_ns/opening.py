@@ -39,6 +39,8 @@ class Opened:
     """What they photographed ``[H, W, 3]``, in [0, 1], over the model's background, on the model's device."""
     source: Path
     """What was opened."""
+    capture: Path
+    """Where the photographs are."""
     scene: str
     """Name of the capture's folder."""
     method: str
@@ -173,7 +175,7 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
     """
     config, pipeline, model, step, capture = open_pipeline(path, data=data)
     pipeline.eval()
-    cameras, truths = _test_views(model, pipeline.datamanager)
+    cameras, truths = views_to_test(model, pipeline.datamanager)
     if not cameras:
         raise DataError(f"{capture} has no test views, so there is nothing to measure {path.parent} on")
     pruning = model.config.pruning
@@ -182,6 +184,7 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
         cameras=cameras,
         truths=truths,
         source=path.parent,
+        capture=capture,
         scene=(capture.parent if capture.suffix == ".json" else capture).resolve().name,
         method=config.method_name or "",
         variant=config.experiment_name or "",
@@ -243,7 +246,8 @@ def _capture(config: TrainerConfig, data: Path | None) -> Path:
     return capture
 
 
-def _test_views(model: SundaeModel, datamanager: SundaeDatamanager) -> tuple[list[Cameras], list[Tensor]]:
+def views_to_test(model: SundaeModel, datamanager: SundaeDatamanager) -> tuple[list[Cameras], list[Tensor]]:
+    """Test cameras and what they photographed, as :class:`Opened` has them."""
     cameras, truths = [], []
     for camera, batch in datamanager.fixed_indices_eval_dataloader:
         cameras.append(camera.to(model.device))
