@@ -1,0 +1,44 @@
+"""Trainers and a finished run that search for a budget."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from budget_runs import Make, Run, set_up, tidy
+
+from sundae_ns import budget
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.data import write_scene
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("budget") / "scene"
+    return write_scene(folder, train_views=12, test_views=2, width=24, height=24, points=200, samples=1)
+
+
+@pytest.fixture
+def make(scene: Path, tmp_path: Path) -> Iterator[Make]:
+    yield lambda **options: set_up(scene, tmp_path, **options)
+    tidy()
+
+
+@pytest.fixture(scope="module")
+def done(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
+    trainer = set_up(scene, tmp_path_factory.mktemp("done"))
+    trainer.train()
+    yield Run(trainer)
+    tidy()
+
+
+@pytest.fixture
+def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """A head of half a megabyte, with 5 features, joins a field of a few kilobytes, in place of a larger one."""
+    monkeypatch.setattr(
+        budget.sizes, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
+    )
+    return {"head": HeadConfig(size="small", pixel_unshuffle=1, num_features=13)}
