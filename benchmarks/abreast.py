@@ -16,11 +16,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import Progress
 from torch import Tensor
 
-from sundae_ns.losses import picture_loss
 from sundae_ns.rasterization.gsplat_backend import project, square_lists
 from sundae_ns.rasterization.gsplat_tiles import TILE
-from sundae_ns.rendering import NEAR_PLANE, Style, colors_of, render
-from sundae_ns.views import View
+from sundae_ns.rendering.render import NEAR_PLANE, Style, colors_of, render
+from sundae_ns.rendering.views import View
+from sundae_ns.training.losses import picture_loss
 
 Field = dict[str, Tensor]
 

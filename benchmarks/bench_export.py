@@ -25,8 +25,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from sundae_ns.evaluation import psnr
-from sundae_ns.opening import Opened, load_run
-from sundae_ns.packed_run import scene_of_run
+from sundae_ns.scenes.opening import Opened, load_run
+from sundae_ns.scenes.packed import scene_of_run
 from sundae_ns.storage import read_ply, write_sog, write_spz
 from sundae_ns.storage.viewers import ANTIALIASED, write_for_viewers
 

@@ -19,8 +19,8 @@ import run
 import torch
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.cuda_graphs import aside, record
 from sundae_ns.evaluation import median_ms
+from sundae_ns.gpu.cuda_graphs import aside, record
 
 RESULTS = Path(__file__).parent / "results" / "heads.jsonl"
 HEADS = (

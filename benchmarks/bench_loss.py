@@ -2,7 +2,7 @@
 
     python benchmarks/bench_loss.py [--results FILE] [--sizes 533x800 1893x1061]
 
-Ways: the kernels of ``sundae_ns.fused_loss`` where there is CUDA, and L1 with pytorch_msssim's SSIM. Times are medians of
+Ways: the kernels of ``sundae_ns.gpu.fused_loss`` where there is CUDA, and L1 with pytorch_msssim's SSIM. Times are medians of
 forward and backward, the device waited for; errors are distances from the convolutions in float64, the gradient's in
 proportion to its own norm.
 """
@@ -19,8 +19,8 @@ import torch
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-from sundae_ns import losses
 from sundae_ns.evaluation import median_ms
+from sundae_ns.training import losses
 
 RESULTS = Path(__file__).parent / "results" / "loss.jsonl"
 WEIGHT = 0.2

@@ -31,9 +31,9 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr
-from sundae_ns.opening import load_run, open_scene
-from sundae_ns.packed_run import scene_of_run
-from sundae_ns.packing_finetune import finetune
+from sundae_ns.scenes.finetune import finetune
+from sundae_ns.scenes.opening import load_run, open_scene
+from sundae_ns.scenes.packed import scene_of_run
 from sundae_ns.storage.packing import (
     FINETUNED,
     Codecs,

@@ -21,7 +21,6 @@ import run
 import torch
 from torch import Tensor
 
-from sundae_ns import checkpoint
 from sundae_ns.pruning import (
     PruningConfig,
     decide,
@@ -31,6 +30,7 @@ from sundae_ns.pruning import (
     neighbor_order,
     select_systematic,
 )
+from sundae_ns.storage.runs import checkpoint
 
 RESULTS = Path(__file__).parent / "results" / "prune.jsonl"
 PREFIX = "_model.gauss_params."

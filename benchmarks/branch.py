@@ -27,15 +27,15 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch import Tensor, nn
 from torch.optim.lr_scheduler import LambdaLR
 
-from sundae_ns import rendering
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.compensation.head import SIZES
 from sundae_ns.evaluation import RunRow, append_row, psnr
 from sundae_ns.evaluation.timing import now
-from sundae_ns.losses import picture_loss
-from sundae_ns.measure import sizes
 from sundae_ns.model import SundaeModel
+from sundae_ns.rendering import render as rendering
+from sundae_ns.scenes.measure import sizes
 from sundae_ns.storage import Sizes
+from sundae_ns.training.losses import picture_loss
 
 RESULTS = Path(__file__).parent / "results" / "branches.jsonl"
 FIELD = ("features_dc", "features_rest", "opacities", "scales", "quats", "features")

@@ -32,8 +32,8 @@ from nerfstudio.utils import profiler, writer
 
 from sundae_ns.data import write_scene
 from sundae_ns.evaluation import RunRow, read_rows
-from sundae_ns.measure import sizes
 from sundae_ns.method_configs import sundae_auto, sundae_tiny
+from sundae_ns.scenes.measure import sizes
 
 TINY = (
     "num_downscales warmup_length stop_screen_size_at reset_alpha_every densify_grad_thresh cull_alpha_thresh".split()

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import torch
 
-from sundae_ns import checkpoint
 from sundae_ns.pruning import PruningConfig, coherence, field_graph
+from sundae_ns.storage.runs import checkpoint
 
 RESULTS = Path(__file__).parent / "results" / "coherence.json"
 PREFIX = "_model.gauss_params."

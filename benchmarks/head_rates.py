@@ -26,9 +26,9 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr
-from sundae_ns.losses import picture_loss
-from sundae_ns.opening import open_pipeline
-from sundae_ns.optimizers import NetworkAdamConfig
+from sundae_ns.scenes.opening import open_pipeline
+from sundae_ns.training.losses import picture_loss
+from sundae_ns.training.optimizers import NetworkAdamConfig
 
 RESULTS = Path(__file__).parent / "results" / "head_rates.jsonl"
 BURST = 1.3

@@ -34,10 +34,10 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts import train
 from rich.progress import track
 
-import sundae_ns.after_step
-import sundae_ns.checkpoint
 import sundae_ns.pruning.cutting
 import sundae_ns.storage.atomic
+import sundae_ns.storage.runs.checkpoint
+import sundae_ns.training.after_step
 from sundae_ns.data import write_scene
 from sundae_ns.errors import CheckpointError
 
@@ -105,12 +105,12 @@ def half_recorded(original: Callable[..., Any]) -> Callable[..., Any]:
 
 
 PLACES: dict[str, Callable[[int], None]] = {
-    "save: half written": lambda n: after(n, sundae_ns.checkpoint.torch, "save", half_saved),
+    "save: half written": lambda n: after(n, sundae_ns.storage.runs.checkpoint.torch, "save", half_saved),
     "save: not yet on the disk": lambda n: after(3 * n, sundae_ns.storage.atomic, "_flush", at_once),
-    "save: the older one not yet gone": lambda n: after(n, sundae_ns.checkpoint, "save", when_done),
+    "save: the older one not yet gone": lambda n: after(n, sundae_ns.storage.runs.checkpoint, "save", when_done),
     "prune: deciding": lambda n: after(1, sundae_ns.pruning.cutting, "decide", at_once),
     "prune: sliced": lambda n: after(1, sundae_ns.pruning.cutting, "keep", when_done),
-    "prune: half recorded": lambda n: after(1, sundae_ns.after_step, "write_text", half_recorded),
+    "prune: half recorded": lambda n: after(1, sundae_ns.training.after_step, "write_text", half_recorded),
 }
 ANY = "any time"
 
@@ -182,7 +182,7 @@ def run_folder(config: TrainerConfig) -> Path:
 def outcome(folder: Path) -> dict[str, Any]:
     """What a finished run left: tensors of the final checkpoint, the record of its prune, and names of its files."""
     models = folder / "nerfstudio_models"
-    state = sundae_ns.checkpoint.load(models / f"step-{STEPS - 1:09d}.ckpt")
+    state = sundae_ns.storage.runs.checkpoint.load(models / f"step-{STEPS - 1:09d}.ckpt")
     prunes = json.loads((folder / "prune.json").read_text())
     return {
         "tensors": {name: value for name, value in state["pipeline"].items() if isinstance(value, torch.Tensor)},
@@ -236,7 +236,7 @@ def main() -> None:
         tally["killed"] += killed
         tally[f"at {place}"] += killed
         try:
-            newest, _ = sundae_ns.checkpoint.newest_whole(models)
+            newest, _ = sundae_ns.storage.runs.checkpoint.newest_whole(models)
             done = int(newest.stem.partition("-")[2]) + 1
             tally["resumed" if done < STEPS else "killed after the last save"] += 1
         except CheckpointError:

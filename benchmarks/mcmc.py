@@ -28,11 +28,11 @@ from gsplat.strategy import MCMCStrategy
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from torch import Tensor
 
-from sundae_ns.densification import start_of_chain
 from sundae_ns.evaluation import append_row
-from sundae_ns.losses import chain_losses
-from sundae_ns.measure import sizes
 from sundae_ns.model import SundaeModel, SundaeModelConfig
+from sundae_ns.scenes.measure import sizes
+from sundae_ns.training.densification import start_of_chain
+from sundae_ns.training.losses import chain_losses
 
 
 @dataclass

@@ -26,9 +26,9 @@ import torch
 import torch.distributed as dist
 from nerfstudio.scripts.train import _set_random_seed
 
-from sundae_ns import checkpoint
 from sundae_ns.evaluation import RunRow, append_row
-from sundae_ns.measure import sizes
+from sundae_ns.scenes.measure import sizes
+from sundae_ns.storage.runs import checkpoint
 
 LINES = run.RESULTS.parent / "multi_gpu.jsonl"
 WARM = 100

@@ -14,8 +14,8 @@ import torch
 
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.opening import load_run
 from sundae_ns.pruning import PruningConfig, decide, footprint
+from sundae_ns.scenes.opening import load_run
 
 RULES: list[dict[str, Any]] = [
     {"score": "random"},

@@ -36,16 +36,17 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import Progress
 
-from sundae_ns import checkpoint
 from sundae_ns.cli.bench.plan import schedule_of
 from sundae_ns.evaluation import RunRow, append_row
 from sundae_ns.evaluation.records import wait_for_lock
 from sundae_ns.evaluation.timing import now
-from sundae_ns.measure import sizes
 from sundae_ns.model import SundaeModel
-from sundae_ns.pruning import field_graph, make_policy
+from sundae_ns.pruning import field_graph
 from sundae_ns.pruning.scores import for_graph
-from sundae_ns.schedulers import Decay
+from sundae_ns.scenes.measure import sizes
+from sundae_ns.storage.runs import checkpoint
+from sundae_ns.training.schedulers import Decay
+from sundae_ns.training.schedules import make_policy
 
 RESULTS = Path(__file__).parent / "results" / "rules.jsonl"
 COLMAP = "colmap --colmap-path sparse/0 --downscale-factor 1 --eval-mode interval --eval-interval 8"

@@ -25,8 +25,8 @@ from nerfstudio.scripts.train import _set_random_seed
 from sundae_ns.evaluation import RunRow, append_row, median_ms, psnr, ssim
 from sundae_ns.evaluation.records import wait_for_lock
 from sundae_ns.evaluation.timing import now
-from sundae_ns.measure import frame_times, revision, sizes
 from sundae_ns.model import SundaeModel
+from sundae_ns.scenes.measure import frame_times, revision, sizes
 from sundae_ns.storage import Sizes, bytes_of
 
 RESULTS = Path(__file__).parent / "results" / "runs.csv"

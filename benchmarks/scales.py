@@ -18,7 +18,7 @@ import torch
 
 from sundae_ns.compensation import resize
 from sundae_ns.evaluation import psnr, ssim, without_nan
-from sundae_ns.opening import load_run
+from sundae_ns.scenes.opening import load_run
 
 RESULTS = Path(__file__).parent / "results" / "scales.json"
 FACTORS = (0.25, 0.4, 0.5, 0.7, 0.9, 0.98, 1.0, 1.02, 1.1, 1.37, 2.0, 3.0)

@@ -23,11 +23,11 @@ from rich.progress import track
 from rules import PLAIN, RULES
 from torch import Tensor
 
-from sundae_ns.opening import open_pipeline
 from sundae_ns.pruning import PruningConfig, decide
 from sundae_ns.rasterization import select_backend
-from sundae_ns.rendering import Style, weights_of
-from sundae_ns.views import View
+from sundae_ns.rendering.render import Style, weights_of
+from sundae_ns.rendering.views import View
+from sundae_ns.scenes.opening import open_pipeline
 
 RESULTS = Path(__file__).parent / "results" / "selections.jsonl"
 COMPARED = ("paper", "contribution", "response-contribution", "systematic-merge", "detail-merge")

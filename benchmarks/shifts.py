@@ -21,8 +21,8 @@ from torch import Tensor
 from sundae_ns.compensation import PHASES
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.model import SundaeModel
-from sundae_ns.opening import load_run
-from sundae_ns.views import View
+from sundae_ns.rendering.views import View
+from sundae_ns.scenes.opening import load_run
 
 RESULTS = Path(__file__).parent / "results" / "shifts.json"
 EDGE = 40

@@ -21,8 +21,8 @@ from torch import Tensor
 from torchvision.transforms.functional import gaussian_blur
 
 from sundae_ns.evaluation import psnr
-from sundae_ns.opening import open_pipeline, views_to_test
 from sundae_ns.rasterization import Rasterization
+from sundae_ns.scenes.opening import open_pipeline, views_to_test
 
 RESULTS = Path(__file__).parent / "results" / "single_views.json"
 SIGMAS = (1, 2, 4, 8, 16)

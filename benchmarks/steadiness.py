@@ -22,7 +22,7 @@ from rich.progress import track
 
 from sundae_ns.compensation import PHASES
 from sundae_ns.evaluation import Frame, change
-from sundae_ns.opening import load_run
+from sundae_ns.scenes.opening import load_run
 
 RESULTS = Path(__file__).parent / "results" / "steadiness.json"
 

@@ -24,24 +24,26 @@ from pytorch_msssim import SSIM
 from rich.progress import track
 from torch import Tensor
 
-from sundae_ns import checkpoint
-from sundae_ns.after_step import finish, prune_if_due, warn_if_too_short
-from sundae_ns.budget import Budget
 from sundae_ns.compensation import PHASES, CompensationHead, HeadConfig, training_window
 from sundae_ns.datamanager import NO_PICTURES, SundaeDatamanager, without_pictures
-from sundae_ns.densification import CappedStrategy, make_strategy
 from sundae_ns.distributed import Arrived, Course, GlobalPruning, Look, Shards, Timetable, slack_of_step
 from sundae_ns.errors import ConfigError, out_of_memory
-from sundae_ns.evaluation import Later, LazyOutputs, Lpips, psnr, ssim
-from sundae_ns.initial_field import Start, initial_field
-from sundae_ns.late_outputs import OUTPUTS, FieldKey, ShownResponse, empty_outputs, late_outputs
-from sundae_ns.losses import chain_losses, picture_losses
-from sundae_ns.preview import Preview, in_viewer
-from sundae_ns.pruning import PruningConfig, PruningPolicy, make_policy
+from sundae_ns.evaluation import Lpips, psnr, ssim
+from sundae_ns.pruning import PruningConfig
 from sundae_ns.rasterization import Backend, Rasterization, select_backend
-from sundae_ns.recordings import Recordings
-from sundae_ns.rendering import NEAR_PLANE, Style, colors_of, render, weights_of
-from sundae_ns.views import View, cut, view_of
+from sundae_ns.rendering.lazy import Later, LazyOutputs
+from sundae_ns.rendering.outputs import OUTPUTS, FieldKey, ShownResponse, empty_outputs, late_outputs
+from sundae_ns.rendering.render import NEAR_PLANE, Style, colors_of, render, weights_of
+from sundae_ns.rendering.replay import Recordings
+from sundae_ns.rendering.views import View, cut, view_of
+from sundae_ns.storage.runs import checkpoint
+from sundae_ns.training.after_step import finish, prune_if_due, warn_if_too_short
+from sundae_ns.training.budget import Budget
+from sundae_ns.training.densification import CappedStrategy, make_strategy
+from sundae_ns.training.initial_field import Start, initial_field
+from sundae_ns.training.losses import chain_losses, picture_losses
+from sundae_ns.training.schedules import PruningPolicy, make_policy
+from sundae_ns.viewer import Preview, in_viewer
 
 _Outputs = MutableMapping[str, Any]
 

@@ -16,10 +16,11 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sundae_ns import checkpoint, distributed
+from sundae_ns import distributed
 from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, StorageError, SundaeError, out_of_memory
 from sundae_ns.storage.atomic import write_text, writing
+from sundae_ns.storage.runs import checkpoint
 
 
 @dataclass

@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 import pytest
 import torch
 
-from sundae_ns import nvrtc
-from sundae_ns.nvrtc import Argument, Launch
+from sundae_ns.gpu import nvrtc
+from sundae_ns.gpu.nvrtc import Argument, Launch
 
 CompileKernels = Callable[..., dict[str, Launch]]
 

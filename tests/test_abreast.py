@@ -11,8 +11,8 @@ import torch
 
 from sundae_ns.data.scene_folder import write_scene
 from sundae_ns.rasterization import GsplatBackend
-from sundae_ns.rendering import Style, render
-from sundae_ns.views import View
+from sundae_ns.rendering.render import Style, render
+from sundae_ns.rendering.views import View
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 RULES = ["random", "contribution", "detail-merge"]

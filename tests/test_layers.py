@@ -12,11 +12,9 @@ import pytest
 ROOT = Path(__file__).parents[1] / "sundae_ns"
 FLOORS = {
     "errors": 0,
-    "nvrtc": 0,
-    "cuda_graphs": 0,
     "graphs": 0,
     "filters": 0,
-    "fused_loss": 1,
+    "gpu": 0,
     "gaussians": 1,
     "rasterization": 1,
     "compensation": 1,
@@ -24,34 +22,19 @@ FLOORS = {
     "storage": 2,
     "evaluation": 2,
     "data": 2,
-    "schedulers": 3,
-    "optimizers": 3,
     "datamanager": 3,
-    "checkpoint": 3,
-    "after_step": 3,
-    "budget": 3,
-    "densification": 3,
     "distributed": 3,
-    "initial_field": 3,
-    "late_outputs": 3,
-    "losses": 3,
     "model": 3,
-    "preview": 3,
-    "recordings": 3,
     "rendering": 3,
-    "run_config": 3,
-    "run_folder": 3,
+    "scenes": 3,
     "trainer": 3,
-    "opening": 3,
-    "measure": 3,
-    "packed_run": 3,
-    "packing_finetune": 3,
-    "views": 3,
+    "training": 3,
+    "viewer": 3,
     "method_configs": 4,
     "cli": 4,
 }
 # Rooms that may import a neighbour on their own floor.
-SAME_FLOOR = {"graphs": {"nvrtc"}, "filters": {"graphs", "nvrtc"}}
+SAME_FLOOR = {"graphs": {"gpu"}, "filters": {"graphs", "gpu"}}
 LISTER = """
 import importlib, json, pkgutil, sys
 room = sys.argv[1]

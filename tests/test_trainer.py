@@ -15,9 +15,9 @@ import pytest
 import torch
 from nerfstudio.engine.trainer import Trainer
 
-from sundae_ns import checkpoint
 from sundae_ns.errors import CheckpointError, DataError, StorageError
 from sundae_ns.method_configs import sundae_tiny
+from sundae_ns.storage.runs import checkpoint
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 
 

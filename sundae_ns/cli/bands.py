@@ -13,17 +13,17 @@ from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
-from sundae_ns.checkpoint import read_field
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.evaluation import Look, look_along_axes, look_through, points_sheet, response_histogram
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, response
-from sundae_ns.run_folder import find_config, read_config, training_cameras
 from sundae_ns.storage import replacing, write_point_cloud, write_text
 from sundae_ns.storage.atomic import writing
 from sundae_ns.storage.kinds import kind_of
+from sundae_ns.storage.runs.checkpoint import read_field
+from sundae_ns.storage.runs.folder import find_config, read_config, training_cameras
 
 RULES = {"high": "high-pass", "low": "low-pass", "combined": "combined"}
 """Captions of the rules, by their names."""

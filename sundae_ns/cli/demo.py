@@ -103,8 +103,8 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
 
         # nerfstudio is chatty while it imports and loads.
         with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
-            from sundae_ns.measure import frame_times, sizes
-            from sundae_ns.opening import load_run
+            from sundae_ns.scenes.measure import frame_times, sizes
+            from sundae_ns.scenes.opening import load_run
 
             opened = load_run(run / "config.yml")
             model, cameras = opened.model, opened.cameras

@@ -135,9 +135,9 @@ def own_kernels() -> Finding:
     name = "our kernels"
     if not torch.cuda.is_available():
         return Finding(name, False, "need a CUDA device", "nothing: on a CPU other code does the same", needed=False)
-    from sundae_ns import fused_loss, nvrtc
     from sundae_ns.compensation import CompensationHead, HeadConfig, kernels
     from sundae_ns.errors import BackendError
+    from sundae_ns.gpu import fused_loss, nvrtc
     from sundae_ns.graphs import traversal
 
     device = torch.device("cuda", 0)

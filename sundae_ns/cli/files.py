@@ -33,7 +33,7 @@ def export(
             warm start takes the coordinates as they were.
     """
     from sundae_ns.errors import ConfigError
-    from sundae_ns.packed_run import scene_of_run
+    from sundae_ns.scenes.packed import scene_of_run
     from sundae_ns.storage import is_nerfstudio_ply, ply_comments, read_ply
     from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.packing import read_scene

@@ -62,7 +62,7 @@ def pack(
     from rich.progress import Progress
 
     from sundae_ns.errors import ConfigError
-    from sundae_ns.packed_run import scene_of_run
+    from sundae_ns.scenes.packed import scene_of_run
     from sundae_ns.storage.packing import FINETUNED, PackConfig, fit_scene, write_fitted
 
     if finetune < 0:
@@ -93,7 +93,7 @@ def pack(
             scene = scene_of_run(run, max_cameras=max_cameras, data=data)
             progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
             if finetune:
-                from sundae_ns.packing_finetune import finetune as train
+                from sundae_ns.scenes.finetune import finetune as train
 
                 scene, codecs = train(
                     run, scene, config, finetune, data=data, progress=lambda _: progress.advance(task)
@@ -126,7 +126,7 @@ def unpack(
     """
     from rich.progress import Progress
 
-    from sundae_ns.packed_run import write_run
+    from sundae_ns.scenes.packed import write_run
     from sundae_ns.storage.packing import read_scene
 
     with Progress(transient=True) as progress:

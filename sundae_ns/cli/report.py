@@ -22,8 +22,8 @@ from sundae_ns.evaluation.flip import INSTALL
 from sundae_ns.evaluation.lpips import Net
 from sundae_ns.evaluation.plots import colors_of, plot_costs, plot_curves, plot_gain, plot_views
 from sundae_ns.evaluation.published import Printed, printed_of
-from sundae_ns.measure import measure_scene, pictures_of
-from sundae_ns.opening import Opened, open_scene
+from sundae_ns.scenes.measure import measure_scene, pictures_of
+from sundae_ns.scenes.opening import Opened, open_scene
 from sundae_ns.storage.atomic import write_text, writing
 
 PNG_WIDTH = 400

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
-from sundae_ns.cuda_graphs import Kept, aside, record, recording
 from sundae_ns.errors import BackendError
+from sundae_ns.gpu.cuda_graphs import Kept, aside, record, recording
 
 _log = logging.getLogger(__name__)
 

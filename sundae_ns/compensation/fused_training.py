@@ -29,8 +29,8 @@ from sundae_ns.compensation.fused import (
 )
 from sundae_ns.compensation.kernels import BACKWARD, FORWARD, PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
-from sundae_ns.cuda_graphs import MAX_SIZES, aside, record
 from sundae_ns.errors import BackendError, SundaeError
+from sundae_ns.gpu.cuda_graphs import MAX_SIZES, aside, record
 
 _log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import torch
 
 from sundae_ns.compensation.unet import SLOPE, UNet
-from sundae_ns.nvrtc import Kernel, Launch
+from sundae_ns.gpu.nvrtc import Kernel, Launch
 
 PACK = 8
 """Channels that a thread moves at once, 16 bytes of them; pictures are padded to a multiple, which tensor cores want too."""

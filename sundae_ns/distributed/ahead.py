@@ -20,7 +20,7 @@ from torch.optim import Adam, Optimizer
 
 from sundae_ns.compensation import training_window
 from sundae_ns.rasterization.sharded import Cameras, Plan, Route, Slack, camera_row, cameras_of
-from sundae_ns.views import View, view_of
+from sundae_ns.rendering.views import View, view_of
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras as Capture

@@ -11,7 +11,7 @@ from sundae_ns.distributed.batches import scaled_group
 from sundae_ns.distributed.shards import Shards, bounds
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians.surgery import per_primitive
-from sundae_ns.pruning.policy import NEVER
+from sundae_ns.training.schedules import NEVER
 
 _FIELD = "_model.gauss_params."
 _EXTRA = "_model._extra_state"

@@ -16,9 +16,10 @@ from sundae_ns.distributed.shards import Shards
 from sundae_ns.errors import DataError, SundaeError
 from sundae_ns.gaussians.parameters import finite_mask, num_primitives
 from sundae_ns.gaussians.rewriting import rewrite
-from sundae_ns.pruning import PruneReport, PruningConfig
-from sundae_ns.pruning.policy import PruningPolicy
+from sundae_ns.pruning import PruningConfig
 from sundae_ns.pruning.scores import Contribution
+from sundae_ns.training.report import PruneReport
+from sundae_ns.training.schedules import PruningPolicy
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from sundae_ns.densification import Statistics
 from sundae_ns.distributed.ahead import Ahead, Look, Timetable, stamped
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.parameters import num_primitives
@@ -36,10 +35,11 @@ from sundae_ns.rasterization.sharded import (
     plan_exchange,
     swap,
 )
+from sundae_ns.training.densification import Statistics
 
 if TYPE_CHECKING:
     from sundae_ns.model import SundaeModel
-    from sundae_ns.views import View
+    from sundae_ns.rendering.views import View
 
 DRIFT = 1.1
 """Rows move when the largest shard has more than this times the mean."""

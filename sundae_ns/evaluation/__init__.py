@@ -3,7 +3,6 @@
 from sundae_ns.evaluation import display
 from sundae_ns.evaluation.flicker import Change, Frame, change
 from sundae_ns.evaluation.flip import flip, flip_available
-from sundae_ns.evaluation.lazy import Later, LazyOutputs
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
 from sundae_ns.evaluation.measured import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality, without_nan
 from sundae_ns.evaluation.memory import peak_memory
@@ -29,8 +28,6 @@ __all__ = [
     "ComparisonRow",
     "Configuration",
     "Frame",
-    "Later",
-    "LazyOutputs",
     "Look",
     "Lpips",
     "Measured",

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError, ConfigError, DataError
+from sundae_ns.gpu.nvrtc import Kernel
 from sundae_ns.graphs import host_search, traversal
 from sundae_ns.graphs.tree import build_tree
-from sundae_ns.nvrtc import Kernel
 
 MOST_EXTENT = 1e150
 """Coordinates up to this have squared distances that float64 can hold."""

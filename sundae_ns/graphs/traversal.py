@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from sundae_ns.gpu.nvrtc import Launch
 from sundae_ns.graphs.tree import BoxTree
-from sundae_ns.nvrtc import Launch
 
 KERNEL = "nearest"
 """Name of the kernel in :data:`SOURCE`."""

@@ -10,21 +10,14 @@ from sundae_ns.pruning.decision import Decision, decide
 from sundae_ns.pruning.detail import pixel_detail
 from sundae_ns.pruning.edges import field_graph
 from sundae_ns.pruning.footprint import footprint
-from sundae_ns.pruning.policy import ContinuousPruning, NoPruning, OneShotPruning, PruningPolicy, make_policy
 from sundae_ns.pruning.redistribution import grown, heirs, merged
-from sundae_ns.pruning.report import PruneReport
 from sundae_ns.pruning.scores import Response, coherence, response, score
 from sundae_ns.pruning.selection import kept_count, select_band, select_random, select_sampled, select_top
 from sundae_ns.pruning.signals import attribute_signal, color_signal, position_signal
 
 __all__ = [
-    "ContinuousPruning",
     "Decision",
-    "NoPruning",
-    "OneShotPruning",
-    "PruneReport",
     "PruningConfig",
-    "PruningPolicy",
     "Response",
     "attribute_signal",
     "band_rule",
@@ -38,7 +31,6 @@ __all__ = [
     "heirs",
     "inclusion_probabilities",
     "kept_count",
-    "make_policy",
     "merged",
     "neighbor_order",
     "pixel_detail",

@@ -11,7 +11,7 @@ import functools
 import torch
 from torch import Tensor
 
-from sundae_ns.nvrtc import Kernel
+from sundae_ns.gpu.nvrtc import Kernel
 
 SOURCE = r"""
 // Each thread has one channel of one primitive.

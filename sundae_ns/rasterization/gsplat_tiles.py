@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from sundae_ns.nvrtc import Kernel
+from sundae_ns.gpu.nvrtc import Kernel
 
 TILE = 16
 """Side of gsplat's tiles, pixels."""

@@ -33,9 +33,9 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     """A CUDA device that exists in torch's answers only."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
-    monkeypatch.setattr("sundae_ns.nvrtc.Kernel", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.gpu.nvrtc.Kernel", lambda *_: None)
     monkeypatch.setattr("sundae_ns.compensation.kernels.compiled", lambda *_: {})
-    monkeypatch.setattr("sundae_ns.fused_loss.compiled", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.gpu.fused_loss.compiled", lambda *_: None)
 
 
 def _kernels(monkeypatch: pytest.MonkeyPatch, problem: str | None) -> None:
@@ -97,7 +97,11 @@ def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise BackendError("a CUDA kernel does not run (too old): update the driver")
 
-    places = ("sundae_ns.nvrtc.Kernel", "sundae_ns.compensation.kernels.compiled", "sundae_ns.fused_loss.compiled")
+    places = (
+        "sundae_ns.gpu.nvrtc.Kernel",
+        "sundae_ns.compensation.kernels.compiled",
+        "sundae_ns.gpu.fused_loss.compiled",
+    )
     for place in places:
         with monkeypatch.context() as patch:
             patch.setattr(place, refuse)

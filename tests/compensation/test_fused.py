@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from sundae_ns import nvrtc
 from sundae_ns.compensation import CompensationHead, HeadConfig, fused, kernels
 from sundae_ns.compensation.fused_training import FusedTraining, _Pass, network_backward
-from sundae_ns.cuda_graphs import MAX_SIZES, RECORD_AT
 from sundae_ns.errors import BackendError, SundaeError
+from sundae_ns.gpu import nvrtc
+from sundae_ns.gpu.cuda_graphs import MAX_SIZES, RECORD_AT
 
 PICTURES_OF_FLOATS = """
 typedef float T;

@@ -18,12 +18,12 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.compensation import training_window
-from sundae_ns.densification import CappedStrategy
 from sundae_ns.distributed import Look, Shards, Timetable, longest_step, slack_of_step
-from sundae_ns.losses import picture_loss
 from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
 from sundae_ns.rasterization.sharded import camera_row
-from sundae_ns.views import view_of
+from sundae_ns.rendering.views import view_of
+from sundae_ns.training.densification import CappedStrategy
+from sundae_ns.training.losses import picture_loss
 
 RATE = 0.01
 

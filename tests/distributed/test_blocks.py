@@ -19,7 +19,8 @@ from torch.nn import Parameter
 from sundae_ns.distributed import bounds, checkpoints, moves, pruning
 from sundae_ns.distributed.shards import per_primitive
 from sundae_ns.errors import CheckpointError, ConfigError
-from sundae_ns.pruning import PruningConfig, make_policy
+from sundae_ns.pruning import PruningConfig
+from sundae_ns.training.schedules import make_policy
 
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "features")
 RANKS = 3

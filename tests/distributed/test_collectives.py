@@ -20,13 +20,14 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns import distributed
-from sundae_ns.densification import CappedStrategy
 from sundae_ns.distributed import Course, GlobalPruning, Look, Shards, slack_of_step
 from sundae_ns.errors import ConfigError
-from sundae_ns.pruning import PruningConfig, make_policy
+from sundae_ns.pruning import PruningConfig
 from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
 from sundae_ns.rasterization.sharded import Cameras, Slack, camera_row, cameras_of, may_be_seen
-from sundae_ns.views import View
+from sundae_ns.rendering.views import View
+from sundae_ns.training.densification import CappedStrategy
+from sundae_ns.training.schedules import make_policy
 
 RunRanks = Callable[[str, Path], None]
 Passed = Callable[[Path, str], None]

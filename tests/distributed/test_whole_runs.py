@@ -24,11 +24,12 @@ import torch
 import torch.distributed as dist
 from PIL import Image
 
-from sundae_ns import checkpoint, distributed
+from sundae_ns import distributed
 from sundae_ns.data import write_scene
 from sundae_ns.distributed import Course, Look, Shards
 from sundae_ns.errors import ConfigError, RankError, rank_ended
 from sundae_ns.method_configs import sundae_tiny
+from sundae_ns.storage.runs import checkpoint
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 
 RunRanks = Callable[[str, Path], None]

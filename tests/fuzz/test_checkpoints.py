@@ -18,11 +18,11 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import Optimizers
 from torch.amp import GradScaler
 
-from sundae_ns import checkpoint
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.model import SundaeModel, SundaeModelConfig
-from sundae_ns.optimizers import FusedAdamConfig
+from sundae_ns.storage.runs import checkpoint
 from sundae_ns.trainer import SundaeTrainer
+from sundae_ns.training.optimizers import FusedAdamConfig
 
 
 def small_model() -> SundaeModel:

@@ -11,9 +11,9 @@ import pytest
 import torch
 from plyfile import PlyData, PlyElement
 
-from sundae_ns import checkpoint
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import read_point_cloud, write_ply
+from sundae_ns.storage.runs import checkpoint
 
 HEADER = b"ply\nformat %s 1.0\nelement vertex %s\n%send_header\n"
 XYZ = b"property float x\nproperty float y\nproperty float z\n"

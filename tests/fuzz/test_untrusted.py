@@ -20,12 +20,12 @@ from typing import Any
 import pytest
 import torch
 
-from sundae_ns import checkpoint
 from sundae_ns.errors import SundaeError
 from sundae_ns.gaussians import from_points
-from sundae_ns.packed_run import write_run
+from sundae_ns.scenes.packed import write_run
 from sundae_ns.storage import read_ply, write_ply
 from sundae_ns.storage.packing import Scene, container, read_scene, write_scene
+from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.viewers import write_for_viewers
 
 PLACES = (

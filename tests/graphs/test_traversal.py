@@ -11,12 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns import nvrtc
 from sundae_ns.errors import BackendError
+from sundae_ns.gpu import nvrtc
+from sundae_ns.gpu.nvrtc import Argument, Launch
 from sundae_ns.graphs import knn, radius_neighbors
 from sundae_ns.graphs.traversal import KERNEL, MAX_NEIGHBORS, OPTIONS, SOURCE, definitions, search_tree
 from sundae_ns.graphs.tree import LEAF, build_tree
-from sundae_ns.nvrtc import Argument, Launch
 
 # A count of the points looked at, and a loop over the threads.
 SHIM = """

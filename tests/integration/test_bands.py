@@ -14,7 +14,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from sundae_ns.cli import main
-from sundae_ns.run_folder import read_config, training_cameras
+from sundae_ns.storage.runs.folder import read_config, training_cameras
 
 
 def test_cameras_are_those_of_the_run(tiny: Any) -> None:

@@ -20,7 +20,7 @@ from sundae_ns.cli.bench.options import PaperOptions
 from sundae_ns.cli.bench.plan import Job, parser_of, plan_scene, schedule_of
 from sundae_ns.cli.bench.quality import run_paper
 from sundae_ns.evaluation import read_rows
-from sundae_ns.opening import open_scene
+from sundae_ns.scenes.opening import open_scene
 
 WARMUP, FINETUNE = 12, 8
 

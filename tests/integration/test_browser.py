@@ -24,8 +24,8 @@ from PIL import Image
 from torch import Tensor
 from viser import transforms
 
-from sundae_ns.preview import rule_config
 from sundae_ns.pruning import decide
+from sundae_ns.viewer import rule_config
 
 ROOT = Path(__file__).parents[2]
 spec = importlib.util.spec_from_file_location("browser", ROOT / "benchmarks" / "browser.py")

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from sundae_ns import checkpoint
 from sundae_ns.errors import MemoryExhaustedError
+from sundae_ns.storage.runs import checkpoint
 
 pytestmark = pytest.mark.gpu
 ROOM = 256 << 20

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.evaluation import psnr
-from sundae_ns.opening import load_run
+from sundae_ns.scenes.opening import load_run
 from sundae_ns.storage import read_ply
 
 PROGRAM = shutil.which("splat-transform")

@@ -18,9 +18,9 @@ from sundae_ns.cli import main
 from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import psnr
-from sundae_ns.measure import compensation, frame_figures, frame_times, sizes
-from sundae_ns.opening import load_run
-from sundae_ns.views import zoomed
+from sundae_ns.rendering.views import zoomed
+from sundae_ns.scenes.measure import compensation, frame_figures, frame_times, sizes
+from sundae_ns.scenes.opening import load_run
 
 
 def test_figures_of_a_run(tiny: Any) -> None:

@@ -16,7 +16,7 @@ from PIL import Image
 
 from sundae_ns.cli import main
 from sundae_ns.evaluation import psnr
-from sundae_ns.opening import load_run
+from sundae_ns.scenes.opening import load_run
 
 
 class Packed(NamedTuple):

@@ -14,16 +14,17 @@ import yaml
 from nerfstudio.configs.method_configs import all_methods
 from torch import Tensor
 
-from sundae_ns import checkpoint, packing_finetune
 from sundae_ns.cli import main
 from sundae_ns.cli.packing import pack
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.evaluation import psnr
 from sundae_ns.model import SundaeModel
-from sundae_ns.opening import load_run
-from sundae_ns.packed_run import scene_of_run, write_run
-from sundae_ns.packing_finetune import finetune, rate_factor
+from sundae_ns.scenes import finetune as packing_finetune
+from sundae_ns.scenes.finetune import finetune, rate_factor
+from sundae_ns.scenes.opening import load_run
+from sundae_ns.scenes.packed import scene_of_run, write_run
 from sundae_ns.storage.packing import FINETUNED, PackConfig, Scene, fit_scene, read_header, read_scene, write_fitted
+from sundae_ns.storage.runs import checkpoint
 
 COARSE = PackConfig(
     position_bits=8,

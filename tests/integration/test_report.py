@@ -15,9 +15,9 @@ from nerfstudio.configs.method_configs import method_configs
 
 from sundae_ns.cli import main
 from sundae_ns.evaluation import COLUMNS, flip_available, read_rows
-from sundae_ns.measure import quality
-from sundae_ns.opening import open_scene
-from sundae_ns.packed_run import scene_of_run
+from sundae_ns.scenes.measure import quality
+from sundae_ns.scenes.opening import open_scene
+from sundae_ns.scenes.packed import scene_of_run
 from sundae_ns.storage.packing import write_scene
 
 

@@ -13,8 +13,8 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from sundae_ns.gaussians.parameters import rgb_to_sh, sh_to_rgb
 from sundae_ns.model import SundaeModel
-from sundae_ns.preview import Rule, rule_config
 from sundae_ns.pruning import PruningConfig, decide
+from sundae_ns.viewer import Rule, rule_config
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[[SundaeModel], Any]

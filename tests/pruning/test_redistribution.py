@@ -18,8 +18,9 @@ from torch.optim import Adam, Optimizer
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.parameters import rgb_to_sh, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.pruning import PruningConfig, decide, field_graph, grown, heirs, make_policy
-from sundae_ns.schedulers import Decay, notify_pruned
+from sundae_ns.pruning import PruningConfig, decide, field_graph, grown, heirs
+from sundae_ns.training.schedulers import Decay, notify_pruned
+from sundae_ns.training.schedules import make_policy
 
 
 def field(n: int = 300, seed: int = 0) -> dict[str, Tensor]:

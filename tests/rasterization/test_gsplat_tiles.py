@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sundae_ns import nvrtc
 from sundae_ns.errors import BackendError
+from sundae_ns.gpu import nvrtc
 from sundae_ns.rasterization import GsplatBackend, gsplat_backend, gsplat_harmonics, gsplat_tiles
 from sundae_ns.rasterization.gsplat_tiles import TILE, Room, tile_lists
 from sundae_ns.rasterization.harmonics import evaluate_harmonics

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from sundae_ns.evaluation import psnr
 from sundae_ns.method_configs import sundae_auto
-from sundae_ns.packed_run import scene_of_run, write_run
-from sundae_ns.packing_finetune import finetune
+from sundae_ns.scenes.finetune import finetune
+from sundae_ns.scenes.packed import scene_of_run, write_run
 from sundae_ns.storage.packing import PackConfig, read_scene, write_fitted
 
 STEPS, SAVE, PRUNE_AT, STOP = 90, 10, 20, 70

@@ -17,8 +17,8 @@ from rich.table import Table
 from sundae_ns.errors import ConfigError
 from sundae_ns.evaluation import without_nan
 from sundae_ns.evaluation.document import number
-from sundae_ns.measure import FrameFigures, frame_figures
-from sundae_ns.opening import load_run
+from sundae_ns.scenes.measure import FrameFigures, frame_figures
+from sundae_ns.scenes.opening import load_run
 
 
 def run_frame(

@@ -53,7 +53,7 @@ def run_graph(
     if field is None:
         positions = draw(distribution, points, seed)
     else:
-        from sundae_ns.checkpoint import read_field
+        from sundae_ns.storage.runs.checkpoint import read_field
 
         positions = read_field(field)[0]["means"]
         positions = positions[torch.isfinite(positions).all(dim=1)]

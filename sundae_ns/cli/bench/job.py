@@ -27,8 +27,8 @@ from sundae_ns.cli.bench.plan import Job, done_file, job_folder
 from sundae_ns.errors import BackendError, CheckpointError, SundaeError
 from sundae_ns.evaluation import Lpips, lpips_weights_available
 from sundae_ns.evaluation.records import wait_for_lock
-from sundae_ns.measure import measure_scene
-from sundae_ns.opening import open_scene
+from sundae_ns.scenes.measure import measure_scene
+from sundae_ns.scenes.opening import open_scene
 from sundae_ns.storage.atomic import write_text
 
 NEVER = 10**9

@@ -72,4 +72,4 @@ class PackConfig:
 
 
 FINETUNED: dict[str, int | float] = {"harmonics_step": 0.03, "feature_bits": 6, "head_bits": 6}
-"""Coarser options, for scenes that have learnt to live with them (``sundae_ns.packing_finetune``)."""
+"""Coarser options, for scenes that have learnt to live with them (``sundae_ns.scenes.finetune``)."""

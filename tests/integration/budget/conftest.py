@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from budget_runs import Make, Run, set_up, tidy
 
-from sundae_ns import budget
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.data import write_scene
+from sundae_ns.training import budget
 
 
 @pytest.fixture(scope="module")

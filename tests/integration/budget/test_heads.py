@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from budget_runs import PRUNE_AT, SAVE, STEPS, Make, Run, same, shown_alike_when_packed, tidy
 
-from sundae_ns import budget
-from sundae_ns.budget.run import Run as Searched
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.measure import sizes
+from sundae_ns.scenes.measure import sizes
+from sundae_ns.training import budget
+from sundae_ns.training.budget.run import Run as Searched
 
 
 def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:

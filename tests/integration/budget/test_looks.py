@@ -10,10 +10,10 @@ from budget_runs import Make
 from nerfstudio.engine.trainer import Trainer
 from torch import Tensor
 
-from sundae_ns.budget.run import EXACT
-from sundae_ns.budget.run import Run as Searched
 from sundae_ns.errors import DataError
-from sundae_ns.pruning.search import NO_PICTURE
+from sundae_ns.training.budget.run import EXACT
+from sundae_ns.training.budget.run import Run as Searched
+from sundae_ns.training.budget.search import NO_PICTURE
 
 
 def searched(trainer: Trainer) -> Searched:

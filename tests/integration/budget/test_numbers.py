@@ -11,12 +11,12 @@ import torch
 from budget_runs import PRUNE_AT, Make, Run
 from torch import Tensor
 
-from sundae_ns import budget
-from sundae_ns.budget import Budget
-from sundae_ns.budget.run import Run as Searched
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import DataError
-from sundae_ns.pruning.search import NO_PICTURE, Search
+from sundae_ns.training import budget
+from sundae_ns.training.budget import Budget
+from sundae_ns.training.budget.run import Run as Searched
+from sundae_ns.training.budget.search import NO_PICTURE, Search
 
 
 def spoil(monkeypatch: pytest.MonkeyPatch, when: Callable[[Searched], bool], values: Callable[[Any], Tensor]) -> None:

@@ -15,11 +15,11 @@ from budget_runs import PRUNE_AT, SAVE, STEPS, STOP, Make, Run, same, set_up, sh
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
-from sundae_ns.budget import bytes_of, driver
-from sundae_ns.budget.run import Run as Searched
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import CheckpointError, ConfigError
-from sundae_ns.measure import sizes
+from sundae_ns.scenes.measure import sizes
+from sundae_ns.training.budget import bytes_of, driver
+from sundae_ns.training.budget.run import Run as Searched
 
 
 def test_it_cuts_and_keeps_the_target(done: Run) -> None:

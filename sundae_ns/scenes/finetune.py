@@ -1,0 +1,185 @@
+"""A short fine-tune of a finished run with the packer's own rounding in the loop, so that it learns to live with it.
+
+The model holds rounded values, those that a reader of the packed file will decode; the optimizer moves exact ones beside them,
+by the gradients at the rounded ones (the straight-through estimator of Bengio, Leonard and Courville, 2013). So the model,
+its losses and its rasteriser need know nothing of rounding. Grids, bases and steps are fitted once, before the first step, and
+the file is written by the same: what was trained is what is stored.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import CheckpointError, ConfigError, out_of_memory
+from sundae_ns.model import SundaeModel
+from sundae_ns.scenes.opening import open_pipeline
+from sundae_ns.scenes.packed import is_unpacked
+from sundae_ns.storage.packing import Codecs, PackConfig, Scene, fit_scene
+from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.runs.folder import config_of
+from sundae_ns.training.optimizers import NetworkAdamConfig
+
+RATES = {
+    "features_dc": 5e-4,
+    "features_rest": 1e-4,
+    "opacities": 1e-2,
+    "scales": 1e-3,
+    "quats": 2e-4,
+    "features": 5e-4,
+    "head": 2e-4,
+}
+"""Rates of Adam at their highest: about a fifth of those that a run begins with. Positions are rounded once and stay: at the
+end of training they hardly move any more, and everything else learns around where they ended up."""
+RISE = 0.05
+"""Share of the steps in which rates rise: Adam knows no gradients at first. They then fall to 0, so that values settle."""
+
+
+def rate_factor(step: int, steps: int) -> float:
+    """Share of the highest rate at a step of 0 to ``steps`` - 1: a short rise, then half a cosine."""
+    rise = max(round(RISE * steps), 1)
+    if step < rise:
+        return (step + 1) / (rise + 1)
+    return 0.5 * (1 + math.cos(math.pi * (step - rise) / max(steps - rise, 1)))
+
+
+def finetune(
+    run: Path,
+    scene: Scene,
+    config: PackConfig,
+    steps: int,
+    *,
+    data: Path | None = None,
+    progress: Callable[[float], object] | None = None,
+) -> tuple[Scene, Codecs]:
+    """Train what a run shows with the rounding of its pack in the loop. The run itself is only read.
+
+    Args:
+        run: folder of a run of sundae or splatfacto, or its ``config.yml``.
+        scene: the same run, as ``packed_run.scene_of_run`` gives it.
+        config: in how many bits it will be packed.
+        steps: how many, at least 1.
+        data: the capture, if it is not where the run says.
+        progress: called after each step with its loss.
+
+    Returns:
+        The trained scene and the codecs it was trained with, for ``storage.packing.write_fitted``.
+
+    Raises:
+        ConfigError: an option cannot work.
+        CheckpointError: the run still densifies, was unpacked from a scene, or cannot be opened.
+        DataError: its capture is gone, or cannot be used.
+        MemoryExhaustedError: the GPU's memory is full.
+    """
+    if steps < 1:
+        raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")
+    path = config_of(run)
+    if is_unpacked(load_config(path)):
+        raise CheckpointError(
+            f"{run} was unpacked from a packed scene and cannot be fine-tuned; fine-tune the run that was packed"
+        )
+    scene, codecs = fit_scene(scene, config)
+    opened = open_pipeline(path, data=data, test_mode="val")
+    pipeline, model = opened.pipeline, opened.model
+    if model.densifying:
+        raise CheckpointError(f"{run} was still growing when it was saved; train it to its end, or pack it as it is")
+    _place(model, scene.field)
+    codecs = codecs.to(model.device)
+    pipeline.train()
+    weights = dict(model.head.named_parameters()) if model.head is not None and scene.head else {}
+    field = _Through.of({name: model.gauss_params[name] for name in codecs.field}, codecs.rounded)
+    head = _Through.of(weights, codecs.rounded_head)
+    optimizer = _optimizer(field.exact, head.exact)
+    highest = [group["lr"] for group in optimizer.param_groups]
+    try:
+        with torch.random.fork_rng([torch.cuda.current_device()] if model.device.type == "cuda" else []):
+            torch.manual_seed(opened.config.machine.seed)  # of random backgrounds
+            for step in range(steps):
+                for group, rate in zip(optimizer.param_groups, highest, strict=True):
+                    group["lr"] = rate * rate_factor(step, steps)
+                field.show()
+                head.show()
+                at = opened.step + 1 + step
+                if weights:
+                    model.step = at  # chooses the window of a large picture
+                loss: Tensor = sum(pipeline.get_train_loss_dict(at)[1].values())
+                pipeline.zero_grad(set_to_none=True)
+                loss.backward()  # type: ignore[no-untyped-call]
+                field.take_gradients()
+                head.take_gradients()
+                optimizer.step()
+                if codecs.head is not None:
+                    for name, value in head.exact.items():
+                        value.data = codecs.head.within(name, value.data)
+                if progress is not None:
+                    progress(loss.item())
+    except torch.cuda.OutOfMemoryError as error:
+        raise out_of_memory(error, model.num_points) from error
+    source = {**scene.meta.get("source", {}), "finetuned": steps}
+    trained = Scene(
+        {name: field.exact.get(name, value).detach().cpu() for name, value in scene.field.items()},
+        {name: value.detach().cpu() for name, value in head.exact.items()},
+        scene.cameras,
+        {**scene.meta, "source": source},
+    )
+    return trained, codecs.to(torch.device("cpu"))
+
+
+class _Through(NamedTuple):
+    """Parameters of the model, which hold rounded values, and the exact values that are trained beside them."""
+
+    shown: Mapping[str, Tensor]
+    exact: dict[str, Tensor]
+    rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
+
+    @classmethod
+    def of(
+        cls, shown: Mapping[str, Tensor], rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
+    ) -> _Through:
+        """Exact values begin as those of the parameters."""
+        return cls(shown, {name: value.detach().clone().requires_grad_() for name, value in shown.items()}, rounded)
+
+    @torch.no_grad()
+    def show(self) -> None:
+        """Round into the parameters, in place: recorded graphs of the head read them where they are."""
+        rounded = self.rounded(self.exact)
+        for name, value in self.shown.items():
+            value.copy_(rounded[name])
+
+    @torch.no_grad()
+    def take_gradients(self) -> None:
+        """Gradients at the rounded values become those of the exact ones."""
+        for name, value in self.exact.items():
+            gradient = self.shown[name].grad
+            if gradient is not None and name == "quats":
+                # Rounding may have turned a quaternion to its negative, the same rotation.
+                gradient = gradient * (value * self.shown[name]).sum(dim=1, keepdim=True).sign()
+            if gradient is not None and name == "features_rest":
+                # Primitives that have no bands, because they look the same from everywhere, cost next to nothing.
+                gradient = gradient.masked_fill((value == 0).flatten(1).all(dim=1)[:, None, None], 0.0)
+            value.grad = gradient
+
+
+def _place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
+    """Give the model this field, in this order; what the field does not have takes no part in the pictures."""
+    n = len(field["means"])
+    for name, value in model.gauss_params.items():
+        new = field.get(name)
+        value.data = value.data.new_zeros(n, *value.shape[1:]) if new is None else new.to(value.data)
+        value.requires_grad_(name in field and name != "means")
+    # Lengths of quaternions are free, and rounded ones are of length 1, to which gradients belong.
+    model.gauss_params["quats"].data = torch.nn.functional.normalize(model.gauss_params["quats"].data)
+
+
+def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> torch.optim.Optimizer:
+    groups = [{"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()]
+    if head:
+        groups.append(
+            {"params": list(head.values()), "lr": RATES["head"], "eps": 1e-8, "betas": NetworkAdamConfig.betas}
+        )
+    return torch.optim.Adam(groups, fused=all(value.is_cuda for value in field.values()))

@@ -1,0 +1,311 @@
+"""Figures of a finished run: quality, bytes and synchronised times, taken from the run itself."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sundae_ns.compensation import over_phases, resize
+from sundae_ns.errors import BackendError, ConfigError
+from sundae_ns.evaluation import (
+    HEAD_OFF,
+    HEAD_ON,
+    ComparisonRow,
+    Configuration,
+    Lpips,
+    Measured,
+    ViewQuality,
+    flip,
+    median_ms,
+    psnr,
+    ssim,
+)
+from sundae_ns.gaussians import FEATURES
+from sundae_ns.model import SundaeModel
+from sundae_ns.rendering.render import plan_of
+from sundae_ns.rendering.views import zoomed
+from sundae_ns.scenes.opening import Opened
+from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
+
+MOST_ZOOM = 1000
+"""Pictures of so many times their size have more pixels than fit into any memory."""
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """Milliseconds a frame, device waited for, median over the given cameras."""
+
+    frame: float
+    """The whole picture, as nerfstudio's commands ask for it: camera, harmonics, splatting of colours and features, and the
+    head."""
+    splat: float
+    """The same without the head, and so without features."""
+    head: float
+    """The head alone, on what it sees of the frame; 0 where it does not run. Pictures of another scale than the trained one are
+    splatted at that one too, with features, which is in ``frame`` only."""
+
+
+@contextmanager
+def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
+    """Give pictures of ``model`` the head's correction, or not, outside of a viewer, whose check box is its own."""
+    before, model.compensated = model.compensated, on
+    try:
+        yield
+    finally:
+        model.compensated = before
+
+
+@torch.no_grad()
+def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int = 3, repeats: int = 5) -> FrameTimes:
+    """Time the rendering of ``cameras`` at their own resolution.
+
+    Args:
+        model: in evaluation mode, on the device that is to be timed.
+        cameras: each of shape ``(1,)``.
+        warmup: untimed runs of each picture.
+        repeats: timed runs of each picture.
+    """
+    background = model._get_background_color()
+
+    def milliseconds(fn: Callable[[], object]) -> float:
+        return median_ms(fn, device=model.device, warmup=warmup, repeats=repeats).median_ms
+
+    def show(camera: Cameras) -> Tensor:
+        return model.get_outputs_for_camera(camera)["rgb"]
+
+    frames: list[float] = []
+    splats: list[float] = []
+    heads: list[float] = []
+    for camera in cameras:
+        for on, times in ((True, frames), (False, splats)):
+            with compensation(model, on):
+                times.append(milliseconds(partial(show, camera)))
+        view = model.view_of(camera)
+        zoom, weight = plan_of(view, model.trained_focal)
+        if model.head is None or not model.head_active or weight == 0:
+            heads.append(0.0)
+            continue
+        pictures, splat = model.render(model.gaussians, view.zoomed(zoom), background, depth=False)
+        heads.append(milliseconds(partial(over_phases, model.head, pictures["base_rgb"], splat.colors, splat.alpha)))
+    return FrameTimes(median(frames), median(splats), median(heads))
+
+
+def sizes(model: SundaeModel) -> Sizes:
+    """Bytes of everything that is needed to render: primitives in fp32, features and head included."""
+    return Sizes(bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head))
+
+
+@dataclass(frozen=True)
+class FrameFigures:
+    """Speed of a configuration beside its own error; means over the test views."""
+
+    width: int
+    height: int
+    """Size of the first picture, pixels."""
+    precision: str
+    """Arithmetic of the head."""
+    phases: int
+    """How often the head ran for a frame."""
+    views: int
+    ms_frame: float
+    ms_splat: float
+    ms_head: float
+    psnr: float
+    ssim: float
+    psnr_base: float
+    ssim_base: float
+
+
+@torch.no_grad()
+def frame_figures(
+    run: Opened,
+    *,
+    factor: float = 1.0,
+    precision: str | None = None,
+    phases: int | None = None,
+    warmup: int = 3,
+    repeats: int = 5,
+) -> FrameFigures:
+    """Time the frames of a run at a size, and compare these very frames with the truth resized alike.
+
+    Args:
+        run: a finished run.
+        factor: on the pictures' sides.
+        precision: of the head, one of ``PRECISIONS``; by default the run's own, and fp32 on a CPU.
+        phases: how often the head runs for a frame, one of ``PHASES``; by default the run's own.
+        warmup, repeats: as for :func:`frame_times`.
+
+    Raises:
+        ConfigError: the factor is not above zero or too large, or phases are not of :data:`PHASES`.
+        BackendError: half precision is asked for on a CPU.
+    """
+    model = run.model
+    if not 0 < factor < MOST_ZOOM:
+        raise ConfigError(
+            f"no picture is {factor} times the size of another; give a factor above 0, and below {MOST_ZOOM}"
+        )
+    on_cpu = model.device.type == "cpu"
+    precision = precision or ("fp32" if on_cpu or model.head is None else model.head.config.precision)
+    if on_cpu and precision != "fp32":
+        raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
+    phases = phases or (1 if model.head is None else model.head.config.phases)
+    cameras = [zoomed(camera, factor) for camera in run.cameras]
+    with _head_as(model, precision=precision, phases=phases):
+        times = frame_times(model, cameras, warmup=warmup, repeats=repeats)
+        errors = dict.fromkeys(("psnr", "ssim", "psnr_base", "ssim_base"), 0.0)
+        for camera, truth in zip(cameras, run.truths, strict=True):
+            outputs = model.get_outputs_for_camera(camera)
+            height, width = outputs["rgb"].shape[:2]
+            target = truth if truth.shape[:2] == (height, width) else resize(truth, height, width)
+            for suffix, picture in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
+                errors["psnr" + suffix] += float(psnr(picture, target)) / len(cameras)
+                errors["ssim" + suffix] += float(ssim(picture, target)) / len(cameras)
+    return FrameFigures(
+        width=int(cameras[0].width),
+        height=int(cameras[0].height),
+        precision=precision,
+        phases=phases,
+        views=len(cameras),
+        ms_frame=times.frame,
+        ms_splat=times.splat,
+        ms_head=times.head,
+        **errors,
+    )
+
+
+@contextmanager
+def _head_as(model: SundaeModel, **changes: Any) -> Iterator[None]:
+    if model.head is None:
+        yield
+        return
+    before = model.head.config
+    changed = replace(before, **changes)
+    changed.validate()
+    model.head.config = changed
+    try:
+        yield
+    finally:
+        model.head.config = before
+
+
+@torch.no_grad()
+def measure_scene(
+    opened: Opened,
+    *,
+    label: str,
+    lpips: Lpips | None = None,
+    warmup: int = 3,
+    repeats: int = 5,
+    progress: Callable[[], object] | None = None,
+    command: str = "",
+) -> Measured:
+    """Evaluate and time a field on its test views, with the head and without.
+
+    What is timed is the very call whose picture is evaluated, view by view.
+
+    Args:
+        opened: the field.
+        label: its name in tables.
+        lpips: LPIPS; None leaves it out.
+        warmup: untimed renderings of each picture.
+        repeats: timed renderings of each picture; 0 leaves times out.
+        progress: called after each view.
+        command: the command to note as the origin of the figures.
+    """
+    model = opened.model
+    has_head = model.head is not None and model.head_active
+    ways = {HEAD_ON: True, HEAD_OFF: False} if has_head else {HEAD_OFF: False}
+    times: dict[str, list[float]] = {name: [] for name in (*ways, "head")}
+    views: dict[str, list[ViewQuality]] = {name: [] for name in ways}
+    for camera, truth in zip(opened.cameras, opened.truths, strict=True):
+        for name, on in ways.items():
+            with compensation(model, on):
+                picture = model.get_outputs_for_camera(camera)["rgb"]
+            views[name].append(quality(picture, truth, lpips))
+        if repeats:
+            found = frame_times(model, [camera], warmup=warmup, repeats=repeats)
+            for name, on in ways.items():
+                times[name].append(found.frame if on else found.splat)
+            times["head"].append(found.head)
+        if progress is not None:
+            progress()
+    stored = sizes(model)
+    bare = {name: value for name, value in model.gauss_params.items() if name != FEATURES}
+    needed = {HEAD_ON: stored.total, HEAD_OFF: bytes_of(bare)}
+    if opened.packed_bytes is not None:
+        # A packed file is read as a whole, whatever is shown of it.
+        stored, needed = Sizes(opened.packed_bytes), dict.fromkeys(needed, opened.packed_bytes)
+    return Measured(
+        label=label,
+        source=str(opened.source),
+        scene=opened.scene,
+        method=opened.method,
+        variant=opened.variant,
+        keep_ratio=opened.keep_ratio,
+        seed=opened.seed,
+        steps=opened.steps,
+        primitives=model.num_points,
+        bytes_primitives=stored.primitives,
+        bytes_head=stored.head,
+        resolution=_resolution(opened.cameras),
+        configurations=tuple(
+            Configuration(name, median(times[name]) if repeats else None, needed[name], tuple(views[name]))
+            for name in ways
+        ),
+        ms_head=median(times["head"]) if repeats else None,
+        lpips_net=lpips.net if lpips is not None else "",
+        prune_s=opened.prune_s,
+        peak_primitives=model.pruning_state["peak"] or None,
+        gpu=torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "",
+        commit=revision(),
+        command=command,
+    )
+
+
+def quality(picture: Tensor, truth: Tensor, lpips: Lpips | None = None) -> ViewQuality:
+    """Every metric of one picture ``[H, W, 3]`` against its truth."""
+    errors = (flip(picture, truth), None if lpips is None else lpips(picture, truth))
+    return ViewQuality(
+        float(psnr(picture, truth)), float(ssim(picture, truth)), *(None if e is None else float(e) for e in errors)
+    )
+
+
+@torch.no_grad()
+def pictures_of(opened: Opened, index: int) -> ComparisonRow:
+    """Truth, base colours and whole picture of one test view."""
+    outputs = opened.model.get_outputs_for_camera(opened.cameras[index])
+    return ComparisonRow(opened.truths[index], outputs["base_rgb"], outputs["rgb"])
+
+
+def revision() -> str:
+    """Commit of the checkout that runs, or what ``BENCHMARK_COMMIT`` says where the tree travelled without git; or empty."""
+    told = os.environ.get("BENCHMARK_COMMIT")
+    if told:
+        return told
+    folder = Path(__file__).parent
+    # An installed package may lie inside somebody else's repository, whose commit says nothing.
+    if not (folder.parent / ".git").exists():
+        return ""
+    command = ["git", "-C", str(folder), "rev-parse", "--short", "HEAD"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+
+
+def _resolution(cameras: Sequence[Cameras]) -> str:
+    """Width x height of the first camera; captures of several sizes say so."""
+    found = {(int(camera.width), int(camera.height)) for camera in cameras}
+    width, height = int(cameras[0].width), int(cameras[0].height)
+    return f"{width}x{height}" + (" and others" if len(found) > 1 else "")

@@ -1,0 +1,437 @@
+"""Finished runs as packed scenes, and packed scenes as runs that nerfstudio's commands open.
+
+A run's ``config.yml`` is a program to nerfstudio, so nothing of it travels: a packed scene states plain values, each is
+checked, and a fresh configuration is made around them.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, cast, get_args, get_type_hints
+
+import torch
+import yaml
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models.splatfacto import SplatfactoModelConfig
+from torch import Tensor
+
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, without_pictures
+from sundae_ns.errors import CheckpointError, PackError
+from sundae_ns.gaussians import FEATURES
+from sundae_ns.model import SundaeModel, SundaeModelConfig
+from sundae_ns.rendering.render import degree_in_use
+from sundae_ns.storage.atomic import write_text, writing
+from sundae_ns.storage.kinds import refuse
+from sundae_ns.storage.packing import Scene
+from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.runs.folder import config_of
+
+TIMESTAMP = "unpacked"
+_FRAME_FILE = "dataparser_transforms.json"
+_HEAD_OPTIONS = ("mode", "size", "pixel_unshuffle", "num_features", "precision")
+_MOST_UNSHUFFLE = 8
+_PARSERS: dict[str, type[DataParserConfig]] = {
+    "colmap": ColmapDataParserConfig,
+    "nerfstudio-data": NerfstudioDataParserConfig,
+}
+_FOLDER = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*")
+"""Paths that a packed scene may name: below the capture, and without a character that a shell would act on, for nerfstudio
+hands paths of pictures to ffmpeg through one."""
+
+
+# -------------------------------------------------------------------------------------------------------------- packing
+
+
+def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> Scene:
+    """What is needed to show a finished run: the field, the head if it takes part, and some training cameras.
+
+    Spherical harmonics that were not trained yet are left out, and so are the features of a head that takes no part.
+
+    Args:
+        run: folder of a run of sundae or splatfacto, or its ``config.yml``, which is not run.
+        max_cameras: most training cameras, evenly chosen; with 0, the capture need not be there any more.
+        data: the capture, if it is not where the run says.
+
+    Raises:
+        CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
+        DataError: its capture is gone, or cannot be used.
+    """
+    refuse(
+        run,
+        packed="give the run that was packed, or the one that sundae unpack makes of it",
+        ply="give the folder of a run; sundae export turns a .ply into .spz or .sog",
+    )
+    path = config_of(run)
+    config = _read_config(path)
+    source = checkpoint.newest_whole(path.parent / config.relative_model_dir)[0]
+    loaded = checkpoint.load(source)
+    model = _restored(cast(SplatfactoModelConfig, config.pipeline.model), loaded, source)
+    field = {name: value.detach() for name, value in model.gauss_params.items()}
+    coefficients = (degree_in_use(field["features_rest"], model.most_bands) + 1) ** 2 - 1
+    field["features_rest"] = field["features_rest"][:, :coefficients]
+    head: dict[str, Tensor] = {}
+    kind: dict[str, Any] | None = None
+    if model.head is not None and model.head_active:
+        head = dict(model.head.state_dict())
+        # The head's own: a budget may have chosen a smaller one than the model's configuration names.
+        kind = {name: getattr(model.head.config, name) for name in _HEAD_OPTIONS}
+    else:
+        field.pop(FEATURES, None)
+    manager = _manager(config)
+    if data is not None and not manager.pictures:
+        raise without_pictures(path.parent)
+    manager.data = data or manager.data
+    meta = {
+        "source": {"method": config.method_name, "step": int(loaded["step"])},
+        "model": {
+            "sh_degree": model.config.sh_degree,
+            "rasterize_mode": model.config.rasterize_mode,
+            "background_color": model.config.background_color,
+            "head": kind,
+            "trained_focal": list(model.trained_focal) if head and model.trained_focal else None,
+        },
+        "frame": _frame(path.parent / _FRAME_FILE),
+        "capture": _describe(manager),
+    }
+    cameras = _cameras(manager, max_cameras) if max_cameras > 0 else None
+    return Scene(field, head, cameras, meta)
+
+
+def _read_config(path: Path) -> TrainerConfig:
+    config = load_config(path)
+    model = getattr(getattr(config, "pipeline", None), "model", None)
+    if not isinstance(config, TrainerConfig) or not isinstance(model, SplatfactoModelConfig):
+        raise CheckpointError(f"{path} is a run of another method; give one of sundae or splatfacto")
+    return config
+
+
+def _setup(config: SundaeModelConfig) -> SundaeModel:
+    """The model of a configuration around a field that is about to be replaced."""
+    # Two points rather than none, which would start a random field of tens of thousands.
+    seeds = (torch.eye(3)[:2], torch.zeros(2, 3))
+    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    model: SundaeModel = config.setup(scene_box=box, num_train_data=0, metadata={}, seed_points=seeds)
+    return model.eval()
+
+
+def _restored(found: SplatfactoModelConfig, loaded: Mapping[str, Any], source: Path) -> SundaeModel:
+    """The model of a checkpoint, on the CPU."""
+    state = {}
+    for name, value in loaded["pipeline"].items():
+        if name.startswith("_model."):
+            state[name.removeprefix("_model.").removeprefix("module.")] = value
+    config = copy.deepcopy(found)
+    ours = isinstance(config, SundaeModelConfig)
+    if not isinstance(config, SundaeModelConfig):
+        shared = {field.name: getattr(found, field.name) for field in fields(SplatfactoModelConfig)}
+        config = SundaeModelConfig(**{**shared, "_target": SundaeModel}, head=HeadConfig(mode="off"))
+    config.camera_optimizer.mode = "off"  # moves the cameras of training, not what is shown
+    config.use_bilateral_grid = False
+    config.random_init = False
+    model = _setup(config)
+    if not ours:
+        state[checkpoint.EXTRA_STATE] = {**model.get_extra_state(), "step": int(loaded["step"])}
+    own = model.state_dict()
+    try:
+        model.load_state_dict({name: state[name] for name in own if name in state})
+    except RuntimeError as error:
+        reason = " ".join(str(error).split())[:200]
+        raise CheckpointError(f"{source} does not fit its own config.yml ({reason}); give another run") from error
+    return model
+
+
+def _frame(path: Path) -> dict[str, Any] | None:
+    """The way from the capture's own coordinates to the model's, as nerfstudio wrote it beside the run."""
+    try:
+        frame = json.loads(path.read_text(encoding="utf-8"))
+        return {"transform": frame["transform"], "scale": float(frame["scale"])}
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _manager(config: TrainerConfig) -> SundaeDatamanagerConfig:
+    """Ours, also for a run that was trained with splatfacto's."""
+    manager = copy.deepcopy(config.pipeline.datamanager)
+    if not isinstance(manager, SundaeDatamanagerConfig):
+        stock = cast(FullImageDatamanagerConfig, manager)
+        manager = SundaeDatamanagerConfig(
+            data=stock.data, dataparser=stock.dataparser, camera_res_scale_factor=stock.camera_res_scale_factor
+        )
+    manager.data = manager.data or config.data
+    return manager
+
+
+def _cameras(manager: SundaeDatamanagerConfig, most: int) -> dict[str, Tensor]:
+    cameras: Cameras = manager.setup(device="cpu", test_mode="test").train_dataset.cameras
+    chosen = torch.linspace(0, len(cameras) - 1, min(most, len(cameras))).round().long()
+    return {
+        "poses": cameras.camera_to_worlds[chosen],
+        "intrinsics": torch.cat([cameras.fx, cameras.fy, cameras.cx, cameras.cy], dim=-1)[chosen].double(),
+        "sizes": torch.cat([cameras.width, cameras.height], dim=-1)[chosen],
+    }
+
+
+def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
+    """Plain values by which the same capture is read, split and scaled again; None for one of a rare parser.
+
+    Neither is there one of a run without its capture, whose cameras are not where those of the capture are.
+    """
+    parser = manager.dataparser
+    kind = next((name for name, known in _PARSERS.items() if type(parser) is known), None)
+    if kind is None or not manager.pictures:
+        return None
+    options: dict[str, Any] = {}
+    for name, default in _options(_PARSERS[kind]).items():
+        value = getattr(parser, name, default)
+        if isinstance(value, Path):
+            value = value.as_posix()
+        if isinstance(value, str) and isinstance(default, Path) and not _FOLDER.fullmatch(value):
+            return None  # outside of the capture
+        options[name] = value
+    return {"parser": kind, "options": options, "scale": manager.camera_res_scale_factor}
+
+
+def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
+    """Options of a parser that matter to a finished run, with their defaults."""
+    left_out = {"_target", "data", "masks_path", "depths_path", "mask_color", "load_3D_points"}
+    return {field.name: getattr(kind(), field.name) for field in fields(kind) if field.name not in left_out}
+
+
+# ------------------------------------------------------------------------------------------------------------ unpacking
+
+
+def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = None) -> Path:
+    """Write a packed scene as a run that ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval`` open.
+
+    Args:
+        scene: from ``read_scene``; what it states of itself is checked.
+        output_dir: folder of runs, made if need be; the run is ``output_dir/name/sundae/unpacked``.
+        name: of the experiment: letters, digits, ``_``, ``.``, ``-``.
+        data: the capture, where it is at hand; without it there are cameras and no pictures.
+
+    Returns:
+        The run's ``config.yml``, which is written last.
+
+    Raises:
+        DataError: the capture is not there, or cannot be used.
+        PackError: the scene states what cannot be, or there is a run of that name already.
+        StorageError: no room or no right to write.
+    """
+    from nerfstudio.configs.method_configs import all_methods
+
+    config: TrainerConfig = copy.deepcopy(all_methods["sundae"])  # type: ignore[assignment]
+    config.experiment_name = re.sub(r"[^\w.-]+", "-", name).strip(".") or "scene"
+    config.timestamp = TIMESTAMP
+    config.output_dir = output_dir.resolve()
+    folder = config.get_base_dir()
+    path = folder / "config.yml"
+    if path.exists():
+        raise PackError(f"{folder} is a run already; choose another folder, or remove it")
+    model = _model_of(scene)
+    config.pipeline.model = model.config
+    manager = config.pipeline.datamanager
+    assert isinstance(manager, SundaeDatamanagerConfig)
+    if data is None:
+        manager.dataparser = NerfstudioDataParserConfig(
+            downscale_factor=1,
+            orientation_method="none",
+            center_method="none",
+            auto_scale_poses=False,
+            eval_mode="all",
+        )
+        manager.pictures = False
+        config.data = folder / "cameras"
+    else:
+        manager.dataparser, manager.camera_res_scale_factor = _capture(scene.meta.get("capture"))
+        check_capture(manager.dataparser, data, ("train", "test"))
+        config.data = data.resolve()
+    manager.data = config.data
+    with writing(f"cannot write to {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+        if data is None:
+            config.data.mkdir(exist_ok=True)
+            write_text(config.data / "transforms.json", json.dumps(_transforms(scene), indent=1))
+        frame = scene.meta.get("frame")
+        if _is_frame(frame):
+            write_text(folder / _FRAME_FILE, json.dumps(frame, indent=4))
+    state = {f"_model.{name}": value for name, value in model.state_dict().items()}
+    checkpoint.save(
+        {"step": model.step, "pipeline": state}, config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"
+    )
+    write_text(path, yaml.dump(config))
+    return path
+
+
+def is_unpacked(config: TrainerConfig) -> bool:
+    """Whether a run was written by :func:`write_run`: it has a field to show, and nothing that training goes on from."""
+    return config.timestamp == TIMESTAMP
+
+
+def _refusal(reason: str) -> PackError:
+    return PackError(f"the packed scene states {reason}; update this program, or pack it again")
+
+
+def _choices(kind: type, name: str) -> tuple[Any, ...]:
+    """Values of an option that is one of a few."""
+    return get_args(get_type_hints(kind)[name])
+
+
+def _one_of(stated: Mapping[str, Any], kind: type, name: str) -> Any:
+    value, choices = stated.get(name), _choices(kind, name)
+    if value not in choices:
+        raise _refusal(f"a {name} that is none of {', '.join(map(str, choices))}")
+    return value
+
+
+def _whole(stated: Mapping[str, Any], name: str, least: int, most: int) -> int:
+    value = stated.get(name)
+    if type(value) is not int or not least <= value <= most:
+        raise _refusal(f"a {name} outside of {least} to {most}")
+    return value
+
+
+def _model_of(scene: Scene) -> SundaeModel:
+    """The model that shows a scene, on the CPU."""
+    stated = scene.meta.get("model")
+    if not isinstance(stated, dict):
+        raise _refusal("no model")
+    config = SundaeModelConfig(
+        sh_degree=_whole(stated, "sh_degree", 0, 4),
+        sh_degree_interval=1,
+        rasterize_mode=_one_of(stated, SplatfactoModelConfig, "rasterize_mode"),
+        background_color=_one_of(stated, SplatfactoModelConfig, "background_color"),
+        head=_head_config(stated.get("head")),
+    )
+    config.camera_optimizer.mode = "off"
+    field = dict(scene.field)
+    n, found = field["features_rest"].shape[:2]
+    wanted = (config.sh_degree + 1) ** 2 - 1
+    if found > wanted:
+        raise _refusal("harmonics of a lower degree than it has")
+    field["features_rest"] = torch.cat([field["features_rest"], torch.zeros(n, wanted - found, 3)], dim=1)
+    model = _setup(config)
+    # A step at which all harmonics take part, and so does the head.
+    step = max(config.sh_degree, 1)
+    extra = {**model.get_extra_state(), "step": step, "trained_focal": _focal(stated.get("trained_focal"))}
+    state: dict[str, Any] = {name: value for name, value in model.state_dict().items() if "." not in name}
+    state[checkpoint.EXTRA_STATE] = extra
+    state |= {f"gauss_params.{name}": value for name, value in field.items()}
+    state |= {f"head.{name}": value for name, value in scene.head.items()}
+    try:
+        model.load_state_dict(state)
+    except (CheckpointError, RuntimeError) as error:
+        raise _refusal("another head than it has") from error
+    return model
+
+
+def _head_config(stated: Any) -> HeadConfig:
+    if stated is None:
+        return HeadConfig(mode="off")
+    if not isinstance(stated, dict) or set(stated) != set(_HEAD_OPTIONS):
+        raise _refusal("a head of an unknown kind")
+    return HeadConfig(
+        mode=_one_of(stated, HeadConfig, "mode"),
+        size=_one_of(stated, HeadConfig, "size"),
+        precision=_one_of(stated, HeadConfig, "precision"),
+        pixel_unshuffle=_whole(stated, "pixel_unshuffle", 1, _MOST_UNSHUFFLE),
+        num_features=_whole(stated, "num_features", 1, 256),
+        start_at=0,
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _focal(stated: Any) -> list[float] | None:
+    if stated is None:
+        return None
+    if not isinstance(stated, list) or len(stated) != 2 or not all(_is_number(v) and v > 0 for v in stated):
+        raise _refusal("focal lengths that cannot be")
+    return [float(value) for value in stated]
+
+
+def _is_frame(stated: Any) -> bool:
+    if not isinstance(stated, dict) or not _is_number(stated.get("scale")):
+        return False
+    rows = stated.get("transform")
+    return isinstance(rows, list) and all(isinstance(row, list) and all(map(_is_number, row)) for row in rows)
+
+
+def _capture(stated: Any) -> tuple[DataParserConfig, float]:
+    """Counterpart of :func:`_describe`: the parser, and the factor on the sides of its pictures."""
+    kind = stated.get("parser") if isinstance(stated, dict) else None
+    options = stated.get("options") if isinstance(stated, dict) else None
+    if kind not in _PARSERS or not isinstance(options, dict):
+        raise PackError("the packed scene does not say how its capture is read; unpack it without --data")
+    scale = stated.get("scale")
+    if not _is_number(scale) or not 0 < scale <= 1:
+        raise _refusal("pictures of a scale that cannot be")
+    parser = _PARSERS[kind](load_3D_points=False)  # type: ignore[call-arg]
+    known = _options(_PARSERS[kind])
+    for name, value in options.items():
+        default = known.get(name)
+        choices = _choices(_PARSERS[kind], name) if isinstance(default, str) and name in known else ()
+        fits = (
+            (isinstance(default, bool) and isinstance(value, bool))
+            or (isinstance(default, float) and _is_number(value))
+            or (name in known and default is None and (value is None or (type(value) is int and value > 0)))
+            or (type(default) is int and type(value) is int)
+            or value in choices
+            or (isinstance(default, Path) and isinstance(value, str) and _FOLDER.fullmatch(value) is not None)
+        )
+        if not fits:
+            raise _refusal(f"an option {str(name)[:40]!r} of its capture that cannot be")
+        setattr(parser, name, Path(value) if isinstance(default, Path) else value)
+    return parser, float(scale)
+
+
+def _transforms(scene: Scene) -> dict[str, Any]:
+    """The cameras as a capture of nerfstudio's layout, in the model's coordinates; lenses are left out, as in rendering."""
+    cameras = scene.cameras
+    if cameras is None or len(cameras["poses"]) == 0:
+        cameras = _outside_camera(scene.field["means"])
+    frames = []
+    for i, pose in enumerate(cameras["poses"].double().tolist()):
+        fx, fy, cx, cy = cameras["intrinsics"][i].tolist()
+        width, height = cameras["sizes"][i].tolist()
+        frames.append(
+            {
+                "file_path": f"view-{i:05d}",
+                "fl_x": fx,
+                "fl_y": fy,
+                "cx": cx,
+                "cy": cy,
+                "w": int(width),
+                "h": int(height),
+                "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]],
+            }
+        )
+    return {"camera_model": "PINHOLE", "frames": frames}
+
+
+def _outside_camera(means: Tensor) -> dict[str, Tensor]:
+    """One camera in front of a scene of which no camera is known: it looks along y, with z upwards."""
+    center = means.median(dim=0).values
+    away = 3 * (means - center).norm(dim=1).median().clamp_min(1e-6)
+    pose = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
+    pose[:, 3] = center + pose[:, 2] * away
+    return {
+        "poses": pose[None],
+        "intrinsics": torch.tensor([[500.0, 500.0, 320.0, 240.0]]).double(),
+        "sizes": torch.tensor([[640, 480]]),
+    }

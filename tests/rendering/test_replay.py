@@ -1,0 +1,301 @@
+"""Frames that are played back: when they are recorded, here with a recorder that is none; and on a GPU, what they show."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox
+from torch import Tensor
+
+from sundae_ns.errors import BackendError
+from sundae_ns.gpu.cuda_graphs import RECORD_AT
+from sundae_ns.model import SundaeModel
+from sundae_ns.rasterization import GsplatBackend, Room
+from sundae_ns.rendering import replay as recordings
+from sundae_ns.rendering.render import Style, render
+from sundae_ns.rendering.views import View
+
+Build = Callable[..., SundaeModel]
+Perturb = Callable[[SundaeModel], SundaeModel]
+MakeCamera = Callable[..., Cameras]
+
+
+class Recorder:
+    """In place of the GPU's: what it plays is rendered anew, and it notes what it was asked for."""
+
+    def __init__(self) -> None:
+        self.recorded: list[int | None] = []
+        self.played = 0
+        self.needed = 100
+        self.fails: Exception | None = None
+
+    def record(
+        self,
+        field: Mapping[str, Tensor],
+        view: View,
+        background: Tensor,
+        style: Style,
+        compensate: bool,
+        pairs: Any = None,
+    ) -> Any:
+        if self.fails is not None:
+            raise self.fails
+        self.recorded.append(pairs)
+        shown = {}
+
+        def show(view: View, background: Tensor) -> dict[str, Tensor]:
+            shown.update(render(field, view, background, style, depth=False, compensate=compensate)[0])
+            return {name: shown[name] for name in recordings.SHOWN}
+
+        return SimpleNamespace(show=show, pairs=pairs or 120)
+
+    def play(self, recording: Any, view: View, background: Tensor) -> tuple[dict[str, Tensor], int]:
+        self.played += 1
+        return recording.show(view, background), self.needed
+
+
+@pytest.fixture
+def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+    found = Recorder()
+    monkeypatch.setattr(recordings, "_record", found.record)
+    monkeypatch.setattr(recordings, "_play", found.play)
+    monkeypatch.setattr(recordings, "_recordable", lambda field, style: True)
+    return found
+
+
+def test_a_size_that_stays_is_recorded_and_played_back(
+    build: Build, perturb: Perturb, camera: MakeCamera, recorder: Recorder
+) -> None:
+    model = perturb(build(background_color="black")).eval()
+    shown = [model.get_outputs_for_camera(camera(shift=0.1 * i))["rgb"] for i in range(RECORD_AT + 2)]
+    assert (len(recorder.recorded), recorder.played) == (1, 3)
+    model._recordings = recordings.Recordings()
+    for i, picture in enumerate(shown):
+        assert torch.equal(picture, model.get_outputs_for_camera(camera(shift=0.1 * i))["rgb"])
+        model.get_outputs_for_camera(camera(width=20 + i))
+
+
+def test_what_a_recording_has_fixed_makes_another_one(
+    build: Build, perturb: Perturb, camera: MakeCamera, recorder: Recorder
+) -> None:
+    model = perturb(build()).eval()
+
+    def show(**options: Any) -> int:
+        for _ in range(RECORD_AT):
+            model.get_outputs_for_camera(camera(**options))
+        return len(recorder.recorded)
+
+    assert show() == 1
+    assert show(width=41) == 2
+    assert show(height=33) == 3
+    model.compensated = False
+    assert show() == 4
+    model.compensated = True
+    assert model.head is not None
+    model.head.config = replace(model.head.config, phases=2)
+    assert show() == 5
+    model.trained_focal = (10.0, 10.0)  # the camera's is 30: the head runs at another scale
+    assert show() == 6
+    with torch.no_grad():
+        model.gauss_params["means"] = torch.nn.Parameter(model.gauss_params["means"].clone())
+    assert show() == 7
+    assert len(model._recordings._kept) == 1
+    model.step = 0  # fewer bands of the harmonics take part
+    assert show() == 8
+    model.config.rasterize_mode = "antialiased"
+    assert show() == 9
+    model.step = 10
+    assert show() == 10  # those of a field that is gone hold memory for nothing
+
+
+def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(
+    build: Build, perturb: Perturb, camera: MakeCamera, recorder: Recorder
+) -> None:
+    model = perturb(build()).eval()
+    for _ in range(RECORD_AT):
+        model.get_outputs_for_camera(camera())
+    recorder.needed = 121
+    outputs = model.get_outputs_for_camera(camera())
+    assert recorder.recorded == [None, int(recordings.SPARE * 121)]
+    assert outputs["rgb"].shape == (32, 40, 3)
+    recorder.needed = 150
+    model.get_outputs_for_camera(camera())
+    assert len(recorder.recorded) == 2
+
+
+def test_one_thread_plays_at_a_time(
+    build: Build, perturb: Perturb, camera: MakeCamera, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = perturb(build()).eval()
+    inside, most, play = [0], [0], recorder.play
+
+    def slowly(*arguments: Any) -> Any:
+        inside[0] += 1
+        most[0] = max(most[0], inside[0])
+        time.sleep(0.02)
+        made = play(*arguments)
+        inside[0] -= 1
+        return made
+
+    monkeypatch.setattr(recordings, "_play", slowly)
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(lambda _: model.get_outputs_for_camera(camera())["rgb"], range(12)))
+    assert (most[0], recorder.played) == (1, 10)
+
+
+@pytest.mark.parametrize("error", [BackendError("no compiler: install one"), torch.cuda.OutOfMemoryError("full")])
+def test_what_cannot_be_recorded_is_rendered_and_said_once(
+    build: Build,
+    perturb: Perturb,
+    camera: MakeCamera,
+    recorder: Recorder,
+    caplog: pytest.LogCaptureFixture,
+    error: Exception,
+) -> None:
+    model = perturb(build()).eval()
+    recorder.fails = error
+    with caplog.at_level(logging.WARNING):
+        shown = [model.get_outputs_for_camera(camera())["rgb"] for _ in range(2 * RECORD_AT)]
+    assert caplog.text.count("cannot be recorded") == 1
+    assert all(torch.equal(picture, shown[0]) for picture in shown)
+
+
+def test_a_part_of_a_field_is_never_recorded(
+    build: Build, perturb: Perturb, camera: MakeCamera, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its tensors are gone with the frame."""
+    model = perturb(build()).eval()
+    box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    for _ in range(2 * RECORD_AT):
+        cropped = model.get_outputs_for_camera(camera(), obb_box=box)["rgb"]
+    half = SimpleNamespace(mask=torch.arange(60) % 2 == 0, values=None)
+    monkeypatch.setattr(model.preview, "decision", lambda _: half)
+    for _ in range(2 * RECORD_AT):
+        previewed = model.get_outputs_for_camera(camera())["rgb"]
+    assert recorder.recorded == []
+    monkeypatch.undo()
+    whole = model.get_outputs_for_camera(camera())["rgb"]
+    assert not torch.equal(cropped, whole)
+    assert not torch.equal(previewed, whole)
+
+
+def test_nothing_is_recorded_on_a_cpu_or_in_training(
+    build: Build, perturb: Perturb, camera: MakeCamera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any, **__: Any) -> None:
+        raise AssertionError("recorded")
+
+    monkeypatch.setattr(recordings, "_record", refuse)
+    model = perturb(build()).eval()
+    for _ in range(2 * RECORD_AT):
+        model.get_outputs_for_camera(camera())
+    field = {"means": torch.zeros(1, 3)}
+    style = replace(model._style, backend=SimpleNamespace(name="gsplat"))  # type: ignore[arg-type]
+    with torch.no_grad():
+        assert recordings._recordable(field, style)
+        assert not recordings._recordable({"means": torch.zeros(0, 3)}, style)
+        assert not recordings._recordable(field, replace(style, training=True))
+        assert not recordings._recordable(field, replace(style, arrivals=lambda *_: None))  # type: ignore[arg-type]
+    assert not recordings._recordable(field, style)  # with gradients
+
+
+# ------------------------------------------------------------------------------------------------------------- on a GPU
+
+
+def eager(model: SundaeModel, camera: Cameras) -> dict[str, Tensor]:
+    model._recordings = recordings.Recordings()
+    outputs = model.get_outputs_for_camera(camera)
+    assert len(model._recordings._kept) == 0
+    return {name: outputs[name] for name in recordings.SHOWN}
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("head", [{}, {"phases": 4}, {"precision": "fp32"}, {"mode": "features"}, {"mode": "off"}])
+@pytest.mark.parametrize("focal", [None, 12.0])
+def test_what_is_played_back_is_what_would_be_rendered(
+    build: Build, perturb: Perturb, camera: MakeCamera, head: dict[str, Any], focal: float | None
+) -> None:
+    model = perturb(build(n=2000, sh_degree=3, head=head, background_color="white")).cuda().eval()
+    model.step = 10_000
+    if focal is not None:
+        model.trained_focal = (focal, focal)
+    views = [camera(width=150, height=101, shift=shift) for shift in (0.0, 0.3, -0.6, 0.1)]
+    expected = [eager(model, view) for view in views]
+    played = model._recordings = recordings.Recordings()
+    if model.head is not None:
+        model.head._accelerate()  # forgets what the frames above have made it record
+    for _ in range(RECORD_AT):
+        model.get_outputs_for_camera(views[0])
+    shown = [model.get_outputs_for_camera(view) for view in views]
+    assert len(played._kept) == 1
+    assert played._can_record
+    # The head is a part of the frame's recording, and has none of its own, unless a single frame has run it often enough.
+    if model.head is not None and model.head.config.phases < RECORD_AT:
+        assert len(model.head._inference._recorded) == 0
+    for found, truth in zip(shown, expected, strict=True):
+        for name, picture in truth.items():
+            torch.testing.assert_close(found[name], picture, rtol=0, atol=2e-3 if name == "rgb" else 1e-6)
+    assert not torch.equal(shown[0]["rgb"], shown[1]["rgb"])
+    assert shown[1]["depth"].isfinite().all()
+    assert bool(shown[1]["features"].any()) == (head.get("mode") != "off")
+
+
+@pytest.mark.gpu
+def test_what_is_trained_meanwhile_is_seen(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = perturb(build(n=500)).cuda().eval()
+    before = [model.get_outputs_for_camera(camera())["rgb"] for _ in range(RECORD_AT + 1)][-1]
+    with torch.no_grad():
+        model.gauss_params["features_dc"] += 0.5
+        for value in model.head.parameters():  # type: ignore[union-attr]
+            value += 0.02
+    after = model.get_outputs_for_camera(camera())["rgb"]
+    assert len(model._recordings._kept) == 1
+    assert not torch.equal(after, before)
+    torch.testing.assert_close(after, eager(model, camera())["rgb"], rtol=0, atol=2e-3)
+    with torch.no_grad():  # a prune
+        for name, value in list(model.gauss_params.items()):
+            model.gauss_params[name] = torch.nn.Parameter(value[::2].clone())
+    for _ in range(RECORD_AT):
+        pruned = model.get_outputs_for_camera(camera())["rgb"]
+    torch.testing.assert_close(pruned, eager(model, camera())["rgb"], rtol=0, atol=2e-3)
+
+
+@pytest.mark.gpu
+def test_a_view_of_many_more_pairs(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = perturb(build(n=3000)).cuda().eval()
+    far, near = camera(width=640, height=480, shift=300.0), camera(width=640, height=480)
+    expected = eager(model, near)["base_rgb"]
+    model._recordings = recordings.Recordings()
+    for _ in range(RECORD_AT):
+        model.get_outputs_for_camera(far)
+    (small,) = model._recordings._kept._kept.values()
+    found = model.get_outputs_for_camera(near)["base_rgb"]
+    (large,) = model._recordings._kept._kept.values()
+    assert large.pairs > small.pairs
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
+    assert model._recordings._can_record
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("size", [(640, 480), (1600, 1000)])
+@torch.no_grad()
+def test_shorter_lists_make_the_same_picture(build: Build, camera: MakeCamera, size: tuple[int, int]) -> None:
+    model = build(n=5000).cuda().eval()
+    model.gauss_params["scales"] += 2 * torch.randn_like(model.gauss_params["scales"])
+    view, background = model.view_of(camera(width=size[0], height=size[1])), torch.zeros(3, device="cuda")
+    theirs = render(model.gaussians, view, background, model._style)[0]
+    room = Room()
+    style = replace(model._style, backend=GsplatBackend(room))
+    ours = render(model.gaussians, view, background, style)[0]
+    assert int(room.needed[0]) > 0
+    for name in ("base_rgb", "depth", "accumulation"):
+        assert torch.equal(ours[name], theirs[name])

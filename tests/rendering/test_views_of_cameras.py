@@ -1,0 +1,106 @@
+"""Cameras of nerfstudio as views of the model, their resolution in training, and windows of their pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sundae_ns.model import SundaeModel
+from sundae_ns.rendering.views import zoomed
+
+Build = Callable[..., SundaeModel]
+Perturb = Callable[[SundaeModel], SundaeModel]
+MakeCamera = Callable[..., Cameras]
+MakeBatch = Callable[..., dict[str, Tensor]]
+TrainingOf = Callable[[SundaeModel], Any]
+
+
+@torch.no_grad()
+def test_a_primitive_lands_where_the_pinhole_says(build: Build, camera: MakeCamera) -> None:
+    xyz = torch.tensor([[0.55, 0.35, 0.0]])
+    model = build(seed_points=(xyz, torch.zeros(1, 3, dtype=torch.uint8))).eval()
+    model.gauss_params["scales"].data.fill_(-5)
+    alpha = model.get_outputs_for_camera(camera())["accumulation"][..., 0]
+    row, column = divmod(int(alpha.argmax()), 40)
+    # In front of the camera by 3; x to the right, y up, pixel centres at one half.
+    assert (column, row) == (int(20 + 30 * 0.55 / 3), int(16 - 30 * 0.25 / 3))
+
+
+@torch.no_grad()
+def test_view_of_downscales_and_leaves_the_camera_alone(build: Build, camera: MakeCamera) -> None:
+    model = build().eval()
+    shown = camera(41, 33)
+    view = model.view_of(shown, downscale=2)
+    assert (view.width, view.height) == (20, 16)
+    torch.testing.assert_close(view.K, torch.tensor([[15.0, 0, 10.25], [0, 15.0, 8.25], [0, 0, 1]]))
+    assert int(shown.width) == 41
+    assert float(shown.fx) == 30.0
+    torch.testing.assert_close(view.viewmat @ torch.tensor([0.0, 0.1, 3.0, 1.0]), torch.tensor([0.0, 0, 0, 1]))
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.4, 1.0, 1.37])
+@torch.no_grad()
+def test_a_zoomed_camera_has_the_zoomed_view(build: Build, camera: MakeCamera, factor: float) -> None:
+    """Of a picture whose sides are rounded by unlike shares."""
+    model, given = build().eval(), camera(41, 33)
+    expected, found = model.view_of(given).zoomed(factor), model.view_of(zoomed(given, factor))
+    assert (found.width, found.height) == (expected.width, expected.height)
+    torch.testing.assert_close(found.K, expected.K)
+    # The same is seen from edge to edge.
+    sides = torch.tensor([[found.width], [found.height], [1.0]])
+    torch.testing.assert_close(found.K / sides, model.view_of(given).K / torch.tensor([[41.0], [33.0], [1.0]]))
+    assert torch.equal(found.viewmat, expected.viewmat)
+    # What is given stays as it is.
+    assert (int(given.width), int(given.height), float(given.fx), float(given.cy)) == (41, 33, 30.0, 16.5)
+
+
+def test_lower_resolution_at_first(build: Build, camera: MakeCamera, training_of: TrainingOf) -> None:
+    model = build(num_downscales=1)
+    assert torch.isfinite(training_of(model).step(0)["main_loss"])
+    assert model.get_outputs(camera())["rgb"].shape == (16, 20, 3)
+    assert model.eval().get_outputs(camera())["rgb"].shape == (32, 40, 3)
+
+
+def test_a_window_is_a_part_of_the_whole_picture(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch
+) -> None:
+    """Pictures, truth and mask of a window are what the whole picture shows there."""
+    whole, cut = (perturb(build(head={"max_train_pixels": limit}, background_color="black")) for limit in (0, 600))
+    with torch.no_grad():
+        # Rasterisers clamp how they linearise large primitives far outside of the picture, and a window is a picture.
+        whole.gauss_params["scales"] -= 2
+    cut.load_state_dict(whole.state_dict())
+    masked = {**batch(), "mask": torch.rand(32, 40, 1, generator=torch.Generator().manual_seed(4)) > 0.5}
+    for model in (whole, cut):
+        model.train()
+    outputs = {model: model.get_outputs(camera()) for model in (whole, cut)}
+    window = outputs[cut]["window"]
+    assert outputs[whole]["window"] is None
+    assert window.width * window.height <= 600
+    rows, columns = slice(window.top, window.top + window.height), slice(window.left, window.left + window.width)
+    for name in ("base_rgb", "accumulation"):
+        torch.testing.assert_close(outputs[cut][name], outputs[whole][name][rows, columns], atol=1e-5, rtol=0)
+    truth = whole._target(masked, outputs[whole])[rows, columns]
+    assert torch.equal(cut._target(masked, outputs[cut]), truth)
+    losses = cut.get_loss_dict(outputs[cut], masked, {})
+    expected = ((outputs[cut]["base_rgb"] - truth).abs() * masked["mask"][rows, columns]).mean()
+    torch.testing.assert_close(losses["base_loss"], cut.config.base_loss_weight * expected)
+
+
+def test_windows_wait_for_the_head_and_for_densification(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
+    model = build(head={"max_train_pixels": 600})
+    assert not model.head_active
+    assert model._look(0).window_pixels == 0
+    perturb(model)
+    assert model._look(0).window_pixels == 600
+    assert model.eval().get_outputs(camera())["rgb"].shape == (32, 40, 3)  # what is shown is whole
+    early = perturb(
+        build(head={"max_train_pixels": 600, "start_at": 0}, pruning={"mode": "continuous", "start": 5, "stop": 50})
+    )
+    assert early.head_active
+    assert early._look(0).window_pixels == 0  # densification takes its statistics from whole pictures

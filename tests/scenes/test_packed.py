@@ -1,0 +1,361 @@
+"""Runs as packed scenes, and back: what travels, what does not, and headers that lie."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.utils.eval_utils import eval_setup
+from torch import Tensor
+
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.datamanager import SundaeDatamanagerConfig
+from sundae_ns.errors import CheckpointError, DataError, PackError, StorageError
+from sundae_ns.gaussians import from_points
+from sundae_ns.scenes import packed as packed_run
+from sundae_ns.scenes.packed import scene_of_run, write_run
+from sundae_ns.storage.packing import Scene, read_scene, write_scene
+from sundae_ns.storage.runs import checkpoint
+
+Json = dict[str, Any]
+
+
+def field(degree: int = 1, features: int = 5) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(60, 3, generator=generator) - 0.5
+    made = from_points(points, points + 0.5, sh_degree=degree, num_features=features, generator=generator)
+    made["features_rest"] = 0.1 * torch.randn(60, (degree + 1) ** 2 - 1, 3, generator=generator)
+    return made
+
+
+def head() -> dict[str, Tensor]:
+    torch.manual_seed(1)
+    state = CompensationHead(HeadConfig(size="tiny", num_features=5)).state_dict()
+    return {name: value + 0.05 * torch.randn_like(value) for name, value in state.items()}
+
+
+def cameras(n: int = 3) -> dict[str, Tensor]:
+    pose = torch.eye(4)[:3]
+    pose[2, 3] = 2.0
+    poses = pose.repeat(n, 1, 1)
+    poses[:, 0, 3] = torch.arange(n) / 10
+    return {
+        "poses": poses,
+        "intrinsics": torch.tensor([[40.5, 41.0, 20.0, 16.0]]).double().repeat(n, 1),
+        "sizes": torch.tensor([[40, 32]]).repeat(n, 1),
+    }
+
+
+def meta() -> Json:
+    return {
+        "source": {"method": "sundae", "step": 30000},
+        "model": {
+            "sh_degree": 2,
+            "rasterize_mode": "antialiased",
+            "background_color": "white",
+            "head": {"mode": "residual", "size": "tiny", "pixel_unshuffle": 2, "num_features": 5, "precision": "bf16"},
+            "trained_focal": [40.0, 41.0],
+        },
+        "frame": {"transform": torch.eye(4)[:3].tolist(), "scale": 0.5},
+        "capture": {"parser": "colmap", "options": {"colmap_path": "sparse/0"}, "scale": 1.0},
+    }
+
+
+def scene() -> Scene:
+    return Scene(field(), head(), cameras(), meta())
+
+
+def opened(config: Path) -> Any:
+    return eval_setup(config, test_mode="test")[1]
+
+
+def test_a_scene_becomes_a_run(tmp_path: Path) -> None:
+    truth = scene()
+    config = write_run(truth, tmp_path, "garden")
+    assert config == tmp_path / "garden" / "sundae" / "unpacked" / "config.yml"
+    pipeline = opened(config)
+    model = pipeline.model
+    found = {name: value.detach() for name, value in model.gauss_params.items()}
+    assert torch.equal(found["features_rest"][:, :3], truth.field["features_rest"])
+    assert found["features_rest"].shape == (60, 8, 3)
+    assert not found["features_rest"][:, 3:].any()
+    for name in ("means", "scales", "quats", "features_dc", "opacities", "features"):
+        assert torch.equal(found[name], truth.field[name]), name
+    for name, value in model.head.state_dict().items():
+        assert torch.equal(value, truth.head[name]), name
+    assert model.head_active
+    assert model.trained_focal == (40.0, 41.0)
+    assert (model.config.rasterize_mode, model.config.background_color) == ("antialiased", "white")
+    seen = pipeline.datamanager.train_dataset
+    assert torch.equal(seen.cameras.camera_to_worlds, cameras()["poses"])
+    assert seen.cameras.fx.flatten().tolist() == [40.5] * 3
+    assert seen[1]["image"].shape == (32, 40, 3)
+    outputs = model.get_outputs_for_camera(seen.cameras[0:1])
+    assert outputs["rgb"].shape == (32, 40, 3)
+    assert (outputs["rgb"] - outputs["base_rgb"]).abs().max() > 1e-3
+    # Grey is what stands for pictures, and no measure of anything.
+    camera, batch = pipeline.datamanager.fixed_indices_eval_dataloader[0]
+    with pytest.raises(DataError, match="unpacked without its capture"):
+        model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
+
+
+def test_pictures_of_the_run_are_those_of_the_scene(tmp_path: Path) -> None:
+    """Through the file, and through another run made of that run."""
+    first = opened(write_run(scene(), tmp_path / "a", "x"))
+    write_scene(tmp_path / "x.sundae", scene_of_run(tmp_path / "a" / "x" / "sundae" / "unpacked"))
+    second = opened(write_run(read_scene(tmp_path / "x.sundae"), tmp_path / "b", "x"))
+    camera = first.datamanager.train_dataset.cameras[1:2]
+    pictures = [run.model.get_outputs_for_camera(camera)["rgb"] for run in (first, second)]
+    assert (pictures[0] - pictures[1]).square().mean().sqrt() < 0.004
+    assert (pictures[0] - 1).abs().max() > 0.2
+
+
+def test_a_run_without_its_capture_names_none(tmp_path: Path) -> None:
+    """It is read otherwise than the capture was: what it would state of it put every camera in a wrong place."""
+    blind = write_run(scene(), tmp_path, "x").parent
+    assert scene_of_run(blind).meta["capture"] is None
+    with pytest.raises(DataError, match="unpacked without its capture"):
+        scene_of_run(blind, data=tmp_path)
+
+
+def test_a_scene_without_cameras_is_looked_at_from_outside(tmp_path: Path) -> None:
+    pipeline = opened(write_run(Scene(field(), head(), None, meta()), tmp_path, "a"))
+    (camera,) = [pipeline.datamanager.train_dataset.cameras[0:1]]
+    accumulation = pipeline.model.get_outputs_for_camera(camera)["accumulation"]
+    assert accumulation.mean() > 0.02
+    assert accumulation[200:280, 280:360].mean() > 0.1
+
+
+def test_a_scene_without_a_head(tmp_path: Path) -> None:
+    plain = meta()
+    plain["model"] |= {"head": None, "trained_focal": None}
+    model = opened(write_run(Scene(field(features=0), {}, cameras(), plain), tmp_path, "a")).model
+    assert model.head is None
+    assert "features" not in model.gauss_params
+
+
+def test_a_run_is_never_replaced(tmp_path: Path) -> None:
+    config = write_run(scene(), tmp_path, "a")
+    before = config.read_bytes()
+    with pytest.raises(PackError, match="is a run already"):
+        write_run(scene(), tmp_path, "a")
+    assert config.read_bytes() == before
+
+
+@pytest.mark.parametrize("parser", ["colmap", "nerfstudio-data"])
+@pytest.mark.parametrize("kind", ["missing", "empty", "pictures"])
+def test_what_is_no_capture_is_refused_before_anything_is_written(tmp_path: Path, kind: str, parser: str) -> None:
+    capture = tmp_path / "capture"
+    if kind != "missing":
+        capture.mkdir()
+    if kind == "pictures":
+        (capture / "a.jpg").touch()
+    found = scene()
+    found.meta["capture"] = {"parser": parser, "options": {}, "scale": 1.0}
+    with pytest.raises(DataError, match=str(capture)):
+        write_run(found, tmp_path / "runs", "a", data=capture)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_an_interrupted_unpack_leaves_no_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise StorageError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "save", full)
+        with pytest.raises(StorageError):
+            write_run(scene(), tmp_path, "a")
+    assert not list(tmp_path.rglob("config.yml"))
+    assert write_run(scene(), tmp_path, "a").exists()
+    (tmp_path / "b").write_text("years of work")
+    with pytest.raises(StorageError, match="a file stands where a folder should be"):
+        write_run(scene(), tmp_path, "b")
+
+
+@pytest.mark.parametrize("name", ["../../up", "/etc/x", "a b;c", "..", ""])
+def test_names_stay_below_the_folder(tmp_path: Path, name: str) -> None:
+    config = write_run(scene(), tmp_path / "runs", name)
+    assert config.resolve().is_relative_to(tmp_path / "runs")
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+LIES: dict[str, Json] = {
+    "no model": {"model": None},
+    "a model of text": {"model": "yes"},
+    "a huge degree": {"model": {"sh_degree": 10**6}},
+    "a true degree": {"model": {"sh_degree": True}},
+    "too low a degree": {"model": {"sh_degree": 0}},
+    "a strange rasteriser": {"model": {"rasterize_mode": "os.system"}},
+    "a list for a colour": {"model": {"background_color": ["white"]}},
+    "another head": {"model": {"head": {"size": "regular"}}},
+    "no head": {"model": {"head": None}},
+    "a head of text": {"model": {"head": "residual"}},
+    "a head that is off": {"model": {"head": {"mode": "off"}}},
+    "a huge head": {"model": {"head": {"pixel_unshuffle": 10**6}}},
+    "features of another number": {"model": {"head": {"num_features": 6}}},
+    "a head with more": {"model": {"head": {"_target": "os.system"}}},
+    "negative focal lengths": {"model": {"trained_focal": [-1.0, 2.0]}},
+    "one focal length": {"model": {"trained_focal": [1.0]}},
+}
+
+
+def merged(base: Json, changes: Json) -> Json:
+    made = dict(base)
+    for name, value in changes.items():
+        both = isinstance(value, dict) and isinstance(base.get(name), dict)
+        made[name] = merged(base[name], value) if both else value
+    return made
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_headers_that_lie_are_refused(tmp_path: Path, lie: str) -> None:
+    stated = merged(meta(), LIES[lie])
+    with pytest.raises(PackError):
+        write_run(Scene(field(), head(), cameras(), stated), tmp_path, "a")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "parser",
+    [
+        ColmapDataParserConfig(colmap_path=Path("sparse/0"), downscale_factor=2, eval_mode="interval", eval_interval=5),
+        NerfstudioDataParserConfig(auto_scale_poses=False, scale_factor=0.5, center_method="focus"),
+    ],
+)
+def test_a_capture_is_read_again_as_it_was(parser: Any) -> None:
+    parser.load_3D_points = False
+    manager = SundaeDatamanagerConfig(dataparser=parser, camera_res_scale_factor=0.5)
+    found, scale = packed_run._capture(packed_run._describe(manager))
+    assert scale == 0.5
+    assert type(found) is type(parser)
+    assert vars(found) == vars(parser)
+
+
+def test_captures_that_are_not_described() -> None:
+    for parser in (BlenderDataParserConfig(), ColmapDataParserConfig(images_path=Path("/elsewhere/images"))):
+        assert packed_run._describe(SundaeDatamanagerConfig(dataparser=parser)) is None
+    for stated in (None, {}, {"parser": "blender-data", "options": {}}, {"parser": "colmap", "options": None}):
+        with pytest.raises(PackError, match="without --data"):
+            packed_run._capture(stated)
+    for scale in (0, 2, "1", None, float("nan")):
+        with pytest.raises(PackError, match="a scale that cannot be"):
+            packed_run._capture({"parser": "colmap", "options": {}, "scale": scale})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("images_path", "../../home"),
+        ("images_path", "/etc"),
+        ("images_path", "$(touch x)"),
+        ("images_path", "a;b"),
+        ("images_path", "a\n"),
+        ("images_path", 3),
+        ("eval_mode", "whatever"),
+        ("eval_mode", ["all"]),
+        ("downscale_factor", 0),
+        ("downscale_factor", True),
+        ("scale_factor", float("nan")),
+        ("scale_factor", "1"),
+        ("auto_scale_poses", 1),
+        ("eval_interval", 2.5),
+        ("_target", "os.system"),
+        ("data", "/etc"),
+        ("masks_path", None),
+    ],
+)
+def test_options_of_a_capture_that_cannot_be(name: str, value: Any) -> None:
+    with pytest.raises(PackError, match="cannot be"):
+        packed_run._capture({"parser": "colmap", "options": {name: value}, "scale": 1.0})
+
+
+# ------------------------------------------------------------------------------------------------------- runs to pack
+
+
+def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path, dict[str, Tensor]]:
+    """A run as ns-train would leave it at a step, without the training."""
+    config = copy.deepcopy(all_methods[method])
+    for name, value in model.items():
+        setattr(config.pipeline.model, name, value)
+    truth = field(degree=2, features=0 if method == "splatfacto" else 5)
+    state: Json = {f"gauss_params.{name}": value for name, value in truth.items()}
+    state["device_indicator_param"] = torch.zeros(0)
+    if method != "splatfacto":
+        made = config.pipeline.model.setup(
+            scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
+            num_train_data=0,
+            metadata={},
+            seed_points=(torch.rand(5, 3), torch.rand(5, 3)),
+        )
+        made.step = step
+        state = made.state_dict() | state
+        state["_extra_state"] = made.get_extra_state()
+        state |= {name: value + 0.01 for name, value in state.items() if name.startswith("head.")}
+    # What stock nerfstudio leaves there beside the model.
+    state["lpips.net.weight"] = torch.zeros(3)
+    state["camera_optimizer.pose_adjustment"] = torch.zeros(7, 6)
+    folder.mkdir()
+    (folder / "config.yml").write_text(yaml.dump(config))
+    (folder / "nerfstudio_models").mkdir()
+    saved = {"step": step, "pipeline": {f"_model.{name}": value for name, value in state.items()}}
+    checkpoint.save(saved, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
+    return folder, truth
+
+
+def test_what_a_run_needs_to_be_shown(tmp_path: Path) -> None:
+    run, truth = run_folder(tmp_path / "run", "sundae-tiny", 1100)
+    found = scene_of_run(run, max_cameras=0)
+    assert set(found.field) == set(truth)
+    assert all(torch.equal(found.field[name], truth[name]) for name in truth)
+    assert found.head
+    assert found.cameras is None
+    assert found.meta["source"] == {"method": "sundae-tiny", "step": 1100}
+    assert found.meta["model"]["head"]["size"] == "tiny"
+    # nothing of where it was trained
+    assert str(tmp_path) not in str(found.meta)
+    assert scene_of_run(run / "config.yml", max_cameras=0).meta == found.meta
+
+
+def test_what_takes_no_part_yet_is_left_out(tmp_path: Path) -> None:
+    run, truth = run_folder(tmp_path / "run", "sundae-tiny", 30, sh_degree_interval=20)
+    found = scene_of_run(run, max_cameras=0)
+    assert found.head == {}
+    assert "features" not in found.field
+    assert torch.equal(found.field["features_rest"], truth["features_rest"][:, :3])
+    model = opened(write_run(found, tmp_path / "out", "a")).model
+    assert model.config.sh_degree == 2
+    assert not model.gauss_params["features_rest"][:, 3:].any()
+
+
+def test_a_run_of_splatfacto(tmp_path: Path) -> None:
+    run, truth = run_folder(tmp_path / "run", "splatfacto", 29999, sh_degree=2, rasterize_mode="antialiased")
+    found = scene_of_run(run, max_cameras=0)
+    assert found.head == {}
+    assert all(torch.equal(found.field[name], truth[name]) for name in truth)
+    assert found.meta["model"]["rasterize_mode"] == "antialiased"
+
+
+def test_runs_that_cannot_be_packed(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        scene_of_run(tmp_path / "nothing")
+    (tmp_path / "config.yml").write_text("a: [1")
+    with pytest.raises(CheckpointError, match=r"is not a run's config\.yml"):
+        scene_of_run(tmp_path)
+    (tmp_path / "config.yml").write_text(yaml.dump(all_methods["nerfacto"]))
+    with pytest.raises(CheckpointError, match="another method"):
+        scene_of_run(tmp_path)
+    run, _ = run_folder(tmp_path / "run", "sundae-tiny", 30)
+    with pytest.raises(DataError):
+        scene_of_run(run)  # its capture is not there
+    (run / "nerfstudio_models" / "step-000000030.ckpt").write_bytes(b"PK")
+    with pytest.raises(CheckpointError, match="no whole checkpoint"):
+        scene_of_run(run, max_cameras=0)

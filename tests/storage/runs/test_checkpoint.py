@@ -1,0 +1,214 @@
+"""Checkpoints: what is accepted, what is refused in one line, and fields read from other programs' files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from torch import Tensor
+
+from sundae_ns.errors import CheckpointError
+from sundae_ns.gaussians import SPLAT_NAMES
+from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.storage import MODEL_FRAME, write_ply
+from sundae_ns.storage.runs import checkpoint
+
+
+def field(n: int = 6, degree: int = 3) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(n)
+    shapes = {
+        "means": (3,),
+        "scales": (3,),
+        "quats": (4,),
+        "features_dc": (3,),
+        "features_rest": ((degree + 1) ** 2 - 1, 3),
+        "opacities": (1,),
+    }
+    return {name: torch.randn(n, *shape, generator=generator) for name, shape in shapes.items()}
+
+
+def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
+    state: dict[str, Any] = {f"gauss_params.{name}": value for name, value in field(n, degree).items()}
+    state["gauss_params.features"] = torch.zeros(n, 5)
+    state["head.weight"] = torch.zeros(4, 4)
+    about = checkpoint.extra_state(7, 5, {"grad2d": None}, {"pruned_at": -1}, None)
+    state["_extra_state"] = {**about, **extra}
+    return state
+
+
+def stock_checkpoint(path: Path, prefix: str = "_model.", n: int = 6) -> dict[str, Tensor]:
+    """What nerfstudio's trainer writes for splatfacto: its own scheduler leaves a numpy number in it."""
+    params = field(n)
+    optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
+    config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
+    scheduler = config.setup().get_scheduler(optimizer, lr_init=1.6e-4)
+    optimizer.step()
+    scheduler.step()
+    torch.save(
+        {
+            "step": 1,
+            "pipeline": {f"{prefix}gauss_params.{name}": value for name, value in params.items()},
+            "optimizers": {"means": optimizer.state_dict()},
+            "schedulers": {"means": scheduler.state_dict()},
+            "scalers": {},
+        },
+        path,
+    )
+    return params
+
+
+def one_line(error: BaseException) -> bool:
+    return isinstance(error, ValueError) and "\n" not in str(error)
+
+
+def test_another_number_of_primitives_fits() -> None:
+    checkpoint.check_model_state(model_state(9), model_state(6), 5)
+
+
+def test_a_part_of_a_field_may_be_empty_and_a_field_may_not() -> None:
+    checkpoint.check_model_state(model_state(0), model_state(6), 5, shard=True)
+    with pytest.raises(CheckpointError, match=r"parameters of \[0\] primitives"):
+        checkpoint.check_model_state(model_state(0), model_state(6), 5)
+
+
+def _without(name: str) -> dict[str, Any]:
+    return {key: value for key, value in model_state().items() if key != name}
+
+
+@pytest.mark.parametrize(
+    ("state", "cause"),
+    [
+        (_without("_extra_state"), "splatfacto checkpoint.*warm-start"),
+        ({"field.weight": torch.zeros(1)}, "another method.*warm-start"),
+        (model_state(method="other"), "not one of sundae"),
+        (model_state(format=99), "format 99"),
+        (model_state(num_features=13), "length 13.*length 5.*num-features 13"),
+        (_without("head.weight"), "no head.weight"),
+        ({**model_state(), "head.weight": torch.zeros(8, 4)}, r"head.weight is \[8, 4\].*\[4, 4\].*head.size compact"),
+        (model_state(degree=2), r"features_rest is \[6, 8, 3\].*\[6, 15, 3\]"),
+    ],
+)
+def test_what_does_not_fit_is_refused(state: dict[str, Any], cause: str) -> None:
+    with pytest.raises(CheckpointError, match=cause) as caught:
+        checkpoint.check_model_state(state, model_state(), 5)
+    assert one_line(caught.value)
+
+
+@pytest.mark.parametrize("prefix", ["_model.", "_model.module."])
+def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> None:
+    params = stock_checkpoint(tmp_path / "step-000000001.ckpt", prefix)
+    with pytest.raises(Exception, match="[Ww]eights.only"):
+        torch.load(tmp_path / "step-000000001.ckpt", weights_only=True)
+    read, in_model_frame = checkpoint.read_field(tmp_path / "step-000000001.ckpt")
+    assert in_model_frame
+    assert tuple(read) == SPLAT_NAMES
+    assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
+
+
+@pytest.mark.parametrize(
+    ("extra", "logits"),
+    [
+        (None, True),
+        ({}, True),
+        ({"logits": True, "budget": {}}, True),
+        ({"logits": False}, False),
+        ({"budget": {}}, False),
+        ({"logits": torch.zeros(2)}, True),
+    ],
+)
+def test_a_field_without_bands_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
+    """Logits in a model without harmonics; harmonics where a search has left them out."""
+    state = {f"_model.gauss_params.{name}": value for name, value in field().items()}
+    state["_model.gauss_params.features_rest"] = state["_model.gauss_params.features_rest"][:, :0]
+    if extra is not None:
+        state["_model._extra_state"] = extra
+    torch.save({"step": 1, "pipeline": state}, tmp_path / "step-000000001.ckpt")
+    read, _ = checkpoint.read_field(tmp_path)
+    stored = field()["features_dc"]
+    expected = sh_to_rgb(read["features_dc"]).logit() if logits else read["features_dc"]
+    torch.testing.assert_close(expected, stored)
+
+
+@pytest.mark.parametrize("inside", [".", "nerfstudio_models"])
+def test_newest_of_a_folder(tmp_path: Path, inside: str) -> None:
+    (tmp_path / inside).mkdir(exist_ok=True)
+    stock_checkpoint(tmp_path / inside / "step-000000999.ckpt", n=3)
+    newest = stock_checkpoint(tmp_path / inside / "step-000029999.ckpt", n=4)
+    assert torch.equal(checkpoint.read_field(tmp_path)[0]["means"], newest["means"])
+
+
+@pytest.mark.parametrize(("comments", "in_model_frame"), [((), False), ((MODEL_FRAME,), True)])
+def test_ply(tmp_path: Path, comments: tuple[str, ...], in_model_frame: bool) -> None:
+    params = field()
+    write_ply(tmp_path / "a.ply", params, comments=list(comments))
+    read, in_frame = checkpoint.read_field(tmp_path / "a.ply")
+    assert in_frame is in_model_frame
+    assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
+    renamed = (tmp_path / "a.ply").rename(tmp_path / "cloud")
+    assert torch.equal(checkpoint.read_field(renamed)[0]["means"], params["means"])
+
+
+class Burglar:
+    """Runs a command when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[str]]:
+        return os.mkdir, (str(self.path),)
+
+
+def test_nothing_in_a_file_is_run(tmp_path: Path) -> None:
+    stolen = tmp_path / "stolen"
+    torch.save({"pipeline": {}, "extra": Burglar(stolen)}, tmp_path / "a.ckpt")
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        checkpoint.read_field(tmp_path / "a.ckpt")
+    assert not stolen.exists()
+
+
+def test_numpy_is_allowed_for_one_file_only(tmp_path: Path) -> None:
+    stock_checkpoint(tmp_path / "a.ckpt")
+    checkpoint.read_field(tmp_path / "a.ckpt")
+    with pytest.raises(Exception, match="[Ww]eights.only"):
+        torch.load(tmp_path / "a.ckpt", weights_only=True)
+
+
+def _save(content: object) -> Callable[[Path], object]:
+    return lambda path: torch.save(content, path)
+
+
+WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (lambda path: None, "does not exist"),
+    "empty folder": (lambda path: path.mkdir(), "holds no checkpoint"),
+    "no checkpoint": (lambda path: path.write_text("hello"), "cannot be read"),
+    "empty file": (lambda path: path.write_bytes(b""), "cannot be read"),
+    "only tensors": (_save({"weight": torch.zeros(2)}), "it holds no model"),
+    "no step": (_save({"pipeline": {"_model.field.weight": torch.zeros(2)}}), "after which step it was saved"),
+    "a step of words": (_save({"step": "3", "pipeline": {}}), "after which step it was saved"),
+    "a number for a name": (_save({"step": 3, "pipeline": {3: torch.zeros(2)}}), "it holds no model"),
+    "a list": (_save([1, 2]), "cannot be read"),
+    "of another method": (_save({"step": 3, "pipeline": {"_model.field.weight": torch.zeros(2)}}), "no Gaussian field"),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_is_no_field(tmp_path: Path, wrong: str) -> None:
+    make, cause = WRONG[wrong]
+    path = tmp_path / "a.ckpt"
+    make(path)
+    with pytest.raises(CheckpointError, match=cause) as caught:
+        checkpoint.read_field(path)
+    assert one_line(caught.value)
+
+
+def test_extra_state_is_plain_data(tmp_path: Path) -> None:
+    state = checkpoint.extra_state(
+        12, 5, {"grad2d": torch.ones(3), "scene_scale": 1.0}, {"pruned_at": 7}, (900.0, 1100.0)
+    )
+    torch.save(state, tmp_path / "a.pt")
+    assert torch.load(tmp_path / "a.pt", weights_only=True)["pruning"] == {"pruned_at": 7}

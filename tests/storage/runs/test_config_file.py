@@ -1,0 +1,99 @@
+"""config.yml made into objects again: what ns-train wrote comes back as it was, and nothing that a file asks for is run."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import pytest
+import yaml
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.engine.trainer import TrainerConfig
+
+from sundae_ns.errors import CheckpointError
+from sundae_ns.scenes.opening import load_run, open_scene
+from sundae_ns.scenes.packed import scene_of_run
+from sundae_ns.storage.runs.config_file import load_config
+
+METHODS = sorted(name for name in all_methods if name.startswith("sundae")) + ["splatfacto", "nerfacto"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_was_saved_comes_back(tmp_path: Path, method: str) -> None:
+    config = copy.deepcopy(all_methods[method])
+    config.data = config.pipeline.datamanager.data = tmp_path / "a capture, ünïcode"
+    path = tmp_path / "config.yml"
+    path.write_text(yaml.dump(config), encoding="utf-8")
+    found = load_config(path)
+    assert type(found) is type(config)
+    assert yaml.dump(found) == yaml.dump(config)
+    # One object named twice is one object again.
+    assert found.pipeline.datamanager.data is found.data
+
+
+def test_options_that_came_later_have_their_defaults(tmp_path: Path) -> None:
+    path = tmp_path / "config.yml"
+    path.write_text("!!python/object:nerfstudio.engine.trainer.TrainerConfig {}")
+    found = load_config(path)
+    assert found.machine == TrainerConfig().machine
+    assert found.max_num_iterations == TrainerConfig().max_num_iterations
+
+
+HOSTILE = {
+    "a call": "!!python/object/apply:os.mkdir ['{}']",
+    "a new object": "!!python/object/new:os.mkdir\nargs: ['{}']",
+    "a call of nerfstudio's": "!!python/object/apply:nerfstudio.utils.scripts.run_command ['mkdir {}']",
+    "a call of what nerfstudio imports": "!!python/object/apply:nerfstudio.utils.scripts.subprocess.run [[mkdir, '{}']]",
+    "a call of ours": "!!python/object/apply:sundae_ns.storage.atomic.write_text ['{}', a]",
+    "a name from elsewhere": "!!python/name:os.mkdir ''",
+    "a name that ours imports": "!!python/name:sundae_ns.storage.atomic.os.mkdir ''",
+    "a function for a target": (
+        "!!python/object:sundae_ns.compensation.head.HeadConfig\n"
+        "_target: !!python/name:nerfstudio.utils.scripts.run_command ''"
+    ),
+    "an object that is no configuration": "!!python/object:nerfstudio.engine.trainer.Trainer {{a: '{}'}}",
+    "an object of no mapping": "!!python/object:nerfstudio.engine.trainer.TrainerConfig ['{}']",
+    "a module": "!!python/module:this ''",
+    "an import": "!!python/name:antigravity.x ''",
+    "a path of numbers": "!!python/object/apply:pathlib.PosixPath [1]",
+    "no member of an enumeration": "!!python/object/apply:nerfstudio.utils.writer.EventName [nothing]",
+    "a class of ours that is gone": "!!python/name:sundae_ns.gone.Class ''",
+    "a tag of nobody": "!unknown 3",
+    "half a file": "a: [1",
+    "deep lists": "[" * 3000,
+    "no text": "\x00",
+}
+
+
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_nothing_that_it_asks_for_is_run(tmp_path: Path, kind: str) -> None:
+    mark, path = tmp_path / "ran", tmp_path / "config.yml"
+    path.write_text(HOSTILE[kind].format(mark) if "{}" in HOSTILE[kind] else HOSTILE[kind])
+    for read in (load_config, scene_of_run, open_scene, load_run):
+        with pytest.raises(CheckpointError) as raised:
+            read(path)
+        assert "\n" not in str(raised.value)
+        assert not mark.exists()
+
+
+def test_nerfstudios_own_reader_runs_it(tmp_path: Path) -> None:
+    """As README warns; if this fails one day, the warning can go."""
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    mark, path = tmp_path / "ran", tmp_path / "config.yml"
+    path.write_text(HOSTILE["a call"].format(mark))
+    with pytest.raises(AssertionError):
+        eval_setup(path)
+    assert mark.exists()
+
+
+@pytest.mark.parametrize("text", ["3", "- 1", "!!python/object:nerfstudio.engine.trainer.TrainerConfig {pipeline: 3}"])
+def test_what_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "config.yml"
+    path.write_text(text)
+    with pytest.raises(CheckpointError):
+        scene_of_run(path)
+    with pytest.raises(CheckpointError):
+        open_scene(path)
+    with pytest.raises(CheckpointError, match=r"cannot be read \(No such file"):
+        load_config(tmp_path / "gone.yml")

@@ -1,0 +1,168 @@
+"""A model on the CPU, of a field made in memory, and what trains and shows it without nerfstudio's trainer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import SceneBox
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils import writer
+from torch import Tensor
+
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.model import SundaeModel, SundaeModelConfig
+from sundae_ns.pruning import PruningConfig
+from sundae_ns.training.optimizers import FusedAdamConfig
+
+
+def _points(n: int = 60) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    xyz = torch.randn(n, 3, generator=generator) * 0.5
+    return xyz, torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
+
+
+def _build(
+    *,
+    n: int = 60,
+    seed_points: Any = "some",
+    head: dict[str, Any] | None = None,
+    pruning: dict[str, Any] | None = None,
+    metadata: dict[str, Any] | None = None,
+    **options: Any,
+) -> SundaeModel:
+    config = SundaeModelConfig(
+        pruning=PruningConfig(**{"prune_at": 3, "keep_ratio": 0.5, **(pruning or {})}),
+        head=HeadConfig(**{"size": "tiny", "num_features": 5, "pixel_unshuffle": 1, **(head or {})}),
+        camera_optimizer=CameraOptimizerConfig(mode="off"),
+        **{"sh_degree": 1, "sh_degree_interval": 1, "num_downscales": 0, "background_color": "random", **options},
+    )
+    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    seeds = _points(n) if isinstance(seed_points, str) else seed_points
+    return config.setup(scene_box=box, num_train_data=4, metadata=metadata or {}, seed_points=seeds)
+
+
+def _perturb(model: SundaeModel) -> SundaeModel:
+    if model.head is not None:
+        with torch.no_grad():
+            for value in model.head.parameters():
+                value += 0.05 * torch.randn(value.shape, generator=torch.Generator().manual_seed(value.numel()))
+    model.step = 10
+    return model
+
+
+def _camera(width: int = 40, height: int = 32, shift: float = 0.0) -> Cameras:
+    pose = torch.eye(4)[None, :3].clone()
+    pose[0, :, 3] = torch.tensor([shift, 0.1, 3.0])
+    return Cameras(pose, fx=30.0, fy=30.0, cx=width / 2, cy=height / 2, width=width, height=height)
+
+
+class FakeDatamanager:
+    """Three training cameras; no test views."""
+
+    eval_dataset = None
+
+    mask: Tensor | None = None
+    """Of each view."""
+
+    def training_views(self) -> Iterator[tuple[Cameras, Tensor | None]]:
+        yield from ((_camera(shift=shift), self.mask) for shift in (-0.5, 0.0, 0.5))
+
+
+def _batch(width: int = 40, height: int = 32, channels: int = 3) -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(2)
+    return {"image": torch.randint(0, 256, (height, width, channels), generator=generator, dtype=torch.uint8)}
+
+
+class Training:
+    """Steps a model as nerfstudio's trainer does, without one."""
+
+    def __init__(self, model: SundaeModel, trainer: Any = None) -> None:
+        self.model = model
+        groups = model.get_param_groups()
+        self.optimizers = Optimizers(
+            {name: {"optimizer": FusedAdamConfig(lr=5e-3), "scheduler": None} for name in groups}, groups
+        )
+        pipeline = SimpleNamespace(datamanager=FakeDatamanager(), model=model)
+        self.callbacks = model.get_training_callbacks(
+            TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)  # type: ignore[arg-type]
+        )
+
+    def run_callbacks(self, location: TrainingCallbackLocation, step: int) -> None:
+        for callback in self.callbacks:
+            callback.run_callback_at_location(step, location=location)
+
+    def step(self, step: int) -> dict[str, Tensor]:
+        self.model.train()
+        self.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step)
+        self.optimizers.zero_grad_all()
+        outputs = self.model(_camera())
+        losses = self.model.get_loss_dict(outputs, _batch(), self.model.get_metrics_dict(outputs, _batch()))
+        torch.stack(list(losses.values())).sum().backward()
+        self.optimizers.optimizer_step_all()
+        self.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step)
+        return losses
+
+    def live(self) -> bool:
+        """Whether model, optimizers and nerfstudio's own list hold the same tensors, with moments of their shape."""
+        for name, value in self.model.gauss_params.items():
+            (held,) = self.optimizers.optimizers[name].param_groups[0]["params"]
+            moments = self.optimizers.optimizers[name].state[value]
+            if held is not value or self.optimizers.parameters[name] != [value]:
+                return False
+            if moments and moments["exp_avg"].shape != value.shape:
+                return False
+        return True
+
+
+@pytest.fixture
+def points() -> Callable[..., tuple[Tensor, Tensor]]:
+    """The sparse cloud that :func:`build` starts from: places ``[n, 3]`` and colours in 0 to 255 ``[n, 3]``."""
+    return _points
+
+
+@pytest.fixture
+def build() -> Callable[..., SundaeModel]:
+    """Make a model of 60 primitives, or ``n``, that prunes half of them after step 3, with a tiny head."""
+    return _build
+
+
+@pytest.fixture
+def perturb() -> Callable[[SundaeModel], SundaeModel]:
+    """Give the head an output, and move on to where it takes part."""
+    return _perturb
+
+
+@pytest.fixture
+def camera() -> Callable[..., Cameras]:
+    """Make a camera at a distance of 3 that looks at the field."""
+    return _camera
+
+
+@pytest.fixture
+def batch() -> Callable[..., dict[str, Tensor]]:
+    """Make what the data manager gives for that camera: a picture of noise ``[height, width, channels]``, uint8."""
+    return _batch
+
+
+@pytest.fixture
+def datamanager() -> FakeDatamanager:
+    return FakeDatamanager()
+
+
+@pytest.fixture
+def training_of() -> Callable[..., Training]:
+    """Set up the training of a model, and of what stands for a trainer if need be, which then goes step by step."""
+    return Training
+
+
+@pytest.fixture(autouse=True)
+def no_leftovers() -> Iterator[None]:
+    yield
+    writer.EVENT_STORAGE.clear()

@@ -1,0 +1,336 @@
+"""The preview of a prune in the viewer: what it shows, and that it changes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any, get_args
+
+import pytest
+import torch
+from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.scene_box import OrientedBox, SceneBox
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.utils import parse_object
+from nerfstudio.viewer.viewer_elements import ViewerElement
+from torch import Tensor
+
+import sundae_ns.pruning.decision
+import sundae_ns.viewer
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.model import SundaeModel, SundaeModelConfig
+from sundae_ns.pruning import PruningConfig, response
+from sundae_ns.training.optimizers import FusedAdamConfig
+from sundae_ns.training.schedules import make_policy
+from sundae_ns.viewer import Rule, rule_config
+
+N = 90
+RULES: tuple[Rule, ...] = get_args(Rule)
+
+
+def camera(shift: float = 0.0) -> Cameras:
+    pose = torch.eye(4)[None, :3].clone()
+    pose[0, :, 3] = torch.tensor([shift, 0.1, 3.0])
+    return Cameras(pose, fx=30.0, fy=30.0, cx=16.0, cy=12.0, width=32, height=24)
+
+
+class Views:
+    """A datamanager with two training cameras, which counts how often they are asked for."""
+
+    eval_dataset = None
+    asked = 0
+
+    def training_views(self) -> Iterator[tuple[Cameras, None]]:
+        self.asked += 1
+        yield from ((camera(-0.5), None), (camera(0.5), None))
+
+
+def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
+    """A model whose head takes part, as a viewer has set it up."""
+    generator = torch.Generator().manual_seed(1)
+    xyz = torch.randn(n, 3, generator=generator) * 0.5
+    rgb = torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
+    config = SundaeModelConfig(
+        pruning=PruningConfig(**{"prune_at": 3, "keep_ratio": 0.5, **pruning}),
+        head=HeadConfig(size="tiny", num_features=5, pixel_unshuffle=1),
+        camera_optimizer=CameraOptimizerConfig(mode="off"),
+        sh_degree=1,
+        num_downscales=0,
+        background_color="black",
+    )
+    box = SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    model = config.setup(scene_box=box, num_train_data=2, metadata={}, seed_points=(xyz, rgb))
+    assert model.head is not None
+    with torch.no_grad():
+        for value in model.head.parameters():
+            value += 0.05 * torch.randn(value.shape, generator=generator)
+    model.step = 10
+    views = Views()
+    pipeline = SimpleNamespace(model=model, datamanager=views)
+    model.preview.control._setup(SimpleNamespace(pipeline=pipeline, viser_server=None))  # type: ignore[arg-type]
+    return model.eval(), views
+
+
+def as_the_viewer(call: Callable[[], Any]) -> Any:
+    """What a function returns to a thread of the viewer."""
+    found: list[Any] = []
+
+    class Renderer(RenderStateMachine):
+        def run(self) -> None:
+            with torch.no_grad():
+                found.append(call())
+
+    thread = Renderer(None, 1.0, None)  # type: ignore[arg-type]
+    thread.start()
+    thread.join()
+    return found[0]
+
+
+def shown(model: SundaeModel, rule: Rule, keep_ratio: float) -> Tensor | None:
+    model.preview.rule.value, model.preview.keep_ratio.value = rule, keep_ratio
+    decision = as_the_viewer(lambda: model.preview.decision(model))
+    return None if decision is None else decision.mask
+
+
+def picture(model: SundaeModel) -> dict[str, Tensor]:
+    return model.get_outputs_for_camera(camera())
+
+
+def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_the_viewer_finds_slider_and_menu() -> None:
+    model, _ = build()
+    found = dict(parse_object(SimpleNamespace(model=model), ViewerElement, "Custom Elements"))
+    assert found["Custom Elements/model/preview/keep_ratio"] is model.preview.keep_ratio
+    assert found["Custom Elements/model/preview/rule"] is model.preview.rule
+    assert not list(model.preview.parameters())
+    assert not [name for name in model.state_dict() if "preview" in name]
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("keep_ratio", [0.01, 0.1, 0.37, 0.99])
+def test_exactly_the_share_is_shown(rule: Rule, keep_ratio: float) -> None:
+    model, _ = build()
+    mask = shown(model, rule, keep_ratio)
+    assert mask is not None
+    assert mask.shape == (N,)
+    assert int(mask.sum()) == max(1, round(keep_ratio * N))
+    again = shown(build()[0], rule, keep_ratio)
+    assert again is not None
+    assert torch.equal(mask, again)
+
+
+PRUNES: list[dict[str, Any]] = [
+    {},
+    {"score": "contribution", "redistribution": "grow"},
+    {"score": "response-contribution", "selection": "shared"},
+    {"score": "coherence-contribution", "selection": "sampled", "redistribution": "none", "seed": 3},
+    {"score": "response", "selection": "band", "signal": "positions", "edges": "centres", "redistribution": "none"},
+]
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("options", PRUNES, ids=lambda options: options.get("score", "default"))
+def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None:
+    model, views = build(**options)
+    model.preview.keep_ratio.value = 0.2
+    decision = as_the_viewer(lambda: model.preview.decision(model))
+    seen = as_the_viewer(lambda: picture(model))
+    model.config.pruning.keep_ratio = 0.2
+    before = {name: value.clone() for name, value in model.gaussians.items()}
+    optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
+    report = make_policy(model.config.pruning).step_post_backward(
+        model.gaussians,
+        optimizers,
+        {"pruned_at": -1, "num_prunes": 0, "peak": N},
+        model.config.pruning.prune_at,
+        contribution=lambda: model.contribution(views),  # type: ignore[arg-type]
+    )
+    assert report is not None
+    assert report.after == int(decision.mask.sum()) == 18
+    values = {name: value[decision.mask] for name, value in before.items()} | dict(decision.values or {})
+    assert {name for name, value in model.gaussians.items() if not torch.equal(value, values[name])} == set()
+    # A merge and growth show in the picture too.
+    left, _ = model.render(model.gaussians, model.view_of(camera()), seen["background"][0, 0], compensate=False)
+    assert torch.equal(seen["rgb"], left["rgb"])
+
+
+def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
+    model, _ = build()
+    known = response(model.gaussians, rule_config(model.config.pruning, "band: both", 0.2)).magnitude
+    masks = {rule: shown(model, rule, 0.2) for rule in RULES}
+    high, low, both, top = (masks[rule] for rule in ("band: high", "band: low", "band: both", "opacity"))
+    assert high is not None
+    assert low is not None
+    assert both is not None
+    assert top is not None
+    assert known[high].min() >= known[~high].max()
+    assert known[low].max() <= known[~low].min()
+    assert torch.equal(both, (both & high) | (both & low))
+    assert int((both & high).sum()) == int((both & low).sum()) == 9
+    opaque = model.opacities[:, 0]
+    assert opaque[top].min() >= opaque[~top].max()
+    # The share of the slider counts, whatever budget the run had.
+    for options in ({"mode": "auto", "max_bytes": 900}, {"mode": "continuous", "target_primitives": 7, "start": 20000}):
+        busy, _ = build(**{"stop": 20000, **options})
+        mask = shown(busy, "as configured", 0.2)
+        assert mask is not None
+        assert torch.equal(mask, masks["as configured"])  # type: ignore[arg-type]
+
+
+@torch.no_grad()
+def test_a_crop_box_cuts_the_preview_too() -> None:
+    model, _ = build()
+    model.preview.keep_ratio.value = 0.5
+    decision = as_the_viewer(lambda: model.preview.decision(model))
+    half = OrientedBox(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]), torch.tensor([2.0, 9.0, 9.0]))
+    seen = as_the_viewer(lambda: model.get_outputs_for_camera(camera(), half))
+    rows = half.within(model.means).squeeze(-1)[decision.mask]
+    assert 0 < int(rows.sum()) < len(rows)
+    params = {name: value[decision.mask][rows] for name, value in model.gaussians.items()}
+    params |= {name: value[rows] for name, value in decision.values.items()}
+    expected, _ = model.render(params, model.view_of(camera()), seen["background"][0, 0], compensate=False)
+    assert torch.equal(seen["rgb"], expected["rgb"])
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("rule", RULES)
+def test_off_every_picture_is_as_before(rule: Rule) -> None:
+    model, views = build()
+    before = picture(model)
+    model.preview.rule.value = rule
+    assert same(as_the_viewer(lambda: picture(model)), before)
+    assert views.asked == 0
+    # On, and off again.
+    model.preview.keep_ratio.value = 0.3
+    assert not same(as_the_viewer(lambda: picture(model)), before)
+    model.preview.keep_ratio.value = 1.0
+    assert same(as_the_viewer(lambda: picture(model)), before)
+
+
+@torch.no_grad()
+def test_on_it_shows_base_colours_and_touches_nothing() -> None:
+    model, _ = build()
+    before = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, Tensor)}
+    versions = [value._version for value in model.parameters()]
+    model.preview.keep_ratio.value = 0.3
+    found = as_the_viewer(lambda: picture(model))
+    assert torch.equal(found["rgb"], found["base_rgb"])
+    assert found["response"].max() > 0
+    after = model.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+    assert [value._version for value in model.parameters()] == versions
+
+
+@torch.no_grad()
+def test_training_and_evaluation_do_not_see_it() -> None:
+    model, views = build()
+    model.train()
+    trained = picture(model)
+    model.eval()
+    evaluated = picture(model)
+    model.preview.keep_ratio.value = 0.1
+    assert same(picture(model), evaluated)
+    model.train()
+    assert same(
+        {k: v for k, v in picture(model).items() if v is not None}, {k: v for k, v in trained.items() if v is not None}
+    )
+    assert views.asked == 0
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the fields whose graph was built, by the preview or by a decision."""
+    seen: list[int] = []
+    original = sundae_ns.viewer.field_graph
+
+    def counted(params: Any, config: PruningConfig) -> Any:
+        seen.append(len(params["means"]))
+        return original(params, config)
+
+    monkeypatch.setattr(sundae_ns.viewer, "field_graph", counted)
+    monkeypatch.setattr(sundae_ns.pruning.decision, "field_graph", counted)
+    return seen
+
+
+def test_graph_and_views_are_used_once_a_field(calls: list[int]) -> None:
+    model, views = build()
+    for rule in RULES:
+        for keep_ratio in (0.1, 0.2, 0.3):
+            shown(model, rule, keep_ratio)
+    # One graph with the configured edges and one with the paper's; the detail that counts depends on the share.
+    assert calls == [N, N]
+    assert views.asked == 3
+    model, views = build(score="contribution")
+    for keep_ratio in (0.1, 0.2, 0.3):
+        shown(model, "as configured", keep_ratio)
+    assert views.asked == 1
+
+
+def test_a_changed_field_is_scored_anew(calls: list[int]) -> None:
+    model, views = build()
+    first = shown(model, "band: high", 0.2)
+    with torch.no_grad():
+        model.means[:45] *= 3  # the same tensor, other values
+    second = shown(model, "band: high", 0.2)
+    assert calls == [N, N]
+    assert first is not None
+    assert second is not None
+    assert not torch.equal(first, second)
+    other, _ = build(70)
+    model.load_state_dict(other.state_dict())
+    third = shown(model, "as configured", 0.2)
+    assert third is not None
+    assert third.shape == (70,)
+    assert calls == [N, N, 70]
+    assert views.asked == 1
+
+
+def test_a_prune_in_training_is_seen_and_a_step_is_not(calls: list[int]) -> None:
+    model, views = build()
+    model.step = 0
+    groups = model.get_param_groups()
+    configs = {name: {"optimizer": FusedAdamConfig(lr=5e-3), "scheduler": None} for name in groups}
+    optimizers = Optimizers(configs, groups)
+    pipeline = SimpleNamespace(datamanager=views, model=model)
+    callbacks = model.get_training_callbacks(
+        TrainingCallbackAttributes(optimizers, None, pipeline, None)  # type: ignore[arg-type]
+    )
+    truth = {"image": torch.zeros(24, 32, 3, dtype=torch.uint8)}
+    model.preview.rule.value, model.preview.keep_ratio.value = "band: both", 0.2
+    kept = []
+    for step in range(5):
+        model.train()
+        for callback in callbacks:
+            callback.run_callback_at_location(step, location=TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        outputs = model(camera())
+        sum(model.get_loss_dict(outputs, truth).values()).backward()  # type: ignore[union-attr]
+        optimizers.optimizer_step_all()
+        for callback in callbacks:
+            callback.run_callback_at_location(step, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        model.eval()
+        kept.append(int(shown(model, "band: both", 0.2).sum()))  # type: ignore[union-attr]
+    after = model.num_points
+    assert after == 45
+    assert kept == [18, 18, 18, 9, 9]
+    assert calls == [N, N, after]  # the second one by the prune itself
+
+
+@torch.no_grad()
+def test_a_rule_that_cannot_be_applied_shows_everything_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
+    few, _ = build(1)  # a graph needs two
+    before = picture(few)
+    few.preview.rule.value, few.preview.keep_ratio.value = "band: high", 0.5
+    for _ in range(2):
+        assert same(as_the_viewer(lambda: picture(few)), before)
+    assert capsys.readouterr().out.count("No preview of band: high") == 1
+    alone, _ = build()
+    del alone.preview.control.viewer
+    assert shown(alone, "as configured", 0.5) is None
+    assert "no training views" in " ".join(capsys.readouterr().out.split())
+    assert shown(alone, "random", 0.5) is not None

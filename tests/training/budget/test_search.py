@@ -1,0 +1,294 @@
+"""The search for a budget by itself: what it accepts, takes back and tries next."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from sundae_ns.errors import CheckpointError
+from sundae_ns.training.budget.search import DEEPEST, NO_PICTURE, SHALLOWEST, Point, Search
+
+
+def search(accepted: int = 1000, **options: Any) -> Search:
+    made = Search(reference=30.1, target=30.0, **options)
+    made.begin("field", accepted)
+    return made
+
+
+END = 200
+"""Steps of training, a look each."""
+
+
+def play(found: Search, recovered: Callable[[int], float], *, patience: int = 4, least: int = 5) -> list[int]:
+    """Search on a field whose PSNR is a function of its count once it has recovered, half the way a look; cuts made."""
+    psnr, count, before, cuts = recovered(found.accepted), found.accepted, found.accepted, []
+    for step in range(1, END + 1):
+        count = count if found.trying else found.accepted
+        psnr += 0.5 * (recovered(count) - psnr)
+        verdict = found.judge(psnr, step, END - step, patience)
+        if verdict == "waiting":
+            continue
+        if verdict == "rejected":
+            count, psnr = before, found.before_cut
+        assert count == found.accepted
+        if found.rejected >= 5:
+            break
+        following = found.next_count(psnr, least, patience)
+        if following is not None and step < END:
+            before = count
+            found.cut(psnr, following, step)
+            cuts.append(following)
+            count, psnr = following, psnr - 3.0
+    assert not found.trying, "the last look has to say"
+    return cuts
+
+
+def verdicts(found: Search, *values: float, left: int = 100, patience: int = 4) -> list[str]:
+    """Of looks at a cut, every 10 steps, with so many steps left after the last of them."""
+    steps = range(found.cut_at + 10, found.cut_at + 10 * len(values) + 1, 10)
+    return [found.judge(psnr, step, left + steps[-1] - step, patience) for psnr, step in zip(values, steps)]
+
+
+@pytest.mark.parametrize("needed", [7, 40, 130, 600, 950])
+def test_finds_about_what_a_scene_needs(needed: int) -> None:
+    def recovered(count: int) -> float:
+        return 30.0 + 2.0 * math.log2(count / needed)
+
+    found = search()
+    play(found, recovered)
+    assert needed <= found.accepted <= 1.3 * needed + 1
+    assert recovered(found.accepted) >= found.target
+
+
+def test_nothing_is_cut_where_nothing_can_go() -> None:
+    found = search()
+    play(found, lambda count: 30.01 if count == 1000 else 20.0)
+    assert (found.accepted, found.rejected) == (1000, 5)
+    assert 0 < found.steps_lost <= 5 * 4, "a few looks each"
+
+
+def test_a_field_that_needs_nothing_is_cut_to_the_least() -> None:
+    found = search()
+    cuts = play(found, lambda _: 40.0, least=17)
+    assert found.accepted == cuts[-1] == 17
+    assert cuts[:3] == [500, 250, 125]
+    assert found.next_count(40.0, 17, 3) is None
+
+
+def cut_in_half() -> Search:
+    found = search()
+    found.cut(30.1, 500, step=100)
+    return found
+
+
+def test_a_cut_is_accepted_once_it_is_seen_to_reach_the_target() -> None:
+    assert verdicts(cut_in_half(), 29.0, 29.99, 30.0) == ["waiting", "waiting", "accepted"]
+
+
+def test_a_cut_may_take_as_long_as_it_is_foreseen_to_recover() -> None:
+    slowly = [28.0 + 0.5 * math.log2(1 + look) for look in range(15)]
+    assert verdicts(cut_in_half(), *slowly, 30.0, left=1000) == ["waiting"] * 15 + ["accepted"]
+    found = cut_in_half()
+    assert verdicts(found, *slowly, left=1000) == ["waiting"] * 15
+    assert found.judge(29.99, 260, 0, patience=4) == "rejected", "time is up"
+    assert found.steps_lost == 160
+
+
+def test_a_cut_is_taken_back_at_once_where_even_the_whole_gain_would_not_do() -> None:
+    found = cut_in_half()
+    assert verdicts(found, 28.0, 29.0, left=15) == ["waiting", "rejected"]  # 1 dB a doubling, and 0.8 to come
+    assert (found.rejected, found.steps_lost, found.accepted) == (1, 20, 1000)
+    assert found.slope == pytest.approx(0.1 + 1.0 - 0.5 * math.log2(35 / 20)), "by what was foreseen of it"
+    assert verdicts(cut_in_half(), 28.0, 29.0, left=18) == ["waiting", "waiting"], (
+        "0.926 may be enough: looks differ by 0.1"
+    )
+
+
+def test_after_some_patience_half_of_the_gain_has_to_do() -> None:
+    values = [28.0, 29.0, 28.0 + math.log2(3)]  # a line: 1 dB a doubling
+    assert verdicts(cut_in_half(), *values, left=20, patience=3) == ["waiting", "waiting", "rejected"]
+    assert verdicts(cut_in_half(), *values, left=20, patience=4) == ["waiting", "waiting", "waiting"]
+    assert verdicts(cut_in_half(), *values, left=30, patience=3) == ["waiting", "waiting", "waiting"]
+
+
+def test_what_is_foreseen_lies_on_a_line_over_the_logarithm_of_the_steps() -> None:
+    found = cut_in_half()
+    verdicts(found, 28.0, 29.0, 28.0 + math.log2(3))
+    assert found.foreseen(0, 1.0) == pytest.approx(28.0 + math.log2(3))
+    assert found.foreseen(30, 1.0) == pytest.approx(29.0 + math.log2(3))
+    assert found.foreseen(30, 0.5) == pytest.approx(28.5 + math.log2(3))
+    falling = cut_in_half()
+    verdicts(falling, 29.0, 28.0)
+    assert falling.foreseen(20, 0.5) == pytest.approx(27.0), "a loss is counted whole"
+
+
+def rest(found: Search, *values: float) -> Search:
+    for psnr in values:
+        assert found.judge(psnr, 10, 100, patience=3) == "resting"
+    return found
+
+
+def test_a_field_that_loses_the_target_by_itself_is_cut_on_by_what_it_has_left() -> None:
+    found = rest(search(), 29.8, 29.9, 29.8, 29.85)
+    assert (found.aim, found.next_count(29.85, 1, 3)) == (30.0, None), "it may still gain"
+    rest(found, 29.82)
+    assert found.aim == pytest.approx(29.77), "less by half of what may be lost"
+    found.slope = 1.0
+    assert found.next_count(29.82, 1, 3) == int(1000 * 0.5**SHALLOWEST)
+    found.cut(29.82, 901, step=100)
+    assert found.before_cut == pytest.approx(29.82)
+    assert verdicts(found, 29.7, 29.78) == ["waiting", "accepted"]
+    assert found.next_count(30.02, 1, 3) == int(901 * 0.5**0.5), "by its margin, where it has one"
+    rest(found, 30.0)
+    assert found.aim == 30.0, "the target is in reach again"
+
+
+def test_a_field_that_gains_no_more_is_cut_by_the_least_however_small_its_margin() -> None:
+    found = rest(search(), 30.02, 30.05, 30.01, 30.02)
+    found.slope = 1.0
+    assert found.next_count(30.02, 1, 3) is None
+    assert rest(found, 30.03).next_count(30.03, 1, 3) == int(1000 * 0.5**SHALLOWEST)
+    assert rest(found, 30.06).next_count(30.06, 1, 3) is None, "it gains again"
+
+
+@pytest.mark.parametrize("values", [(29.8, 29.9, 29.85, 29.87, 29.91, 29.9, 29.9), (30.2, 30.1, 30.1, 30.1, 30.1)])
+def test_a_field_that_gains_or_has_reached_the_target_keeps_it(values: tuple[float, ...]) -> None:
+    assert rest(search(), *values).aim == 30.0
+
+
+def test_a_head_that_has_not_let_anything_go_yet_lowers_nothing() -> None:
+    found = search()
+    found.begin("head", 1000)
+    assert rest(found, *[29.5] * 9).aim == 30.0
+    found.cuts = 1
+    assert rest(found, 29.5).aim == pytest.approx(29.45)
+    found.begin("head", 500)
+    assert (found.aim, found.stuck) == (30.0, 0)
+
+
+def test_a_picture_that_is_not_a_number_is_no_success() -> None:
+    found = cut_in_half()
+    assert verdicts(found, NO_PICTURE) == ["rejected"]
+    assert (found.accepted, found.failed) == (1000, 500)
+    assert found.slope == 0, "it says nothing of what a halving costs"
+    assert found.next_count(30.1, 1, 3) == int(1000 * 0.5**0.5)
+    assert Search.from_state(found.state()).state()["trail"] == [[10, NO_PICTURE]]
+
+
+def test_a_field_without_pictures_is_trained_and_neither_cut_nor_taken_for_all_there_is() -> None:
+    found = rest(search(), 30.1, *[NO_PICTURE] * 9)
+    assert (found.stuck, found.aim, found.next_count(NO_PICTURE, 1, 3)) == (9, 30.0, None)
+
+
+def test_no_band_goes_where_all_of_them_have_made_no_picture() -> None:
+    found = Search(reference=30.0, degrees={"3": NO_PICTURE})
+    assert (found.next_degree(3, 0.1), found.lowest_degree(3, 0.1)) == (None, 3)
+
+
+def test_what_has_failed_is_come_up_to_from_above() -> None:
+    found = search()
+    found.cut(30.1, 500, step=0)
+    assert found.judge(29.0, 1, 0, patience=4) == "rejected"
+    assert found.next_count(40.0, 1, 3) == int(1000 * 0.5**0.5)
+    found.accepted = 520
+    assert found.next_count(40.0, 1, 3) == found.next_count(30.5, 1, 3) == int(520 * 0.5**SHALLOWEST)
+    found.begin("head", 520)
+    assert found.next_count(40.0, 1, 3) == 260
+
+
+def test_what_has_failed_is_forgotten_once_a_field_as_small_is_accepted() -> None:
+    found = search()
+    found.cut(30.1, 500, step=0)
+    assert found.judge(29.0, 1, 0, patience=4) == "rejected"
+    found.cut(30.5, 501, step=2)
+    assert (found.judge(30.5, 3, 50, patience=4), found.failed) == ("accepted", 500)
+    found.cut(30.5, 490, step=4)
+    assert (found.judge(30.5, 5, 50, patience=4), found.failed) == ("accepted", 0)
+    found.slope = 0.5
+    assert found.next_count(30.5, 1, 3) == 245, "by what a halving costs alone"
+
+
+def test_how_deep_to_cut_follows_from_what_the_last_cut_cost() -> None:
+    found = search()
+    assert found.next_count(30.0, 1, 3) == round(1000 * 0.5**DEEPEST)
+    found.cut(31.0, 500, step=0)
+    assert found.judge(30.4, 1, 50, patience=4) == "accepted"
+    assert found.slope == pytest.approx(0.6)
+    assert found.next_count(30.3, 1, 3) == int(500 * 0.5**0.5)
+    assert found.next_count(30.05, 1, 3) is None
+    assert search().next_count(29.99, 1, 3) is None, "a field below the target is trained, not cut"
+    assert found.judge(30.05, 2, 50, patience=4) == "resting"
+    found.cut(30.3, 353, step=3)
+    assert found.judge(30.3, 4, 50, patience=4) == "accepted"
+    assert found.slope == pytest.approx(0.3), "a lucky cut does not make the next one cheap"
+    assert (found.cuts, found.rejected) == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("values", "order", "lowest"),
+    [
+        ({3: 30.0, 2: 30.0, 1: 29.95, 0: 29.95}, [3, 1, 0], 0),
+        ({3: 30.0, 2: 29.95, 1: 29.5, 0: 29.0}, [3, 1, 2], 2),
+        ({3: 30.0, 2: 29.5, 1: 29.5, 0: 30.5}, [3, 1, 2], 3),
+        ({3: 30.0, 2: 30.0, 1: 29.95, 0: 29.0}, [3, 1, 0], 1),
+        ({1: 30.0, 0: 30.2}, [1, 0], 0),
+    ],
+)
+def test_degrees_are_bisected(values: dict[int, float], order: list[int], lowest: int) -> None:
+    found, top, tried = Search(), max(values), []
+    while (degree := found.next_degree(top, 0.1)) is not None:
+        tried.append(degree)
+        found.degrees[str(degree)] = values[degree]
+    assert tried == order
+    assert found.lowest_degree(top, 0.1) == lowest
+
+
+def test_state_goes_through_a_checkpoint() -> None:
+    found = search()
+    found.cut(30.1, 500, step=100)
+    found.judge(29.0, 110, 50, patience=4)
+    found.lowered, found.best = 29.0, 29.1
+    found.curve.append(Point(1, "field", 10, 100, 30.0, "waiting", 5))
+    assert Search.from_state(found.state()) == found
+    assert json.loads(json.dumps(found.state()))["curve"][0]["primitives"] == 10
+
+
+def test_a_state_of_an_older_version_is_taken() -> None:
+    found = search()
+    older = {name: value for name, value in found.state().items() if name not in ("trail", "lowered", "best", "stuck")}
+    assert Search.from_state({**older, "last_psnr": 29.0}).state().keys() == found.state().keys()
+    with pytest.raises(CheckpointError, match="other entries"):
+        Search.from_state({name: value for name, value in older.items() if name != "target"})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"phase": "lunch"},
+        {"accepted": "many"},
+        {"degree": 5},
+        {"degree": -2},
+        {"num_features": 1025},
+        {"curve": [{"step": 1}]},
+        {"new": 1},
+        {"cuts": 0.5},
+        {"trail": [[10, 30.0, 1]]},
+        {"trail": [[0, 30.0]]},
+        {"trail": [[10, math.inf]]},
+        {"trail": [3]},
+        {"trail": 3},
+        {"trail": [["a", "b"]]},
+    ],
+)
+def test_a_foreign_state_is_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(CheckpointError, match="search for a budget"):
+        Search.from_state({**search().state(), **change})
+
+
+def test_states_at_the_ends_of_what_can_be_are_taken() -> None:
+    for change in ({"degree": 4}, {"degree": -1}, {"num_features": 1024}, {"num_features": -1}):
+        Search.from_state({**search().state(), **change})

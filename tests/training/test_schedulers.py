@@ -1,0 +1,113 @@
+"""Learning rates: the decay, its restart at the prune, and a state that plain ``torch.load`` reads."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+import torch
+from torch.optim import Adam
+from torch.optim.lr_scheduler import ExponentialLR, LambdaLR
+
+from sundae_ns.training.schedulers import Decay, PruneAwareDecayConfig, notify_pruned
+
+
+def scheduler(**options: object) -> LambdaLR:
+    config = PruneAwareDecayConfig(lr_final=1e-4, max_steps=100, **options)  # type: ignore[arg-type]
+    optimizer = Adam([torch.nn.Parameter(torch.zeros(1))], lr=1e-2)
+    made = config.setup().get_scheduler(optimizer, lr_init=1e-2)
+    assert isinstance(made, LambdaLR)
+    return made
+
+
+def rates(made: LambdaLR, steps: int, prune_at: int | None = None) -> list[float]:
+    """Rate that each step uses, the scheduler stepping after it as in nerfstudio's trainer."""
+    found = []
+    for step in range(steps):
+        found.append(made.optimizer.param_groups[0]["lr"])
+        made.optimizer.step()
+        made.step()
+        if step == prune_at:
+            notify_pruned({"means": made}, step)
+    return found
+
+
+def test_exponential_from_first_to_last() -> None:
+    found = rates(scheduler(), 130)
+    assert found[0] == pytest.approx(1e-2)
+    assert found[50] == pytest.approx(1e-3)
+    assert found[100] == pytest.approx(1e-4)
+    assert found[129] == pytest.approx(1e-4)
+
+
+def test_half_a_cosine_from_first_to_last() -> None:
+    found = rates(scheduler(shape="cosine"), 130)
+    assert found[0] == pytest.approx(1e-2)
+    assert found[25] == pytest.approx(1e-4 + 0.99e-2 * (1 + 0.5**0.5) / 2)
+    assert found[50] == pytest.approx((1e-2 + 1e-4) / 2)
+    assert found[100] == found[129] == pytest.approx(1e-4)
+    restarted = rates(scheduler(shape="cosine", lr_restart=4e-3, warmup_steps=4), 130, prune_at=40)
+    assert restarted[:41] == pytest.approx(found[:41])
+    assert restarted[42] == pytest.approx(3 / 5 * 4e-3, rel=0.01)
+    assert restarted[70] == pytest.approx((4e-3 + 1e-4) / 2)
+    assert restarted[100] == pytest.approx(1e-4)
+
+
+def test_prune_restarts_the_decay() -> None:
+    found = rates(scheduler(lr_restart=4e-3), 130, prune_at=40)
+    plain = rates(scheduler(), 130)
+    assert found[:41] == pytest.approx(plain[:41])
+    # The scheduler sets a step's rate after the step before, so the prune shows one step later.
+    assert found[42] == pytest.approx(4e-3, rel=0.15)
+    assert found[70] == pytest.approx((4e-3 * 1e-4) ** 0.5)
+    assert found[100] == pytest.approx(1e-4)
+
+
+def test_without_restart_the_prune_changes_nothing() -> None:
+    assert rates(scheduler(), 80, prune_at=40) == pytest.approx(rates(scheduler(), 80))
+
+
+def test_held_until_the_prune_then_rising_and_falling() -> None:
+    found = rates(scheduler(lr_restart=1e-2, hold_until_prune=True, warmup_steps=9), 130, prune_at=40)
+    assert found[:41] == pytest.approx([1e-2] * 41)
+    assert found[42] < 0.4e-2
+    rising = found[42:50]
+    assert rising == sorted(rising)
+    assert found[49] > 0.5e-2
+    falling = found[52:101]
+    assert falling == sorted(falling, reverse=True)
+    assert found[100] == pytest.approx(1e-4)
+
+
+def test_only_the_first_prune_counts_and_others_are_left_alone() -> None:
+    made = scheduler(lr_restart=1e-2)
+    stock = ExponentialLR(Adam([torch.nn.Parameter(torch.zeros(1))]), gamma=0.9)
+    notify_pruned({"means": made, "other": stock}, 10)
+    notify_pruned({"means": made, "other": stock}, 20)
+    (decay,) = made.lr_lambdas
+    assert isinstance(decay, Decay)
+    assert decay.pruned_at == 10
+
+
+@pytest.mark.parametrize("shape", ["exponential", "cosine"])
+@pytest.mark.parametrize("prune_at", [None, 30])
+def test_a_resumed_scheduler_goes_on_the_same(prune_at: int | None, shape: str) -> None:
+    options = {"lr_restart": 5e-3, "hold_until_prune": True, "warmup_steps": 20, "shape": shape}
+    whole, first, second = scheduler(**options), scheduler(**options), scheduler(**options)
+    expected = rates(whole, 90, prune_at)
+    rates(first, 45, prune_at)
+    buffer = io.BytesIO()
+    torch.save({"scheduler": first.state_dict(), "optimizer": first.optimizer.state_dict()}, buffer)
+    buffer.seek(0)
+    state = torch.load(buffer)
+    second.optimizer.load_state_dict(state["optimizer"])
+    second.load_state_dict(state["scheduler"])
+    assert rates(second, 45) == pytest.approx(expected[45:])
+
+
+def test_rates_are_python_floats() -> None:
+    made = scheduler(lr_restart=1e-3)
+    for step in (0, 7, 200):
+        assert type(made.lr_lambdas[0](step)) is float  # type: ignore[operator]
+    rates(made, 5, prune_at=2)
+    assert all(type(rate) is float for rate in made.get_last_lr())

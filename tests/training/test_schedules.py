@@ -1,0 +1,401 @@
+"""Policies: at the right step only, once, resumable, and with training going on afterwards."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import fields, replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Adam, Optimizer
+
+from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.graphs import build_graph
+from sundae_ns.pruning import PruningConfig
+from sundae_ns.training.report import PruneReport
+from sundae_ns.training.schedules import ContinuousPruning, NoPruning, OneShotPruning, PruningPolicy, make_policy
+
+Field = tuple[dict[str, Parameter], dict[str, Optimizer]]
+
+
+def field(n: int = 100, seed: int = 0) -> Field:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {
+        "means": (3,),
+        "scales": (3,),
+        "quats": (4,),
+        "features_dc": (3,),
+        "features_rest": (3, 3),
+        "opacities": (1,),
+    }
+    params = {name: Parameter(torch.randn(n, *shape, generator=generator)) for name, shape in shapes.items()}
+    return params, {name: Adam([value], lr=0.01) for name, value in params.items()}
+
+
+def train_step(params: dict[str, Parameter], optimizers: dict[str, Optimizer]) -> float:
+    for optimizer in optimizers.values():
+        optimizer.zero_grad()
+    loss = torch.stack([value.square().mean() for value in params.values()]).sum()
+    loss.backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+    return loss.item()
+
+
+def run(
+    policy: PruningPolicy, made: Field, steps: range, state: dict[str, Any] | None = None, **options: Any
+) -> tuple[list[PruneReport], dict[str, Any]]:
+    params, optimizers = made
+    state = policy.initialize_state() if state is None else state
+    reports = []
+    options.setdefault("contribution", lambda: params["opacities"].detach().sigmoid().squeeze(1))
+    for step in steps:
+        train_step(params, optimizers)
+        report = policy.step_post_backward(params, optimizers, state, step, {}, **options)
+        if report is not None:
+            reports.append(report)
+    return reports, state
+
+
+def saved_and_loaded(state: dict[str, Any]) -> dict[str, Any]:
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    buffer.seek(0)
+    return torch.load(buffer, weights_only=True)
+
+
+def test_one_shot_prunes_once_and_training_goes_on() -> None:
+    made = field()
+    policy = make_policy(PruningConfig(prune_at=3, keep_ratio=0.25))
+    losses = []
+    state = policy.initialize_state()
+    for step in range(8):
+        reports, state = run(policy, made, range(step, step + 1), state)
+        assert bool(reports) == (step == 3)
+        if step > 3:
+            losses.append(train_step(*made))
+        if reports:
+            assert (reports[0].before, reports[0].after, reports[0].peak) == (100, 25, 100)
+            assert reports[0].sigma is not None
+    assert losses == sorted(losses, reverse=True)
+    assert {len(value) for value in made[0].values()} == {25}
+    assert made[1]["means"].state[made[0]["means"]]["exp_avg"].shape == (25, 3)
+
+
+def test_a_resumed_run_does_not_prune_twice() -> None:
+    policy = make_policy(PruningConfig(prune_at=3, keep_ratio=0.5))
+    made = field()
+    _, state = run(policy, made, range(5))
+    reports, state = run(policy, made, range(2, 9), saved_and_loaded(state))
+    assert reports == []
+    assert state == {"pruned_at": 3, "num_prunes": 1, "peak": 100}
+    assert len(made[0]["means"]) == 50
+
+
+def test_a_warm_start_behind_the_step_prunes_at_once() -> None:
+    reports, _ = run(make_policy(PruningConfig(prune_at=3)), field(), range(10, 14))
+    assert [report.step for report in reports] == [10]
+
+
+def test_the_same_seed_gives_the_same_field() -> None:
+    kept = []
+    for seed in (1, 1, 2):
+        made = field()
+        run(make_policy(PruningConfig(prune_at=1, seed=seed)), made, range(3))
+        kept.append(made[0]["means"].detach())
+    assert torch.equal(kept[0], kept[1])
+    assert not torch.equal(kept[0], kept[2])
+
+
+def test_continuous_keeps_a_share_on_schedule() -> None:
+    policy = make_policy(PruningConfig(mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, num_neighbors=4))
+    reports, state = run(policy, field(), range(13))
+    assert [report.step for report in reports] == [2, 5, 8]
+    assert [report.after for report in reports] == [70, 49, 34]
+    assert {report.peak for report in reports} == {100}
+    assert state["num_prunes"] == 3
+    assert reports[0].sigma != reports[1].sigma
+
+
+def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
+    config = PruningConfig(
+        mode="continuous", start=0, every=2, stop=100, max_primitives=110, keep_ratio=1.0, num_neighbors=4
+    )
+    policy = make_policy(config)
+    state = policy.initialize_state()
+    counts, peaks = [], []
+    params, optimizers = field(100)
+    for step in range(6):
+        grown, _ = field(15, seed=step)
+        params = {name: Parameter(torch.cat([params[name].detach(), grown[name].detach()])) for name in params}
+        optimizers = {name: Adam([value]) for name, value in params.items()}
+        run(policy, (params, optimizers), range(step, step + 1), state)
+        counts.append(len(params["means"]))
+        peaks.append(state["peak"])
+    assert counts == [110, 125, 110, 125, 110, 125]
+    assert peaks == [115, 125, 140, 140, 140, 140]
+
+
+@pytest.mark.parametrize("last", [60, 90])
+def test_continuous_ends_at_exactly_the_target(last: int) -> None:
+    config = PruningConfig(
+        mode="continuous", start=0, every=2, stop=3, target_primitives=80, max_primitives=120, num_neighbors=4
+    )
+    policy = make_policy(config)
+    made = field()
+    reports, state = run(policy, made, range(2))
+    assert [report.after for report in reports] == [80]
+    params, optimizers = field(last)  # what densification has made of it meanwhile
+    densification = {"grad2d": torch.zeros(last), "count": torch.zeros(last), "scene_scale": 1.0}
+    for step in (3, 4):
+        policy.step_post_backward(
+            params, optimizers, state, step, contribution=lambda: torch.ones(last), strategy_state=densification
+        )
+        assert {len(value) for value in params.values()} == {80}
+        assert all(optimizers[name].param_groups[0]["params"] == [params[name]] for name in optimizers)
+        rows = [len(value) for value in densification.values() if isinstance(value, Tensor)]
+        assert set(rows) <= {80}
+    assert state["peak"] == 100
+
+
+def test_a_resumed_continuous_run_goes_on_as_if_never_stopped() -> None:
+    config = PruningConfig(mode="continuous", start=1, every=2, stop=7, keep_ratio=0.8, num_neighbors=4)
+    whole, halves = field(), field()
+    run(make_policy(config), whole, range(8))
+    _, state = run(make_policy(config), halves, range(4))
+    run(make_policy(config), halves, range(4, 8), saved_and_loaded(state))
+    assert torch.equal(whole[0]["means"], halves[0]["means"])
+
+
+def test_continuous_draws_anew_each_time() -> None:
+    config = PruningConfig(
+        mode="continuous", start=0, every=1, keep_ratio=0.5, score="random", selection="sampled", redistribution="none"
+    )
+    policy = make_policy(config)
+    kept = []
+    for step in (3, 3, 4):
+        made = field()
+        policy.step_post_backward(*made, policy.initialize_state(), step)
+        kept.append(made[0]["means"].detach())
+    assert torch.equal(kept[0], kept[1])
+    assert not torch.equal(kept[0], kept[2])
+
+
+def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> None:
+    made = field()
+    params, optimizers = made
+    params["means"].data[5] = torch.nan
+    params["opacities"].data[[5, 9]] = torch.inf
+    asked: list[int] = []
+
+    def contribution() -> Tensor:
+        asked.append(len(params["means"]))
+        return torch.ones(len(params["means"]))
+
+    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=0.5))
+    report = policy.step_post_backward(
+        params, optimizers, policy.initialize_state(), 0, contribution=contribution, strategy_state=None
+    )
+    assert report is not None
+    assert asked == [98]
+    assert (report.before, report.dropped_nonfinite, report.after) == (100, 2, 49)
+    assert "2 were NaN or infinite" in report.summary()
+    assert all(value.isfinite().all() for value in params.values())
+
+
+def test_the_state_of_densification_is_sliced_along() -> None:
+    made = field()
+    made[0]["means"].data[0] = torch.nan
+    strategy_state = {"grad2d": torch.arange(100), "scene_scale": 2.0}
+    config = PruningConfig(prune_at=0, score="opacity", selection="top", redistribution="none", keep_ratio=0.1)
+    opacities = made[0]["opacities"].detach().squeeze(1).clone()
+    policy = make_policy(config)
+    policy.step_post_backward(*made, policy.initialize_state(), 0, strategy_state=strategy_state)
+    assert strategy_state["grad2d"].tolist() == sorted((opacities[1:].topk(10).indices + 1).tolist())
+    assert strategy_state["scene_scale"] == 2.0
+
+
+def test_full_keep_ratio_keeps_all_and_asks_for_nothing() -> None:
+    made = field(10)
+    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=1.0))
+    report = policy.step_post_backward(*made, policy.initialize_state(), 0)
+    assert report is not None
+    assert (report.before, report.after, report.sigma) == (10, 10, None)
+
+
+def test_off_never_prunes_but_counts() -> None:
+    reports, state = run(make_policy(PruningConfig(mode="off", prune_at=0, start=0, every=1)), field(), range(4))
+    assert reports == []
+    assert state == {"pruned_at": -1, "num_prunes": 0, "peak": 100}
+
+
+def test_a_failed_prune_leaves_field_and_state() -> None:
+    made = field(10)
+    policy = make_policy(PruningConfig(prune_at=0))
+    state = policy.initialize_state()
+    with pytest.raises(DataError, match=r"contribution has shape \[9\] for 10 primitives"):
+        policy.step_post_backward(*made, state, 0, contribution=lambda: torch.ones(9))
+    assert len(made[0]["means"]) == 10
+    assert state["pruned_at"] == -1
+
+
+def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
+    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=0.5))
+    params, optimizers = field()
+    foreign = {**params, "means": Parameter(torch.zeros(100, 3))}
+    with pytest.raises(DataError, match="optimizer of 'means'"):
+        policy.step_post_backward(
+            foreign, optimizers, policy.initialize_state(), 0, contribution=lambda: torch.ones(100)
+        )
+    assert len(foreign["means"]) == 100
+
+
+def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
+    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=0.5))
+    params, optimizers = field(10)
+    params["opacities"].data[:] = torch.nan
+    with pytest.raises(DataError, match="none of 10 primitives is finite: the training has diverged"):
+        policy.step_post_backward(params, optimizers, policy.initialize_state(), 0)
+
+
+def test_report_is_one_line_of_plain_numbers() -> None:
+    (report,), _ = run(make_policy(PruningConfig(prune_at=0)), field(), range(1))
+    assert all(type(getattr(report, f.name)) in (int, float) for f in fields(report))
+    summary = report.summary()
+    assert "\n" not in summary
+    assert summary.startswith("step 0: kept 10 of 100 primitives in ")
+    assert f"sigma {report.sigma:.3g}, tau {report.tau:.3g}, {report.isolated:,} isolated" in summary
+    (unscored,), _ = run(
+        make_policy(PruningConfig(prune_at=0, score="opacity", redistribution="none")), field(), range(1)
+    )
+    assert "sigma" not in unscored.summary()
+
+
+@pytest.mark.parametrize("edge", [{"tau": 5e-324}, {"tau": math.inf}, {"sigma": 5e-324}, {"sigma": 1e150}])
+def test_the_smallest_and_largest_edges_that_work(edge: dict[str, float]) -> None:
+    config = replace(PruningConfig(), **edge)  # type: ignore[arg-type]
+    config.validate()
+    graph = build_graph(torch.randn(50, 3), tau=config.tau, sigma=config.sigma)
+    assert not graph.weights.isnan().any()
+    if config.sigma is not None:
+        assert math.isfinite(graph.tau)
+
+
+def test_the_last_options_that_work() -> None:
+    edge = {"num_neighbors": 1, "every": 1, "start": 4, "stop": 4, "max_primitives": 1, "keep_ratio": 1.0, "gamma": 1.0}
+    PruningConfig(mode="continuous", **edge).validate()  # type: ignore[arg-type]
+
+
+def test_continuous_leaves_a_field_alone_that_holds_the_target() -> None:
+    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=1, target_primitives=100))
+    state = policy.initialize_state()
+    assert [policy.due(state, 0, n) for n in (99, 100, 101)] == [False, False, True]
+
+
+@pytest.mark.parametrize(("cap", "expected"), [(200, [70, 49, 34]), (70, [70, 49, 34]), (60, [60, 42, 29])])
+def test_continuous_under_a_cap_keeps_the_share_too(cap: int, expected: list[int]) -> None:
+    config = PruningConfig(
+        mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, max_primitives=cap, num_neighbors=4
+    )
+    reports, _ = run(make_policy(config), field(), range(13))
+    assert [report.step for report in reports] == [2, 5, 8]
+    assert [report.after for report in reports] == expected
+
+
+def test_a_field_above_the_cap_is_pruned_when_continuous_pruning_has_ended() -> None:
+    """As after a resume under a lower cap."""
+    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_primitives=100))
+    state = policy.initialize_state()
+    assert [policy.due(state, step, 101) for step in (9, 10, 30)] == [False, True, True]
+    assert not policy.due(state, 30, 100)
+
+
+def test_continuous_prunes_a_step_once() -> None:
+    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=1))
+    assert [policy.due({**policy.initialize_state(), "pruned_at": 5}, step, 100) for step in (5, 6)] == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind"), [("one-shot", OneShotPruning), ("continuous", ContinuousPruning), ("off", NoPruning)]
+)
+def test_mode_names_the_policy(mode: Any, kind: type[PruningPolicy]) -> None:
+    assert type(make_policy(PruningConfig(mode=mode))) is kind
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"keep_ratio": 0.0},
+        {"keep_ratio": 1.01},
+        {"keep_ratio": float("nan")},
+        {"gamma": -0.1},
+        {"gamma": 1.1},
+        {"mode": "sometimes"},
+        {"selection": "best"},
+        {"score": "beauty"},
+        {"signal": "noise"},
+        {"bandwidth": "guess"},
+        {"num_neighbors": 0},
+        {"every": 0},
+        {"prune_at": -1},
+        {"start": 5, "stop": 4, "mode": "continuous"},
+        {"tau": 0.0},
+        {"tau": math.nan},
+        {"sigma": -1.0},
+        {"sigma": 1e200},
+        {"sigma": math.inf},
+        {"sigma": math.nan},
+        {"max_primitives": 0, "mode": "continuous"},
+        {"max_primitives": 100},
+    ],
+)
+def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))) as caught:
+        make_policy(replace(PruningConfig(), **wrong))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"mode": "auto", "stop": 20000, "max_bytes": 1, "max_primitives": 1}, "max_bytes and max_primitives are both"),
+        ({"mode": "auto", "stop": 20000, "max_psnr_drop": 0.0}, "max_psnr_drop is 0.0"),
+        ({"mode": "auto", "stop": 14999}, "auto has no time to search"),
+        ({"mode": "auto", "stop": 20000, "rounds": 2}, "rounds is 2 but mode is auto"),
+        ({"mode": "auto", "stop": 20000, "target_primitives": 5}, "target_primitives is set but mode is auto"),
+        ({"max_bytes": 5}, "max_bytes is set but mode is one-shot: set mode to auto"),
+        ({"mode": "continuous", "max_psnr_drop": 0.1}, "max_psnr_drop is set but mode is continuous"),
+        ({"mode": "continuous", "max_primitives": 4, "target_primitives": 5}, "is more than max_primitives"),
+        ({"mode": "auto", "stop": 20000, "search_every": 0}, "search_every is 0"),
+    ],
+)
+def test_budgets_that_cannot_work_name_the_mend(options: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        PruningConfig(**options).validate()  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_a_target_may_be_the_cap() -> None:
+    PruningConfig(mode="continuous", max_primitives=5, target_primitives=5).validate()
+
+
+@pytest.mark.parametrize("budget", [{}, {"max_psnr_drop": 0.5}, {"max_bytes": 100}, {"max_primitives": 1}])
+def test_one_budget_is_enough(budget: dict[str, object]) -> None:
+    PruningConfig(mode="auto", stop=20000, **budget).validate()  # type: ignore[arg-type]
+
+
+def test_the_share_is_that_of_what_a_prune_leaves() -> None:
+    target = PruningConfig(mode="continuous", target_primitives=30)
+    assert (target.share(60), target.share(10), PruningConfig(keep_ratio=0.2).share(60)) == (0.5, 1.0, 0.2)
+    cap = PruningConfig(mode="continuous", max_primitives=30, keep_ratio=0.6)
+    assert (cap.share(60), cap.share(10)) == (0.5, 0.6)
+    assert PruningConfig(keep_ratio=0.25, rounds=2).share(60) == 0.5
+
+
+@pytest.mark.parametrize("mode", ["off", "one-shot"])
+def test_the_schedule_of_another_mode_is_not_looked_at(mode: Any) -> None:
+    PruningConfig(mode=mode, start=2000, stop=1000).validate()
