@@ -1,31 +1,61 @@
-# make demo: install, then train and evaluate the embedded scene.   make test: install if need be, then every check.
-# make browser: the viewer in a headless Chromium (apt-get install chromium), which wants a quiet machine.
+# make demo: install, then train and evaluate the embedded scene.
+# make test: install if need be, then what CI runs.   make test-all: every seed, and the viewer's tests in a browser.
+# make coverage: lines that the tests run.   make mutants: small faults that the tests
+# notice, all in half an hour, or make mutants SAMPLE=40.
+# make browser: the viewer in a headless Chromium (apt-get install chromium); it needs a quiet machine.
 PYTHON ?= python3
+WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+# Files stay whole, because their tests share trained runs. tests/conftest.py puts long files first.
+SIDE_BY_SIDE := --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test browser install clean
+.PHONY: demo test test-all lint types pytest browser coverage mutants install clean
 
 install: $(INSTALLED)
 
+# constraints.txt lists the whole set: pip has nothing to resolve, unless pip check finds that this Python needs more.
+# pip compiles one file after the other; compileall uses all cores.
 $(INSTALLED): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --constraint constraints.txt setuptools wheel
-	$(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	$(BIN)/pip install --quiet --no-deps --no-compile --requirement constraints.txt
+	$(BIN)/pip install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/pip check || $(BIN)/pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	$(BIN)/python -m compileall -q -j 0 $(VENV)/lib || true
 	touch $@
 
 demo: $(INSTALLED)
 	$(BIN)/sundae demo .demo
 
-test: $(INSTALLED)
+# mypy runs beside pytest; make waits for both and fails if one does.
+test: lint
+	$(MAKE) --no-print-directory --jobs 2 types pytest
+
+test-all: export SUNDAE_ALL_SEEDS := 1
+test-all: test browser
+
+lint: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(INSTALLED)
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q -m "not browser"
+
+pytest: $(INSTALLED)
+	$(BIN)/python -m pytest -q -m "not browser" $(SIDE_BY_SIDE)
 
 browser: $(INSTALLED)
 	$(BIN)/python -m pytest -q -m browser
 
+coverage: $(INSTALLED)
+	$(BIN)/coverage erase
+	$(BIN)/coverage run -m pytest -q -m "not browser" $(SIDE_BY_SIDE)
+	$(BIN)/coverage combine --quiet
+	$(BIN)/coverage report --skip-covered --show-missing
+
+mutants: $(INSTALLED)
+	$(BIN)/python benchmarks/mutants.py $(if $(SAMPLE),--sample $(SAMPLE))
+
 clean:
-	rm -rf $(VENV) .demo build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .demo build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage*

@@ -1,11 +1,12 @@
-"""Exported files of a run, read back by a program of others and rendered; one JSON line a file.
+"""Read exported files of a run back by another program, and render them; print one JSON line for each file.
 
     npm install @playcanvas/splat-transform          # needs node 22; or have it in PATH
     python benchmarks/bench_export.py --run RUN --views 4 --downscale 2
 
-Each file is turned into a .ply by ``splat-transform``, read from there, and rendered by the run's own rasteriser, without the
-head. ``psnr`` is against the photographs, ``psnr_model`` the same of the model's own base colours, and ``psnr_between`` of the
-file's pictures against the model's. ``theirs`` are the files that splat-transform itself makes of our .ply, for comparison.
+``splat-transform`` turns each file into a .ply, which the run's own rasteriser renders without the head. ``psnr`` is
+against the test images, ``psnr_model`` that of the model's own base colours, and ``psnr_between`` compares the two
+renderings. ``theirs`` are the files that splat-transform makes of our .ply, for comparison. Lines belong in
+results/exports.jsonl.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ def says_antialiased(ply: Path) -> bool:
         return ANTIALIASED.encode() in file.read(4096).partition(b"end_header")[0]
 
 
-def smaller(picture: Tensor, factor: int) -> Tensor:
+def smaller(image: Tensor, factor: int) -> Tensor:
     """Means of squares of pixels ``[H, W, 3]``."""
-    return avg_pool2d(picture.permute(2, 0, 1), factor).permute(1, 2, 0)
+    return avg_pool2d(image.permute(2, 0, 1), factor).permute(1, 2, 0)
 
 
 @torch.no_grad()
-def pictures_of(run: Opened, field: Mapping[str, Tensor], views: list[int], downscale: int, text: str) -> list[Tensor]:
+def images_of(run: Opened, field: Mapping[str, Tensor], views: list[int], downscale: int, text: str) -> list[Tensor]:
     model = run.model
     background = model._get_background_color()
     made = []
@@ -58,8 +59,8 @@ def pictures_of(run: Opened, field: Mapping[str, Tensor], views: list[int], down
     return made
 
 
-def mean_psnr(pictures: list[Tensor], truths: list[Tensor]) -> float:
-    return round(sum(float(psnr(a, b)) for a, b in zip(pictures, truths, strict=True)) / len(truths), 3)
+def mean_psnr(images: list[Tensor], truths: list[Tensor]) -> float:
+    return round(sum(float(psnr(a, b)) for a, b in zip(images, truths, strict=True)) / len(truths), 3)
 
 
 def main() -> None:
@@ -81,11 +82,11 @@ def main() -> None:
     antialiased = model.config.rasterize_mode == "antialiased"
     logits = model.config.sh_degree == 0
     views = torch.linspace(0, len(run.cameras) - 1, min(options.views, len(run.cameras))).round().long().tolist()
-    own = pictures_of(run, dict(model.gauss_params), views, options.downscale, "The model")
+    own = images_of(run, dict(model.gauss_params), views, options.downscale, "The model")
     truths = [
         smaller(run.truths[i], options.downscale)[: p.shape[0], : p.shape[1]] for i, p in zip(views, own, strict=True)
     ]
-    # From here on the colours are harmonics, whatever the model has.
+    # From here on the colours are SH coefficients, whatever the model has.
     model.config.sh_degree = max(model.config.sh_degree, 1)
 
     export = partial(write_for_viewers, params=scene.field, antialiased=antialiased, sigmoid_colors=logits)
@@ -106,8 +107,8 @@ def main() -> None:
         for file in files:
             back = transform(options.splat_transform, file, folder / "back.ply")
             field = {key: value.to(model.device) for key, value in read_ply(back).items()}
-            pictures = pictures_of(run, field, views, options.downscale, file.name)
-            squared = sum(float(((a - b) ** 2).mean()) for a, b in zip(pictures, own, strict=True)) / len(own)
+            images = images_of(run, field, views, options.downscale, file.name)
+            squared = sum(float(((a - b) ** 2).mean()) for a, b in zip(images, own, strict=True)) / len(own)
             result = {
                 "run": options.run.resolve().parents[1].name,
                 "file": file.name,
@@ -120,7 +121,7 @@ def main() -> None:
                 "height": own[0].shape[0],
                 "rasterizer": model.backend.name,
                 "psnr_model": mean_psnr(own, truths),
-                "psnr": mean_psnr(pictures, truths),
+                "psnr": mean_psnr(images, truths),
                 "psnr_between": None if squared == 0 else round(-10 * torch.tensor(squared).log10().item(), 2),
             }
             print(json.dumps(result), flush=True)

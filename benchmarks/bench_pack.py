@@ -1,16 +1,14 @@
-"""Packed scenes: bytes, bits a primitive, quality and seconds; one JSON line.
+"""Measure packed scenes: bytes, bits a primitive, quality and seconds; print one JSON line.
 
-    python benchmarks/bench_pack.py                              # 1,000,000 random primitives, which pack worst
-    python benchmarks/bench_pack.py --run RUN --views 6          # a finished run, at the size that it was trained at
+    python benchmarks/bench_pack.py                              # 1,000,000 random primitives
+    python benchmarks/bench_pack.py --run RUN --views 6          # a finished run, at its training resolution
     python benchmarks/bench_pack.py --run RUN --set harmonics=codebooks feature_bits=5
     python benchmarks/bench_pack.py --run RUN --views 99 --finetune 1000                # as sundae pack --finetune 1000
 
-Random primitives have no structure that an entropy coder could use; they measure time. Of a run, the test views are rendered
-before and after: ``psnr`` and ``psnr_packed`` are against the photographs, each with the head and without (``_base``), and
-``psnr_between`` is of the packed model's pictures against the unpacked one's: where it is B, a model of PSNR P keeps about
-P - 10 log10(1 + 10^((P - B) / 10)) dB. With ``--finetune`` the packed model has been trained on with rounding in the loop, and
-the other is still the run as it was; options are the coarser ones of ``FINETUNED``, changed by ``--set``. ``--plain`` leaves
-the training out, so that what these options cost by themselves can be seen.
+Random primitives have no structure for an entropy coder; they measure time. A run is rendered before and after packing:
+``psnr`` and ``psnr_packed`` are against the test images, with the head and without (``_base``); ``psnr_between``
+compares the two renderings. With ``--finetune`` the packed model trains with rounding in the loop, from the coarser
+options of ``FINETUNED``, which ``--set`` changes. Lines belong in results/packs.jsonl.
 """
 
 from __future__ import annotations
@@ -72,7 +70,7 @@ def config_of(settings: list[str], finetuned: bool) -> PackConfig:
 
 
 def prepared(run: Path | None, scene: Scene, config: PackConfig, steps: int) -> tuple[Scene, Codecs, list[float]]:
-    """The scene as it will be written, trained before if steps are given, its codecs, and the loss of each step."""
+    """The scene to write, fine-tuned for ``steps``, its codecs, and the loss of each step."""
     losses: list[float] = []
     if run is None or steps == 0:
         return *fit_scene(scene, config), losses
@@ -87,7 +85,7 @@ def prepared(run: Path | None, scene: Scene, config: PackConfig, steps: int) -> 
 
 
 def seconds(action: Callable[[], Any]) -> tuple[float, float]:
-    """Seconds on the clock, and of all cores together."""
+    """Wall-clock seconds, and processor seconds of all cores."""
     start, busy = time.perf_counter(), time.process_time()
     action()
     return time.perf_counter() - start, time.process_time() - busy
@@ -113,9 +111,9 @@ def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
     sums = {name + suffix: 0.0 for name in names for suffix in ("", "_base")}
     for i in track(chosen, description="Rendering", transient=True):
         camera, truth = before.cameras[i], before.truths[i]
-        pictures: list[dict[str, Tensor]] = [model.get_outputs_for_camera(camera) for model in (before.model, after)]
+        images: list[dict[str, Tensor]] = [model.get_outputs_for_camera(camera) for model in (before.model, after)]
         for suffix, output in (("", "rgb"), ("_base", "base_rgb")):
-            old, new = (picture[output].clamp(0, 1) for picture in pictures)
+            old, new = (image[output].clamp(0, 1) for image in images)
             # Errors of all views together: PSNR is their logarithm.
             for name, (a, b) in zip(names, ((old, truth), (new, truth), (new, old)), strict=True):
                 value = float(psnr(a, b))
@@ -141,14 +139,13 @@ def main() -> None:
     parser.add_argument(
         "--finetune", type=int, default=0, metavar="STEPS", help="train with rounding in the loop first"
     )
-    parser.add_argument("--plain", action="store_true", help="with --finetune: its options, but no training")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
 
     torch.set_num_threads(options.threads)
     config = config_of(options.set, options.finetune > 0)
-    steps = 0 if options.plain else options.finetune
+    steps = options.finetune
     scene = random_scene(options.primitives) if options.run is None else scene_of_run(options.run)
     with tempfile.TemporaryDirectory() as name:
         file = Path(name) / "scene.sundae"
@@ -161,7 +158,6 @@ def main() -> None:
         result = {
             "run": None if options.run is None else options.run.resolve().parents[1].name,
             "set": options.set,
-            "finetune": options.finetune,
             "finetune_steps": steps,
             "threads": options.threads,
             **sizes(report),

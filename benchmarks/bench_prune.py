@@ -1,9 +1,11 @@
-"""Time of a prune by the default rule, part by part: python benchmarks/bench_prune.py CHECKPOINT [--points 500000].
+"""Time a prune by the default rule, part by part; print one JSON line.
 
-The field of a checkpoint is repeated, with jitter, until there are so many primitives: clusters, flat primitives and floaters
-are those of a trained field. Contributions are drawn at random, for the pass over the training views is not timed. Times are
-in seconds of the processor (all threads) on a CPU, which other work on the machine hardly disturbs, and of the wall clock on a
-GPU; ``ratio`` is to the graph of centres alone in the same run. One line goes to ``benchmarks/results/prune.jsonl``.
+    python benchmarks/bench_prune.py CHECKPOINT --points 500000 >> benchmarks/results/prune.jsonl
+
+The field of a checkpoint is repeated with jitter up to ``--points``, so that clusters, flat primitives and floaters are
+those of a trained field. Contributions are random; the pass over the training views is not timed. Times are processor
+seconds of all threads on a CPU, and wall-clock seconds on a GPU; ``ratio`` is relative to the graph of centres in the
+same run.
 """
 
 from __future__ import annotations
@@ -17,7 +19,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import run
 import torch
 from torch import Tensor
 
@@ -32,16 +33,16 @@ from sundae_ns.pruning import (
 )
 from sundae_ns.storage.runs import checkpoint
 
-RESULTS = Path(__file__).parent / "results" / "prune.jsonl"
 PREFIX = "_model.gauss_params."
 
 
 def field_of(path: Path, points: int, device: str) -> dict[str, Tensor]:
+    """The field of a checkpoint, repeated with jitter up to a number of points."""
     entries = checkpoint.load(path)["pipeline"]
     whole = {name.removeprefix(PREFIX): v.float() for name, v in entries.items() if name.startswith(PREFIX)}
     count = len(whole["means"])
     field = {name: value[torch.arange(points) % count].clone() for name, value in whole.items()}
-    # Half the size of the primitive itself: where a trained field has its neighbours.
+    # Half the size of the primitive: the distance of neighbours in a trained field.
     jitter = torch.randn(points, 3, generator=torch.Generator().manual_seed(0))
     jitter[:count] = 0
     field["means"] += 0.5 * field["scales"].exp().amax(dim=1, keepdim=True) * jitter
@@ -54,7 +55,6 @@ def main() -> None:
     parser.add_argument("--points", type=int, default=500_000)
     parser.add_argument("--keep", type=float, default=0.1)
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--results", type=Path, default=RESULTS)
     options = parser.parse_args()
     params = field_of(options.checkpoint, options.points, options.device)
     weight = torch.rand(options.points, generator=torch.Generator().manual_seed(1)).to(options.device)
@@ -72,12 +72,12 @@ def main() -> None:
         return result
 
     if not on_cpu:
-        decide(params, config, lambda: weight)  # kernels are compiled by the first
+        decide(params, config, lambda: weight)  # compile the kernels
         torch.cuda.reset_peak_memory_stats()
     before = _memory(on_cpu)
 
     def parts() -> float:
-        """Share of primitives without an heir. The graph is gone when the whole is measured."""
+        """Share of primitives without an heir. Frees the graph before the whole is measured."""
         timed("graph of centres", lambda: field_graph(params, replace(config, edges="centres")))
         graph = timed("graph with appearance", lambda: field_graph(params, config))
         count = round(options.keep * options.points)
@@ -99,12 +99,11 @@ def main() -> None:
         "ratio": {name: round(value / seconds["graph of centres"], 2) for name, value in seconds.items()},
         "extra_mib": round(_memory(on_cpu) - before),
     }
-    print(json.dumps(line, indent=2))
-    run.append_line(options.results, line)
+    print(json.dumps(line))
 
 
 def _memory(on_cpu: bool) -> float:
-    """Most memory so far, MiB."""
+    """Peak memory so far, MiB."""
     if on_cpu:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return torch.cuda.max_memory_allocated() / 2**20

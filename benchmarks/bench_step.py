@@ -1,37 +1,55 @@
-"""Time a training step of ``sundae-tiny`` with its head; print one JSON line.
+"""Time training steps, the loss, or the heads alone; print one JSON line for each row.
 
-    python benchmarks/bench_step.py                       # 128 x 128, 5,000 primitives
+    python benchmarks/bench_step.py                            # sundae-tiny on a CPU, 128 x 128, 5,000 primitives
     python benchmarks/bench_step.py --primitives 20000 --size 256 --device cuda
+    python benchmarks/bench_step.py loss --device cuda         # fused kernels and convolutions, with their errors
+    python benchmarks/bench_step.py heads                      # on CUDA, each head as one CUDA graph
 
-The step is the whole of it: render, head, losses, backward pass, optimizers. The times are medians, device waited for.
+A step is render, head, losses, backward pass and optimizers. Times are medians in milliseconds, device waited for.
+Errors of a loss are distances from the convolutions in float64; the gradient's is relative to its norm. Of the heads,
+``ms_HxW`` is a frame in fp16 as the model runs it, ``ms_train_HxW`` forward and backward in bf16 with fp32 weights;
+``layers`` is the network layer by layer, without the kernels.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable, Iterator
 from copy import deepcopy
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.optimizers import Optimizers
+from pytorch_msssim import SSIM
+from torch import Tensor
 
+from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import median_ms
+from sundae_ns.gpu.cuda_graphs import record, warm_up
 from sundae_ns.method_configs import sundae_tiny
+from sundae_ns.training import losses
+
+SIZES = ((533, 800), (824, 1240), (1893, 1061))
+"""Height and width of the images of the loss and of the heads, pixels."""
+SSIM_WEIGHT = 0.2
+HEADS = (
+    HeadConfig(size="tiny"),
+    HeadConfig(size="compact"),
+    HeadConfig(size="wide"),
+    *(HeadConfig(size=size, pixel_unshuffle=1) for size in ("small", "regular", "large")),  # the paper's
+)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--primitives", type=int, default=5000)
-    parser.add_argument("--size", type=int, default=128)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--repeats", type=int, default=30)
-    options = parser.parse_args()
-
+def steps(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """A step of ``sundae-tiny`` with its head and without."""
     torch.manual_seed(0)
     config = deepcopy(sundae_tiny.config)
-    # Points in a ball that fills the picture, as the demo's scene does.
+    # Points in a ball that fills the image, as in the demo's scene.
     points = torch.nn.functional.normalize(torch.randn(options.primitives, 3), dim=1)
     points *= torch.rand(options.primitives, 1) ** (1 / 3)
     colors = torch.randint(0, 256, points.shape)
@@ -48,32 +66,118 @@ def main() -> None:
     size, focal = options.size, float(options.size)
     camera = Cameras(pose, focal, focal, size / 2, size / 2, size, size).to(options.device)
     batch = {"image": torch.rand(size, size, 3, device=options.device)}
-
     # A step between the prune and the end.
     model.step = config.max_num_iterations
 
     def step() -> None:
         optimizers.zero_grad_all()
         outputs = model(camera)
-        losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
-        torch.stack(list(losses.values())).sum().backward()
+        values = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
+        torch.stack(list(values.values())).sum().backward()
         optimizers.optimizer_step_all()
 
-    times = {"with_head": median_ms(step, device=options.device, repeats=options.repeats)}
+    with_head = median_ms(step, device=options.device, repeats=options.repeats)
     model.config.head.start_at = 2 * config.max_num_iterations
-    times["without"] = median_ms(step, device=options.device, repeats=options.repeats)
-    result = {
+    without = median_ms(step, device=options.device, repeats=options.repeats)
+    yield {
         "primitives": options.primitives,
         "size": size,
-        "device": options.device,
         "backend": model.backend.name,
-        "threads": torch.get_num_threads(),
         "features": model.num_features,
-        "ms_step_with_head": round(times["with_head"].median_ms, 1),
-        "ms_step_without_head": round(times["without"].median_ms, 1),
-        "ms_step_with_head_p90": round(times["with_head"].p90_ms, 1),
+        "ms_step_with_head": round(with_head.median_ms, 1),
+        "ms_step_without_head": round(without.median_ms, 1),
+        "ms_step_with_head_p90": round(with_head.p90_ms, 1),
     }
-    print(json.dumps(result))
+
+
+def loss(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """The loss of an image and its gradient: by the fused kernels on CUDA, and by convolutions."""
+
+    def convolved(dtype: torch.dtype) -> Callable[[Tensor, Tensor], Tensor]:
+        ssim = SSIM(data_range=1.0, channel=3)
+        ssim.win = ssim.win.to(options.device, dtype)  # no buffer: moving the module would leave it
+        return lambda image, target: losses.convolved_loss(image, target, ssim, SSIM_WEIGHT)
+
+    def graded(way: Callable[[Tensor, Tensor], Tensor], image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        leaf = image.detach().requires_grad_()
+        value = way(leaf, target)
+        return value.detach(), torch.autograd.grad(value, leaf)[0]
+
+    ways = {"convolutions": convolved(torch.float32)}
+    if options.device == "cuda":
+        ways["fused"] = lambda image, target: losses.fused_loss(image, target, SSIM_WEIGHT)[0]
+    for height, width in SIZES:
+        torch.manual_seed(0)
+        target = torch.rand(height, width, 3, device=options.device)
+        image = (target + 0.1 * torch.randn_like(target)).clamp(0, 1)
+        exact, slope = graded(convolved(torch.float64), image.double(), target.double())
+        for name, way in ways.items():
+            value, gradient = graded(way, image, target)
+            timing = median_ms(partial(graded, way, image, target), device=options.device, repeats=options.repeats)
+            yield {
+                "way": name,
+                "height": height,
+                "width": width,
+                "ms": round(timing.median_ms, 3),
+                "loss_error": abs(float(value) - float(exact)),
+                "gradient_rel_error": float((gradient - slope).norm() / slope.norm()),
+            }
+
+
+def heads(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """Each head alone, in inference and in training."""
+    for config in HEADS:
+        line: dict[str, Any] = {name: getattr(config, name) for name in ("size", "num_features", "pixel_unshuffle")}
+        line["parameters"] = sum(p.numel() for p in CompensationHead(config).parameters())
+        for height, width in SIZES:
+            line |= {f"{name}_{height}x{width}": round(ms, 3) for name, ms in _head_ms(config, height, width).items()}
+        yield line
+
+
+def _head_ms(config: HeadConfig, height: int, width: int) -> dict[str, float]:
+    """Milliseconds of one head on images of one size."""
+    splat = torch.rand(height, width, 3 + config.num_features, device="cuda")
+    base, alpha = torch.rand_like(splat[..., :3]), torch.rand_like(splat[..., :1])
+    # [H, W, C] as splatted, seen as [1, C, H, W].
+    inputs = torch.rand(1, height, width, config.num_features + 4, device="cuda").half().permute(0, 3, 1, 2)
+    net = CompensationHead(config).net.cuda().half()
+    head = CompensationHead(replace(config, precision="fp16")).cuda().eval()
+    with torch.no_grad():
+        with warm_up(inputs.device):
+            for _ in range(3):
+                net(inputs)
+        graph = record(lambda: net(inputs), inputs.device)[0]
+        found = {"ms_layers": median_ms(graph.replay, device=inputs.device).median_ms}
+        found["ms"] = median_ms(partial(head, base, splat, alpha), device=inputs.device, warmup=10).median_ms
+    leaves = [image.clone().requires_grad_() for image in (splat, alpha)]
+    for name, fused in (("ms_train", True), ("ms_train_layers", False)):
+        trained = CompensationHead(replace(config, fused=fused)).cuda()
+
+        def step(trained: CompensationHead = trained) -> None:
+            out = trained(base, *leaves)
+            out.backward(torch.ones_like(out))
+
+        found[name] = median_ms(step, device=inputs.device).median_ms
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parts = {"steps": steps, "loss": loss, "heads": heads}
+    parser.add_argument("part", nargs="?", choices=parts, default="steps")
+    parser.add_argument("--primitives", type=int, default=5000, help="of the step")
+    parser.add_argument("--size", type=int, default=128, help="side of the step's images, pixels")
+    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cpu; heads: cuda")
+    parser.add_argument("--repeats", type=int, default=30, help="timed runs; their median counts")
+    options = parser.parse_args()
+    options.device = options.device or ("cuda" if options.part == "heads" else "cpu")
+    if options.device == "cuda" and not torch.cuda.is_available():
+        parser.error("there is no CUDA device here; sundae doctor says more")
+    if options.part == "heads" and options.device != "cuda":
+        parser.error("heads are timed on CUDA; leave --device out")
+    device = torch.cuda.get_device_name() if options.device == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+    for line in parts[options.part](options):
+        print(json.dumps({**line, "device": device}), flush=True)
 
 
 if __name__ == "__main__":

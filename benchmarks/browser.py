@@ -1,17 +1,28 @@
-"""Chromium, driven by its own DevTools protocol: what the browser's test and ``browser_training.py`` share.
+"""nerfstudio's viewer in a headless Chromium, while training; print one JSON line.
 
-The protocol is JSON over a websocket, and a websocket library comes with viser: a driver of a few calls needs no further
-dependency, and none that has to match the version of a distribution's Chromium. The browser runs without a display and
-renders WebGL in software. Host names are not resolved, so that nothing but this machine's loopback can be reached.
+    python benchmarks/browser.py --seconds 300          # needs a Chromium (apt-get install chromium)
+
+Trains with the viewer open, moves the camera and uses the controls, and watches the render thread and memory. Exits
+with 1 if the viewer falls silent, a log has an error, training stands still, or the training process still grows by
+more than ``--allowed`` megabytes a minute in the second half.
+
+The driver talks Chromium's own DevTools protocol, which is JSON over a websocket; viser brings the websocket library.
+So there is no further dependency whose version has to match the browser. ``tests/integration/test_browser.py`` uses the
+driver too. The browser needs no display and renders WebGL in software. It resolves no host names, and reaches only this
+machine's loopback.
 """
 
 from __future__ import annotations
 
+import argparse
 import base64
 import io
+import itertools
 import json
 import os
 import queue
+import random
+import re
 import shutil
 import signal
 import socket
@@ -29,10 +40,13 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
+
+from sundae_ns.data import write_embedded_capture
 
 FLAGS = """
 --headless=new --no-sandbox --no-first-run --disable-dev-shm-usage --disable-background-networking --disable-sync
@@ -52,12 +66,12 @@ def find_chromium() -> str | None:
 
 
 class BrowserError(RuntimeError):
-    """The browser did not do what was asked, in time."""
+    """The browser did not react in time, or refused a call."""
 
 
 @dataclass
 class Camera:
-    """Camera of the page, as it last told the viewer: OpenCV axes, in the viewer's units."""
+    """Camera of the page, from its last message to the viewer: OpenCV axes, in the viewer's units."""
 
     wxyz: tuple[float, float, float, float]
     position: tuple[float, float, float]
@@ -85,8 +99,8 @@ class Browser:
         self.errors: list[str] = []
         """What the page wrote to its console as an error, and exceptions that it did not catch; without ``KNOWN``."""
         self.camera: Camera | None = None
-        self.pictures: list[tuple[int, int]] = []
-        """Width and height of every picture that the viewer has sent."""
+        self.images: list[tuple[int, int]] = []
+        """Width and height of every image that the viewer has sent."""
 
     # ------------------------------------------------------------------------------------------- life of the browser
 
@@ -133,7 +147,7 @@ class Browser:
         self._page = self.call("Target.attachToTarget", {"targetId": page, "flatten": True}, browser=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
-        # The page talks to the viewer in a worker, which is stopped at its start so that nothing it says is missed.
+        # The page talks to the viewer in a worker; it waits at its start until its messages are recorded.
         self.call("Target.setAutoAttach", {"autoAttach": True, "waitForDebuggerOnStart": True, "flatten": True})
         width, height = self._size
         self.call(
@@ -244,8 +258,8 @@ class Browser:
     def _on_received(self, message: Any) -> None:
         for part in _messages(message):
             if part.get("type") == "BackgroundImageMessage":
-                with Image.open(io.BytesIO(part["rgb_bytes"])) as picture:
-                    self.pictures.append(picture.size)
+                with Image.open(io.BytesIO(part["rgb_bytes"])) as image:
+                    self.images.append(image.size)
 
     # ------------------------------------------------------------------------------------------------------- the page
 
@@ -263,10 +277,10 @@ class Browser:
         return found["result"].get("value")
 
     def screenshot(self) -> NDArray[np.uint8]:
-        """What the page shows ``[H, W, 3]``."""
+        """The page as shown ``[H, W, 3]``."""
         data = self.call("Page.captureScreenshot", {"format": "png"})["data"]
-        with Image.open(io.BytesIO(base64.b64decode(data))) as picture:
-            return np.asarray(picture.convert("RGB"))
+        with Image.open(io.BytesIO(base64.b64decode(data))) as image:
+            return np.asarray(image.convert("RGB"))
 
     def mouse(self, kind: str, x: float, y: float, pressed: bool = False) -> None:
         """One event of the mouse: ``mouseMoved``, ``mousePressed`` or ``mouseReleased``, at a pixel of the page."""
@@ -297,7 +311,7 @@ class Browser:
 
 
 def _unpack(response: dict[str, Any]) -> Any:
-    """A message of viser's websocket; None for what is no binary frame."""
+    """A message of viser's websocket; None unless the frame is binary."""
     return msgspec.msgpack.decode(base64.b64decode(response["payloadData"])) if response["opcode"] == 2 else None
 
 
@@ -337,14 +351,14 @@ const middle = e => {
 OPTIONS = "[...document.querySelectorAll('[role=option]')].filter(e => e.getBoundingClientRect().height)"
 _AFTER_FRAMES = "requestAnimationFrame(() => requestAnimationFrame(() => requestAnimationFrame(done)))"
 SLOW = 30.0
-"""Seconds after which a page that does not react is given up."""
+"""Seconds that a page has to react."""
 
 
 class ViewerPage(Browser):
     """nerfstudio's viewer in a page, used through its controls with mouse and keyboard."""
 
     seen: NDArray[np.uint8]
-    """The page as it was when it last came to rest, ``[H, W, 3]``."""
+    """Screenshot of the page when it last came to rest ``[H, W, 3]``."""
 
     def _script(self, body: str) -> Any:
         return self.evaluate(f"(() => {{ {CONTROL} return {body}; }})()")
@@ -373,7 +387,7 @@ class ViewerPage(Browser):
         wait_for(lambda: self.evaluate(f"{OPTIONS}.length > 0"), f"the options of {name!r}", SLOW)
 
     def options(self, name: str) -> list[str]:
-        """What a menu offers."""
+        """Options of a menu."""
         self._unfold(name)
         found = self.evaluate(f"{OPTIONS}.map(e => e.innerText.trim())")
         self.key("Escape", 27)
@@ -415,41 +429,40 @@ class ViewerPage(Browser):
         return left, top, width, height
 
     def settle(self, act: Callable[[], Any] | None = None, longest: int = 512) -> Any:
-        """Do something and wait for the picture that the viewer then draws at full size; what ``act`` returned.
+        """Call ``act`` and wait for the viewer's image at full size; the result of ``act``.
 
-        The viewer answers with a small picture first and, when nothing more happens, with one whose longer side is
-        ``longest``; one that was on its way before the act is of full size too.
+        The viewer answers with a small image first and then, if nothing more happens, with one whose longer side is
+        ``longest``. An image that was on its way before the act is of full size too.
         """
-        start = len(self.pictures)
+        start = len(self.images)
         result = None if act is None else act()
         latest = [start, time.monotonic()]
 
         def done() -> bool:
-            sizes = [max(size) for size in self.pictures[start:]]
+            sizes = [max(size) for size in self.images[start:]]
             if start + len(sizes) != latest[0]:
                 latest[:] = [start + len(sizes), time.monotonic()]
             if not sizes or sizes[-1] != longest:
                 return False
-            # Where drawing is fast enough, the first picture is of full size as well; if it is the only one, it is either
-            # the last one, or was on its way before.
+            # A fast machine draws the first image at full size; a single image may also have been on its way before.
             return min(sizes) < longest or time.monotonic() - latest[1] > (2 if len(sizes) > 1 else 6)
 
         try:
-            wait_for(done, "a picture of full size", 2 * SLOW)
+            wait_for(done, "an image of full size", 2 * SLOW)
         except BrowserError as error:
-            raise BrowserError(f"{error}; there came {self.pictures[start:]}") from error
-        width, height = self.pictures[-1]
+            raise BrowserError(f"{error}; images were {self.images[start:]}") from error
+        width, height = self.images[-1]
         shown = f"document.body.innerText.includes('Resolution: {width}x{height}px')"
         wait_for(lambda: bool(self.evaluate(shown)), "the page to show it", SLOW)
         self.seen = self.still()
         return result
 
     def rest(self, seconds: float = 1.5) -> None:
-        """Wait until camera and picture have stayed as they are for some time; a page glides on after a drag."""
+        """Wait until camera and image rest for some time; a page glides on after a drag."""
         state: list[Any] = [None, 0.0]
 
         def resting() -> bool:
-            now = (self.camera, len(self.pictures))
+            now = (self.camera, len(self.images))
             if now != state[0]:
                 state[:] = [now, time.monotonic()]
             return time.monotonic() - float(state[1]) > seconds
@@ -473,8 +486,8 @@ class Server:
 
     Args:
         command: name in the environment's folder of commands, and its arguments without those of the viewer.
-        log: file for what it writes.
-        ready: words in its output after which it may be talked to.
+        log: file for its output.
+        ready: words in its output that say that it is ready.
     """
 
     def __init__(self, command: Sequence[object], log: Path, ready: str) -> None:
@@ -491,15 +504,15 @@ class Server:
             )
 
     def output(self) -> str:
-        """What it has written so far."""
+        """Its output so far."""
         return self._log.read_text(errors="replace")
 
     def complaints(self) -> list[str]:
-        """Words in its output that speak of errors."""
+        """Words in its output that report errors."""
         return [word for word in ("Traceback", "Exception", "Error") if word in self.output()]
 
     def listens(self) -> bool:
-        """Whether a browser may come.
+        """Whether it accepts a browser.
 
         Raises:
             BrowserError: it has ended.
@@ -511,10 +524,111 @@ class Server:
         return False
 
     def stop(self) -> None:
-        """End it, kindly for ten seconds."""
+        """Terminate it; kill it after ten seconds."""
         self.process.terminate()
         try:
             self.process.wait(10)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
+
+
+# --------------------------------------------------------------------------------------------------------------- training
+
+
+PRUNE_AT = 300
+STEP = re.compile(r"(\d+) \(\d+\.\d+%\)")
+"""nerfstudio's table of progress."""
+SLICE = 30.0
+"""In every period of this many seconds images must arrive."""
+
+
+def resident(pid: int) -> float:
+    """Megabytes of a process in the host's memory."""
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def last_step(log: str) -> int:
+    """Last step in the log; -1 before the first."""
+    found = STEP.findall(log[-20_000:])
+    return int(found[-1]) if found else -1
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=300.0)
+    parser.add_argument("--allowed", type=float, default=5.0, help="megabytes a minute")
+    options = parser.parse_args()
+    chromium = find_chromium()
+    if chromium is None:
+        sys.exit("no Chromium here; apt-get install chromium")
+    chance = random.Random(0)
+    with tempfile.TemporaryDirectory() as folder:
+        scene = write_embedded_capture(
+            Path(folder) / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1
+        )
+        words = ["ns-train", "sundae-tiny", "--data", scene, "--output-dir", Path(folder) / "out", "--vis", "viewer"]
+        words += ["--max-num-iterations", 10_000_000, "--steps-per-save", 10_000_000, "--logging.steps-per-log", 10]
+        words += ["--pipeline.model.pruning.prune-at", PRUNE_AT, "--pipeline.model.warmup-length", 5]
+        server = Server(words, Path(folder) / "train.log", "(0.00%)")
+        try:
+            with ViewerPage(chromium, 640, 400) as page:
+                wait_for(server.listens, "ns-train", 180)
+                page.open(server.address)
+                wait_for(lambda: bool(page.images), "the first image", 60)
+                wait_for(lambda: last_step(server.output()) > PRUNE_AT, "the prune", 300)
+                page.press("Hide Train Cams")
+                outputs = page.options("Output type")
+                acts = itertools.cycle(
+                    [
+                        *(lambda name=name: page.choose("Output type", name) for name in outputs),
+                        lambda: page.choose("Output type", outputs[0]),
+                        lambda: page.tick("Neural compensation", False),
+                        lambda: page.slide("Keep ratio", 0.3),
+                        lambda: page.slide("Keep ratio", 0.05),
+                        lambda: page.slide("Keep ratio", 1.1),
+                        lambda: page.tick("Neural compensation", True),
+                    ]
+                )
+                start, first_step = time.monotonic(), last_step(server.output())
+                samples, arrived, acted, next_act = [], [len(page.images)], 0, start
+                while (now := time.monotonic()) < start + options.seconds:
+                    if now >= next_act:
+                        next(acts)()
+                        acted, next_act = acted + 1, now + 5
+                    page.drag(200, 250, 200 + chance.uniform(-80, 80), 250 + chance.uniform(-30, 30), seconds=0.5)
+                    samples.append((now - start, resident(server.process.pid), last_step(server.output())))
+                    if now - start > SLICE * len(arrived):
+                        arrived.append(len(page.images))
+                arrived.append(len(page.images))
+                errors = list(page.errors)
+            listening, complaints = server.listens(), server.complaints()
+        finally:
+            server.stop()
+
+    seconds, memory, steps = np.array(samples, dtype=float).T
+    late = seconds > seconds[-1] / 2
+    growth = float(np.polyfit(seconds[late], memory[late], 1)[0]) * 60
+    slices = np.diff(arrived).tolist()
+    result = {
+        "seconds": round(float(seconds[-1]), 1),
+        "steps": int(steps[-1]) - first_step,
+        "controls_used": acted,
+        "camera_moves": len(samples),
+        "images": arrived[-1] - arrived[0],
+        "images_in_the_poorest_30_s": min(slices),
+        "page_errors": errors,
+        "log_errors": complaints,
+        "host_mb_first": round(float(memory[0]), 1),
+        "host_mb_middle": round(float(memory[late][0]), 1),
+        "host_mb_last": round(float(memory[-1]), 1),
+        "host_mb_a_minute_second_half": round(growth, 2),
+        "device": torch.cuda.get_device_name(0) if torch.cuda.is_available() else "cpu",
+    }
+    print(json.dumps(result))
+    stuck = min(slices) == 0 or steps[-1] <= steps[late][0]
+    sys.exit(int(stuck or bool(errors) or bool(complaints) or not listening or growth > options.allowed))
+
+
+if __name__ == "__main__":
+    main()

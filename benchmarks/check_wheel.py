@@ -1,9 +1,9 @@
-"""Build the wheel, install it where the repository is not, and use it: methods, types, demo; print one JSON line.
+"""Build the wheel, install it outside the repository, and use it: methods, doctor, demo; print one JSON line.
 
     python benchmarks/check_wheel.py                 # a few minutes on a CPU; --demo-steps 0 leaves the demo out
 
-The environment is a fresh one with nothing in it but the wheel; what the wheel depends on (torch, nerfstudio and theirs) is
-lent to it by the environment that this script runs in. Exits with 1 if anything is missing.
+The environment is fresh and holds only the wheel; its dependencies come from the environment that runs this script.
+Exits with 1 if anything is missing.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def run(*words: object, cwd: Path, **variables: str) -> str:
 
 
 def packaged() -> set[str]:
-    """Files of the package that git knows, as they are named in a wheel."""
+    """Files of the package in git, by their names in a wheel."""
     listed = run("git", "ls-files", "sundae_ns", "method_configs", cwd=ROOT).split()
     return {name.replace("method_configs/", "sundae_ns/method_configs/", 1) for name in listed}
 
@@ -68,7 +68,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         wheel_options = ["--no-deps", "--no-build-isolation", "--wheel-dir", folder]
-        # From a copy: setuptools leaves a build folder beside its sources.
+        # From a clone: setuptools leaves a build folder beside its sources.
         run("git", "clone", "--quiet", ROOT, folder / "source", cwd=folder)
         run(sys.executable, "-m", "pip", "wheel", *wheel_options, folder / "source", cwd=folder)
         (wheel,) = folder.glob("*.whl")
@@ -80,7 +80,7 @@ def main() -> None:
         python = clean / "bin" / "python"
         run(sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--no-deps", wheel, cwd=folder)
         (site,) = clean.glob("lib/python*/site-packages")
-        lent = [path for path in sys.path if path.endswith("site-packages") and Path(path) != site]
+        lent = [path for path in sys.path if any(Path(path).glob("*.dist-info"))]
         (site / "lent.pth").write_text("\n".join(lent or [sysconfig.get_path("purelib")]))
         for command, module in (("ns-train", "train"), ("ns-eval", "eval")):
             (clean / "bin" / command).write_text(SCRIPT.format(python=python, module=module))

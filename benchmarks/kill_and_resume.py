@@ -3,8 +3,8 @@
     python benchmarks/kill_and_resume.py                      # 20 kills: while saving, while pruning, at any time
     python benchmarks/kill_and_resume.py --kills 3 --seed 1
 
-Every run is nerfstudio's own training command on the embedded scene, in a process of its own: it is forked off one that has
-nerfstudio imported and no threads, so that a start takes no ten seconds. Exits with 1 if any resumed run ended differently.
+Every run is nerfstudio's own training command on the embedded scene, in a process of its own. A server process without
+threads imports nerfstudio once and forks the runs. Exits with 1 if any resumed run ended differently.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from rich.progress import track
 import sundae_ns.pruning.cutting
 import sundae_ns.storage.atomic
 import sundae_ns.storage.runs.checkpoint
-import sundae_ns.training.after_step
-from sundae_ns.data import write_scene
+import sundae_ns.training.report
+from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import CheckpointError
 
 STEPS, SAVE_EVERY, PRUNE_AT = 70, 12, 36
 LONGEST = 600.0
-"""Seconds after which a run of some ten hangs."""
+"""Seconds after which a run counts as hanging; it takes about ten."""
 
-# Forked off this process, which has threads (a progress bar's, torch's), a run could wait for ever for what one of them held.
+# This process has threads (a progress bar's, torch's): a run forked off it could wait for ever for a lock of theirs.
 SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(["nerfstudio.scripts.train", "sundae_ns.model", "sundae_ns.trainer"])
 
@@ -62,7 +62,7 @@ def die() -> None:
 
 
 def after(calls: int, module: Any, name: str, place: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
-    """From the ``calls``-th call of ``module.name`` on, call ``place(original)`` in its stead."""
+    """Replace ``module.name`` by ``place(original)`` from its ``calls``-th call on."""
     original, seen = getattr(module, name), [0]
 
     def wrapper(*arguments: Any, **options: Any) -> Any:
@@ -110,13 +110,13 @@ PLACES: dict[str, Callable[[int], None]] = {
     "save: the older one not yet gone": lambda n: after(n, sundae_ns.storage.runs.checkpoint, "save", when_done),
     "prune: deciding": lambda n: after(1, sundae_ns.pruning.cutting, "decide", at_once),
     "prune: sliced": lambda n: after(1, sundae_ns.pruning.cutting, "keep", when_done),
-    "prune: half recorded": lambda n: after(1, sundae_ns.training.after_step, "write_text", half_recorded),
+    "prune: half recorded": lambda n: after(1, sundae_ns.training.report, "write_text", half_recorded),
 }
 ANY = "any time"
 
 
 def plan(kills: int, rng: random.Random) -> list[str]:
-    """Where the kills fall: first one at each place, then at random, half of the rest at any time."""
+    """Places of the kills: one at each, then random ones; half of the rest at any time."""
     places = [ANY, *PLACES][:kills]
     while len(places) < kills:
         places.append(ANY if len(places) % 2 else rng.choice(list(PLACES)))
@@ -124,7 +124,7 @@ def plan(kills: int, rng: random.Random) -> list[str]:
 
 
 def train_here(config: TrainerConfig, log: Path, place: str | None, nth: int) -> None:
-    """What a process of its own does: train, its output in ``log``, and die at the ``nth`` time at ``place``."""
+    """Train in this process, with its output in ``log``; die the ``nth`` time that ``place`` is reached."""
     torch.set_num_threads(1)
     with open(log, "a") as file:
         os.dup2(file.fileno(), 1)
@@ -142,28 +142,28 @@ def start(config: TrainerConfig, log: Path, place: str | None = None, nth: int =
 
 
 def ended(child: BaseProcess, log: Path) -> int:
-    """Wait for a process; its exit code, negative for the signal that ended it."""
+    """Wait for a process; its exit code, or minus the signal that ended it."""
     child.join(LONGEST)
     if child.exitcode is None:
         child.kill()
         child.join()
-        raise SystemExit(f"a run did not end within {LONGEST} s; it came so far:\n{log.read_text()[-3000:]}")
+        raise SystemExit(f"a run did not end within {LONGEST} s; the end of its log:\n{log.read_text()[-3000:]}")
     return child.exitcode
 
 
 def finish(child: BaseProcess, log: Path) -> None:
     code = ended(child, log)
     if code != 0:
-        raise SystemExit(f"a run failed with exit code {code}; it ended so:\n{log.read_text()[-3000:]}")
+        raise SystemExit(f"a run failed with exit code {code}; the end of its log:\n{log.read_text()[-3000:]}")
 
 
 def was_killed(child: BaseProcess, log: Path) -> bool:
-    """Wait for a process, and say whether it was killed."""
+    """Wait for a process; whether it was killed."""
     return ended(child, log) == -signal.SIGKILL
 
 
 def kill_at_any_time(config: TrainerConfig, log: Path, seconds: float, rng: random.Random) -> bool:
-    """Start a run that takes about so many seconds, and kill it; anew where it has ended by then."""
+    """Start a run that takes about ``seconds``, and kill it; try again if it ended before. Whether it was killed."""
     for _ in range(10):
         child = start(config, log)
         time.sleep(rng.uniform(0.0, seconds))
@@ -171,7 +171,7 @@ def kill_at_any_time(config: TrainerConfig, log: Path, seconds: float, rng: rand
         if was_killed(child, log):
             return True
         shutil.rmtree(run_folder(config))
-        seconds *= 0.8  # the machine has less to do than it had
+        seconds *= 0.8  # the machine has become faster
     return False
 
 
@@ -180,7 +180,7 @@ def run_folder(config: TrainerConfig) -> Path:
 
 
 def outcome(folder: Path) -> dict[str, Any]:
-    """What a finished run left: tensors of the final checkpoint, the record of its prune, and names of its files."""
+    """Result of a finished run: tensors of the final checkpoint, the record of its prune, and names of its files."""
     models = folder / "nerfstudio_models"
     state = sundae_ns.storage.runs.checkpoint.load(models / f"step-{STEPS - 1:09d}.ckpt")
     prunes = json.loads((folder / "prune.json").read_text())
@@ -205,7 +205,7 @@ def main() -> None:
     root = options.out or Path(tempfile.mkdtemp(prefix="kill-and-resume-"))
     root.mkdir(parents=True, exist_ok=True)
     log = root / "log"
-    write_scene(root / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
+    write_embedded_capture(root / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
     arguments = ["sundae-tiny", "--data", str(root / "scene"), *OPTIONS]
     parsed = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)
 
@@ -217,7 +217,7 @@ def main() -> None:
     whole = configured("whole")
     finish(start(whole, log), log)
     began = time.monotonic()
-    expected = configured("again")  # a second time: how long a run takes, and whether the same seed gives the same
+    expected = configured("again")  # again: the time of a run, and whether the same seed gives the same
     finish(start(expected, log), log)
     seconds = time.monotonic() - began
     reference, again = outcome(run_folder(whole)), outcome(run_folder(expected))

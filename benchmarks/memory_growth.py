@@ -3,8 +3,9 @@
     python benchmarks/memory_growth.py                                            # 2,000 steps on a CPU
     python benchmarks/memory_growth.py --device cuda --size 256 --points 20000    # with gsplat
 
-Sampled every 50 steps from 200 past the prune on; a growth is the slope of the line through the samples. Exits with 1 if the
-host's resident memory, or what torch has allocated or reserved on the GPU, grows by more than ``--allowed`` bytes a step.
+Samples every 50 steps, from 200 past the prune; growth is the slope of the line through the samples. Exits with 1 if
+the host's resident memory, or torch's allocated or reserved memory on the GPU, grows by more than ``--allowed`` bytes a
+step.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from sundae_ns.data import write_scene
+from sundae_ns.data import write_embedded_capture
 from sundae_ns.method_configs import sundae_tiny
 
 PRUNE_AT, SETTLE, EVERY = 60, 200, 50
 
 
 def resident() -> int:
-    """Bytes of this process in the host's memory."""
+    """Resident memory of this process, bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def configured(options: argparse.Namespace, folder: Path) -> Any:
-    scene = write_scene(
+    scene = write_embedded_capture(
         folder / "scene",
         train_views=8,
         test_views=2,
@@ -60,9 +61,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--steps", type=int, default=2000, help="steps past the prune")
-    parser.add_argument("--size", type=int, default=64, help="side of a picture, pixels")
+    parser.add_argument("--size", type=int, default=64, help="side of an image, pixels")
     parser.add_argument("--points", type=int, default=300, help="of the sparse cloud")
-    parser.add_argument("--allowed", type=float, default=4096, help="bytes a step; a picture of 64 x 64 is 49,152")
+    parser.add_argument("--allowed", type=float, default=4096, help="bytes a step; an image of 64 x 64 is 49,152")
     options = parser.parse_args()
     torch.manual_seed(0)
     cuda = options.device == "cuda"
@@ -87,7 +88,7 @@ def main() -> None:
     slopes = {}
     result: dict[str, Any] = {
         "steps_past_the_prune": options.steps,
-        "picture": f"{options.size}x{options.size}",
+        "image": f"{options.size}x{options.size}",
         "primitives": model.num_points,
         "rasterizer": model.backend.name,
         "device": torch.cuda.get_device_name(0) if cuda else "cpu",

@@ -1,14 +1,17 @@
-"""Break the code that prunes, cuts, packs and shares out, one small change at a time, and count how many the tests notice.
+"""Break the code that prunes, schedules, packs and shards, one small change at a time, and count the changes that tests
+notice.
 
-    python benchmarks/mutants.py --each 50 --seed 0 > benchmarks/results/reliability/mutants.json
+    python benchmarks/mutants.py                    # 200 changes, about half an hour on one core
+    python benchmarks/mutants.py --sample 40        # a quick look
+    python benchmarks/mutants.py --rooms packing --sample 50 --seed 1
 
-A change is one of: another comparison; ``+ -``, ``* /``, ``and or``, ``True False``, ``min max``, ``any all`` or ``floor ceil``
-swapped; a ``not`` dropped; a whole number one higher, another number doubled; a call left out whose result nobody takes.
-Left alone: docstrings, annotations, texts of errors, decorators, and default values of options, which are choices.
+A change is one of: another comparison; ``+ -``, ``* /``, ``and or``, ``True False``, ``min max``, ``any all`` or
+``floor ceil`` swapped; a ``not`` dropped; an integer one higher, another number doubled; a call dropped whose result is
+not used. Docstrings, annotations, error messages, decorators and defaults of options stay unchanged.
 
-Each room of ``ROOMS`` gets a sample of its own and the tests of its own, so that a change takes seconds. Each changed module is
-tried in a process of its own that has torch and pytest imported already; nothing on disk is touched. A change that cannot be
-told from the original by any test counts as one that went unnoticed.
+``--sample`` is spread evenly over the rooms of ``ROOMS``, drawn with a fixed seed. Each room has tests of its own, so a
+change takes seconds. Each changed module runs in a process of its own, which has torch and pytest imported; nothing on
+disk changes. A change that no test can tell from the original counts as unnoticed. Prints JSON.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any, NamedTuple
 
-# Imported here so that the processes need not: all but the package and its tests.
+# Imported here, and so once for all processes: all but the package and its tests.
 import hypothesis  # noqa: F401
 import nerfstudio.engine.optimizers
 import numpy  # noqa: F401
@@ -42,31 +45,35 @@ from rich.progress import track
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sundae_ns"
 SECONDS = 120
-"""A changed module that takes longer than this is noticed too: its tests hang."""
+"""A changed module counts as noticed if its tests take longer than this: they hang."""
 
 
 class Room(NamedTuple):
-    """Modules that are changed together, and the tests that are to notice."""
+    """Modules, and the tests that should notice a change in them."""
 
     modules: tuple[str, ...]
     """Globs below the package."""
     tests: tuple[str, ...]
-    """Globs below ``tests``; those named like the changed module go first."""
+    """Globs below ``tests``; the test named like the changed module runs first."""
     functions: tuple[str, ...] = ()
-    """The only ones to change, of a module that does more; empty for all of it."""
+    """Only these functions change; empty for whole modules."""
 
 
 ROOMS = {
     "pruning": Room(("pruning/[!_]*.py",), ("pruning/test_*.py",)),
+    "schedules": Room(
+        ("training/schedules.py", "training/budget/search.py"),
+        ("training/test_schedules.py", "training/budget/test_search.py"),
+    ),
     "surgery": Room(
         ("gaussians/surgery.py", "gaussians/merging.py", "gaussians/rewriting.py"), ("gaussians/test_*.py",)
     ),
     "packing": Room(("storage/packing/[!_]*.py",), ("storage/packing/test_*.py", "fuzz/test_packs.py")),
-    # What ranks say to each other is tried by processes of their own, which import what is on disk.
+    # Tests of the collectives start processes, which import the modules on disk: only functions without any are here.
     "ranks": Room(
         ("distributed/[!_]*.py",),
         ("distributed/test_blocks.py",),
-        ("bounds", "moves", "per_primitive", "scaled_group", "state_of_rank", "_map_state", "_decide"),
+        ("bounds", "moves", "scaled_group", "state_of_rank", "_map_state", "_decide"),
     ),
 }
 
@@ -97,7 +104,7 @@ _LEFT_ALONE = (ast.Raise, ast.JoinedStr, ast.Import, ast.ImportFrom)
 
 
 def sites(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Every place that can be changed, by its number in :func:`walk`, and what is done to it."""
+    """Every place that can change: its number in :func:`walk`, and the kind of change."""
     for index, node in enumerate(walk(tree)):
         if isinstance(node, ast.Compare):
             yield index, "compare"
@@ -118,7 +125,7 @@ def sites(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def walk(node: ast.AST) -> Iterator[ast.AST]:
-    """Nodes that are worth changing, in a fixed order."""
+    """Nodes that may change, in a fixed order."""
     yield node
     for name, value in ast.iter_fields(node):
         if name in ("annotation", "returns", "decorator_list"):
@@ -146,7 +153,7 @@ def change(tree: ast.AST, index: int, kind: str) -> str:
     elif kind == "and or":
         node.op = ast.Or() if isinstance(node.op, ast.And) else ast.And()
     elif kind == "not":
-        node.operand = ast.UnaryOp(node.op, node.operand)  # twice is not at all
+        node.operand = ast.UnaryOp(node.op, node.operand)  # twice cancels
     elif kind == "constant":
         value = node.value
         node.value = (
@@ -161,7 +168,7 @@ def change(tree: ast.AST, index: int, kind: str) -> str:
 
 
 class Changed(importlib.abc.SourceLoader, importlib.abc.MetaPathFinder):
-    """Imports one module of the package from a changed tree."""
+    """Imports one module of the package from a changed syntax tree."""
 
     def __init__(self, path: Path, tree: ast.AST) -> None:
         self.path, self.source = path, ast.unparse(tree)
@@ -178,12 +185,12 @@ class Changed(importlib.abc.SourceLoader, importlib.abc.MetaPathFinder):
 
 
 def parse(room: Room) -> dict[Path, ast.Module]:
-    """The room's modules."""
+    """Syntax trees of the room's modules."""
     return {path: ast.parse(path.read_text()) for glob in room.modules for path in sorted(PACKAGE.glob(glob))}
 
 
 def places(room: Room, trees: dict[Path, ast.Module]) -> list[tuple[Path, int, str]]:
-    """Everything that may be changed in a room: where, its number in :func:`walk`, and how."""
+    """Every place of a room that can change: module, number in :func:`walk`, kind of change."""
     found = []
     for path, tree in trees.items():
         lines = {
@@ -201,13 +208,13 @@ def places(room: Room, trees: dict[Path, ast.Module]) -> list[tuple[Path, int, s
 
 
 def tests_of(room: Room, path: Path) -> list[str]:
-    """The room's tests, those of the module first."""
+    """The room's test files, those of the module first."""
     files = [str(file) for glob in room.tests for file in sorted((ROOT / "tests").glob(glob))]
     return sorted(files, key=lambda file: Path(file).stem != f"test_{path.stem}")
 
 
 def noticed(tests: list[str], finder: Changed | None) -> bool:
-    """Whether the tests fail with the changed module."""
+    """Whether the tests fail, with a changed module if one is given."""
     child = os.fork()
     if child == 0:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
@@ -216,7 +223,7 @@ def noticed(tests: list[str], finder: Changed | None) -> bool:
             sys.meta_path.insert(0, finder)
         os.chdir(ROOT)
         os._exit(int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", *tests]) != 0))
-    # Not by an alarm in the child: tests of bad input set one of their own.
+    # No alarm in the child: tests of bad input set one themselves.
     began = time.monotonic()
     while time.monotonic() - began < SECONDS:
         ended, status = os.waitpid(child, os.WNOHANG)
@@ -230,25 +237,28 @@ def noticed(tests: list[str], finder: Changed | None) -> bool:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--each", type=int, default=50, help="changes of each room; all, if it has fewer places")
+    parser.add_argument("--sample", type=int, default=200, help="number of changes, spread evenly over the rooms")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=list(ROOMS))
     options = parser.parse_args()
     torch.set_num_threads(1)
     if "sundae_ns" in sys.modules:
         raise SystemExit(f"{nerfstudio.__name__} has imported the package before it could be changed")
+    each = -(-options.sample // len(options.rooms))
     began = time.monotonic()
     result: dict[str, Any] = {"seed": options.seed, "rooms": {}, "survivors": []}
     for name in options.rooms:
         room = ROOMS[name]
         trees = parse(room)
         every = places(room, trees)
-        sample = sorted(random.Random(options.seed).sample(range(len(every)), min(options.each, len(every))))
+        if not every:
+            raise SystemExit(f"{name}: no place to change; ROOMS names modules or functions that do not exist")
+        sample = sorted(random.Random(options.seed).sample(range(len(every)), min(each, len(every))))
         if noticed(tests_of(room, ROOT), None):
-            raise SystemExit(f"{name}: the tests fail on the code as it is")
+            raise SystemExit(f"{name}: the tests fail on the unchanged code; mend them first")
         survivors = []
         console = Console(stderr=True)
-        # Without a thread that refreshes it: what it held when a child is forked off, the child would wait for.
+        # No thread that refreshes it: a forked child would wait for the locks of that thread.
         doing = f"Changing and testing {name}"
         for number in track(sample, doing, transient=True, auto_refresh=False, console=console):
             path, index, kind = every[number]

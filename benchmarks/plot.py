@@ -1,76 +1,125 @@
-"""Plot quality against bytes and against time of the measured runs: python benchmarks/plot.py [RUNS] [-o FIGURE]."""
+"""Draw the plots of docs/results.md from benchmarks/results, into docs/figures.
+
+python benchmarks/plot.py            # runs.png, heads.png, rules.png
+python benchmarks/plot.py runs       # one of them
+"""
 
 from __future__ import annotations
 
 import argparse
-import csv
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.ticker import NullFormatter
+from tables import HEADLINE, MB, METHODS, lines_of, runs
 
-ROOT = Path(__file__).parents[1]
-RUNS = ROOT / "benchmarks" / "results" / "runs.csv"
-FIGURE = ROOT / "docs" / "figures" / "runs.png"
-AXES = (("bytes_total", 1e6, "MB, primitives and head in fp32"), ("ms_frame", 1.0, "ms a frame, head included"))
+FIGURES = Path(__file__).parents[1] / "docs" / "figures"
+MARKERS = {"bonsai": "o", "fox": "s"}
+KEPT_RULES = {
+    "detail-merge": "detail, merged (default)",
+    "detail": "detail",
+    "response-contribution": "response x contribution",
+    "contribution": "contribution, sampled",
+    "contribution-top": "highest contribution",
+    "random": "random",
+    "paper": "paper's band",
+}
+"""Rules of the plot, by the names that readers see."""
 
 
-def ran_beside_others(variant: str) -> bool:
-    """Whether runs of this kind shared their GPU: their times say nothing."""
-    return variant.endswith("-branch") or variant.startswith("budget-")
+def plot_runs() -> Any:
+    """PSNR of methods against their bytes, a panel for each capture."""
+    shown = [row for row in runs() if row.variant in HEADLINE]
+    scenes = list(dict.fromkeys(row.scene for row in shown))
+    colors = {"splatfacto": "gray", "sundae": "tab:red"}
+    figure, panels = plt.subplots(1, len(scenes), figsize=(5.5 * len(scenes), 4), layout="constrained")
+    for panel, scene in zip(panels, scenes, strict=True):
+        for row in (row for row in shown if row.scene == scene):
+            place = (row.bytes_total / MB, row.psnr)
+            panel.plot(*place, "o", color=colors.get(row.variant, "tab:blue"))
+            panel.annotate(METHODS[row.variant].strip("*"), place, (6, -3), textcoords="offset points", fontsize=8)
+        panel.set_xscale("log")
+        panel.set_xlim(3, 600)
+        panel.set_xticks([3, 10, 30, 100, 300])
+        panel.xaxis.set_major_formatter("{x:g}")
+        panel.xaxis.set_minor_formatter(NullFormatter())
+        panel.set_title(f"{scene}: 10% of the primitives; gray: all of them", fontsize=9)
+        panel.set_xlabel("MB in fp32, head included")
+        panel.set_ylabel("test PSNR, dB")
+        panel.grid(alpha=0.3)
+    return figure
+
+
+def plot_heads() -> Any:
+    """Gain of each head over the same primitives trained without one, against its time."""
+    figure, panel = plt.subplots(figsize=(6, 4), layout="constrained")
+    for scene, marker in MARKERS.items():
+        own = [line for line in lines_of("heads.csv") if line["scene"] == scene and line["rate"] == "cosine"]
+        ms, gains = [float(line["ms_824x1240"]) for line in own], [float(line["gain"]) for line in own]
+        panel.plot(ms, gains, marker + "-", label=scene)
+        for line, x, y in zip(own, ms, gains, strict=True) if scene == "bonsai" else ():
+            name = line["size"] + (" (default)" if line["size"] == "wide" else "")
+            panel.annotate(name, (x, y), (6, 6), textcoords="offset points", fontsize=8)
+    panel.set_xscale("log")
+    panel.set_xlim(0.5, 5)
+    panel.set_xticks([0.5, 1, 2, 5])
+    panel.xaxis.set_major_formatter("{x:g}")
+    panel.xaxis.set_minor_formatter(NullFormatter())
+    panel.set_ylim(0, 2.4)
+    panel.set_xlabel("head, ms at 824 x 1240 in fp16 (H200; regular: H100)")
+    panel.set_ylabel("gain in test PSNR, dB")
+    panel.legend()
+    panel.grid(alpha=0.3, which="both")
+    return figure
+
+
+def plot_rules() -> Any:
+    """PSNR of pruning rules against the share they keep, over random primitives, a panel for each capture."""
+    figure, panels = plt.subplots(1, len(MARKERS), figsize=(5.5 * len(MARKERS), 4), layout="constrained")
+    for panel, scene in zip(panels, MARKERS, strict=True):
+        psnr = {
+            (line["rule"], float(line["keep"])): float(line["psnr"])
+            for line in lines_of("rules.csv")
+            if line["scene"] == scene
+        }
+        keeps = sorted({keep for _, keep in psnr})
+        for rule, name in KEPT_RULES.items():
+            width = 2.5 if rule == "detail-merge" else 1.2
+            panel.plot(
+                [f"{keep:.0%}" for keep in keeps],
+                [psnr[rule, keep] - psnr["random", keep] for keep in keeps],
+                "o-",
+                label=name,
+                linewidth=width,
+            )
+        panel.set_title(f"{scene}, 15,000 steps after the prune, no head", fontsize=9)
+        panel.set_xlabel("primitives kept")
+        panel.set_ylabel("test PSNR over random primitives, dB")
+        panel.grid(alpha=0.3)
+    figure.legend(*panels[0].get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
+    return figure
+
+
+PLOTS: dict[str, Callable[[], Any]] = {"runs": plot_runs, "heads": plot_heads, "rules": plot_rules}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("runs", type=Path, nargs="?", default=RUNS)
-    parser.add_argument("-o", "--out", type=Path, default=FIGURE)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("plots", nargs="*", default=list(PLOTS), help="runs, heads, rules; by default all")
+    parser.add_argument("-o", "--out", type=Path, default=FIGURES, help="folder")
     options = parser.parse_args()
-    with open(options.runs, newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["ms_frame"]]
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    figure, panels = plt.subplots(len(scenes), 2, figsize=(13, 4.2 * len(scenes)), layout="constrained")
-    labels = sorted({(row["method"], row["variant"]) for row in rows})
-    colors = {label: plt.get_cmap("tab20")(i % 20) for i, label in enumerate(labels)}
-    # One filling a machine: times compare within a filling only.
-    newest = rows[-1]["gpu"]
-    for scene, line in zip(scenes, panels, strict=True):
-        own = [row for row in rows if row["scene"] == scene]
-        for (column, unit, title), panel in zip(AXES, line, strict=True):
-            for label in labels:
-                for here in (True, False):
-                    runs = [
-                        row
-                        for row in own
-                        if (row["method"], row["variant"]) == label
-                        and (row["gpu"] == newest) == here
-                        and not (column == "ms_frame" and ran_beside_others(row["variant"]))
-                    ]
-                    if not runs:
-                        continue
-                    panel.scatter(
-                        [float(row[column]) / unit for row in runs],
-                        [float(row["psnr"]) for row in runs],
-                        facecolor=colors[label] if here else "none",
-                        edgecolor=colors[label],
-                        marker="s" if label[0] == "splatfacto" else "o",
-                        s=50 if here else 30,
-                        label=" ".join([*label, runs[0]["gpu"].split()[1]]),
-                    )
-                    if here and label == ("sundae", "default"):
-                        for row in runs:
-                            place = float(row[column]) / unit, float(row["psnr"])
-                            panel.annotate(row["commit"], place, (7, -3), textcoords="offset points", fontsize=7)
-            panel.set_xlabel(title)
-            panel.set_ylabel("test PSNR, dB")
-            panel.set_title(f"{scene}, {own[0]['resolution']} px")
-            panel.grid(alpha=0.3)
-        handles, names = line[0].get_legend_handles_labels()
-        line[1].legend(handles, names, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(options.out, dpi=110)
-    print(f"wrote {options.out}")
+    odd = [name for name in options.plots if name not in PLOTS]
+    if odd:
+        parser.error(f"no plot {odd[0]}; give some of {', '.join(PLOTS)}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name in options.plots:
+        PLOTS[name]().savefig(options.out / f"{name}.png", dpi=110)
+        print(f"wrote {name}.png")
 
 
 if __name__ == "__main__":

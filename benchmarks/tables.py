@@ -1,146 +1,316 @@
-"""The measured runs as Markdown tables.
+"""Rewrite the tables of README.md and docs/*.md from benchmarks/results.
 
-    python benchmarks/tables.py [results/runs.csv]     # prints all rows, a table for each scene
-    python benchmarks/tables.py --readme               # writes README's table anew, between its markers
+    python benchmarks/tables.py            # rewrite every table between its markers
+    python benchmarks/tables.py quality    # print one table
 
-tests/test_readme.py checks that README's table is what this makes of runs.csv and, for packed scenes, of pack.jsonl. Branches,
-whose frames nobody timed, are not printed: ``rules_report.py`` shows them.
+A page holds the markers ``<!-- table: NAME -->`` and ``<!-- end of table -->``; the lines between them are made here.
+``tests/test_benchmarks.py`` checks that every page is current.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from statistics import mean
+from typing import Any
 
 from sundae_ns.evaluation import RunRow, read_rows
 from sundae_ns.evaluation.document import number, table
 
 ROOT = Path(__file__).parents[1]
-RUNS = ROOT / "benchmarks" / "results" / "runs.csv"
-PACKS = ROOT / "benchmarks" / "results" / "pack.jsonl"
-README = ROOT / "README.md"
-BEGIN = "<!-- made by: python benchmarks/tables.py --readme -->"
-END = "<!-- end of what is made -->"
+RESULTS = ROOT / "benchmarks" / "results"
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+MARKED = re.compile(r"(<!-- table: (?P<name>[\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 MB = 1e6
 
-
-@dataclass(frozen=True)
-class Shown:
-    """A line of README's table: which row of runs.csv, and what it is called there."""
-
-    scene: str
-    method: str
-    variant: str
-    commit: str
-    label: str
-    timed: bool = True
-    """Whether its times stand beside those of the other rows of the scene."""
-    packed: str = ""
-    """Name in pack.jsonl, where lines for the packed run are to follow."""
+METHODS = {
+    "splatfacto": "splatfacto, 30,000 steps",
+    "splatfacto-7k": "splatfacto, 7,000 steps",
+    "sundae-warm-up": "the full field before the prune",
+    "sundae": "**sundae**",
+    "sundae-no-head": "the same primitives, trained without a head",
+    "mcmc": "3DGS-MCMC",
+    "random-no-head": "random primitives",
+    "contribution-no-head": "highest contribution, as LightGaussian",
+}
+"""Arms of runs.csv in the order of a table, by the names that readers see."""
+HEADLINE = ("splatfacto", "sundae", "sundae-no-head", "mcmc", "contribution-no-head")
 
 
-SHOWN = (
-    Shown("bonsai", "splatfacto", "peers-splatfacto", "04e59ca", "splatfacto"),
-    Shown("bonsai", "sundae", "peers-sundae", "04e59ca", "**sundae**"),
-    Shown("bonsai", "sundae", "peers-mcmc", "04e59ca", "3DGS-MCMC"),
-    Shown("bonsai", "sundae", "peers-contribution-no-head", "04e59ca", "contribution pruning, as LightGaussian's"),
-    Shown("bonsai", "sundae", "band-positions", "2e7bd23", "the paper's band rule (an older head)", timed=False),
-    Shown("bonsai", "sundae", "default", "8b20125", "another run of sundae", timed=False, packed="bonsai-default-42"),
-    Shown("fox", "splatfacto", "default", "5e4bc58", "splatfacto"),
-    Shown("fox", "sundae", "default", "ef71d9f", "**sundae**", packed="fox, 30,000 steps"),
-    Shown("fox", "sundae", "no-head-branch", "ef71d9f", "the same field, no head", timed=False),
-)
+def lines_of(name: str) -> list[dict[str, Any]]:
+    """Rows of a results file, ``.jsonl`` or ``.csv``; cells of a CSV are text."""
+    text = (RESULTS / name).read_text(encoding="utf-8")
+    if name.endswith(".jsonl"):
+        return [json.loads(line) for line in text.splitlines()]
+    return list(csv.DictReader(text.splitlines()))
 
 
-def readme_table(rows: list[RunRow]) -> str:
-    """README's table, of the rows that it shows."""
-    lines, scene = [], ""
-    for shown in SHOWN:
-        key = (shown.scene, shown.method, shown.variant, shown.commit)
-        (row,) = [row for row in rows if (row.scene, row.method, row.variant, row.commit) == key]
-        first = "" if shown.scene == scene else f"{row.scene}, {row.resolution.replace('x', ' x ')}"
-        scene = shown.scene
-        lines.append(
-            [
-                first,
-                shown.label,
-                number(row.primitives, 0),
-                *(number(row.psnr, 2), number(row.ssim, 4), number(row.psnr_base, 2)),
-                number(row.bytes_total / MB, 1),
-                number(row.ms_frame, 2) if shown.timed else "",
-                f"{number(row.train_s, 0)} s" if shown.timed and row.train_s is not None else "",
-            ]
-        )
-        if shown.packed:
-            lines += packed_lines(shown.packed)
-    heads = ["scene", "method", "primitives", "PSNR", "SSIM", "PSNR, head off", "MB", "ms a frame", "training"]
-    return "\n".join(table(heads, lines))
+def runs() -> list[RunRow]:
+    """Rows of runs.csv by capture, in the order of :data:`METHODS`."""
+    rows = [row for row in read_rows(RESULTS / "runs.csv") if row.variant in METHODS]
+    return sorted(rows, key=lambda row: (row.scene, list(METHODS).index(row.variant)))
 
 
-def with_spread(values: Sequence[float]) -> str:
-    """Mean, and half the range of several: ``28.29 ± 0.04``."""
-    spread = f" ± {(max(values) - min(values)) / 2:.2f}" if len(values) > 1 else ""
-    return f"{mean(values):.2f}{spread}"
+def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    """Rows whose first cell is left out where it repeats the one above."""
+    seen = ""
+    shown = []
+    for first, *others in rows:
+        shown.append([first if first != seen else "", *others])
+        seen = first
+    return shown
 
 
-def packed_lines(run: str) -> list[list[str]]:
-    """README's lines of a run packed with the default options, as it is and fine-tuned; the last measurements count."""
-    measured = [json.loads(line) for line in PACKS.read_text(encoding="utf-8").splitlines()]
-    last = {line.get("finetune_steps", 0): line for line in measured if line["run"] == run and not line["set"]}
-    lines = []
-    for steps, found in sorted(last.items()):
-        label = "the same, packed" + (f" with --finetune {steps}" if steps else "")
-        quality = (number(found["psnr_packed"], 2), "", number(found["psnr_packed_base"], 2))
-        lines.append(["", label, number(found["primitives"], 0), *quality, number(found["bytes"] / MB, 1), "", ""])
-    return lines
+def scene(row: RunRow) -> str:
+    return f"{row.scene}, {row.resolution.replace('x', ' x ')}"
 
 
-def with_table(text: str, rows: list[RunRow]) -> str:
-    """README with its table made anew."""
-    before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    if not after:
-        raise SystemExit(f"README has no markers; put these lines around its table: {BEGIN} and {END}")
-    return f"{before}{BEGIN}\n{readme_table(rows)}\n{END}{after}"
-
-
-def scene_tables(rows: list[RunRow]) -> str:
-    """All rows, a table for each scene."""
-    heads = ["method", "variant", "keep", "primitives", "PSNR", "SSIM", "PSNR, head off", "MB"]
-    heads += ["ms a frame", "train s", "prune s", "peak primitives", "peak MiB", "commit", "GPU"]
-    parts = []
-    for scene in dict.fromkeys(row.scene for row in rows):
-        own = [row for row in rows if row.scene == scene and row.ms_frame is not None]
-        lines = [
-            [
-                *(row.method, row.variant, "" if row.keep_ratio is None else f"{row.keep_ratio:.0%}"),
-                *(number(row.primitives, 0), number(row.psnr, 2), number(row.ssim, 4), number(row.psnr_base, 2)),
-                *(number(row.bytes_total / MB, 1), number(row.ms_frame, 2)),
-                *(number(row.train_s, 0), number(row.prune_s, 1)),
-                *(number(row.peak_primitives, 0), number(row.peak_vram_mib, 0)),
-                *(row.commit, row.gpu.replace("NVIDIA ", "")),
-            ]
-            for row in sorted(own, key=lambda row: (row.method, row.commit, row.variant))
+def headline() -> list[str]:
+    """README's table: today's default beside stock splatfacto."""
+    heads = ["capture", "method", "primitives", "PSNR", "SSIM", "PSNR head off", "MB", "ms a frame"]
+    rows = [
+        [
+            *(scene(row), METHODS[row.variant], number(row.primitives, 0), number(row.psnr, 2), number(row.ssim, 4)),
+            number(row.psnr_base, 2) if row.bytes_head else "",
+            *(number(row.bytes_total / MB, 1), number(row.ms_frame, 2)),
         ]
-        title = f"**{scene}**, {own[0].resolution} px, every 8th image for test"
-        parts += ["", title, "", *table(heads, lines)]
-    return "\n".join(parts)
+        for row in runs()
+        if row.variant in HEADLINE
+    ]
+    return table(heads, first_of_each(rows))
+
+
+def quality() -> list[str]:
+    """All methods on the captures: quality, size and time of the same rendering."""
+    heads = ["capture", "method", "keep", "primitives", "PSNR, dB", "SSIM", "PSNR, head off", "MB", "ms a frame"]
+    rows = [
+        [
+            *(scene(row), METHODS[row.variant], "" if row.keep_ratio is None else f"{row.keep_ratio:.0%}"),
+            *(number(row.primitives, 0), number(row.psnr, 2), number(row.ssim, 4)),
+            number(row.psnr_base, 2) if row.bytes_head else "",
+            *(number(row.bytes_total / MB, 1), number(row.ms_frame, 2)),
+        ]
+        for row in runs()
+    ]
+    return table(heads, first_of_each(rows))
+
+
+def speed() -> list[str]:
+    """Milliseconds of frames, each with the error of the same frames."""
+    heads = ["field", "size", "head in", "primitives", "frame, ms", "splat, ms", "head, ms", "PSNR, dB", "SSIM", "GPU"]
+    rows = [
+        [
+            *(line["config"], f"{line['width']} x {line['height']}", line["precision"] if line["ms_head"] else ""),
+            *(number(line["primitives"], 0), number(line["ms_frame"], 2), number(line["ms_splat"], 2)),
+            number(line["ms_head"], 2) if line["ms_head"] else "",
+            *(number(line["psnr"], 2), number(line["ssim"], 4), gpu(line["device"])),
+        ]
+        for line in lines_of("frames.jsonl")
+    ]
+    return table(heads, first_of_each(rows))
+
+
+def sizes() -> list[str]:
+    """The head at other image sizes than the training images'."""
+    heads = ["capture", "factor", "size", "PSNR, dB", "head off", "SSIM", "head off"]
+    rows = [
+        [line["scene"], line["factor"], f"{line['width']} x {line['height']}"]
+        + [line[name] for name in ("psnr", "psnr_base", "ssim", "ssim_base")]
+        for line in lines_of("sizes.csv")
+    ]
+    return table(heads, first_of_each(rows))
+
+
+def packing() -> list[str]:
+    """Packed runs: bytes, and PSNR before and after."""
+    heads = ["run", "options", "fine-tuning", "primitives", "MB", "PSNR of the run", "packed", "head off, packed"]
+    rows = []
+    for line in lines_of("packs.jsonl"):
+        if line["run"] is not None:
+            steps = line.get("finetune_steps", 0)
+            rows.append(
+                [
+                    *(line["run"], " ".join(line["set"]) or "default", f"{steps:,} steps" if steps else ""),
+                    *(number(line["primitives"], 0), number(line["bytes"] / MB, 2)),
+                    *(number(line[name], 2) for name in ("psnr", "psnr_packed", "psnr_packed_base")),
+                ]
+            )
+    return table(heads, first_of_each(rows))
+
+
+def exports() -> list[str]:
+    """Files for viewers, read back by splat-transform: bytes, and PSNR without the head."""
+    heads = ["run", "file", "primitives", "MB", "PSNR of the run, head off", "of the file"]
+    rows = [
+        [
+            *(line["run"] + ", antialiased" * line["antialiased"], line["file"], number(line["primitives"], 0)),
+            *(number(line["bytes"] / MB, 3), number(line["psnr_model"], 2), number(line["psnr"], 2)),
+        ]
+        for line in lines_of("exports.jsonl")
+    ]
+    return table(heads, first_of_each(rows))
+
+
+def graph() -> list[str]:
+    """The neighbour graph with the high-pass response, beside scipy's cKDTree."""
+    heads = ["device", "points", "distribution", "graph and response, s", "cKDTree, s", "error", "peak, MiB"]
+    rows = [
+        [
+            *(gpu(line["device_name"]), number(line["points"], 0), line["distribution"]),
+            *(f"{line['seconds']:g}", f"{line['reference_seconds']:g}" if line["reference_seconds"] else "-"),
+            *(f"{line['response_rel_error']:.0e}", number(line["peak_mib"], 0)),
+        ]
+        for line in lines_of("graph.jsonl")
+    ]
+    return table(heads, first_of_each(rows), words=1)
+
+
+def rasterizer() -> list[str]:
+    """Rasterisers on random views, with their errors against the reference in float64."""
+    heads = [
+        "rasterizer",
+        "device",
+        "primitives",
+        "size",
+        "forward, ms",
+        "and backward, ms",
+        "max. error",
+        "gradient's",
+    ]
+    rows = [
+        [
+            *(line["rasterizer"], gpu(line["device_name"]), number(line["primitives"], 0)),
+            f"{line['width']} x {line['height']}",
+            *(f"{line['forward_ms']:g}", f"{line['forward_backward_ms']:g}"),
+            *(f"{line['max_error']:.0e}", f"{line['gradient_error']:.0e}"),
+        ]
+        for line in lines_of("rasterizer.jsonl")
+        if "max_error" in line
+    ]
+    return table(heads, rows)
+
+
+def multi_gpu() -> list[str]:
+    """Training on one and several GPUs."""
+    heads = ["field", "GPUs", "primitives", "images a second", "PSNR, dB", "MiB of a GPU, at most"]
+    rows = [
+        [
+            "tiled, not pruned" if "tiled" in line["variant"] else f"{line['scene']}, whole run",
+            f"{line['ranks']} {gpu(line['gpu']).split()[-1]}",
+            *(number(line["primitives"], 0), number(line["images_per_s"], 1)),
+            number(list(line["psnr_after_images"].values())[-1], 2),
+            number(max(line["peak_mib"]), 0),
+        ]
+        for line in sorted(lines_of("multi_gpu.jsonl"), key=lambda line: (line["variant"], line["ranks"]))
+    ]
+    return table(heads, first_of_each(rows))
+
+
+def rules() -> list[str]:
+    """Rules of pruning on two captures at three shares, 15,000 steps after the prune, without a head."""
+    lines = lines_of("rules.csv")
+    columns = list(dict.fromkeys((line["scene"], float(line["keep"])) for line in lines))
+    cells = {(line["rule"], line["scene"], float(line["keep"])): line for line in lines}
+
+    def cell(rule: str, column: tuple[str, float]) -> str:
+        line = cells.get((rule, *column))
+        if line is None:
+            return "-"
+        spread = f" ± {float(line['psnr_range']) / 2:.2f}" if int(line["seeds"]) > 1 else ""
+        return f"{float(line['psnr']):.2f}{spread}"
+
+    def total(rule: str) -> float:
+        return -sum(float(cells[(rule, *column)]["psnr"]) for column in columns if (rule, *column) in cells)
+
+    heads = ["rule", *(f"{name}, {keep:.0%}" for name, keep in columns)]
+    names = sorted({line["rule"] for line in lines}, key=total)
+    return table(heads, [[name, *(cell(name, column) for column in columns)] for name in names], words=1)
+
+
+def heads() -> list[str]:
+    """Sizes of the head on two captures."""
+    columns = [
+        "capture",
+        "head",
+        "rate",
+        "MB",
+        "head, ms at 824 x 1240",
+        "PSNR, dB",
+        "gain",
+        "head off",
+        "training views",
+    ]
+    rows = [
+        [
+            *(line["scene"], line["size"], line["rate"]),
+            number(4e-6 * int(line["parameters"]), 1) if line["parameters"] else "",
+            f"{float(line['ms_824x1240']):.2f} ({gpu(line['gpu'])})" if line["gpu"] else "",
+            *(number(float(line[name]), 2) for name in ("psnr", "gain", "psnr_base", "psnr_train")),
+        ]
+        for line in lines_of("heads.csv")
+    ]
+    return table(columns, first_of_each(rows))
+
+
+def budgets() -> list[str]:
+    """Primitives that ``sundae-auto`` keeps for a drop of 0.1 dB, and other ways to as many."""
+    columns = ["scene", "method", "seed", "primitives before", "kept", "peak", "SH degree", "head", "MB", "PSNR, dB"]
+    rows = [
+        [
+            *(line["scene"], line["method"], line["seed"], number(int(line["before"]), 0) if line["before"] else "-"),
+            *(number(int(line[name]), 0) for name in ("primitives", "peak")),
+            *(line["degree"], line["head"], number(int(line["bytes"]) / MB, 3), number(float(line["psnr"]), 2)),
+        ]
+        for line in lines_of("budgets.csv")
+    ]
+    return table(columns, first_of_each(rows))
+
+
+def gpu(name: str) -> str:
+    """Name of a device as tables show it."""
+    return name.replace("NVIDIA ", "").replace(" 80GB HBM3", "")
+
+
+TABLES: dict[str, Callable[[], list[str]]] = {
+    "headline": headline,
+    "quality": quality,
+    "speed": speed,
+    "sizes": sizes,
+    "packing": packing,
+    "exports": exports,
+    "graph": graph,
+    "rasterizer": rasterizer,
+    "multi-gpu": multi_gpu,
+    "rules": rules,
+    "heads": heads,
+    "budgets": budgets,
+}
+
+
+def with_tables(text: str) -> str:
+    """A page with its tables made anew.
+
+    Raises:
+        KeyError: a marker names no table.
+    """
+    return MARKED.sub(lambda found: found[1] + "\n".join(TABLES[found["name"]]()) + "\n" + found[3], text)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("runs", type=Path, nargs="?", default=RUNS)
-    parser.add_argument("--readme", action="store_true", help="write README's table anew")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", nargs="?", choices=TABLES, help="print this table, and rewrite nothing")
     options = parser.parse_args()
-    rows = read_rows(options.runs)
-    if options.readme:
-        README.write_text(with_table(README.read_text(encoding="utf-8"), rows), encoding="utf-8")
-    else:
-        print(scene_tables(rows))
+    if options.table:
+        print("\n".join(TABLES[options.table]()))
+        return
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        if with_tables(text) != text:
+            page.write_text(with_tables(text), encoding="utf-8")
+            print(f"wrote {page.relative_to(ROOT)}")
 
 
 if __name__ == "__main__":

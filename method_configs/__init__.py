@@ -1,7 +1,7 @@
-"""The methods that ``ns-train`` lists; every entry point of the package points here.
+"""The methods that ``ns-train`` lists; all entry points of the package point here.
 
-Keep this import light, and free of ``nerfstudio.configs.method_configs``: entry points are loaded while that module is
-half imported, and an error here would break every ``ns-*`` command.
+Keep this import light and free of ``nerfstudio.configs.method_configs``: nerfstudio loads entry points while that module is
+half imported, and an error here breaks every ``ns-*`` command.
 """
 
 from sundae_ns.errors import show_in_one_line
@@ -18,7 +18,7 @@ from sundae_ns.method_configs.sundae import (
     sundae_tiny,
 )
 
-# nerfstudio's commands have no place of their own for this, and all of them load the plug-in.
+# nerfstudio has no hook for this, but all of its commands load the plug-in.
 show_in_one_line()
 
 __all__ = [

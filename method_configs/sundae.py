@@ -1,4 +1,4 @@
-"""Method specifications of SUNDAE and its variants: one object tree each, built by helpers that share nothing."""
+"""Methods of SUNDAE: a configuration each, built anew by helpers so that no two share an object."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ def _constant(lr: float) -> dict[str, Any]:
 
 
 def optimizers(steps: int, *, means_restart: float | None = 1.6e-4) -> dict[str, Any]:
-    """A fresh set of optimizers for a run of ``steps`` steps: splatfacto's rates, and those of features and head.
+    """Optimizers for a run: splatfacto's rates, and rates of features and head.
 
     Args:
-        steps: length of the run, where decaying rates reach their final value.
-        means_restart: rate of the centres right after the prune, from which its decay begins anew, so that the kept
-            primitives can move into the gaps that the others left; None: the decay goes on.
+        steps: length of the run, at which decaying rates reach their final value.
+        means_restart: rate of the centres right after the prune, where its decay restarts so that kept primitives can fill
+            the gaps; None does not restart it.
     """
     return {
         "means": {
@@ -48,7 +48,7 @@ def optimizers(steps: int, *, means_restart: float | None = 1.6e-4) -> dict[str,
         "quats": _constant(0.001),
         "features": _constant(0.0025),
         "compensation": {
-            # The usual eps: with 3DGS's tiny one, weights whose gradient is all but zero would take full steps.
+            # The usual eps: with the tiny one of 3DGS, weights with almost no gradient would take full steps.
             "optimizer": NetworkAdamConfig(lr=1e-3, eps=1e-8),
             "scheduler": PruneAwareDecayConfig(
                 lr_final=1e-5,
@@ -81,15 +81,15 @@ def method(
     """One method.
 
     Args:
-        name: what users type after ``ns-train``.
-        description: the line in ``ns-train --help``.
-        pruning: when and what to prune.
-        head: the compensation head.
+        name: name after ``ns-train``.
+        description: line in ``ns-train --help``.
+        pruning: options of pruning.
+        head: options of the head.
         steps: length of the run.
         means_restart: see :func:`optimizers`.
-        trainer: more options of the trainer.
-        datamanager: more options of the datamanager.
-        model: more options of the model.
+        trainer: other options of the trainer.
+        datamanager: other options of the datamanager.
+        model: other options of the model.
     """
     config = SundaeTrainerConfig(
         method_name=name,
@@ -139,20 +139,20 @@ sundae_100 = _keep(100)
 
 sundae_continuous = method(
     "sundae-continuous",
-    "SUNDAE with continuous pruning while densifying: a lower peak of memory; cap and final count exact, where given.",
+    "SUNDAE with continuous pruning during densification: a lower peak of memory, with an optional cap and final number.",
     pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
 )
 
 sundae_auto = method(
     "sundae-auto",
-    "SUNDAE that finds its own budget: as few primitives, bands and network as lose 0.1 dB, or as many as bytes allow.",
+    "SUNDAE that searches its budget: the smallest field and head within 0.1 dB, or the best within bytes or primitives.",
     pruning=PruningConfig(mode="auto", stop=28000),
     datamanager={"holdout_every": 8},
 )
 
 sundae_paper = method(
     "sundae-paper",
-    "SUNDAE as literal as the paper's text allows: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",
+    "SUNDAE as the paper's text has it: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",
     pruning=PruningConfig(
         keep_ratio=0.1,
         selection="band",

@@ -1,4 +1,4 @@
-"""nerfstudio's full-image datamanager, with what SUNDAE needs and the stock one lacks."""
+"""nerfstudio's full-image datamanager with checks of the capture, held-out views, and an order that can be resumed."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, Nerfst
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from torch import Tensor
 
-from sundae_ns.data.capture import check_picture, check_transforms, no_transforms, undecodable
+from sundae_ns.data.capture import check_image, check_transforms, no_transforms, undecodable
 from sundae_ns.data.colmap import check_colmap
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.storage.point_cloud import read_point_cloud
 
 DATASET_FRAME = "sundae_dataset_frame"
-"""Key of the training set's metadata: (transform ``[3, 4]``, scale) from the capture's own coordinates to the model's."""
+"""Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""
 
-NO_PICTURES = "sundae_no_pictures"
-"""Key of a dataset's metadata and of a batch: there is a camera alone, and grey stands for its picture."""
+NO_IMAGES = "sundae_no_images"
+"""Key of a dataset's metadata and of a batch: cameras without images, which are grey."""
 
 
-def without_pictures(run: object = "this run") -> DataError:
-    """The error for training or evaluating on grey, which stands for the pictures of a run without its capture."""
+def no_images_error(run: object = "this run") -> DataError:
+    """The error for training or evaluating on the grey images of a run that was unpacked without its capture."""
     return DataError(
-        f"{run} was unpacked without its capture: its cameras are there to look through, not to train or evaluate on; give "
-        "the capture to sundae unpack with --data"
+        f"{run} was unpacked without its capture, so its cameras have no images to train or evaluate on; give the capture to "
+        "sundae unpack with --data"
     )
 
 
 class LightNerfstudioParser(Nerfstudio):
-    """The ``nerfstudio-data`` parser, reading sparse clouds without open3d, which needs system libraries of a desktop."""
+    """The ``nerfstudio-data`` parser without open3d, which needs system libraries of a desktop."""
 
     def _load_3D_points(
         self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float
@@ -52,14 +52,14 @@ class LightNerfstudioParser(Nerfstudio):
         return {"points3D_xyz": moved, "points3D_rgb": rgb}
 
 
-def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, pictures: bool = True) -> None:
-    """Check a capture in one of the two layouts that most captures have, before its parser sees it.
+def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, images: bool = True) -> None:
+    """Check a capture in nerfstudio's or COLMAP's layout before its parser reads it.
 
     Args:
-        parser: configuration of the parser; captures of other parsers are left to them.
+        parser: configuration of the parser; captures of other parsers are not checked.
         data: the capture: a folder, or a ``transforms.json``.
         splits: splits that will be read.
-        pictures: whether the pictures will be needed; a finished run can be looked at without them.
+        images: whether the images will be needed; a viewer needs the cameras only.
 
     Raises:
         DataError: the first thing that cannot be used, and where it stands.
@@ -69,8 +69,8 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
     if isinstance(parser, ColmapDataParserConfig):
         if parser.load_3D_points and not any((data / parser.colmap_path).glob("points3D.*")):
             parser.load_3D_points = False  # the model then warns, and starts from random points
-        images = data / parser.images_path if pictures else None
-        check_colmap(data / parser.colmap_path, images, points=parser.load_3D_points)
+        folder = data / parser.images_path if images else None
+        check_colmap(data / parser.colmap_path, folder, points=parser.load_3D_points)
     elif isinstance(parser, NerfstudioDataParserConfig):
         path = data if data.suffix == ".json" else data / "transforms.json"
         if not path.is_file():
@@ -79,43 +79,42 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
 
 
 class CheckedDataset(InputDataset):
-    """nerfstudio's pictures; one that cannot be decoded is named, and grey stands for those that a capture does not have."""
+    """nerfstudio's dataset; it names an image that cannot be decoded, and gives grey images if there is no capture."""
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """Picture, and mask if there is one.
+        """Image, and mask if the capture has masks.
 
         Raises:
             DataError: a file of this view is damaged.
         """
-        if self.metadata.get(NO_PICTURES):
+        if self.metadata.get(NO_IMAGES):
             camera = self.cameras[image_idx]
             grey = torch.tensor(128, dtype=torch.uint8) if image_type == "uint8" else torch.tensor(0.5)
             image = grey.expand(int(camera.height.item()), int(camera.width.item()), 3)
-            return {"image_idx": image_idx, "image": image, NO_PICTURES: True}
+            return {"image_idx": image_idx, "image": image, NO_IMAGES: True}
         try:
             return super().get_data(image_idx, image_type)
-        except Exception as error:  # decoders raise many kinds; each means the same to the user
+        except Exception as error:  # decoders raise many kinds with one meaning for the user
             raise undecodable(self.image_filenames[image_idx], error) from error
 
 
 @dataclass
 class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
-    """Full images, in an order that depends on nothing but the seed and the step."""
+    """Full images, in an order that depends on the seed and the step alone."""
 
     _target: type = field(default_factory=lambda: SundaeDatamanager)
     holdout_every: int = 0
-    """Hold back every n-th training view from training, for choosing budgets without touching test views. 0: none."""
-    pictures: bool = True
-    """False for cameras without pictures, as sundae unpack writes them: they can be looked through, and nothing else."""
+    """Hold out every n-th training view, for decisions that must not use test views. 0 holds out none."""
+    images: bool = True
+    """False for cameras without images, as sundae unpack writes them without a capture: for the viewer only."""
 
 
 class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     """Serves whole images.
 
-    Beyond the stock datamanager: it caches images on machines without CUDA; the view of a step is a function of seed and
-    step, so that a resumed run continues the same order; it can hold back training views; and it lists the training
-    views, with their masks, for the pass that measures each primitive's contribution. Training cameras stay on the CPU,
-    where reading their sizes does not wait for the GPU.
+    Beyond the stock datamanager: it caches images on machines without CUDA. The view of a step is a function of seed and
+    step, so a resumed run continues in the same order. It can hold out training views, and lists the others with their
+    masks. Training cameras stay on the CPU, where reading their sizes does not wait for the GPU.
     """
 
     config: SundaeDatamanagerConfig
@@ -129,8 +128,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     ) -> None:
         if config.train_cameras_sampling_strategy != "random":
             raise ConfigError(
-                "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run could not "
-                "continue it; use random"
+                "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run would differ; "
+                "use random"
             )
         if config.holdout_every < 0 or config.holdout_every == 1:
             raise ConfigError(f"holdout-every is {config.holdout_every}; give 0 (none) or at least 2")
@@ -141,7 +140,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             config.dataparser,
             data,
             ("train", "val" if test_mode == "val" else "test"),
-            pictures=config.pictures and test_mode != "inference",
+            images=config.images and test_mode != "inference",
         )
         try:
             super().__init__(config, device, test_mode, **kwargs)
@@ -149,19 +148,19 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise
         except EOFError as error:
             raise DataError(
-                "nerfstudio asks a question about this capture, and nobody is there to answer; start the command in a "
-                "terminal, or give --downscale-factor 1 to its parser if it is about smaller pictures"
+                "nerfstudio asks a question about this capture, but there is no terminal to answer it; start the command in a "
+                "terminal, or give --downscale-factor 1 to its parser if it asks about downscaled images"
             ) from error
-        except Exception as error:  # parsers raise many kinds, assertions too; each means the same to the user
+        except Exception as error:  # parsers raise many kinds, assertions too, with one meaning for the user
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise DataError(f"{data} cannot be parsed ({reason}); check the capture") from error
         self._order: tuple[int, list[int]] = (-1, [])
         self._cameras: dict[int, Cameras] = {}
         self.place: tuple[int, int] = (0, 1)
-        """Rank of this process, and of how many that train together: each sees another view at a step."""
+        """Rank of this process and number of ranks; each rank gets another view at a step."""
 
     def create_train_dataset(self) -> CheckedDataset:
-        """The training set, with the transform from the capture's frame to the model's in its metadata."""
+        """Training set, with the transform from the capture's coordinates to the model's in its metadata."""
         outputs = self.train_dataparser_outputs
         if len(outputs.image_filenames) == 0:
             raise DataError(f"no training images in {self.config.dataparser.data}; check the path and the split")
@@ -169,25 +168,25 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         return self._marked(super().create_train_dataset())
 
     def create_eval_dataset(self) -> CheckedDataset:
-        """The test set."""
+        """Test set."""
         return self._marked(super().create_eval_dataset())
 
     def _marked(self, dataset: CheckedDataset) -> CheckedDataset:
-        if not self.config.pictures:
-            dataset.metadata[NO_PICTURES] = True
+        if not self.config.images:
+            dataset.metadata[NO_IMAGES] = True
         return dataset
 
     @property
     def holdout_indices(self) -> list[int]:
-        """Training views that are held back."""
+        """Indices of the held-out training views."""
         every = self.config.holdout_every
         return list(range(every - 1, len(self.train_dataset), every)) if every else []
 
     @property
     def train_indices(self) -> list[int]:
-        """Training views that training sees."""
-        held_back = set(self.holdout_indices)
-        return [i for i in range(len(self.train_dataset)) if i not in held_back]
+        """Indices of the other training views."""
+        held_out = set(self.holdout_indices)
+        return [i for i in range(len(self.train_dataset)) if i not in held_out]
 
     def view_of_step(self, step: int) -> int:
         """Index of the training view of ``step``: each pass over the views is a new permutation."""
@@ -199,31 +198,31 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         return self._order[1][position]
 
     def training_views(self) -> Iterator[tuple[Cameras, torch.Tensor | None]]:
-        """Every training view that is not held back: camera, on the CPU and of shape ``(1,)``, and the pixels to learn from.
+        """Training views that are not held out: camera of shape ``(1,)`` on the CPU, and mask.
 
-        These are bool ``[H, W, 1]``; None for all of them.
+        The mask is bool ``[H, W, 1]``, True for pixels to train on; None for all pixels.
         """
         outputs = self.train_dataparser_outputs
-        # nerfstudio masks what lies outside of this lens by itself.
+        # nerfstudio masks the border of this lens by itself.
         round_lens = (outputs.cameras.camera_type == CameraType.FISHEYE624.value).any()
-        masked = self.config.pictures and (outputs.mask_filenames is not None or bool(round_lens))
+        masked = self.config.images and (outputs.mask_filenames is not None or bool(round_lens))
         for index in self.train_indices:
-            # First the mask: what undistorts it changes the camera.
+            # Read the mask first: undistortion changes the camera.
             mask = self.cached_train[index].get("mask") if masked else None
             yield self.train_dataset.cameras[index : index + 1], mask
 
     def holdout_views(self) -> Iterator[tuple[Cameras, dict[str, torch.Tensor]]]:
-        """Held-back views as (camera, batch) pairs, in the form that nerfstudio's evaluation takes; one is loaded at a time."""
+        """Held-out views as camera and batch, as nerfstudio's evaluation takes them; loaded one at a time."""
         for index in self.holdout_indices:
             yield self._view(index)
 
     def _view(self, index: int) -> tuple[Cameras, dict[str, torch.Tensor]]:
         batch = dict(self.cached_train[index])
-        batch["image"] = batch["image"].to(self.device, non_blocking=True)  # pinned, where it waits in host memory
+        batch["image"] = batch["image"].to(self.device, non_blocking=True)  # pinned in host memory
         return self._camera(index), batch
 
     def _camera(self, index: int) -> Cameras:
-        """A training camera, kept, since nerfstudio takes long to cut one out of many; asked for after its picture was read."""
+        """A training camera, cached because nerfstudio's slicing is slow; ask for it after its image was read."""
         if index not in self._cameras:
             camera = self.train_dataset.cameras[index : index + 1]
             camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
@@ -239,23 +238,23 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> list[dict[str, torch.Tensor]]:
         dataset = self.train_dataset if split == "train" else self.eval_dataset
-        if not self.config.pictures:
-            # The viewer asks for all of them before it shows anything.
+        if not self.config.images:
+            # The viewer loads all of them before its first frame.
             return super()._load_images(split, "gpu")
-        self._check_pictures(dataset)
+        self._check_images(dataset)
         if split == "train" and self.eval_dataset:
-            # A test view that cannot be read should be known now, not at the prune.
-            self._check_pictures(self.eval_dataset)
+            # Report a damaged test view now, not at the prune.
+            self._check_images(self.eval_dataset)
         if cache_images_device == "cpu" and not torch.cuda.is_available():
-            # The stock code pins the memory of "cpu" caches, which needs a driver; "gpu" means the model's device.
+            # The stock "cpu" cache pins memory, which needs a driver; "gpu" means the model's device.
             cache_images_device = "gpu"
         return super()._load_images(split, cache_images_device)
 
-    def _check_pictures(self, dataset: InputDataset) -> None:
+    def _check_images(self, dataset: InputDataset) -> None:
         scale = dataset.scale_factor
         masks: Sequence[Path | None] = dataset._dataparser_outputs.mask_filenames or [None] * len(dataset)
         for index, (path, mask) in enumerate(zip(dataset.image_filenames, masks)):
-            full = check_picture(path)
+            full = check_image(path)
             size = tuple(int(side * scale) for side in full)
             camera = dataset.cameras[index]
             expected = (int(camera.width.item()), int(camera.height.item()))
@@ -264,5 +263,5 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                     f"{path.name} is {size[0]} x {size[1]} px but its camera says {expected[0]} x {expected[1]}; "
                     "give each size its own camera, or resize the images"
                 )
-            if mask is not None and check_picture(mask, mask=True) != full:
-                raise DataError(f"{mask} has not the size of its picture {path.name}; make it {full[0]} x {full[1]} px")
+            if mask is not None and check_image(mask, mask=True) != full:
+                raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")

@@ -7,18 +7,29 @@ import importlib
 import os
 import shutil
 import subprocess
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
+import hypothesis
 import pytest
 import torch
+from filelock import FileLock
 
 from sundae_ns.gpu import nvrtc
 from sundae_ns.gpu.nvrtc import Argument, Launch
 
 CompileKernels = Callable[..., dict[str, Launch]]
+Once = Callable[[str, Callable[[Path], None]], Path]
 
-# What a GPU's compiler knows by itself, and a loop over the threads. A block has one thread here, so that what the threads
-# of a block share is filled before it is read.
+ALL_SEEDS = os.environ.get("SUNDAE_ALL_SEEDS") == "1"
+_FIRST = ("integration", "distributed", "cli")
+"""Folders with long files, the longest first. Workers that start with these end together."""
+
+# Definitions that a GPU's compiler has built in, and a setter of the block index. A block has one thread here, so
+# memory that threads of a block share is filled before it is read.
 _SHIM = """
 #include <math.h>
 #define __device__
@@ -37,18 +48,45 @@ extern "C" void at(unsigned block) { blockIdx.x = block; }
 
 
 def pytest_configure() -> None:
-    # Tests are small: a second thread gains little, and waits long where something else runs on the machine. Commands
-    # that tests start inherit it, so that their sums come out as those of this process.
+    # Tests are small: a second thread gains little, and waits on a busy machine. Commands that tests start inherit
+    # this, so their sums are the same as those of this process.
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
+    # A test on a busy machine may be slow, so examples have no deadline.
+    hypothesis.settings.register_profile("few", max_examples=10, deadline=None)
+    hypothesis.settings.register_profile("all", max_examples=200, deadline=None)
+    hypothesis.settings.load_profile("all" if ALL_SEEDS else "few")
+
+
+def _callers() -> list[SimpleNamespace]:
+    """The functions on the stack, innermost first, without their sources."""
+    frame, found = sys._getframe(1), []
+    while frame is not None:
+        found.append(SimpleNamespace(function=frame.f_code.co_name))
+        frame = frame.f_back
+    return found
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    # nerfstudio calls inspect.stack() 26 times while it is imported, each time for one name; below pytest that takes 10 s.
+    with mock.patch("inspect.stack", _callers):
+        return (yield)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    here = Path(__file__).parent
+    order = {name: place for place, name in enumerate(_FIRST)}
+    items.sort(key=lambda item: order.get(item.path.relative_to(here).parts[0], len(order)))
+    if not ALL_SEEDS:
+        for item in items:
+            if item.get_closest_marker("long"):
+                item.add_marker(pytest.mark.skip(reason="takes a minute or more: make test-all"))
     if torch.cuda.is_available():
         return
     skip = pytest.mark.skip(reason="no CUDA device here")
     for item in items:
-        if "gpu" in item.keywords:
+        if item.get_closest_marker("gpu"):  # not item.keywords, which has the folder tests/gpu too
             item.add_marker(skip)
 
 
@@ -58,8 +96,27 @@ def _seed() -> None:
 
 
 @pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """Make a folder once for all workers of pytest-xdist: the first to ask makes it, the others wait for it."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def made(name: str, make: Callable[[Path], None]) -> Path:
+        folder, done = shared / name, shared / f"{name}.done"
+        with FileLock(shared / f"{name}.lock"):
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                make(folder)
+                done.touch()
+        return folder
+
+    return made
+
+
+@pytest.fixture(scope="session")
 def open3d() -> None:
-    """Skips where open3d cannot be imported: it loads libraries of a desktop."""
+    """Skip if open3d cannot be imported: it loads libraries of a desktop."""
     try:
         importlib.import_module("open3d")
     except (ImportError, OSError) as error:
@@ -68,7 +125,7 @@ def open3d() -> None:
 
 @pytest.fixture(scope="session")
 def compile_for_cpu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., ctypes.CDLL]:
-    """The very lines of CUDA kernels as a library for the CPU: of a source and options of the compiler."""
+    """Compile a CUDA source, with compiler options, to a library for the CPU."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("no g++ here to compile the kernels for the CPU")
@@ -87,7 +144,7 @@ def compile_for_cpu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., c
 
 @pytest.fixture(scope="session")
 def compile_kernels(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKernels:
-    """The same as launches: of a source, names of kernels and options of the compiler."""
+    """Compile a CUDA source for the CPU, and return launch functions for the named kernels."""
 
     def compile_them(source: str, names: Sequence[str], options: Sequence[str] = ()) -> dict[str, Launch]:
         loaded = compile_for_cpu(source, options)
@@ -95,7 +152,7 @@ def compile_kernels(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKerne
         def launch_of(name: str) -> Launch:
             def launch(threads: int, arguments: Sequence[Argument]) -> None:
                 values = [nvrtc._as_c(a, torch.device("cpu")) for a in arguments]
-                # More threads than asked for, as whole blocks have.
+                # More threads than requested, as whole blocks have.
                 for block in range(threads + 3):
                     loaded.at(block)
                     getattr(loaded, name)(*values)

@@ -1,11 +1,13 @@
-"""Scripts of ``benchmarks/`` say what they do when they are asked, and do it only when they are not."""
+"""Scripts of ``benchmarks/``: their help, their commands, and the tables that they write into README and docs."""
 
 from __future__ import annotations
 
-import re
+import ast
+import json
 import runpy
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tyro
@@ -13,13 +15,15 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
 from sundae_ns.evaluation import read_rows
 
-FOLDER = Path(__file__).parents[1] / "benchmarks"
-DATAPARSER = {"--colmap-path", "--downscale-factor", "--eval-mode", "--eval-interval"}
-SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py") if "__main__" in path.read_text(encoding="utf-8"))
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "benchmarks"
+RESULTS = FOLDER / "results"
+SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py"))
+TABLE = "<!-- table: headline -->\n| old |\n<!-- end of table -->"
 
 
 def run(monkeypatch: pytest.MonkeyPatch, name: str, *arguments: str) -> int:
-    """Run a script as ``python benchmarks/NAME ARGUMENTS`` does, and give its exit code."""
+    """Run a script as ``python benchmarks/NAME ARGUMENTS`` does; its exit code."""
     monkeypatch.syspath_prepend(str(FOLDER))
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     with pytest.raises(SystemExit) as caught:
@@ -28,35 +32,97 @@ def run(monkeypatch: pytest.MonkeyPatch, name: str, *arguments: str) -> int:
     return caught.value.code
 
 
+def loaded(monkeypatch: pytest.MonkeyPatch, name: str) -> dict[str, Any]:
+    """Names of a script that was not started."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    return runpy.run_path(str(FOLDER / name))
+
+
+def test_there_are_at_most_a_dozen() -> None:
+    assert 0 < len(SCRIPTS) <= 12
+
+
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_help(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(monkeypatch, name, "--help") == 0
     assert capsys.readouterr().out.startswith(f"usage: {name}")
+    assert f"python benchmarks/{name}" in (ast.get_docstring(ast.parse((FOLDER / name).read_text())) or "")
 
 
-def test_a_table_of_branches_that_were_not_measured(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(monkeypatch, "branch_table.py", "3") == 2
-    assert "there are no branches of 3 steps; give one of " in capsys.readouterr().err
+# ---------------------------------------------------------------------------------------------------------------- results
+
+
+def test_results_are_small_and_can_be_read() -> None:
+    for path in RESULTS.iterdir():
+        text = path.read_text()
+        assert len(text) < 10_000, path.name
+        if path.suffix == ".jsonl":
+            assert all(isinstance(json.loads(line), dict) for line in text.splitlines()), path.name
+    assert len(read_rows(RESULTS / "runs.csv")) >= 10
 
 
 def test_commands_of_rows_are_ones_that_ns_train_takes() -> None:
-    """What a row says was run can be typed: options come before the dataparser, and a branch's are named as its script's."""
-    rows = [row for row in read_rows(FOLDER / "results" / "runs.csv") if row.command.startswith("ns-train ")]
-    assert len(rows) > 500
+    rows = [row for row in read_rows(RESULTS / "runs.csv") if row.command.startswith("ns-train ")]
+    assert len(rows) >= 5
     for row in rows:
-        _, _, of_parser = row.command.partition(" colmap ")
-        options, _, of_script = of_parser.partition(" (")
-        assert "--pipeline." not in options, row
-        assert set(re.findall(r"--\S+", options)) <= DATAPARSER, row
-        assert not of_script or of_script.startswith(("branch.py --", "mcmc.py --")), row
+        words = row.command.split()[1:]
+        config = tyro.cli(AnnotatedBaseConfigUnion, args=words)  # type: ignore[arg-type]
+        assert config.max_num_iterations == row.steps  # type: ignore[attr-defined]
 
 
-def test_the_command_of_a_rules_row_is_parsed(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = read_rows(FOLDER / "results" / "runs.csv")
-    row = [row for row in rows if (row.variant, row.keep_ratio) == ("paper", 0.3)][-1]
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=row.command.split()[1:])
-    pruning = config.pipeline.model.pruning  # type: ignore[attr-defined]
-    assert (config.max_num_iterations, pruning.keep_ratio) == (row.steps, 0.3)
-    assert (pruning.selection, pruning.score, pruning.signal) == ("band", "response", "positions")
+# ----------------------------------------------------------------------------------------------------------------- tables
+
+
+def test_tables_of_all_pages_are_those_of_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    tables = loaded(monkeypatch, "tables.py")
+    for page in tables["PAGES"]:
+        text = page.read_text(encoding="utf-8")
+        assert tables["with_tables"](text) == text, f"{page.name} is not current; run: python benchmarks/tables.py"
+
+
+def test_every_table_can_be_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, make in loaded(monkeypatch, "tables.py")["TABLES"].items():
+        heads, rule, *rows = make()
+        assert rows, name
+        assert {line.count("|") for line in (rule, *rows)} == {heads.count("|")}, name
+
+
+def test_a_page_changes_between_its_markers_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    tables = loaded(monkeypatch, "tables.py")
+    made = tables["with_tables"](f"before\n{TABLE}\nbetween\n{TABLE}\nafter\n")
+    headline = "\n".join(tables["headline"]())
+    block = TABLE.replace("| old |", headline)
+    assert made == f"before\n{block}\nbetween\n{block}\nafter\n"
+    assert tables["with_tables"](made) == made
+    assert tables["with_tables"]("| a |\n") == "| a |\n"
+    with pytest.raises(KeyError, match="no-such-table"):
+        tables["with_tables"](TABLE.replace("headline", "no-such-table"))
+
+
+def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    plots = loaded(monkeypatch, "plot.py")
+    monkeypatch.setattr(sys, "argv", ["plot.py", "-o", str(tmp_path)])
+    plots["main"]()
+    assert {path.stem for path in tmp_path.iterdir()} == set(plots["PLOTS"])
+
+
+# ---------------------------------------------------------------------------------------------------------------- mutants
+
+
+def test_rooms_of_mutants_name_modules_and_tests_that_exist() -> None:
+    tree = ast.parse((FOLDER / "mutants.py").read_text())
+    rooms = next(
+        node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "ROOMS"
+    )
+    assert isinstance(rooms, ast.Dict)
+    for value in rooms.values:
+        assert isinstance(value, ast.Call)
+        modules, tests, *functions = (ast.literal_eval(argument) for argument in value.args)
+        found = [path for glob in modules for path in (ROOT / "sundae_ns").glob(glob)]
+        assert all(list((ROOT / "sundae_ns").glob(glob)) for glob in modules), modules
+        assert all(list((ROOT / "tests").glob(glob)) for glob in tests), tests
+        source = "\n".join(path.read_text() for path in found)
+        for function in functions[0] if functions else ():
+            assert f"\ndef {function}(" in source, function

@@ -13,7 +13,7 @@ import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from PIL import Image
 
-from sundae_ns.data import write_scene
+from sundae_ns.data import write_embedded_capture
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import ConfigError, DataError
 
@@ -23,7 +23,7 @@ VIEWS = 7
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("capture") / "scene"
-    return write_scene(out, train_views=VIEWS, test_views=2, width=20, height=16, points=60, samples=1)
+    return write_embedded_capture(out, train_views=VIEWS, test_views=2, width=20, height=16, points=60, samples=1)
 
 
 @pytest.fixture
@@ -233,7 +233,7 @@ def test_no_training_images(own_copy: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "advice"),
     [
-        ("a.jpg", "has no transforms.json; make a capture of pictures with `ns-process-data images --data"),
+        ("a.jpg", "has no transforms.json; make a capture of images with `ns-process-data images --data"),
         ("sparse/0/cameras.bin", "it is in COLMAP layout: add `colmap --colmap-path sparse/0` to ns-train"),
         ("colmap/sparse/0/cameras.txt", "add `colmap --colmap-path colmap/sparse/0` to ns-train"),
     ],
@@ -247,5 +247,5 @@ def test_a_folder_that_is_no_capture_says_how_to_make_one_of_it(tmp_path: Path, 
 
 def test_a_file_that_is_no_capture(tmp_path: Path) -> None:
     (tmp_path / "walk.mp4").touch()
-    with pytest.raises(DataError, match="no capture but a file; ns-process-data video"):
+    with pytest.raises(DataError, match="is a file, not a capture; ns-process-data video"):
         manager(tmp_path / "walk.mp4")

@@ -1,89 +1,170 @@
-"""The layer rule, in fresh interpreters: a room imports only rooms on lower floors, and stays light."""
+"""The layer rule: a room imports only rooms on lower floors, type checking included, and stays light."""
 
 from __future__ import annotations
 
+import ast
 import json
 import subprocess
 import sys
+from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1] / "sundae_ns"
-FLOORS = {
-    "errors": 0,
-    "graphs": 0,
-    "filters": 0,
-    "gpu": 0,
-    "gaussians": 1,
-    "rasterization": 1,
-    "compensation": 1,
-    "pruning": 2,
-    "storage": 2,
-    "evaluation": 2,
-    "data": 2,
-    "datamanager": 3,
-    "distributed": 3,
-    "model": 3,
-    "rendering": 3,
-    "scenes": 3,
-    "trainer": 3,
-    "training": 3,
-    "viewer": 3,
-    "method_configs": 4,
-    "cli": 4,
-}
-# Rooms that may import a neighbour on their own floor.
-SAME_FLOOR = {"graphs": {"gpu"}, "filters": {"graphs", "gpu"}}
+ROOT = Path(__file__).parents[1]
+PACKAGE = "sundae_ns"
+FLOORS = (
+    "errors",
+    "gpu",
+    "data",
+    "graphs",
+    "filters",
+    "gaussians",
+    "rasterization",
+    "compensation",
+    "evaluation",
+    "pruning",
+    "storage",
+    "rendering",
+    "training",
+    "distributed",
+    "datamanager",
+    "viewer",
+    "callbacks",
+    "model",
+    "trainer",
+    "scenes",
+    "method_configs",
+    "cli",
+)
+"""Rooms from the lowest floor up; each has a floor of its own."""
+SHELL = ("model", "trainer")
+"""Only rooms above may know these."""
+BARE = FLOORS[: FLOORS.index("rendering")]
+"""Rooms that import neither nerfstudio nor gsplat when they are imported."""
+MAX_MODULES = 6
+"""Modules beside the folders in the package's root."""
 LISTER = """
 import importlib, json, pkgutil, sys
-room = sys.argv[1]
-module = importlib.import_module(room)
-if hasattr(module, "__path__"):
-    for info in pkgutil.walk_packages(module.__path__, room + "."):
-        importlib.import_module(info.name)
+for room in sys.argv[1:]:
+    module = importlib.import_module(room)
+    if hasattr(module, "__path__"):
+        for info in pkgutil.walk_packages(module.__path__, room + "."):
+            importlib.import_module(info.name)
 print(json.dumps(sorted(sys.modules)))
 """
 
 
-def imported_by(module: str) -> set[str]:
-    """Names of all modules in a fresh interpreter after importing ``module`` and everything below it."""
-    result = subprocess.run([sys.executable, "-c", LISTER, module], capture_output=True, text=True, check=True)
-    return set(json.loads(result.stdout.splitlines()[-1]))
+def room_of(module: str) -> str | None:
+    """The room of a module of the package; None for other modules and for the package itself."""
+    parts = module.split(".")
+    return parts[1] if parts[0] == PACKAGE and len(parts) > 1 else None
 
 
-def violations(room: str, modules: set[str]) -> set[str]:
-    """Modules of the package that ``room`` must not have imported, and nerfstudio or gsplat where they must not be."""
-    rooms = {name.split(".")[1] for name in modules if name.startswith("sundae_ns.")} - {room}
-    allowed_peers = {"errors"} | SAME_FLOOR.get(room, set())
-    floor = FLOORS[room]
-    found = {r for r in rooms if FLOORS[r] > floor or (floor < 3 and FLOORS[r] == floor and r not in allowed_peers)}
-    if floor < 3:
-        found |= modules & {"nerfstudio", "gsplat"}
-    if floor == 0:
-        found |= modules & {"torchvision", "PIL", "rich", "tyro"}
+@cache
+def modules() -> dict[str, Path]:
+    """Files of the package by the names of their modules."""
+    names = {}
+    for _, path in sources():
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        if parts[0] != PACKAGE:
+            parts = (PACKAGE, *parts)
+        names[".".join(parts).removesuffix(".__init__")] = path
+    return names
+
+
+def imports_of(source: str) -> Iterator[str]:
+    """Modules that a source imports anywhere, under ``TYPE_CHECKING`` and inside functions too."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None:
+            assert node.level == 0, "imports are absolute"
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                yield name if node.module == PACKAGE or name in modules() else node.module
+
+
+def sources() -> Iterator[tuple[str, Path]]:
+    """Every file of the package with its room."""
+    for path in sorted((ROOT / PACKAGE).rglob("*.py")):
+        parts = path.relative_to(ROOT / PACKAGE).with_suffix("").parts
+        if parts != ("__init__",):
+            yield parts[0], path
+    for path in sorted((ROOT / "method_configs").rglob("*.py")):
+        yield "method_configs", path
+
+
+def violations(room: str, imported: Iterable[str]) -> set[str]:
+    """Rooms that ``room`` must not import."""
+    rooms = {found for module in imported if (found := room_of(module)) is not None} - {room}
+    return {other for other in rooms if FLOORS.index(other) > FLOORS.index(room)}
+
+
+def circles(edges: dict[str, set[str]]) -> list[str]:
+    """Modules on a circle of imports."""
+    found = []
+    for start in edges:
+        seen: set[str] = set()
+        waiting = [start]
+        while waiting:
+            for target in edges.get(waiting.pop(), set()) - seen:
+                seen.add(target)
+                waiting.append(target)
+        if start in seen:
+            found.append(start)
     return found
 
 
 def test_every_room_has_a_floor() -> None:
-    rooms = {p.stem for p in ROOT.iterdir() if not p.name.startswith("_") and p.suffix in ("", ".py")}
-    assert rooms | {"method_configs"} == set(FLOORS)
+    rooms = {room for room, _ in sources()}
+    assert rooms == set(FLOORS)
 
 
-@pytest.mark.parametrize("room", [room for room in FLOORS if FLOORS[room] < 3])
-def test_room_imports_only_lower_floors(room: str) -> None:
-    assert not violations(room, imported_by(f"sundae_ns.{room}"))
+def test_few_modules_stand_beside_the_folders() -> None:
+    modules = [path.name for path in (ROOT / PACKAGE).glob("*.py") if path.name != "__init__.py"]
+    assert len(modules) <= MAX_MODULES, modules
 
 
-def test_shell_does_not_import_cli_or_configs() -> None:
-    modules = imported_by("sundae_ns.model")
-    assert "nerfstudio" in modules
-    assert not {m for m in modules if m.startswith(("sundae_ns.cli", "sundae_ns.method_configs"))}
+def test_rooms_import_only_lower_floors() -> None:
+    found = {}
+    for room, path in sources():
+        wrong = violations(room, imports_of(path.read_text()))
+        if wrong:
+            found[str(path.relative_to(ROOT))] = wrong
+    assert not found
 
 
-def test_the_detector_can_fail() -> None:
-    modules = imported_by("sundae_ns.pruning")
-    assert "sundae_ns.graphs" in modules
-    # The same modules would be a violation had a room on a lower floor imported them.
-    assert "pruning" in violations("gaussians", modules)
-    assert "nerfstudio" in violations("graphs", {"nerfstudio"})
+def test_no_module_is_on_a_circle() -> None:
+    assert not circles({name: set(imports_of(path.read_text())) for name, path in modules().items()})
+
+
+def test_the_bare_rooms_import_neither_nerfstudio_nor_gsplat() -> None:
+    command = [sys.executable, "-c", LISTER, *(f"{PACKAGE}.{room}" for room in BARE)]
+    result = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert not {"nerfstudio", "gsplat"} & set(json.loads(result.stdout.splitlines()[-1]))
+
+
+def test_the_detectors_can_fail() -> None:
+    assert violations("gaussians", ["sundae_ns.pruning.decision", "sundae_ns.errors"]) == {"pruning"}
+    source = "if TYPE_CHECKING:\n    from sundae_ns.model import SundaeModel\ndef f():\n    from sundae_ns import cli\n"
+    assert violations("distributed", imports_of(source)) == {"model", "cli"}
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == ["a", "b", "c"]
+
+
+@pytest.mark.parametrize("name", SHELL)
+def test_nothing_below_the_shell_knows_it(name: str) -> None:
+    below = FLOORS[: FLOORS.index("datamanager")]
+    assert not [
+        str(path.relative_to(ROOT))
+        for room, path in sources()
+        if room in below and f"{PACKAGE}.{name}" in set(imports_of(path.read_text()))
+    ]
+
+
+def test_the_model_is_short_and_asks_for_no_kind() -> None:
+    text = (ROOT / PACKAGE / "model.py").read_text()
+    assert len(text.splitlines()) < 400
+    for word in ("shards", "budget", "preview"):
+        assert word not in text.lower(), word

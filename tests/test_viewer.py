@@ -21,10 +21,12 @@ from torch import Tensor
 import sundae_ns.pruning.decision
 import sundae_ns.viewer
 from sundae_ns.compensation import HeadConfig
+from sundae_ns.gaussians.field import Field
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.pruning import PruningConfig, response
+from sundae_ns.rendering import LocalField, render
 from sundae_ns.training.optimizers import FusedAdamConfig
-from sundae_ns.training.schedules import make_policy
+from sundae_ns.training.schedules import make_schedule
 from sundae_ns.viewer import Rule, rule_config
 
 N = 90
@@ -41,6 +43,8 @@ class Views:
     """A datamanager with two training cameras, which counts how often they are asked for."""
 
     eval_dataset = None
+    place = (0, 1)
+    holdout_indices: tuple[int, ...] = ()
     asked = 0
 
     def training_views(self) -> Iterator[tuple[Cameras, None]]:
@@ -70,7 +74,7 @@ def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
     model.step = 10
     views = Views()
     pipeline = SimpleNamespace(model=model, datamanager=views)
-    model.preview.control._setup(SimpleNamespace(pipeline=pipeline, viser_server=None))  # type: ignore[arg-type]
+    model.viewer_controls.control._setup(SimpleNamespace(pipeline=pipeline, viser_server=None))  # type: ignore[arg-type]
     return model.eval(), views
 
 
@@ -90,8 +94,8 @@ def as_the_viewer(call: Callable[[], Any]) -> Any:
 
 
 def shown(model: SundaeModel, rule: Rule, keep_ratio: float) -> Tensor | None:
-    model.preview.rule.value, model.preview.keep_ratio.value = rule, keep_ratio
-    decision = as_the_viewer(lambda: model.preview.decision(model))
+    model.viewer_controls.rule.value, model.viewer_controls.keep_ratio.value = rule, keep_ratio
+    decision = as_the_viewer(model.viewer_controls.preview)
     return None if decision is None else decision.mask
 
 
@@ -106,10 +110,10 @@ def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
 def test_the_viewer_finds_slider_and_menu() -> None:
     model, _ = build()
     found = dict(parse_object(SimpleNamespace(model=model), ViewerElement, "Custom Elements"))
-    assert found["Custom Elements/model/preview/keep_ratio"] is model.preview.keep_ratio
-    assert found["Custom Elements/model/preview/rule"] is model.preview.rule
-    assert not list(model.preview.parameters())
-    assert not [name for name in model.state_dict() if "preview" in name]
+    assert found["Custom Elements/model/viewer_controls/keep_ratio"] is model.viewer_controls.keep_ratio
+    assert found["Custom Elements/model/viewer_controls/rule"] is model.viewer_controls.rule
+    assert not list(model.viewer_controls.parameters())
+    assert not [name for name in model.state_dict() if "viewer_controls" in name]
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -127,9 +131,8 @@ def test_exactly_the_share_is_shown(rule: Rule, keep_ratio: float) -> None:
 
 PRUNES: list[dict[str, Any]] = [
     {},
-    {"score": "contribution", "redistribution": "grow"},
-    {"score": "response-contribution", "selection": "shared"},
-    {"score": "coherence-contribution", "selection": "sampled", "redistribution": "none", "seed": 3},
+    {"score": "contribution", "redistribution": "none"},
+    {"score": "response-contribution", "selection": "sampled", "seed": 3},
     {"score": "response", "selection": "band", "signal": "positions", "edges": "centres", "redistribution": "none"},
 ]
 
@@ -138,31 +141,33 @@ PRUNES: list[dict[str, Any]] = [
 @pytest.mark.parametrize("options", PRUNES, ids=lambda options: options.get("score", "default"))
 def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None:
     model, views = build(**options)
-    model.preview.keep_ratio.value = 0.2
-    decision = as_the_viewer(lambda: model.preview.decision(model))
+    model.viewer_controls.keep_ratio.value = 0.2
+    decision = as_the_viewer(model.viewer_controls.preview)
     seen = as_the_viewer(lambda: picture(model))
     model.config.pruning.keep_ratio = 0.2
-    before = {name: value.clone() for name, value in model.gaussians.items()}
+    share = 0.2 if model.config.pruning.uses_detail else None
+    before = {name: value.clone() for name, value in model.state.field.items()}
     optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
-    report = make_policy(model.config.pruning).step_post_backward(
-        model.gaussians,
+    report = make_schedule(model.config.pruning).step_post_backward(
+        model.state.field,
         optimizers,
         {"pruned_at": -1, "num_prunes": 0, "peak": N},
         model.config.pruning.prune_at,
-        contribution=lambda: model.contribution(views),  # type: ignore[arg-type]
+        contribution=lambda: model.contribution(views, share),  # type: ignore[arg-type]
     )
     assert report is not None
     assert report.after == int(decision.mask.sum()) == 18
     values = {name: value[decision.mask] for name, value in before.items()} | dict(decision.values or {})
-    assert {name for name, value in model.gaussians.items() if not torch.equal(value, values[name])} == set()
+    assert {name for name, value in model.state.field.items() if not torch.equal(value, values[name])} == set()
     # A merge and growth show in the picture too.
-    left, _ = model.render(model.gaussians, model.view_of(camera()), seen["background"][0, 0], compensate=False)
+    settings = model.render_settings(training=False).without_head()
+    left, _ = render(model.source, model.view_of(camera()), seen["background"][0, 0], settings)
     assert torch.equal(seen["rgb"], left["rgb"])
 
 
 def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
     model, _ = build()
-    known = response(model.gaussians, rule_config(model.config.pruning, "band: both", 0.2)).magnitude
+    known = response(model.state.field, rule_config(model.config.pruning, "band: both", 0.2)).magnitude
     masks = {rule: shown(model, rule, 0.2) for rule in RULES}
     high, low, both, top = (masks[rule] for rule in ("band: high", "band: low", "band: both", "opacity"))
     assert high is not None
@@ -186,15 +191,16 @@ def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
 @torch.no_grad()
 def test_a_crop_box_cuts_the_preview_too() -> None:
     model, _ = build()
-    model.preview.keep_ratio.value = 0.5
-    decision = as_the_viewer(lambda: model.preview.decision(model))
+    model.viewer_controls.keep_ratio.value = 0.5
+    decision = as_the_viewer(model.viewer_controls.preview)
     half = OrientedBox(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]), torch.tensor([2.0, 9.0, 9.0]))
     seen = as_the_viewer(lambda: model.get_outputs_for_camera(camera(), half))
     rows = half.within(model.means).squeeze(-1)[decision.mask]
     assert 0 < int(rows.sum()) < len(rows)
-    params = {name: value[decision.mask][rows] for name, value in model.gaussians.items()}
+    params = {name: value[decision.mask][rows] for name, value in model.state.field.items()}
     params |= {name: value[rows] for name, value in decision.values.items()}
-    expected, _ = model.render(params, model.view_of(camera()), seen["background"][0, 0], compensate=False)
+    settings = model.render_settings(training=False).without_head()
+    expected, _ = render(LocalField(Field(params)), model.view_of(camera()), seen["background"][0, 0], settings)
     assert torch.equal(seen["rgb"], expected["rgb"])
 
 
@@ -203,13 +209,13 @@ def test_a_crop_box_cuts_the_preview_too() -> None:
 def test_off_every_picture_is_as_before(rule: Rule) -> None:
     model, views = build()
     before = picture(model)
-    model.preview.rule.value = rule
+    model.viewer_controls.rule.value = rule
     assert same(as_the_viewer(lambda: picture(model)), before)
     assert views.asked == 0
     # On, and off again.
-    model.preview.keep_ratio.value = 0.3
+    model.viewer_controls.keep_ratio.value = 0.3
     assert not same(as_the_viewer(lambda: picture(model)), before)
-    model.preview.keep_ratio.value = 1.0
+    model.viewer_controls.keep_ratio.value = 1.0
     assert same(as_the_viewer(lambda: picture(model)), before)
 
 
@@ -218,7 +224,7 @@ def test_on_it_shows_base_colours_and_touches_nothing() -> None:
     model, _ = build()
     before = {name: value.clone() for name, value in model.state_dict().items() if isinstance(value, Tensor)}
     versions = [value._version for value in model.parameters()]
-    model.preview.keep_ratio.value = 0.3
+    model.viewer_controls.keep_ratio.value = 0.3
     found = as_the_viewer(lambda: picture(model))
     assert torch.equal(found["rgb"], found["base_rgb"])
     assert found["response"].max() > 0
@@ -234,7 +240,7 @@ def test_training_and_evaluation_do_not_see_it() -> None:
     trained = picture(model)
     model.eval()
     evaluated = picture(model)
-    model.preview.keep_ratio.value = 0.1
+    model.viewer_controls.keep_ratio.value = 0.1
     assert same(picture(model), evaluated)
     model.train()
     assert same(
@@ -302,7 +308,7 @@ def test_a_prune_in_training_is_seen_and_a_step_is_not(calls: list[int]) -> None
         TrainingCallbackAttributes(optimizers, None, pipeline, None)  # type: ignore[arg-type]
     )
     truth = {"image": torch.zeros(24, 32, 3, dtype=torch.uint8)}
-    model.preview.rule.value, model.preview.keep_ratio.value = "band: both", 0.2
+    model.viewer_controls.rule.value, model.viewer_controls.keep_ratio.value = "band: both", 0.2
     kept = []
     for step in range(5):
         model.train()
@@ -325,12 +331,12 @@ def test_a_prune_in_training_is_seen_and_a_step_is_not(calls: list[int]) -> None
 def test_a_rule_that_cannot_be_applied_shows_everything_and_says_so_once(capsys: pytest.CaptureFixture[str]) -> None:
     few, _ = build(1)  # a graph needs two
     before = picture(few)
-    few.preview.rule.value, few.preview.keep_ratio.value = "band: high", 0.5
+    few.viewer_controls.rule.value, few.viewer_controls.keep_ratio.value = "band: high", 0.5
     for _ in range(2):
         assert same(as_the_viewer(lambda: picture(few)), before)
     assert capsys.readouterr().out.count("No preview of band: high") == 1
     alone, _ = build()
-    del alone.preview.control.viewer
+    del alone.viewer_controls.control.viewer
     assert shown(alone, "as configured", 0.5) is None
     assert "no training views" in " ".join(capsys.readouterr().out.split())
     assert shown(alone, "random", 0.5) is not None

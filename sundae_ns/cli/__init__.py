@@ -1,4 +1,4 @@
-"""The ``sundae`` command: what nerfstudio's own commands do not cover. Floor 4."""
+"""The ``sundae`` command: tasks that nerfstudio's commands do not cover. Floor 9."""
 
 from sundae_ns.cli.main import main
 

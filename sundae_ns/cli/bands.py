@@ -1,4 +1,4 @@
-"""``sundae bands``: what the high-pass, the low-pass and the combined rule of the paper keep of a field."""
+"""``sundae bands``: the primitives that the paper's high-pass, low-pass and combined rules keep."""
 
 from __future__ import annotations
 
@@ -6,73 +6,80 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
+from PIL.Image import Image
 from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError, SundaeError
-from sundae_ns.evaluation import Look, look_along_axes, look_through, points_sheet, response_histogram
+from sundae_ns.evaluation import (
+    Projection,
+    points_sheet,
+    project_along_axes,
+    project_through_camera,
+    response_histogram,
+)
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, response
+from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, kept_count, response
+from sundae_ns.scenes.cameras import training_cameras
 from sundae_ns.storage import replacing, write_point_cloud, write_text
 from sundae_ns.storage.atomic import writing
 from sundae_ns.storage.kinds import kind_of
 from sundae_ns.storage.runs.checkpoint import read_field
-from sundae_ns.storage.runs.folder import find_config, read_config, training_cameras
+from sundae_ns.storage.runs.folder import find_config
+
+if TYPE_CHECKING:
+    from nerfstudio.cameras.cameras import Cameras
 
 RULES = {"high": "high-pass", "low": "low-pass", "combined": "combined"}
-"""Captions of the rules, by their names."""
+"""Captions of the rules by name."""
 QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 1.0)
 SIDE = 720
-"""Longer side of a panel that shows a camera's view, pixels."""
+"""Longer side of a camera's panel, pixels."""
 SAMPLED = 20_000
-"""Primitives by which the training view that sees most of the field is found."""
+"""Number of primitives that are projected to find the training view with the most primitives."""
 
 
-def base_colors(params: Mapping[str, Tensor], *, logits: bool) -> Tensor:
-    """Colours of primitives as seen from nowhere in particular: uint8 ``[N, 3]``.
-
-    Args:
-        params: a field.
-        logits: whether a field without bands of spherical harmonics stores logits of colours, as splatfacto's
-            checkpoints do; in .ply files it is always the harmonics' first band.
-    """
-    colors = params["features_dc"].detach()
-    harmonic = not logits or params["features_rest"].shape[1] > 0
-    shown = sh_to_rgb(colors) if harmonic else torch.sigmoid(colors)
-    return (255 * shown.clamp(0, 1)).round().to(torch.uint8)
+def base_colors(features_dc: Tensor) -> Tensor:
+    """View-independent colours, uint8 ``[N, 3]``, from the SH coefficients of degree 0 ``[N, 3]``."""
+    return (255 * sh_to_rgb(features_dc).clamp(0, 1)).round().to(torch.uint8)
 
 
 def band_masks(
     params: Mapping[str, Tensor], config: PruningConfig, graph: NeighborGraph, keep_ratio: float
 ) -> dict[str, Tensor]:
-    """Which primitives each rule keeps, bool ``[N]`` by the names of :data:`RULES`.
+    """The primitives that each rule keeps, bool ``[N]`` by the names of :data:`RULES`.
 
-    The paper takes both ends of one ranking, that of the high-pass response: what responds most passes the high-pass
-    filter, what responds least the low-pass filter, and the combined rule takes ``gamma`` of the first.
+    All rules rank the primitives by the magnitude of their high-pass response, as the paper does. The high-pass rule keeps
+    the largest, the low-pass rule the smallest, and the combined rule a share ``gamma`` of the largest and the rest of the
+    smallest.
 
     Args:
         params: the field, all finite.
         config: signal and gamma.
-        graph: of the field, on which the response is taken.
+        graph: neighbour graph of the field.
         keep_ratio: share that each rule keeps.
     """
     shares = {"high": 1.0, "low": 0.0, "combined": config.gamma}
-    return {name: decide(params, band_rule(config, keep_ratio, shares[name]), graph=graph).mask for name in RULES}
+    count = kept_count(keep_ratio, len(params["means"]))
+    return {
+        name: decide(params, band_rule(config, keep_ratio, share), count=count, graph=graph).mask
+        for name, share in shares.items()
+    }
 
 
 def band_figures(magnitude: Tensor, masks: Mapping[str, Tensor], keep_ratio: float) -> dict[str, Any]:
-    """Counts, thresholds and overlaps of what :func:`band_masks` chose, as plain numbers.
+    """Counts, thresholds and overlaps of the masks, as plain numbers for JSON.
 
     Args:
-        magnitude: ``[N]``, NaN where undefined.
+        magnitude: response magnitudes ``[N]``, NaN where undefined.
         masks: from :func:`band_masks`.
-        keep_ratio: of the masks.
+        keep_ratio: keep ratio of the masks.
     """
     ends = {name: magnitude[mask & magnitude.isfinite()] for name, mask in masks.items()}
     both = masks["combined"]
@@ -91,7 +98,7 @@ def band_figures(magnitude: Tensor, masks: Mapping[str, Tensor], keep_ratio: flo
 
 
 def response_figures(magnitude: Tensor) -> dict[str, Any]:
-    """Quantiles of the response magnitudes ``[N]``, those that are undefined left out, and how many are 0."""
+    """Quantiles of the defined response magnitudes ``[N]``, and the number of those that are 0."""
     known = magnitude[magnitude.isfinite()].sort().values
     places = [round(share * (len(known) - 1)) for share in QUANTILES] if len(known) else []
     return {
@@ -101,40 +108,53 @@ def response_figures(magnitude: Tensor) -> dict[str, Any]:
     }
 
 
-def _views(points: Tensor, source: Path, view: int | None) -> tuple[list[Look], str]:
-    """From where to look, and in words: through a training camera if the run and its capture are there."""
+def _cameras_of_run(source: Path) -> Cameras:
+    """Training cameras of the run that a path belongs to.
+
+    Raises:
+        CheckpointError: the run's ``config.yml`` cannot be read.
+        DataError: the path belongs to no run, or the run's capture cannot be used.
+    """
+    config = find_config(source) if kind_of(source) != "ply" else None
+    if config is None:
+        raise DataError("the field has no run, and so no cameras")
+    return training_cameras(config)
+
+
+def _project(points: Tensor, source: Path, view: int | None) -> tuple[list[Projection], str]:
+    """Projections of the points and their description: through a training camera if the run and its capture exist.
+
+    Args:
+        points: centres ``[N, 3]``.
+        source: the path that the user gave.
+        view: index of the training view; None chooses the view with the most primitives.
+    """
     try:
-        config = find_config(source) if kind_of(source) != "ply" else None
-        if config is None:
-            raise DataError("the field comes without a run, and so without cameras")
-        cameras = training_cameras(read_config(config))
+        cameras = _cameras_of_run(source)
     except SundaeError as error:
         if view is not None:
             raise ConfigError(f"there is no training view {view}: {error}") from error
-        return look_along_axes(points), f"three orthogonal views, since {str(error).partition(';')[0]}"
+        return project_along_axes(points), f"three orthogonal views, because {str(error).partition(';')[0]}"
     if view is not None and not 0 <= view < len(cameras):
         raise ConfigError(f"there is no training view {view}: the run has {len(cameras)}, from 0 on")
+    from sundae_ns.rendering.views import view_of  # loads nerfstudio, which fields without a run do not need
 
-    def look(index: int, centres: Tensor) -> Look:
-        camera = cameras[index]
-        size = (int(camera.width.item()), int(camera.height.item()))
-        factor = SIDE / max(size)
-        pose = camera.camera_to_worlds.reshape(3, 4)
-        rotation = pose[:, :3] * pose.new_tensor([1.0, -1.0, -1.0])  # nerfstudio's axes are OpenGL's
-        viewmat = torch.cat([rotation.T, -rotation.T @ pose[:, 3:]], dim=1)
-        K = camera.get_intrinsics_matrices().reshape(3, 3).clone()
-        K[:2] *= factor
-        return look_through(centres, viewmat, K, round(size[0] * factor), round(size[1] * factor))
+    def project(index: int, centres: Tensor) -> Projection:
+        camera = view_of(cameras[index], "cpu")
+        camera = camera.zoomed(SIDE / max(camera.width, camera.height))
+        return project_through_camera(centres, camera.viewmat, camera.K, camera.width, camera.height)
 
     if view is None:
-        few = points[:: max(1, len(points) // SAMPLED)]
-        view = max(range(len(cameras)), key=lambda index: _inside(look(index, few)))
-    return [look(view, points)], f"training view {view}"
+        sample = points[:: max(1, len(points) // SAMPLED)]
+        view = max(range(len(cameras)), key=lambda index: _visible(project(index, sample)))
+    return [project(view, points)], f"training view {view}"
 
 
-def _inside(look: Look) -> int:
-    x, y = look.pixels.T
-    return int(((look.depth > 0) & (x >= 0) & (y >= 0) & (x < look.width) & (y < look.height)).sum())
+def _visible(projection: Projection) -> int:
+    """Number of points inside the image."""
+    x, y = projection.pixels.T
+    inside = (x >= 0) & (y >= 0) & (x < projection.width) & (y < projection.height)
+    return int(((projection.depth > 0) & inside).sum())
 
 
 def run_bands(
@@ -146,12 +166,12 @@ def run_bands(
     view: int | None,
     console: Console | None = None,
 ) -> int:
-    """Write clouds, pictures and figures of a field to a folder; options are those of the command.
+    """Write point clouds, images and ``bands.json`` of a field to a folder; the options are those of the command.
 
     Raises:
-        CheckpointError: there is no field.
-        ConfigError: an option cannot work.
-        DataError: the field cannot be filtered.
+        CheckpointError: the source holds no field.
+        ConfigError: an option is out of range.
+        DataError: no primitive of the field is finite, or it has too few for a graph.
         StorageError: the folder cannot be written to.
     """
     console = console or Console()
@@ -175,26 +195,25 @@ def run_bands(
         params = {name: value[finite] for name, value in field.items()}
         if len(params["means"]) == 0:
             raise DataError(f"none of the {len(finite)} primitives in {run} is finite; give another field")
-        colors = base_colors(params, logits=run.suffix != ".ply")
+        colors = base_colors(params["features_dc"])
         next_is("Graph and response")
         config = band_rule(config, ratios[0], config.gamma)
         graph = field_graph(params, config)
         found = response(params, config, graph)
         next_is("Cameras")
-        looks, looked = _views(params["means"], source, view)
+        projections, seen_from = _project(params["means"], source, view)
         next_is("Rules")
-        shown = torch.nan_to_num(found.magnitude, nan=-1.0)
+        scalar = torch.nan_to_num(found.magnitude, nan=-1.0)
         figures, thresholds, files = [], {}, []
 
         def cloud(name: str, mask: Tensor | None = None) -> None:
             rows = slice(None) if mask is None else mask
-            scalars = {"response": shown[rows]}
-            write_point_cloud(out / name, params["means"][rows], colors[rows], scalars=scalars)
+            write_point_cloud(out / name, params["means"][rows], colors[rows], scalars={"response": scalar[rows]})
             files.append(name)
 
-        def picture(name: str, drawn: Any) -> None:
+        def save_png(name: str, image: Image) -> None:
             with replacing(out / name) as partial:
-                drawn.save(partial, format="png")
+                image.save(partial, format="png")
             files.append(name)
 
         cloud("all.ply")
@@ -205,12 +224,15 @@ def run_bands(
             for name, mask in masks.items():
                 cloud(f"{name}-{keep_ratio:g}.ply", mask)
             everything = torch.ones_like(masks["high"])
-            sets = {f"all: {len(everything):,}": everything}
+            sets = {f"all: {len(everything):,} primitives": everything}
             sets |= {f"{RULES[name]}: {int(mask.sum()):,}": mask for name, mask in masks.items()}
-            title = f"{keep_ratio:g} of the primitives' centres; signal: {config.signal}; {looked.partition(',')[0]}"
-            picture(f"bands-{keep_ratio:g}.png", points_sheet(looks, colors, sets, title=title))
-            next_is(f"Kept {keep_ratio:g}")
-        picture("response.png", response_histogram(found.magnitude, thresholds=thresholds))
+            title = (
+                f"Centres of the primitives that each rule keeps: keep ratio {keep_ratio:g}, signal {config.signal}, "
+            )
+            title += seen_from.partition(",")[0]
+            save_png(f"bands-{keep_ratio:g}.png", points_sheet(projections, colors, sets, title=title))
+            next_is(f"Keep ratio {keep_ratio:g}")
+        save_png("response.png", response_histogram(found.magnitude, thresholds=thresholds))
 
     result = {
         "field": str(run),
@@ -225,14 +247,17 @@ def run_bands(
         "gamma": config.gamma,
         "response": response_figures(found.magnitude),
         "bands": figures,
-        "looked_from": looked,
+        "seen_from": seen_from,
         "files": files,
     }
     write_text(out / "bands.json", json.dumps(result, indent=2, allow_nan=False) + "\n")
-    console.print(f"{len(params['means']):,} primitives, sigma {found.sigma:.3g}, {looked}", highlight=False)
+    console.print(f"{len(params['means']):,} primitives, sigma {found.sigma:.3g}, {seen_from}", highlight=False)
     for figure in figures:
         kept, overlap = figure["kept"]["combined"], figure["overlap"]
-        ends = f"{overlap['combined and high']:,} of the high-pass and {overlap['combined and low']:,} of the low-pass"
-        console.print(f"keep {figure['keep_ratio']:g}: {kept:,} each; the combined rule keeps {ends}", highlight=False)
+        shared = f"{overlap['combined and high']:,} with high-pass and {overlap['combined and low']:,} with low-pass"
+        console.print(
+            f"keep ratio {figure['keep_ratio']:g}: {kept:,} primitives by each rule; combined shares {shared}",
+            highlight=False,
+        )
     console.print(f"wrote bands.json and {len(files)} files to {out}", highlight=False)
     return 0

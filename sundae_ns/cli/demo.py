@@ -1,4 +1,4 @@
-"""``sundae demo``: the whole job on the embedded scene, through the commands that users type."""
+"""``sundae demo``: train and evaluate the embedded scene with nerfstudio's commands."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ from rich.console import Console
 from rich.progress import Progress
 
 from sundae_ns.cli.process import percent_of, run_logged
-from sundae_ns.data import write_scene
+from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import ConfigError
 from sundae_ns.evaluation import ComparisonRow, Quality, RunFigures, report_text, save_comparison
 
 METHOD = "sundae-tiny"
 SHOWN = 3
-"""Test views in the picture."""
+"""Number of test views in the comparison image."""
 
 
 def _command(name: str) -> str:
-    """A console script beside this interpreter, so that the demo runs what is installed with it."""
+    """Path of a console script beside this interpreter, or its bare name if there is none."""
     path = Path(sys.executable).parent / name
     return str(path) if path.exists() else name
 
 
-def _picture(path: Path) -> torch.Tensor:
+def _read_image(path: Path) -> torch.Tensor:
     """Pixels ``[H, W, 3]``, float32 in [0, 1]."""
     with Image.open(path) as image:
         return torch.from_numpy(np.asarray(image.convert("RGB"), dtype=np.float32) / 255)
 
 
 def _comparison(renders: Path, out: Path) -> None:
-    """Truth, base, compensated and error of a few test views, from the pictures that ``ns-eval`` wrote."""
+    """Write the comparison image of a few test views from the images that ``ns-eval`` wrote."""
     pairs = sorted(renders.glob("eval_img_*.png"))
     rows = []
     for path in pairs[:: max(len(pairs) // SHOWN, 1)][:SHOWN]:
-        truth, compensated = _picture(path).chunk(2, dim=1)
-        base = _picture(path.with_name(path.name.replace("img", "base")))
+        truth, compensated = _read_image(path).chunk(2, dim=1)
+        base = _read_image(path.with_name(path.name.replace("img", "base")))
         rows.append(ComparisonRow(truth, base, compensated, title=f"test view {int(path.stem[-4:])}"))
     save_comparison(out, rows)
 
@@ -55,20 +55,20 @@ def _check_steps(steps: int) -> None:
 
     prune_at = sundae_tiny.config.pipeline.model.pruning.prune_at
     if steps <= prune_at:
-        raise ConfigError(f"steps is {steps}: the demo prunes after step {prune_at}; give more, or leave it out")
+        raise ConfigError(f"steps is {steps}: the demo prunes after step {prune_at}; give more, or omit it")
 
 
 def run_demo(out: Path, steps: int | None = None, console: Console | None = None) -> int:
-    """Make the scene, train, evaluate, and print the table.
+    """Write the scene, train, evaluate, and print the results.
 
     Args:
-        out: folder for scene, run, logs and pictures; an earlier demo in it is replaced.
-        steps: length of the training instead of the method's own.
+        out: folder for scene, run, logs and images; an earlier demo in it is replaced.
+        steps: number of training steps; None takes the method's default.
         console: where to print.
 
     Raises:
-        ConfigError: so few steps never come to the prune.
-        SundaeError: a command failed; the message shows the end of its output.
+        ConfigError: training ends before the prune.
+        SundaeError: a command failed; the message ends with the last lines of its output.
     """
     if steps is not None:
         _check_steps(steps)
@@ -79,7 +79,9 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
     console.print(f"SUNDAE demo on {device}: ray-trace a scene, train it with ns-train, evaluate it with ns-eval.")
     with Progress(console=console, transient=True) as progress:
         tracing = progress.add_task("Ray tracing the scene", total=None)
-        write_scene(scene, progress=lambda done, total: progress.update(tracing, completed=done, total=total))
+        write_embedded_capture(
+            scene, progress=lambda done, total: progress.update(tracing, completed=done, total=total)
+        )
         training = progress.add_task(f"ns-train {METHOD}", total=100)
 
         def show(line: str) -> None:
@@ -91,7 +93,7 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         train += ["--experiment-name", "demo", "--timestamp", "run"]
         if steps is not None:
             train += ["--max-num-iterations", str(steps)]
-        # An earlier demo's prunes are not this one's.
+        # Remove the record of an earlier demo.
         (run / "prune.json").unlink(missing_ok=True)
         run_logged(train, out / "train.log", show)
         progress.update(training, completed=100)
@@ -101,7 +103,7 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         run_logged(evaluate, out / "eval.log")
         progress.add_task("Timing frames", total=None)
 
-        # nerfstudio is chatty while it imports and loads.
+        # nerfstudio prints messages while it imports and loads.
         with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
             from sundae_ns.scenes.measure import frame_times, sizes
             from sundae_ns.scenes.opening import load_run
@@ -129,5 +131,5 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         ms_head=times.head,
     )
     console.print(report_text(figures), highlight=False)
-    console.print(f"Pictures: {out / 'comparison.png'}   Look around: ns-viewer --load-config {run / 'config.yml'}")
+    console.print(f"Images: {out / 'comparison.png'}   View: ns-viewer --load-config {run / 'config.yml'}")
     return 0

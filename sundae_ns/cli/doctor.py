@@ -1,4 +1,4 @@
-"""``sundae doctor``: what this machine can run, and how to mend what it cannot."""
+"""``sundae doctor``: which parts of SUNDAE run on this machine, and how to fix the others."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rich.table import Table
 
 PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
 LEAST_DRIVERS = {"12": 525, "13": 580}
-"""Oldest drivers on Linux by the CUDA version that torch is built for, from the release notes of NVIDIA's CUDA toolkit."""
+"""Oldest Linux driver by the CUDA version of torch, from the release notes of NVIDIA's CUDA toolkit."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,14 @@ class Finding:
     name: str
     ok: bool
     detail: str
-    mend: str = ""
+    fix: str = ""
+    """Command or advice that fixes it."""
     needed: bool = True
-    """Whether training needs it, rather than one more comfort."""
+    """Whether training needs it."""
 
 
 def versions() -> list[Finding]:
-    """Python, and the packages that matter."""
+    """Versions of Python and of the required packages."""
     findings = [Finding("python", True, platform.python_version())]
     for package in PACKAGES:
         try:
@@ -48,60 +49,60 @@ def versions() -> list[Finding]:
 
 
 def cuda() -> Finding:
-    """Whether torch sees a CUDA device."""
+    """Whether torch finds a CUDA device."""
     if torch.cuda.is_available():
         return Finding("CUDA", True, f"{torch.cuda.get_device_name(0)}, torch built for {torch.version.cuda}")
     if torch.version.cuda is None:
         return Finding("CUDA", False, "this torch is built without CUDA", "pip install torch==2.11.0", needed=False)
-    mend = (
+    fix = (
         "apt-get install nvidia-driver (Ubuntu: ubuntu-drivers install), then reboot; nvidia-smi shows whether it works"
     )
     least = LEAST_DRIVERS.get(torch.version.cuda.partition(".")[0])
     if least:
-        mend += f", and its version: this torch is built for CUDA {torch.version.cuda}, which needs {least} or newer"
-    return Finding("CUDA", False, "no device that torch can use", mend, needed=False)
+        fix += f", and its version: this torch is built for CUDA {torch.version.cuda}, which needs {least} or newer"
+    return Finding("CUDA", False, "no device that torch can use", fix, needed=False)
 
 
 def nvcc() -> Finding:
-    """Whether there is a CUDA compiler that builds gsplat's kernels: torch refuses one of another major version."""
+    """Whether a CUDA compiler can build gsplat's kernels; torch refuses one of another major version."""
     purpose = "gsplat needs it once, to build its kernels"
     built = torch.version.cuda
-    mend = "NVIDIA's CUDA toolkit of torch's version, with CUDA_HOME set to it and its bin folder in PATH"
+    fix = "NVIDIA's CUDA toolkit of torch's version, with CUDA_HOME set to it and its bin folder in PATH"
     if built:
         place = f"/usr/local/cuda-{built}"
-        mend = (
+        fix = (
             f"apt-get install cuda-toolkit-{built.replace('.', '-')} from NVIDIA's repository (Ubuntu 24.04's own "
             f"nvidia-cuda-toolkit is 12.0), then export CUDA_HOME={place} PATH={place}/bin:$PATH"
         )
     in_path = shutil.which("nvcc")
     home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
-    # As torch looks for it.
+    # The same search order as torch's.
     found = Path(in_path) if in_path and not home else Path(home or "/usr/local/cuda") / "bin" / "nvcc"
     if not found.is_file():
-        where = f" in {found.parent}, to which CUDA_HOME points" if home else ""
-        return Finding("nvcc", False, f"not found{where}; {purpose}", mend, needed=False)
-    if not in_path:  # gsplat calls it by its name before it lets torch build
+        where = f" in {found.parent}, the folder that CUDA_HOME names" if home else ""
+        return Finding("nvcc", False, f"not found{where}; {purpose}", fix, needed=False)
+    if not in_path:  # gsplat calls nvcc by name before torch builds
         detail = f"{found} is not in PATH; {purpose}"
         return Finding("nvcc", False, detail, f"export PATH={found.parent}:$PATH", needed=False)
     release = _release_of(found)
     if built and release.partition(".")[0] != built.partition(".")[0]:
-        detail = f"{found} is of CUDA {release or 'an unknown version'}, this torch is built for {built}; {purpose}"
-        return Finding("nvcc", False, detail, mend, needed=False)
+        detail = f"{found} has CUDA {release or 'of unknown version'}, this torch is built for {built}; {purpose}"
+        return Finding("nvcc", False, detail, fix, needed=False)
     return Finding("nvcc", True, f"{found} {release}, for gsplat's kernels")
 
 
 def _release_of(compiler: Path) -> str:
-    """The CUDA version that a compiler says it is of, ``13.0`` for one; empty if it says none."""
+    """CUDA version that a compiler reports, such as ``13.0``; empty if it reports none."""
     try:
-        said = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True, timeout=60).stdout
+        output = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True, timeout=60).stdout
     except (OSError, subprocess.SubprocessError):
         return ""
-    found = re.search(r"release (\d+\.\d+)", said)
+    found = re.search(r"release (\d+\.\d+)", output)
     return found[1] if found else ""
 
 
 def kernels_built() -> bool:
-    """Whether gsplat's CUDA extension lies ready: shipped with it, or built before. Builds nothing."""
+    """Whether gsplat's CUDA extension is installed or was built before; builds nothing."""
     spec = importlib.util.find_spec("gsplat")
     if spec is None or spec.origin is None:
         return False
@@ -113,13 +114,13 @@ def kernels_built() -> bool:
 
 
 def kernels(compile_kernels: bool) -> Finding:
-    """Whether gsplat's kernels run; builds them only if asked to."""
+    """Whether gsplat's kernels run; ``compile_kernels`` builds missing ones."""
     if not torch.cuda.is_available():
-        mend = "sundae doctor --compile, once there is a CUDA device"
-        return Finding("gsplat kernels", False, "need a CUDA device", mend, needed=False)
+        fix = "sundae doctor --compile, once there is a CUDA device"
+        return Finding("gsplat kernels", False, "need a CUDA device", fix, needed=False)
     if not compile_kernels and not kernels_built():
-        mend = "sundae doctor --compile (minutes; else the first training step does it)"
-        return Finding("gsplat kernels", False, "not built yet", mend, needed=False)
+        fix = "sundae doctor --compile (takes minutes; otherwise the first training step builds them)"
+        return Finding("gsplat kernels", False, "not built yet", fix, needed=False)
     from sundae_ns.errors import BackendError
     from sundae_ns.rasterization import select_backend
 
@@ -127,14 +128,14 @@ def kernels(compile_kernels: bool) -> Finding:
         select_backend("gsplat", "cuda")
     except BackendError as error:
         return Finding("gsplat kernels", False, str(error), "sundae doctor --compile", needed=False)
-    return Finding("gsplat kernels", True, "run")
+    return Finding("gsplat kernels", True, "working")
 
 
 def own_kernels() -> Finding:
-    """Whether the kernels of this package compile and load: neighbour search, the loss, what lies between the head's layers."""
+    """Whether this package's kernels compile and load: neighbour search, the loss, and the fused parts of the head."""
     name = "our kernels"
     if not torch.cuda.is_available():
-        return Finding(name, False, "need a CUDA device", "nothing: on a CPU other code does the same", needed=False)
+        return Finding(name, False, "need a CUDA device", "nothing; a CPU uses equivalent code", needed=False)
     from sundae_ns.compensation import CompensationHead, HeadConfig, kernels
     from sundae_ns.errors import BackendError
     from sundae_ns.gpu import fused_loss, nvrtc
@@ -148,54 +149,56 @@ def own_kernels() -> Finding:
         net = CompensationHead(HeadConfig()).net
         kernels.compiled(device, torch.bfloat16, kernels.definitions(net, True), kernels.FORWARD + kernels.BACKWARD)
     except BackendError as error:
-        cause, mend = str(error).rsplit(": ", 1)
-        detail = f"{cause}: neighbours are searched on the CPU, head and SSIM run layer by layer"
-        return Finding(name, False, detail, mend, needed=False)
-    return Finding(name, True, "run")
+        cause, fix = str(error).rsplit(": ", 1)
+        detail = f"{cause}: neighbours are searched on the CPU; head and SSIM run layer by layer"
+        return Finding(name, False, detail, fix, needed=False)
+    return Finding(name, True, "working")
 
 
 def rasterizer(kernels_finding: Finding) -> Finding:
-    """Which rasteriser ``auto`` takes."""
+    """Which rasteriser ``auto`` selects."""
     from sundae_ns.rasterization import numba_problem
 
     if torch.cuda.is_available():
         if kernels_finding.ok:
-            return Finding("rasteriser", True, "auto takes gsplat")
+            return Finding("rasteriser", True, "auto selects gsplat")
         if kernels_finding.detail == "not built yet":
-            return Finding("rasteriser", True, "auto takes gsplat, after it has built its kernels")
+            return Finding("rasteriser", True, "auto selects gsplat, after its kernels are built")
     elif problem := numba_problem():
-        cause, mend = problem.rsplit("; ", 1)
-        detail = f"auto takes reference, in plain PyTorch: several times as slow as cpu, since {cause}"
-        return Finding("rasteriser", False, detail, mend, needed=False)
+        cause, fix = problem.rsplit("; ", 1)
+        detail = f"auto selects reference, in plain PyTorch; it is several times slower than cpu. {cause}"
+        return Finding("rasteriser", False, detail, fix, needed=False)
     else:
-        return Finding("rasteriser", True, "auto takes cpu, compiled by numba: for small scenes; a capture needs CUDA")
-    return Finding("rasteriser", True, "auto takes reference, in plain PyTorch: slow; mend gsplat's kernels")
+        return Finding(
+            "rasteriser", True, "auto selects cpu, compiled by numba; it suits small scenes, a capture needs CUDA"
+        )
+    return Finding("rasteriser", True, "auto selects reference, in plain PyTorch, which is slow; fix gsplat's kernels")
 
 
 def lpips() -> Finding:
-    """Whether the metric's weights are at hand."""
+    """Whether the weights of LPIPS are on disk."""
     from sundae_ns.evaluation import lpips_weights_available, lpips_weights_path, lpips_weights_url
 
     if lpips_weights_available():
-        return Finding("LPIPS weights", True, "at hand")
-    mend = f"curl --location --create-dirs --output {shlex.quote(str(lpips_weights_path()))} {lpips_weights_url()}"
-    return Finding("LPIPS weights", False, "not at hand: metrics leave LPIPS out", mend, needed=False)
+        return Finding("LPIPS weights", True, "on disk")
+    fix = f"curl --location --create-dirs --output {shlex.quote(str(lpips_weights_path()))} {lpips_weights_url()}"
+    return Finding("LPIPS weights", False, "missing; metrics leave out LPIPS", fix, needed=False)
 
 
 def system_library(name: str, package: str) -> Finding:
-    """Whether a library is there that open3d, and so ns-export, loads."""
+    """Whether a library is installed that open3d loads, and with it ns-export."""
     if ctypes.util.find_library(name):
         return Finding(f"lib{name}", True, "found, for ns-export")
     return Finding(f"lib{name}", False, "not found; ns-export needs it", f"apt-get install {package}", needed=False)
 
 
 def program(name: str, command: str, purpose: str) -> Finding:
-    """Whether a program is there that commands of nerfstudio call; its package is called as it is.
+    """Whether a program is installed that nerfstudio's commands call; its package has the same name.
 
     Args:
-        name: of the finding.
-        command: to look for in PATH.
-        purpose: the commands that do not start without it.
+        name: name of the finding.
+        command: program to find in PATH.
+        purpose: the commands that need it.
     """
     found = shutil.which(command)
     if found:
@@ -215,18 +218,18 @@ def examine(compile_kernels: bool = False) -> list[Finding]:
         lpips,
         lambda: system_library("usb-1.0", "libusb-1.0-0"),
         lambda: system_library("GL", "libgl1"),
-        lambda: program("COLMAP", "colmap", "ns-process-data, which makes captures of pictures and videos"),
-        # ns-render asks for it even where it writes images only.
+        lambda: program("COLMAP", "colmap", "ns-process-data, which makes captures from images and videos"),
+        # ns-render requires it even if it writes only images.
         lambda: program("ffmpeg", "ffmpeg", "ns-process-data and ns-render"),
     ]
     return versions() + [finding() for finding in findings]
 
 
 def run_doctor(compile_kernels: bool = False, console: Console | None = None) -> int:
-    """Print the report; the exit code is 1 if something is missing that training needs.
+    """Print the report; the exit code is 1 if training lacks something.
 
     Args:
-        compile_kernels: build gsplat's kernels if they are not built.
+        compile_kernels: build gsplat's kernels if they are missing.
         console: where to print.
     """
     console = console or Console()
@@ -236,9 +239,9 @@ def run_doctor(compile_kernels: bool = False, console: Console | None = None) ->
         mark = "[green]ok[/]" if finding.ok else "[red]missing[/]" if finding.needed else "[yellow]-[/]"
         table.add_row(mark, finding.name, finding.detail)
     console.print(table)
-    mends = [finding for finding in findings if not finding.ok and finding.mend]
-    if mends:
-        console.print("\nTo mend:")
-        for finding in mends:
-            console.print(f"  {finding.name}: {finding.mend}", soft_wrap=True, highlight=False)
+    fixes = [finding for finding in findings if not finding.ok and finding.fix]
+    if fixes:
+        console.print("\nTo fix:")
+        for finding in fixes:
+            console.print(f"  {finding.name}: {finding.fix}", soft_wrap=True, highlight=False)
     return int(any(finding.needed and not finding.ok for finding in findings))

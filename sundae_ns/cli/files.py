@@ -1,4 +1,4 @@
-"""``sundae export`` and ``sundae prune``: fields as files that other people's programs read."""
+"""``sundae export`` and ``sundae prune``: fields as files for other programs."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import tyro
 
 
 def check_folder(out: Path) -> None:
-    """Raise ``StorageError`` unless the folder of a file to write is there."""
+    """Raise ``StorageError`` unless the folder of an output file exists."""
     from sundae_ns.errors import StorageError
 
     if not out.parent.is_dir():
-        raise StorageError(f"{out.parent} is no folder; make it first, or choose another")
+        raise StorageError(f"{out.parent} is no folder; create it first, or choose another")
 
 
 def export(
@@ -21,16 +21,16 @@ def export(
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     upright: bool = False,
 ) -> int:
-    """Write the base colours of a scene as a .ply, .spz or .sog, which have no place for features or a head.
+    """Write the base colours of a scene as a .ply, .spz or .sog file; these formats hold no features and no head.
 
-    Antialiased scenes are marked as such. Primitives that are not finite are left out.
+    Antialiased scenes are marked as such. Primitives with NaN or infinite values are left out.
 
     Args:
-        scene: folder of a run, its config.yml, a file of sundae pack, or a 3DGS .ply of any program.
-        out: the file; its name says the format: .ply (exact), .spz or .sog (much smaller, rounded). An older one is
-            replaced once the new one is whole.
-        upright: turn the scene so that viewers show it upright: nerfstudio's z points up, their -y. For showing only; a
-            warm start takes the coordinates as they were.
+        scene: a run (its folder or config.yml), a packed scene, or a 3DGS .ply of any program.
+        out: file to write; its suffix selects the format: .ply (exact), .spz or .sog (quantised, much smaller).
+            An existing file is replaced only once the new one is complete.
+        upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
+            Do not use the rotated file for a warm start.
     """
     from sundae_ns.errors import ConfigError
     from sundae_ns.scenes.packed import scene_of_run
@@ -44,7 +44,7 @@ def export(
     kind = kind_of(scene)
     if kind == "ply":
         if out.suffix.lower() == ".ply":
-            raise ConfigError(f"{scene} is a .ply already; give a name that ends in .spz or .sog")
+            raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
         if upright and not is_nerfstudio_ply(scene):
             raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
         field, antialiased, sigmoid_colors = read_ply(scene), ANTIALIASED in ply_comments(scene), False
@@ -59,9 +59,9 @@ def export(
     mode = ", antialiased" if antialiased else ""
     print(f"{out}: {written.primitives:,} primitives, degree {written.degree}{mode}, {written.bytes:,} bytes")
     if written.dropped:
-        print(f"{written.dropped:,} were not finite (NaN or infinite) and are left out")
+        print(f"left out {written.dropped:,} primitives that were not finite (NaN or infinite)")
     if written.cut:
-        print(f"harmonics above degree {written.degree} are left out, for which {out.suffix} has no place; .ply has")
+        print(f"left out harmonics above SH degree {written.degree}, which {out.suffix} cannot store; .ply can")
     return 0
 
 
@@ -77,35 +77,38 @@ def prune(
 ) -> int:
     """Prune a 3DGS .ply of any program, without training and without cameras.
 
-    What is left has its values unchanged. A contribution to pictures is estimated by opacity and size, for want of cameras.
+    The kept primitives are unchanged. Without cameras, contributions are estimated from opacity and size.
 
     Args:
-        source: a binary 3DGS .ply.
-        out: the .ply to write; all properties and comments of the source are kept.
+        source: binary 3DGS .ply file.
+        out: .ply file to write; it keeps all properties and comments of the source.
         keep: share of the primitives to keep, in (0, 1].
-        score: importance of a primitive: high-pass response, contribution, their product, opacity, or random.
-        selection: by chance in proportion to the score, evenly through space (systematic) or anywhere (sampled); its highest
-            and lowest band (the paper's, with score response and signal positions); or the highest only.
-        signal: what the graph filters: position, colour, opacity and size, or positions alone.
-        gamma: share that the band selection takes from the high end.
-        seed: of random choices.
+        score: importance of a primitive: high-pass response, contribution, their product, opacity, or a random number.
+        selection: systematic and sampled draw at random by score, evenly through space or independently.
+            Band keeps the highest and lowest scores (the paper's rule, with score response and signal positions).
+            Top keeps the highest scores.
+        signal: graph signal to filter: position, colour, opacity and size, or positions only.
+        gamma: share of the kept primitives that the band selection takes from the highest scores.
+        seed: random seed.
     """
     from sundae_ns.errors import ConfigError
-    from sundae_ns.pruning import PruningConfig, decide, footprint
+    from sundae_ns.gaussians import finite_mask
+    from sundae_ns.pruning import PruningConfig, decide, footprint, kept_count
     from sundae_ns.storage import read_ply
     from sundae_ns.storage.kinds import refuse
     from sundae_ns.storage.ply import keep_vertices
 
     if out.suffix.lower() != ".ply":
-        raise ConfigError(f"{out} is not named .ply, the one format that is written; rename it")
+        raise ConfigError(f"{out} does not end in .ply, the only output format; rename it")
     check_folder(out)
     config = PruningConfig(keep_ratio=keep, score=score, selection=selection, signal=signal, gamma=gamma, seed=seed)
     config.validate()
     refuse(source, packed="sundae export makes a .ply of it, which can be pruned")
     field = read_ply(source)
-    decision = decide(field, config, lambda: footprint(field))
+    count = kept_count(keep, int(finite_mask(field).sum()))
+    decision = decide(field, config, lambda: footprint(field), count=count)
     keep_vertices(source, out, decision.mask)
     print(f"{out}: {decision.kept:,} of {len(decision.mask):,} primitives")
     if decision.dropped_nonfinite:
-        print(f"{decision.dropped_nonfinite:,} were not finite (NaN or infinite) and do not count")
+        print(f"dropped {decision.dropped_nonfinite:,} primitives that were not finite (NaN or infinite)")
     return 0

@@ -1,4 +1,4 @@
-"""Entry point of ``sundae``: one subcommand a module, errors shown as one line."""
+"""Entry point of ``sundae``: one module per subcommand, errors on one line."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from sundae_ns.cli.packing import pack, unpack
 from sundae_ns.errors import SundaeError
 
 app = tyro.extras.SubcommandApp()
-app.command(bench, name="bench", help="Measure a part of SUNDAE on this machine.")
+app.command(bench, name="bench", help="Benchmark SUNDAE on this machine.")
 for command in (pack, unpack, export, prune):
     app.command(command)
 
 
 @app.command
 def doctor(compile: bool = False) -> int:  # noqa: A002
-    """Check what this machine can run, and say for each thing missing the command that mends it.
+    """Check this machine, and print the command that installs or repairs each missing part.
 
     Args:
-        compile: build gsplat's CUDA kernels now if they are not built yet (minutes, needs nvcc).
+        compile: build gsplat's CUDA kernels if they are not built yet; this takes minutes and needs nvcc.
     """
     from sundae_ns.cli.doctor import run_doctor
 
@@ -45,26 +45,26 @@ def scene(
     kind: Literal["still-life", "wall"] = "still-life",
     sensor_noise: float = 0.0,
 ) -> int:
-    """Write the embedded scene: a small ray-traced capture in nerfstudio format, with a sparse point cloud.
+    """Write the embedded scene: a small ray-traced capture in nerfstudio's format, with a sparse point cloud.
 
     Args:
-        out: folder to write; it is the value for ns-train's --data.
-        seed: varies everything; the same seed gives the same scene.
-        train_views: training pictures.
-        test_views: test pictures.
-        width: pixels.
-        height: pixels.
-        points: size of the sparse point cloud.
-        kind: the still life, or one flat painted wall, which needs next to nothing.
-        sensor_noise: standard deviation of the noise of each pixel, in [0, 1].
+        out: folder to write; pass it to ns-train as --data.
+        seed: random seed of the whole scene; the same seed gives the same scene.
+        train_views: number of training images.
+        test_views: number of test images.
+        width: image width in pixels.
+        height: image height in pixels.
+        points: number of points in the sparse point cloud.
+        kind: a still life, or one flat painted wall, for which a few primitives suffice.
+        sensor_noise: standard deviation of the noise added to each pixel; colours are in [0, 1].
     """
     from rich.progress import Progress
 
-    from sundae_ns.data import write_scene
+    from sundae_ns.data import write_embedded_capture
 
     with Progress(transient=True) as progress:
         task = progress.add_task("Ray tracing", total=train_views + test_views)
-        write_scene(
+        write_embedded_capture(
             out,
             seed=seed,
             train_views=train_views,
@@ -82,11 +82,11 @@ def scene(
 
 @app.command
 def demo(out: Annotated[Path, tyro.conf.Positional] = Path(".demo"), steps: int | None = None) -> int:
-    """Make the embedded scene, train it with ns-train, evaluate it with ns-eval, and show what came out.
+    """Write the embedded scene, train it with ns-train, evaluate it with ns-eval, and print the results.
 
     Args:
-        out: folder for the scene, the run and the pictures.
-        steps: length of the training instead of sundae-tiny's own.
+        out: folder for the scene, the run and the images.
+        steps: number of training steps; by default that of sundae-tiny.
     """
     from sundae_ns.cli.demo import run_demo
 
@@ -102,16 +102,15 @@ def report(
     warmup: int = 3,
     repeats: int = 5,
 ) -> int:
-    """Evaluate finished runs on their test views, speed beside error: tables, plots, curves over training.
+    """Measure quality, speed and size of finished runs on their test views; write tables, plots and training curves.
 
     Args:
-        runs: folders of runs of sundae and splatfacto, or their config.yml, which is read and not run; and packed
-            scenes.
+        runs: runs of sundae or splatfacto (their folders or config.yml), and packed scenes. No code in them is executed.
         out: folder to write.
-        data: where the capture is, if it is not where the runs say; packed scenes do not say.
-        lpips_net: net of LPIPS, which is taken where its weights are at hand; values of different nets do not compare.
-        warmup: untimed renderings of each picture.
-        repeats: timed renderings of each picture; 0 takes no times.
+        data: folder of the capture, if it moved; packed scenes need it, because they do not record it.
+        lpips_net: net of LPIPS, which is measured if its weights are on disk; values of different nets do not compare.
+        warmup: untimed renderings of each view before timing.
+        repeats: timed renderings of each view; 0 measures no times.
     """
     from sundae_ns.cli.report import run_report
 
@@ -129,17 +128,17 @@ def bands(
     bandwidth: Literal["robust", "literal"] = "robust",
     view: int | None = None,
 ) -> int:
-    """Show what the high-pass, the low-pass and the combined rule keep of a field: point clouds, pictures and figures.
+    """Show the primitives that the high-pass, low-pass and combined rules keep: point clouds, images and statistics.
 
     Args:
-        run: a run of sundae or splatfacto (its folder, config.yml or a checkpoint), or a 3DGS .ply.
-        out: folder to write to; made if need be.
+        run: a run of sundae or splatfacto (its folder, config.yml or a checkpoint), or a 3DGS .ply file.
+        out: folder to write; created if missing.
         keep_ratio: shares of the primitives to keep, each in (0, 1].
-        signal: graph signal that is filtered: the paper's positions, or position, colour, opacity and size.
-        gamma: share that the combined rule takes from the high end.
-        neighbors: most neighbours of a primitive in the graph.
-        bandwidth: how reach and width of the graph's edges are found; literal is the paper's.
-        view: training view to look through; by default the one that sees most of the field.
+        signal: graph signal to filter: positions, as in the paper, or position, colour, opacity and size.
+        gamma: share of the kept primitives that the combined rule takes from the largest responses.
+        neighbors: maximum number of neighbours of a primitive in the graph.
+        bandwidth: rule that sets radius and width of the graph's edge weights; literal is the paper's.
+        view: index of the training view to draw; by default the one with the most primitives.
     """
     from sundae_ns.cli.bands import run_bands
     from sundae_ns.pruning import PruningConfig
@@ -149,10 +148,10 @@ def bands(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run ``sundae``; exits with 2 and one line on an error of ours."""
+    """Run ``sundae``; a :class:`SundaeError` is printed on one line, and the exit code is 2."""
     try:
         with warnings.catch_warnings():
-            # nerfstudio's own, at its import: a user of ours can do nothing about them.
+            # Warnings of nerfstudio's imports, which users of sundae cannot fix.
             warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
             code = app.cli(prog="sundae", description="SUNDAE for nerfstudio.", args=arguments)
     except SundaeError as error:

@@ -1,4 +1,4 @@
-"""``sundae pack`` and ``sundae unpack``: a finished run as one small file, and back."""
+"""``sundae pack`` and ``sundae unpack``: convert a finished run into one small file, and back."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ def pack(
     head_bits: int | None = None,
     level: int = 19,
 ) -> int:
-    """Pack a finished run into one file with everything that is needed to show the scene, and say what takes how much.
+    """Pack a finished run into one file that can be rendered, and print the size of each part.
 
     Args:
-        run: folder of a run of sundae or splatfacto, or its config.yml.
-        out: the file to write, scene.sundae for example; an older one is replaced once the new one is whole.
-        max_cameras: most training cameras to keep for looking around; 0: none, and the capture need not be there.
-        finetune: train for so many steps first, 1000 for example, with this very rounding in the loop. The run is only read.
-            What a scene can learn to live with is then rounded more coarsely, which takes fewer bytes.
-        data: the capture, if it is not where the run says.
-        position_bits: bits of each coordinate within a block, 4 to 21.
-        block: primitives of a block of positions: smaller ones are more exact and take more bytes.
-        scale_bits: bits of each log-scale, 4 to 16.
-        rotation_bits: bits of each of the three stored components of a rotation, 4 to 16.
-        color_bits: bits of each channel of the view-independent colour, 4 to 16.
-        opacity_bits: bits of the logit of the opacity, 4 to 16.
-        harmonics: view-dependent colour, transformed and rounded, or by residual codebooks: fewer bytes, more loss.
-        harmonics_step: step that transformed coefficients are rounded to; by default 0.02, 0.03 with a fine-tune.
-        harmonics_books: residual codebooks of the view-dependent colour: bytes a primitive, 1 to 32.
-        feature_bits: bits of each feature, 4 to 16; by default 7, 6 with a fine-tune.
-        feature_books: residual codebooks of the feature vectors instead, up to 32.
-        head: weights of the head.
-        head_bits: bits of each weight of an int8 head, 3 to 8; by default 7, 6 with a fine-tune.
-        level: effort of the entropy coder, 1 to 22; unpacking is as fast at all of them.
+        run: a run of sundae or splatfacto (its folder or config.yml).
+        out: file to write, for example scene.sundae; an existing file is replaced only once the new one is complete.
+        max_cameras: maximum number of training cameras to store for viewers; with 0, the capture is not needed.
+        finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
+            The defaults then quantise more coarsely, for a smaller file.
+        data: folder of the capture, if it moved.
+        position_bits: bits per coordinate within a block, 4 to 21.
+        block: number of primitives per block of positions; smaller blocks are more exact and larger on disk.
+        scale_bits: bits per log-scale, 4 to 16.
+        rotation_bits: bits per stored component of a rotation (three components), 4 to 16.
+        color_bits: bits per channel of the view-independent colour, 4 to 16.
+        opacity_bits: bits per opacity logit, 4 to 16.
+        harmonics: coding of view-dependent colour: a transform with rounding, or residual codebooks (smaller, lossier).
+        harmonics_step: rounding step of transformed coefficients; by default 0.02, 0.03 with a fine-tune.
+        harmonics_books: number of residual codebooks of view-dependent colour, 1 to 32; each takes a byte per primitive.
+        feature_bits: bits per feature, 4 to 16; by default 7, 6 with a fine-tune.
+        feature_books: number of residual codebooks of the feature vectors, up to 32; 0 rounds features instead.
+        head: number format of the head's weights.
+        head_bits: bits per weight of an int8 head, 3 to 8; by default 7, 6 with a fine-tune.
+        level: effort of the entropy coder, 1 to 22; it does not change the time to unpack.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -67,7 +67,7 @@ def pack(
 
     if finetune < 0:
         raise ConfigError(f"finetune is {finetune}; give the number of steps, or 0 for none")
-    # What a fine-tune has other defaults for.
+    # A fine-tune changes the defaults of these options.
     given = {"harmonics_step": harmonics_step, "feature_bits": feature_bits, "head_bits": head_bits}
     fixed = {
         "position_bits": position_bits,
@@ -86,10 +86,10 @@ def pack(
     config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, **fixed})  # type: ignore[arg-type]
     config.validate()
     check_folder(out)
-    # The bar keeps its place to write to where what nerfstudio prints is held back.
+    # The bar writes to the real stdout while nerfstudio's messages are suppressed.
     with Progress(console=Console(file=sys.stdout), transient=True) as progress:
         task = progress.add_task("Reading the run", total=2 + finetune)
-        with redirect_stdout(StringIO()):  # nerfstudio is chatty while it reads a capture
+        with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
             scene = scene_of_run(run, max_cameras=max_cameras, data=data)
             progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
             if finetune:
@@ -103,7 +103,7 @@ def pack(
         progress.update(task, description="Packing")
         report = write_fitted(out, scene, codecs)
     print(f"{out}: {report.primitives:,} primitives in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
-    print(f"{'':14}{'bytes':>12}{'bits a primitive':>20}")
+    print(f"{'':14}{'bytes':>12}{'bits per primitive':>20}")
     for name, bits in report.bits.items():
         print(f"{name:14}{round(bits * report.primitives / 8):12,}{bits:20.2f}")
     print(f"{'all':14}{report.bytes:12,}{8 * report.bytes / report.primitives:20.2f}")
@@ -116,13 +116,13 @@ def unpack(
     name: str | None = None,
     data: Path | None = None,
 ) -> int:
-    """Unpack a scene as a run that ns-viewer, ns-render and ns-eval open. Nothing in the file is run.
+    """Unpack a scene into a run for ns-viewer, ns-render and ns-eval. No code in the file is executed.
 
     Args:
-        scene: a file that sundae pack wrote.
-        out: folder of runs, as ns-train's --output-dir.
-        name: of the experiment; by default the file's.
-        data: the capture that the scene was trained on, which ns-eval needs; without it there are cameras and no pictures.
+        scene: file written by sundae pack.
+        out: folder of runs, like ns-train's --output-dir.
+        name: name of the experiment; by default the file's name.
+        data: folder of the capture on which the scene was trained; ns-eval needs its images.
     """
     from rich.progress import Progress
 
@@ -135,7 +135,7 @@ def unpack(
         progress.update(task, advance=1, description="Writing the run")
         path = write_run(found, out, name or scene.stem, data=data)
     print(f"{len(found.field['means']):,} primitives, {'with' if found.head else 'without'} a head")
-    print(f"Look around: ns-viewer --load-config {path}")
+    print(f"View: ns-viewer --load-config {path}")
     if data is not None:
         print(f"Evaluate: ns-eval --load-config {path}")
     return 0

@@ -1,4 +1,4 @@
-"""Commands run as processes of their own, their output kept in a file."""
+"""Subprocesses whose output goes to a log file."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
 
     Args:
         arguments: the command; it gets no input.
-        log: file for its output, stderr included; an earlier one is replaced.
+        log: file for stdout and stderr; an existing file is replaced.
         on_line: called with each line of output.
 
     Raises:
-        SundaeError: it failed; the message shows the end of its output.
+        SundaeError: the command failed; the message ends with the last lines of its output.
     """
-    # Safe path: `python -m` would look in the current folder first, where another sundae_ns may lie.
+    # With the safe path, `python -m` does not import a sundae_ns from the current folder.
     environment = {**os.environ, "COLUMNS": "160", "PYTHONSAFEPATH": "1"}
     last: deque[str] = deque(maxlen=_TAIL)
     with open(log, "w", encoding="utf-8") as file:
@@ -47,18 +47,16 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
                 if on_line is not None:
                     on_line(line)
             code = process.wait()
-        except BaseException:  # above all an interrupt, which should not leave it behind
+        except BaseException:  # an interrupt must not leave the process running
             process.terminate()
             process.wait()
             raise
     if code != 0:
         tail = "\n".join(last)
-        raise SundaeError(
-            f"{Path(arguments[0]).name} failed with {code}; its whole output is in {log}, it ended so:\n{tail}"
-        )
+        raise SundaeError(f"{Path(arguments[0]).name} failed with {code}; its log is {log}, which ends with:\n{tail}")
 
 
 def percent_of(line: str) -> float | None:
-    """How far a training run says that it is, in per cent, if this line of its output says so."""
+    """Progress in per cent from a line of ns-train's output; None if the line has none."""
     found = _PERCENT.match(line)
     return float(found[1]) if found else None

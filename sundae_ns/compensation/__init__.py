@@ -1,4 +1,4 @@
-"""Neural compensation: the U-Net that makes up, in image space, for what pruning lost. Floor 1."""
+"""Neural compensation: a U-Net that corrects rendered images for what pruning removed."""
 
 from sundae_ns.compensation.head import PHASES, CompensationHead, HeadConfig
 from sundae_ns.compensation.phases import over_phases

@@ -1,7 +1,7 @@
-"""The head with all that lies between its convolutions in a few kernels: for pictures that are only looked at.
+"""The head without gradients, in a few kernels: for inference.
 
-cuDNN convolves; :mod:`sundae_ns.compensation.kernels` does the rest. The whole is recorded as one CUDA graph for each
-picture size that stays. Gradients are the business of :mod:`sundae_ns.compensation.fused_training`.
+cuDNN convolves; :mod:`sundae_ns.compensation.kernels` does the rest. The whole is recorded as one CUDA graph per image
+size that repeats. :mod:`sundae_ns.compensation.fused_training` computes gradients.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from torch import Tensor, nn
 from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError
-from sundae_ns.gpu.cuda_graphs import Kept, aside, record, recording
+from sundae_ns.gpu.cuda_graphs import GraphCache, is_recording, record, warm_up
 
 _log = logging.getLogger(__name__)
 
 
 class Weights:
-    """What the convolutions read: a network's weights in the dtype of the arithmetic, channels last.
+    """A network's convolution weights in the dtype of the arithmetic, channels last.
 
     Args:
         net: the network.
-        dtype: of the arithmetic.
+        dtype: dtype of the arithmetic.
     """
 
     def __init__(self, net: UNet, dtype: torch.dtype) -> None:
@@ -37,13 +37,13 @@ class Weights:
         channels = padded_channels(first.shape[1] // net.pixel_unshuffle**2, net.pixel_unshuffle)
         shape = (len(first), channels * net.pixel_unshuffle**2, *first.shape[2:])
         self._source = [first, *others]
-        # As many channels as a folded picture has.
+        # The number of channels of a folded image.
         padded = first.new_zeros(shape, dtype=dtype).contiguous(memory_format=torch.channels_last)
         self.cast = [padded, *(torch.empty_like(w, dtype=dtype, memory_format=torch.channels_last) for w in others)]
         self.refresh()
 
     def refresh(self) -> None:
-        """Take over what the network has learnt since."""
+        """Copy the network's current weights."""
         first, *others = self._source
         self.cast[0][:, : first.shape[1]].copy_(first)
         torch._foreach_copy_(self.cast[1:], others)
@@ -51,31 +51,31 @@ class Weights:
 
 @dataclass
 class Tape:
-    """What gradients need of a pass: the pictures that were convolved, and those results that nothing has activated yet."""
+    """Values that the backward pass needs: inputs of the convolutions, and results before their bias and activation."""
 
     inputs: list[Tensor] = field(default_factory=list)
-    """Of all 3 x 3 convolutions, in order; every second one holds the activations of the convolution before."""
+    """Inputs of all 3 x 3 convolutions, in order; every second one holds the activations of the convolution before."""
     coarse: list[Tensor] = field(default_factory=list)
-    """What the upsamplings read, from the coarsest level on."""
+    """Inputs of the upsamplings, from the coarsest level on."""
     last: Tensor | None = None
-    """What the last kernel reads."""
+    """Input of the last kernel."""
 
 
 def padded_channels(channels: int, fold: int) -> int:
-    """Channels of an unfolded pixel, the empty ones included, such that the folded picture has whole packs."""
+    """Channels of an unfolded pixel, including padding, such that the folded image has whole packs."""
     per_pack = PACK // math.gcd(PACK, fold**2)
     return -(-channels // per_pack) * per_pack
 
 
 def fold(splatted: Tensor, alpha: Tensor, size: int, residual: bool, folded: Tensor, launches: Launches) -> None:
-    """Put what was splatted into the network's input, blocks of ``size`` pixels a side folded into channels.
+    """Write splatted values to the network's input, with blocks of ``size`` pixels per side folded into channels.
 
     Args:
-        splatted: colours and features, float32; pixels may be apart, rows may not ``[H, W, 3 + F]``.
-        alpha: accumulation, likewise ``[H, W, 1]``.
-        size: of the blocks, pixels.
+        splatted: colours and features, float32; pixels may have a stride, rows must be adjacent ``[H, W, 3 + F]``.
+        alpha: accumulation, with the same layout ``[H, W, 1]``.
+        size: side of the blocks, pixels.
         residual: whether the network sees colours and accumulation beside the features.
-        folded: where to, ``[1, C, h, w]`` channels last.
+        folded: output, ``[1, C, h, w]`` channels last.
         launches: the kernels.
     """
     height, width = splatted.shape[:2]
@@ -92,11 +92,11 @@ def fold(splatted: Tensor, alpha: Tensor, size: int, residual: bool, folded: Ten
 
 
 def network(net: UNet, weights: Weights, folded: Tensor, launches: Launches) -> Tape:
-    """The network from its folded input to what the last kernel makes the picture from.
+    """Run the network from its folded input to the input of the last kernel.
 
     Args:
-        net: gives the biases.
-        weights: of the network.
+        net: the network, for its biases.
+        weights: weights of the network.
         folded: ``[1, C, h, w]`` channels last.
         launches: the kernels.
 
@@ -119,35 +119,34 @@ def network(net: UNet, weights: Weights, folded: Tensor, launches: Launches) -> 
         launches["activate"](raw.numel() // PACK, [raw, bias, channels, rows * columns])
         return convolved(raw)
 
-    x, rooms = folded, []
+    x, skips = folded, []
     raw, bias = double(x)
     for level in range(1, levels):
         _, channels, rows, columns = raw.shape
-        # The skip connection needs no copy: it is written where the decoder finds it.
+        # The skip connection needs no copy: it is written where the decoder reads it.
         coarser = cast("nn.Conv2d", cast("nn.Sequential", net.encoder[level])[0]).out_channels
-        room = picture_like(raw, channels + coarser, rows, columns)
-        x = picture_like(raw, channels, rows // 2, columns // 2)
-        launches["pool"](x.numel() // PACK, [raw, bias, channels, rows, columns, room, room.shape[1], x])
-        rooms.append(room)
+        skip = image_like(raw, channels + coarser, rows, columns)
+        x = image_like(raw, channels, rows // 2, columns // 2)
+        launches["pool"](x.numel() // PACK, [raw, bias, channels, rows, columns, skip, skip.shape[1], x])
+        skips.append(skip)
         raw, bias = double(x)
-    for room in reversed(rooms):
+    for skip in reversed(skips):
         _, channels, rows, columns = raw.shape
         tape.coarse.append(raw)
         threads = 4 * raw.numel() // PACK
-        launches["upsample"](threads, [raw, bias, channels, rows, columns, room, room.shape[1]])
-        raw, bias = double(room)
+        launches["upsample"](threads, [raw, bias, channels, rows, columns, skip, skip.shape[1]])
+        raw, bias = double(skip)
     tape.last = raw
     return tape
 
 
 def unfold(net: UNet, raw: Tensor, base: Tensor, alpha: Tensor, launches: Launches) -> Tensor:
-    """The picture from the result of the last 3 x 3 convolution.
+    """The image from the result of the last 3 x 3 convolution.
 
     Args:
-        net: gives the last layers.
+        net: the network, for its last layers.
         raw: ``[1, width, h, w]`` channels last.
-        base: picture to be corrected, float32; where the network makes pictures by itself, anything of its size
-            ``[H, W, 3]``.
+        base: image to correct, float32; any tensor of its size if the network is not residual ``[H, W, 3]``.
         alpha: accumulation, float32 ``[H, W, 1]``.
         launches: the kernels.
 
@@ -169,116 +168,115 @@ def unfold(net: UNet, raw: Tensor, base: Tensor, alpha: Tensor, launches: Launch
     return out
 
 
-def folded_room(net: UNet, height: int, width: int, like: Tensor, dtype: torch.dtype) -> Tensor:
-    """An uninitialised input of the network for a picture of a size ``[1, C, h, w]`` channels last."""
+def folded_input(net: UNet, height: int, width: int, like: Tensor, dtype: torch.dtype) -> Tensor:
+    """An uninitialised input of the network for an image size, ``[1, C, h, w]`` channels last."""
     size = net.pixel_unshuffle
     stride = 2 ** (len(net.encoder) - 1)
     rows, columns = (-(-side // (size * stride)) * stride for side in (height, width))
     channels = padded_channels(convolutions(net)[0].in_channels // size**2, size) * size**2
-    return picture_like(like, channels, rows, columns, dtype)
+    return image_like(like, channels, rows, columns, dtype)
 
 
 def convolutions(net: UNet) -> list[nn.Conv2d]:
-    """The 3 x 3 convolutions, in the order in which they run."""
+    """The 3 x 3 convolutions, in the order of execution."""
     blocks = [cast("nn.Sequential", block) for block in (*net.encoder, *net.decoder)]
     return [layer for block in blocks for layer in block if isinstance(layer, nn.Conv2d)]
 
 
 def last_layers(net: UNet) -> tuple[Tensor, Tensor, Tensor]:
-    """Bias of the last 3 x 3 convolution, weights ``[C, width]`` and bias of the 1 x 1 convolution after it."""
+    """Bias of the last 3 x 3 convolution, then weights ``[C, width]`` and bias of the 1 x 1 convolution."""
     weight = net.out.weight.detach().reshape(len(net.out.weight), -1).contiguous()
     return bias_of(convolutions(net)[-1]), weight, bias_of(net.out)
 
 
 def bias_of(conv: nn.Conv2d) -> Tensor:
-    """The bias, which all convolutions of the network have."""
+    """The bias of a convolution; all of the network's have one."""
     assert conv.bias is not None
     return conv.bias.detach()
 
 
-def picture_like(like: Tensor, channels: int, rows: int, columns: int, dtype: torch.dtype | None = None) -> Tensor:
-    """An uninitialised picture ``[1, channels, rows, columns]`` channels last."""
+def image_like(like: Tensor, channels: int, rows: int, columns: int, dtype: torch.dtype | None = None) -> Tensor:
+    """An uninitialised image ``[1, channels, rows, columns]``, channels last."""
     shape = (1, channels, rows, columns)
     dtype = like.dtype if dtype is None else dtype
     return torch.empty(shape, dtype=dtype, device=like.device, memory_format=torch.channels_last)
 
 
-def pixel_stride(picture: Tensor) -> int:
-    """Values from one pixel of ``[H, W, C]`` to the next; rows follow each other without gaps, as in a slice of channels."""
-    row, pixel, channel = picture.stride()
-    assert row == pixel * picture.shape[1] or picture.shape[0] == 1
-    assert channel == 1 or picture.shape[2] == 1
+def pixel_stride(image: Tensor) -> int:
+    """Stride, in values, between pixels of ``[H, W, C]``; rows must be adjacent, as in a slice of channels."""
+    row, pixel, channel = image.stride()
+    assert row == pixel * image.shape[1] or image.shape[0] == 1
+    assert channel == 1 or image.shape[2] == 1
     return pixel
 
 
 class _Recording(NamedTuple):
     graph: torch.cuda.CUDAGraph
     folded: Tensor
-    """Where the graph reads."""
+    """Input of the graph."""
     raw: Tensor
-    """Where it writes."""
+    """Output of the graph."""
 
 
 class FusedInference:
-    """Compensated pictures of a network without gradients, with its newest weights.
+    """Compensated images of a network without gradients, with its current weights.
 
-    A plain object that refers to the network, so that recordings and weights stay out of checkpoints.
+    A plain object that refers to the network, so that graphs and weights stay out of checkpoints.
 
     Args:
-        net: the network; its parameters must stay the same tensors while they stay on their device.
-        residual: whether its output corrects a picture, or is one.
+        net: the network; its parameters must stay the same tensors while on one device.
+        residual: whether the output corrects an image or is one.
     """
 
     def __init__(self, net: UNet, residual: bool) -> None:
         self.net = net
         self.residual = residual
-        self._recorded: Kept[_Recording] = Kept()
+        self._recorded: GraphCache[_Recording] = GraphCache()
         self._can_record = True
 
     def __call__(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
-        """One picture.
+        """Compensate one image.
 
         Args:
             base: float32, on CUDA ``[H, W, 3]``.
-            splatted: likewise; pixels may be apart, rows may not ``[H, W, 3 + F]``.
-            alpha: likewise ``[H, W, 1]``.
-            dtype: arithmetic, float16 or bfloat16.
-
+            splatted: float32, on CUDA; pixels may have a stride, rows must be adjacent ``[H, W, 3 + F]``.
+            alpha: with the same layout ``[H, W, 1]``.
+            dtype: dtype of the arithmetic, float16 or bfloat16.
         Returns:
             ``[H, W, 3]`` float32, see :meth:`sundae_ns.compensation.CompensationHead.forward`.
 
         Raises:
-            BackendError: the kernels cannot be compiled or loaded here.
+            BackendError: the kernels cannot be compiled or loaded.
         """
         net = self.net
         launches = compiled(base.device, dtype, definitions(net, self.residual))
         height, width = base.shape[:2]
         key = (height, width, dtype, net.out.weight.data_ptr())
-        room = partial(folded_room, net, height, width, base, dtype)
-        kept = None
-        if self._can_record and not recording():
+        new_input = partial(folded_input, net, height, width, base, dtype)
+        recorded = None
+        if self._can_record and not is_recording():
             try:
-                kept = self._recorded.get(key, lambda: self._record(room().zero_(), launches))
+                recorded = self._recorded.get(key, lambda: self._record(new_input().zero_(), launches))
             except BackendError as error:
-                _log.warning("the head is shown kernel by kernel: %s", error)
+                _log.warning("the head is not recorded and runs kernel by kernel: %s", error)
                 self._can_record = False
-        folded = room() if kept is None else kept.folded
+        folded = new_input() if recorded is None else recorded.folded
         fold(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
-        if kept is None:
+        if recorded is None:
             raw = self._run(folded, launches)
         else:
-            kept.graph.replay()
-            raw = kept.raw
+            recorded.graph.replay()
+            raw = recorded.raw
         return unfold(net, raw, base, alpha, launches)
 
     def _run(self, folded: Tensor, launches: Launches) -> Tensor:
-        # Casting half a million weights takes no time, and shows what was learnt since the last picture.
+        # Casting half a million weights costs nothing, and follows the network's training.
         raw = network(self.net, Weights(self.net, folded.dtype), folded, launches).last
         assert raw is not None
         return raw
 
     def _record(self, folded: Tensor, launches: Launches) -> _Recording:
-        with aside(folded.device):
+        with warm_up(folded.device):
             self._run(folded, launches)
         graph, raw = record(lambda: self._run(folded, launches), folded.device)
         return _Recording(graph, folded, raw)

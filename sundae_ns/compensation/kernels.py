@@ -1,11 +1,10 @@
-"""CUDA source of what lies between the head's convolutions, forwards and backwards, and the calls that start it.
+"""CUDA kernels between the head's convolutions, forward and backward, and their compilation.
 
-Run layer by layer, most of the head's time goes into reading and writing pictures: a bias, an activation, a pooling, an
-upsampling and a concatenation are a pass each. Here a pass does all that happens between two convolutions, and writes its
-result where the next one reads it.
+Layer by layer, most of the head's time goes to reading and writing images: bias, activation, pooling, upsampling and
+concatenation are a pass each. Here one pass does everything between two convolutions, and writes its result where the
+next convolution reads it.
 
-The source is plain C++ apart from the few words by which a thread finds its number, so that the tests run the very same
-lines on a CPU.
+The source is plain C++ except for the thread indices and conversions, so the tests compile the same source for the CPU.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ from sundae_ns.compensation.unet import SLOPE, UNet
 from sundae_ns.gpu.nvrtc import Kernel, Launch
 
 PACK = 8
-"""Channels that a thread moves at once, 16 bytes of them; pictures are padded to a multiple, which tensor cores want too."""
+"""Channels that a thread moves at once, 16 bytes; images are padded to a multiple, which tensor cores need too."""
 
 FORWARD = ("fold", "activate", "pool", "upsample", "unfold")
-"""Kernels of :data:`SOURCE` that make a picture."""
+"""Kernels of :data:`SOURCE` for the forward pass."""
 
 BACKWARD = tuple(f"{name}_backward" for name in FORWARD)
-"""Those of their gradients."""
+"""Kernels of :data:`SOURCE` for the backward pass."""
 
 _CONVERSIONS = {
     torch.float16: r"""
@@ -43,13 +42,13 @@ __device__ __forceinline__ T store(float f) { T v; asm("cvt.rn.bf16.f32 %0, %1;"
 SOURCE = r"""
 struct __align__(PACK * sizeof(T)) Pack { T v[PACK]; };
 
-// All pictures are channels last: [height, width, channels]. A thread has one pack of channels of one pixel.
+// All images are channels last: [height, width, channels]. A thread has one pack of channels of one pixel.
 
 __device__ __forceinline__ float leaky(float x) { return x > 0.0f ? x : SLOPE * x; }
 
 __device__ __forceinline__ T activated(T x, float bias) { return store(leaky(load(x) + bias)); }
 
-// Casts what was splatted, puts it side by side, pads it by zeros at the bottom, to the right and in channels, and folds
+// Casts and concatenates splatted values, pads them by zeros at the bottom, to the right and in channels, and folds
 // blocks of R x R pixels into channels: channel c of pixel (dy, dx) of a block becomes channel (c R + dy) R + dx.
 extern "C" __global__ void fold(const float* __restrict__ splatted, int splatted_stride,
                                 const float* __restrict__ alpha, int alpha_stride, int num_colors, int num_features,
@@ -62,12 +61,12 @@ extern "C" __global__ void fold(const float* __restrict__ splatted, int splatted
     const bool is_alpha = c < num_colors && c == 3;
     const float* from = is_alpha ? alpha : splatted + (c < num_colors ? c : c - num_colors + 3);
     const int stride = is_alpha ? alpha_stride : splatted_stride;
-    T* to = out + i * (R * R);
+    T* result = out + i * (R * R);
     for (int dy = 0; dy < R; ++dy)
         for (int dx = 0; dx < R; ++dx) {
             const int row = y * R + dy, column = x * R + dx;
             const bool inside = row < height && column < width && c < num_colors + num_features;
-            to[dy * R + dx] = store(inside ? from[((long long)row * width + column) * stride] : 0.0f);
+            result[dy * R + dx] = store(inside ? from[((long long)row * width + column) * stride] : 0.0f);
         }
 }
 
@@ -83,7 +82,7 @@ extern "C" __global__ void activate(T* x, const float* __restrict__ bias, int ch
     ((Pack*)x)[i] = pack;
 }
 
-// The same, of 2 x 2 pixels, into the last channels of a picture that is wider in channels; and their mean.
+// Adds the bias and activates; writes the result into the last channels of a wider image, and the mean of 2 x 2 pixels.
 extern "C" __global__ void pool(const T* __restrict__ x, const float* __restrict__ bias, int channels, int rows,
                                 int columns, T* __restrict__ wide, int wide_channels, T* __restrict__ pooled) {
     const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
@@ -110,8 +109,8 @@ extern "C" __global__ void pool(const T* __restrict__ x, const float* __restrict
     ((Pack*)pooled)[i] = mean;
 }
 
-// Adds the bias, activates, doubles the size bilinearly (pixels are areas), and writes into the first channels of a wider
-// picture. A fine pixel lies a quarter of a pixel from the centre of the coarse one that it is in.
+// Adds the bias, activates, doubles the size bilinearly (pixels are areas), and writes into the first channels of a
+// wider image. A fine pixel's centre is a quarter of a coarse pixel from the centre of its coarse pixel.
 extern "C" __global__ void upsample(const T* __restrict__ x, const float* __restrict__ bias, int channels, int rows,
                                     int columns, T* __restrict__ wide, int wide_channels) {
     const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
@@ -138,7 +137,7 @@ extern "C" __global__ void upsample(const T* __restrict__ x, const float* __rest
     *(Pack*)(wide + fine * wide_channels + c) = pack;
 }
 
-// Adds the bias, activates, takes the last, 1 x 1 convolution, unfolds blocks, crops, and adds the correction.
+// Adds the bias, activates, applies the final 1 x 1 convolution, unfolds blocks, crops, and adds the correction.
 extern "C" __global__ void unfold(const T* __restrict__ x, const float* __restrict__ bias,
                                   const float* __restrict__ weight, const float* __restrict__ out_bias, int rows,
                                   int columns, const float* __restrict__ base, const float* __restrict__ alpha,
@@ -166,42 +165,44 @@ extern "C" __global__ void unfold(const T* __restrict__ x, const float* __restri
         const int c = o / (R * R), y = row + o / R % R, x = column + o % R;
         if (y >= height || x >= width) continue;
         const long long pixel = (long long)y * width + x;
-        // What overflowed on the way corrects nothing.
+        // Pixels that overflowed are not corrected.
         const float value = sum[o] - sum[o] == 0.0f ? sum[o] : 0.0f;
         out[3 * pixel + c] = RESIDUAL ? base[3 * pixel + c] + alpha[pixel * alpha_stride] * value : value;
     }
 }
 
-// Gradients. Below zero an activation keeps its sign, so that it tells its slope as well as what it was made from.
+// Gradients. An activation keeps its input's sign, so its value determines its slope.
 
-__device__ __forceinline__ float sloped(float gradient, float at) { return at > 0.0f ? gradient : SLOPE * gradient; }
+__device__ __forceinline__ float leaky_gradient(float gradient, float at) {
+    return at > 0.0f ? gradient : SLOPE * gradient;
+}
 
-// Of the unfolded picture, with respect to what was convolved last; and of each pixel's three values before they were
-// weighted by accumulation, and the last activations, from which the last convolution's weights get theirs.
+// Backward of `unfold`: the gradient of its input; and for the gradient of the 1 x 1 convolution's weights, its input
+// activations and the gradients of its outputs.
 extern "C" __global__ void unfold_backward(const T* __restrict__ x, const float* __restrict__ bias,
                                            const float* __restrict__ weight, const float* __restrict__ out_bias,
                                            int rows, int columns, const float* __restrict__ gradient,
                                            const float* __restrict__ alpha, int alpha_stride, int height, int width,
-                                           T* __restrict__ to_x, T* __restrict__ values, T* __restrict__ to_values,
-                                           float* __restrict__ to_alpha) {
+                                           T* __restrict__ grad_x, T* __restrict__ values, T* __restrict__ grad_values,
+                                           float* __restrict__ grad_alpha) {
     __shared__ float w[3 * R * R * WIDTH];
     for (int k = threadIdx.x; k < 3 * R * R * WIDTH; k += blockDim.x) w[k] = weight[k];
     __syncthreads();
     const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
     if (i >= (long long)rows * columns) return;
     const int column = (int)(i % columns) * R, row = (int)(i / columns) * R;
-    float sum[3 * R * R], to_sum[3 * R * R];
+    float sum[3 * R * R], grad_sum[3 * R * R];
 #pragma unroll
     for (int o = 0; o < 3 * R * R; ++o) {
         const int c = o / (R * R), y = row + o / R % R, x_ = column + o % R;
         const long long pixel = (long long)y * width + x_;
         const bool inside = y < height && x_ < width;
         sum[o] = out_bias[o];
-        to_sum[o] = inside ? gradient[3 * pixel + c] * (RESIDUAL ? alpha[pixel * alpha_stride] : 1.0f) : 0.0f;
-        to_values[i * (3 * R * R) + o] = store(to_sum[o]);
+        grad_sum[o] = inside ? gradient[3 * pixel + c] * (RESIDUAL ? alpha[pixel * alpha_stride] : 1.0f) : 0.0f;
+        grad_values[i * (3 * R * R) + o] = store(grad_sum[o]);
     }
     for (int c = 0; c < WIDTH; c += PACK) {
-        Pack pack = *(const Pack*)(x + i * WIDTH + c), to;
+        Pack pack = *(const Pack*)(x + i * WIDTH + c), result;
 #pragma unroll
         for (int k = 0; k < PACK; ++k) {
             pack.v[k] = activated(pack.v[k], bias[c + k]);
@@ -211,11 +212,11 @@ extern "C" __global__ void unfold_backward(const T* __restrict__ x, const float*
             for (int o = 0; o < 3 * R * R; ++o) {
                 const float factor = w[o * WIDTH + c + k];
                 sum[o] += factor * value;
-                total += factor * to_sum[o];
+                total += factor * grad_sum[o];
             }
-            to.v[k] = store(sloped(total, value));
+            result.v[k] = store(leaky_gradient(total, value));
         }
-        *(Pack*)(to_x + i * WIDTH + c) = to;
+        *(Pack*)(grad_x + i * WIDTH + c) = result;
         *(Pack*)(values + i * WIDTH + c) = pack;
     }
     if (!RESIDUAL) return;
@@ -227,25 +228,25 @@ extern "C" __global__ void unfold_backward(const T* __restrict__ x, const float*
             float total = 0.0f;
 #pragma unroll
             for (int c = 0; c < 3; ++c) total += gradient[3 * pixel + c] * sum[(c * R + dy) * R + dx];
-            to_alpha[pixel] = total;
+            grad_alpha[pixel] = total;
         }
 }
 
-// Of activations, in place.
+// Backward of `activate`, in place.
 extern "C" __global__ void activate_backward(T* gradient, const T* __restrict__ activations, int channels, int pixels) {
     const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
     if (i >= (long long)pixels * (channels / PACK)) return;
     Pack pack = ((Pack*)gradient)[i];
     const Pack at = ((const Pack*)activations)[i];
 #pragma unroll
-    for (int k = 0; k < PACK; ++k) pack.v[k] = store(sloped(load(pack.v[k]), load(at.v[k])));
+    for (int k = 0; k < PACK; ++k) pack.v[k] = store(leaky_gradient(load(pack.v[k]), load(at.v[k])));
     ((Pack*)gradient)[i] = pack;
 }
 
-// Of a skip connection and of the mean, with respect to what was convolved.
-extern "C" __global__ void pool_backward(const T* __restrict__ to_wide, const T* __restrict__ wide, int wide_channels,
-                                         const T* __restrict__ to_pooled, int channels, int rows, int columns,
-                                         T* __restrict__ to_x) {
+// Backward of `pool`: the gradient of its input, from those of the skip connection and of the mean.
+extern "C" __global__ void pool_backward(const T* __restrict__ grad_wide, const T* __restrict__ wide, int wide_channels,
+                                         const T* __restrict__ grad_pooled, int channels, int rows, int columns,
+                                         T* __restrict__ grad_x) {
     const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
     const int packs = channels / PACK;
     if (i >= (long long)rows * columns * packs) return;
@@ -253,21 +254,20 @@ extern "C" __global__ void pool_backward(const T* __restrict__ to_wide, const T*
     const long long pixel = i / packs;
     const int column = (int)(pixel % columns), row = (int)(pixel / columns);
     const long long at = pixel * wide_channels + (wide_channels - channels) + c;
-    const Pack direct = *(const Pack*)(to_wide + at), activations = *(const Pack*)(wide + at);
+    const Pack direct = *(const Pack*)(grad_wide + at), activations = *(const Pack*)(wide + at);
     const long long coarse = (long long)(row / 2) * (columns / 2) + column / 2;
-    const Pack mean = *(const Pack*)(to_pooled + coarse * channels + c);
-    Pack to;
+    const Pack mean = *(const Pack*)(grad_pooled + coarse * channels + c);
+    Pack result;
 #pragma unroll
     for (int k = 0; k < PACK; ++k)
-        to.v[k] = store(sloped(load(direct.v[k]) + 0.25f * load(mean.v[k]), load(activations.v[k])));
-    ((Pack*)to_x)[i] = to;
+        result.v[k] = store(leaky_gradient(load(direct.v[k]) + 0.25f * load(mean.v[k]), load(activations.v[k])));
+    ((Pack*)grad_x)[i] = result;
 }
 
-// Of the doubled picture, with respect to what was convolved: the same weights, gathered. At a border the last pixel
-// stands in for those beyond it.
-extern "C" __global__ void upsample_backward(const T* __restrict__ to_wide, int wide_channels,
+// Backward of `upsample`: gathers with the same weights. At a border the last pixel stands for those beyond it.
+extern "C" __global__ void upsample_backward(const T* __restrict__ grad_wide, int wide_channels,
                                              const T* __restrict__ x, const float* __restrict__ bias, int channels,
-                                             int rows, int columns, T* __restrict__ to_x) {
+                                             int rows, int columns, T* __restrict__ grad_x) {
     const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
     const int packs = channels / PACK;
     if (i >= (long long)rows * columns * packs) return;
@@ -281,28 +281,29 @@ extern "C" __global__ void upsample_backward(const T* __restrict__ to_wide, int 
             const int fine_y = y < 0 ? 0 : y >= 2 * rows ? 2 * rows - 1 : y;
             const int fine_x = x_ < 0 ? 0 : x_ >= 2 * columns ? 2 * columns - 1 : x_;
             const float weight = (a == 0 || a == 1 ? 0.75f : 0.25f) * (b == 0 || b == 1 ? 0.75f : 0.25f);
-            const Pack pack = *(const Pack*)(to_wide + ((long long)fine_y * 2 * columns + fine_x) * wide_channels + c);
+            const long long pixel = (long long)fine_y * 2 * columns + fine_x;
+            const Pack pack = *(const Pack*)(grad_wide + pixel * wide_channels + c);
 #pragma unroll
             for (int k = 0; k < PACK; ++k) sum[k] += weight * load(pack.v[k]);
         }
     const Pack pack = ((const Pack*)x)[i];
-    Pack to;
+    Pack result;
 #pragma unroll
-    for (int k = 0; k < PACK; ++k) to.v[k] = store(sloped(sum[k], load(pack.v[k]) + bias[c + k]));
-    ((Pack*)to_x)[i] = to;
+    for (int k = 0; k < PACK; ++k) result.v[k] = store(leaky_gradient(sum[k], load(pack.v[k]) + bias[c + k]));
+    ((Pack*)grad_x)[i] = result;
 }
 
-// Of the folded picture, with respect to what was splatted; that of accumulation is added to what is there.
-extern "C" __global__ void fold_backward(const T* __restrict__ to_folded, int num_colors, int num_features, int padded,
-                                         int height, int width, int rows, int columns, float* __restrict__ to_splatted,
-                                         float* __restrict__ to_alpha) {
+// Backward of `fold`; the gradient of accumulation is added to its current value.
+extern "C" __global__ void fold_backward(const T* __restrict__ grad_folded, int num_colors, int num_features,
+                                         int padded, int height, int width, int rows, int columns,
+                                         float* __restrict__ grad_splatted, float* __restrict__ grad_alpha) {
     const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
     if (i >= (long long)rows * columns * padded) return;
     const int c = (int)(i % padded);
     if (c >= num_colors + num_features) return;
     const long long block = i / padded;
     const int x = (int)(block % columns), y = (int)(block / columns);
-    const T* from = to_folded + i * (R * R);
+    const T* from = grad_folded + i * (R * R);
     for (int dy = 0; dy < R; ++dy)
         for (int dx = 0; dx < R; ++dx) {
             const int row = y * R + dy, column = x * R + dx;
@@ -310,24 +311,24 @@ extern "C" __global__ void fold_backward(const T* __restrict__ to_folded, int nu
             const long long pixel = (long long)row * width + column;
             const float value = load(from[dy * R + dx]);
             if (c < num_colors && c == 3)
-                to_alpha[pixel] += value;
+                grad_alpha[pixel] += value;
             else
-                to_splatted[pixel * (3 + num_features) + (c < num_colors ? c : c - num_colors + 3)] = value;
+                grad_splatted[pixel * (3 + num_features) + (c < num_colors ? c : c - num_colors + 3)] = value;
         }
 }
 """
 
 Launches = Mapping[str, Launch]
-"""By the kernel's name."""
+"""Launch functions by kernel name."""
 
 
 def program(dtype: torch.dtype) -> str:
-    """The source for pictures of a dtype, with what it leaves open apart from :func:`definitions`."""
+    """The source for images of a dtype; :func:`definitions` gives its macros."""
     return _CONVERSIONS[dtype] + SOURCE
 
 
 def definitions(net: UNet, residual: bool) -> tuple[str, ...]:
-    """Compiler options for a network: its folding and its width, and whether it corrects a picture."""
+    """Compiler options for a network: its fold, its width, and whether it corrects an image."""
     return (
         f"-DR={net.pixel_unshuffle}",
         f"-DWIDTH={net.out.in_channels}",
@@ -341,15 +342,15 @@ def definitions(net: UNet, residual: bool) -> tuple[str, ...]:
 def compiled(
     device: torch.device, dtype: torch.dtype, options: tuple[str, ...], names: tuple[str, ...] = FORWARD
 ) -> Launches:
-    """The kernels for a device, compiled once.
+    """The kernels for a device, compiled on the first call.
 
     Args:
-        device: a CUDA device.
-        dtype: of pictures between the convolutions, float16 or bfloat16.
+        device: CUDA device.
+        dtype: dtype of images between the convolutions, float16 or bfloat16.
         options: see :func:`definitions`.
-        names: which of them.
+        names: kernels to compile.
 
     Raises:
-        BackendError: they cannot be compiled or loaded here.
+        BackendError: the kernels cannot be compiled or loaded.
     """
     return {name: Kernel(program(dtype), name, device, options) for name in names}

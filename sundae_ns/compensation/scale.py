@@ -1,7 +1,7 @@
-"""Pictures of another scale than the head was trained at.
+"""Images of another scale than those the head was trained on.
 
-A screen-space network knows one size of a pixel in the scene. Shown a picture of half or twice the focal length it may do
-harm, so such pictures are compensated at the trained scale, and the correction is resized.
+A screen-space network learns one size of a pixel in the scene. On an image of half or twice the focal length it may do
+harm, so such images are compensated at the trained scale, and the correction is resized.
 """
 
 from __future__ import annotations
@@ -12,36 +12,36 @@ import torch.nn.functional as F
 from torch import Tensor
 
 TOLERANCE = 1.01
-"""Ratio of focal lengths within which the head is used as it is: what test cameras differ by from those trained on. A picture
-2% larger or smaller is better off with the correction of the trained scale (``docs/results.md``)."""
+"""Ratio of focal lengths up to which the head runs at the image's own scale: the difference between training and test
+cameras. An image 2% larger or smaller is better with the correction of the trained scale."""
 FADE = (4.0, 2.0)
-"""Pictures shrunk by more than the first factor are shown without the head, those by less than the second with all of it:
-a thumbnail should not cost a whole picture, nor the head appear at once while one zooms."""
+"""Images shrunk by more than the first factor are shown without the head, those by less than the second with all of it:
+a thumbnail must not cost a full-size image, nor the head appear abruptly during a zoom."""
 
-MOST_PIXELS = 2**24
-"""A picture that would have more pixels than this at the trained scale, as a wide view may, fades the head out as well, up to
-twice as many; but for those that are larger themselves. 33 million pixels take two gigabytes."""
+MAX_PIXELS = 2**24
+"""The head also fades out for images with more pixels than this at the trained scale, such as a wide view, and is off
+at twice as many. 33 million pixels take two gigabytes."""
 
-ROOM = 1.25
-"""Pictures of any size are compensated at a scale that is larger by so much."""
+MARGIN = 1.25
+"""The pixel limit does not apply at scales up to this factor, whatever the size of the image."""
 
 
 class ScalePlan(NamedTuple):
-    """How to compensate a picture."""
+    """Scale and weight at which an image is compensated."""
 
     zoom: float
-    """Factor on the picture's focal length and sides at which the head runs; 1 for the picture itself."""
+    """Factor on the focal length and sides of the image at which the head runs; 1 for the image itself."""
     weight: float
     """Share of the correction that is added; 0 means that the head need not run."""
 
 
 def plan(focal: float, trained: tuple[float, float] | None, pixels: int) -> ScalePlan:
-    """How to compensate a picture.
+    """Plan the compensation of an image.
 
     Args:
-        focal: focal length of the picture, pixels.
-        trained: shortest and longest focal length of the training pictures; None where they are not known.
-        pixels: how many the picture has.
+        focal: focal length of the image, pixels.
+        trained: shortest and longest focal length of the training images; None if unknown.
+        pixels: number of pixels of the image.
     """
     if trained is None:
         return ScalePlan(1.0, 1.0)
@@ -49,12 +49,12 @@ def plan(focal: float, trained: tuple[float, float] | None, pixels: int) -> Scal
     zoom = nearest / focal
     if 1 / TOLERANCE <= zoom <= TOLERANCE:
         return ScalePlan(1.0, 1.0)
-    most = max(MOST_PIXELS, ROOM**2 * pixels)
-    return ScalePlan(zoom, min(_fading(zoom, *FADE), _fading(pixels * zoom**2, 2 * most, most)))
+    limit = max(MAX_PIXELS, MARGIN**2 * pixels)
+    return ScalePlan(zoom, min(_fading(zoom, *FADE), _fading(pixels * zoom**2, 2 * limit, limit)))
 
 
 def _fading(value: float, off: float, full: float) -> float:
-    """1 up to ``full``, and from there straight down to 0 at ``off``."""
+    """1 up to ``full``, then linearly down to 0 at ``off``."""
     return min(max((off - value) / (off - full), 0.0), 1.0)
 
 

@@ -1,7 +1,7 @@
 """The paper's network: four levels, average pooling, bilinear upsampling, skip connections, no normalisation layers.
 
-No normalisation on purpose: the viewer switches between training and evaluation for every frame, and a picture must not
-depend on the pictures shown before it.
+No normalisation on purpose: the viewer switches between training and evaluation for every frame, and an image must not
+depend on earlier ones.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 LEVELS = 4
-"""Resolutions that the network works at; the coarsest is 1 / 2 ** (LEVELS - 1) of its input."""
+"""Number of resolutions of the network; the coarsest is 1 / 2 ** (LEVELS - 1) of its input."""
 
 
 SLOPE = 0.1
-"""Slope of the activation below zero. Without normalisation layers a plain ReLU can die, and whole levels with it."""
+"""Slope of the activation below zero. Without normalisation a plain ReLU can die, and whole levels with it."""
 
 
 def _double_conv(c_in: int, c_out: int) -> nn.Sequential:
     layers: list[nn.Module] = []
     for channels in (c_in, c_out):
         conv = nn.Conv2d(channels, c_out, 3, padding=1)
-        # Keeps the variance of activations through the depth (He et al. 2015), which nothing else here would.
+        # Keep the variance of activations through the depth (He et al. 2015): there is no normalisation.
         nn.init.kaiming_normal_(conv.weight, a=SLOPE)
         nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
         layers += [conv, nn.LeakyReLU(SLOPE, inplace=True)]
@@ -39,10 +39,10 @@ class UNet(nn.Module):
         in_channels: channels of the input image.
         out_channels: channels of the output image.
         width: channels of the finest level; each coarser level doubles them. 64 gives the paper's 30 MB.
-        max_width: most channels of a level; None for the paper's doubling all the way.
-        pixel_unshuffle: fold blocks of this many pixels a side into channels first, and unfold the result. 1 is the
-            paper's network; 2 does a quarter of the work at the full-resolution level.
-        zero_init: start with an output of exactly zero.
+        max_width: largest number of channels of a level; None for the paper's doubling.
+        pixel_unshuffle: fold blocks of this many pixels per side into channels first, and unfold the result. 1 is the
+            paper's network; 2 quarters the work at the full-resolution level.
+        zero_init: initialise the output to exactly zero.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class UNet(nn.Module):
         height, width = image.shape[-2:]
         stride = self.pixel_unshuffle * 2 ** (LEVELS - 1)
         bottom, right = -height % stride, -width % stride
-        # By zeros, as the convolutions pad themselves.
+        # Pad by zeros, as the convolutions do.
         x = F.pad(image, (0, right, 0, bottom)) if bottom or right else image
         x = F.pixel_unshuffle(x, self.pixel_unshuffle)
         skips: list[Tensor] = []

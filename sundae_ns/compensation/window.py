@@ -1,4 +1,4 @@
-"""Windows of large pictures to train on, so that a step costs the same however many pixels a capture has."""
+"""Random windows of large training images, so that the cost of a step does not grow with the image size."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import NamedTuple
 import torch
 
 GRID = 16
-"""Sides of a window are multiples of this many pixels, so that the U-Net need not pad it."""
+"""Sides of a window are multiples of this many pixels, so that the U-Net needs no padding."""
 
 
 class Window(NamedTuple):
-    """A part of a picture, in pixels."""
+    """A rectangle of an image, in pixels."""
 
     left: int
     top: int
@@ -20,19 +20,16 @@ class Window(NamedTuple):
 
 
 def training_window(width: int, height: int, max_pixels: int, seed: int) -> Window | None:
-    """A random window of the picture's own aspect ratio.
+    """A random window with the image's aspect ratio, or None to train on the whole image.
 
-    Positions are drawn from beyond the picture's edges too and moved back inside, because uniform ones would hardly ever
-    show the pixels next to the edges.
+    Positions are drawn from beyond the edges too and moved back inside, because uniform ones would rarely include the
+    pixels next to the edges.
 
     Args:
-        width: of the picture, pixels.
-        height: of the picture, pixels.
-        max_pixels: most pixels of a window; 0 for no limit.
-        seed: the window is a function of it, so that a resumed run sees the windows of one that was never stopped.
-
-    Returns:
-        None where the whole picture is to be trained on.
+        width: image width in pixels.
+        height: image height in pixels.
+        max_pixels: largest number of pixels of a window; 0 for no limit.
+        seed: the window is a function of it, so that a resumed run uses the same windows.
     """
     if max_pixels == 0 or width * height <= max_pixels:
         return None

@@ -1,4 +1,4 @@
-"""Pinhole cameras in nerfstudio's convention, on an orbit around a scene or before a wall.
+"""Pinhole cameras in nerfstudio's convention, on an orbit around a scene or in front of a wall.
 
 World: z up. Camera: OpenGL axes (x right, y up, looking along -z). Pixels: x right, y down, centres at +0.5.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from sundae_ns.data.shapes import Array
 
 GOLDEN = (5**0.5 - 1) / 2
-"""Golden ratio less 1: its multiples, modulo 1, fill [0, 1) evenly however many there are."""
+"""Golden ratio minus 1: any number of its multiples, modulo 1, fills [0, 1) evenly."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Camera:
 
 
 def look_at(eye: Array, target: Array) -> Array:
-    """Camera-to-world matrix ``[4, 4]`` of a level camera at ``eye`` ``[3]`` that looks at ``target`` ``[3]``."""
+    """Camera-to-world matrix ``[4, 4]`` of a camera at ``eye`` ``[3]`` that faces ``target`` ``[3]``, without roll."""
     back = eye - target
     back = back / np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -42,17 +42,17 @@ def look_at(eye: Array, target: Array) -> Array:
 
 
 def _focal_length(width: int, height: int, field_of_view: float) -> float:
-    """In pixels; the field of view is in degrees, across the shorter side."""
+    """Focal length in pixels for a field of view in degrees, across the shorter side."""
     return float(0.5 * min(width, height) / np.tan(np.radians(field_of_view) / 2))
 
 
 def orbit(
     count: int, *, width: int, height: int, rng: np.random.Generator, field_of_view: float = 50.0
 ) -> list[Camera]:
-    """``count`` cameras once around the scene, at heights and distances that change from view to view.
+    """``count`` cameras on one orbit around the scene, at varying heights and distances.
 
-    The angle grows steadily, the elevation follows the golden-ratio sequence: neighbours in the list are neighbours
-    around the scene, yet any few of them in a row cover low, middle and high views.
+    The azimuth grows steadily; the elevation follows the golden-ratio sequence. Neighbours in the list are neighbours
+    around the scene, and a few consecutive cameras cover low, middle and high views.
 
     Args:
         count: number of cameras.
@@ -77,9 +77,10 @@ def orbit(
 def facing(
     count: int, *, width: int, height: int, rng: np.random.Generator, field_of_view: float = 50.0
 ) -> list[Camera]:
-    """``count`` cameras before the plane y = 0, which all look at it, from up to 40 degrees to the side.
+    """``count`` cameras at y < 0 that face the plane y = 0, from up to 40 degrees to the side.
 
-    Places follow the golden-ratio sequence across and up, so that any few in a row cover the whole range.
+    Positions advance steadily across; their height follows the golden-ratio sequence, so a few consecutive cameras
+    cover the whole range.
 
     Args:
         count: number of cameras.
@@ -128,6 +129,6 @@ def project(camera: Camera, points: Array) -> tuple[Array, Array]:
 
 
 def in_frame(camera: Camera, image_points: Array, depth: Array) -> Array:
-    """True ``[M]`` for projected points that lie in front of the camera and inside its picture."""
+    """True ``[M]`` for projected points that lie in front of the camera and inside its image."""
     x, y = image_points[:, 0], image_points[:, 1]
     return (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)

@@ -1,7 +1,7 @@
-"""What a capture has to be before it is parsed: ``transforms.json`` and pictures, checked one by one.
+"""Checks of a capture before it is parsed: ``transforms.json`` and the headers of its images.
 
-nerfstudio's parsers take a well-formed capture for granted: elsewhere they end in an assertion, or train on NaN. Pure
-functions of files; they read text and the headers of pictures, no pixels.
+nerfstudio's parsers assume a well-formed capture; on any other they raise an assertion or train on NaN. These functions
+read text and image headers, no pixels.
 """
 
 from __future__ import annotations
@@ -19,38 +19,38 @@ from PIL import Image
 from sundae_ns.errors import DataError
 
 MAX_SIDE = 65535
-"""Longest side of a picture, in pixels; JPEG's own limit."""
+"""Longest side of an image, in pixels: JPEG's limit."""
 _LARGEST = 1e12
-"""Largest coordinate or focal length that survives float32 arithmetic with squares in it."""
+"""Largest coordinate or focal length; its square must stay in the range of float32."""
 _PIXELS_PER_BYTE = 4096
-"""More pixels a byte than any still-picture format reaches, even for one flat colour."""
-_SMALL_PICTURE = 1 << 20
-"""Pictures of up to this many pixels are decoded whatever the size of their file."""
+"""Pixels per byte that no image format reaches, even for one flat colour."""
+_SMALL_IMAGE = 1 << 20
+"""Images of up to this many pixels pass, for any size of the file."""
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 
 def number(value: Any, name: str, where: str, *, positive: bool = False) -> float:
-    """``value`` as a finite float.
+    """Return ``value`` as a finite float.
 
     Raises:
-        DataError: it is no number, not finite, too large, or not positive where it must be.
+        DataError: it is not a number, not finite, too large, or not positive although ``positive`` is set.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise DataError(f"{where}: {name} is {_short(value)}; it must be a number")
     if not abs(value) <= _LARGEST:
-        raise DataError(f"{where}: {name} is {_short(value)}; it must be finite, and at most {_LARGEST:g}")
+        raise DataError(f"{where}: {name} is {_short(value)}; it must be finite and at most {_LARGEST:g}")
     if positive and not value > 1e-6:
         raise DataError(f"{where}: {name} is {_short(value)}; it must be positive")
     return float(value)
 
 
 def side(value: Any, name: str, where: str) -> int:
-    """``value`` as the side of a picture in pixels.
+    """Return ``value`` as the side of an image in pixels.
 
     Raises:
-        DataError: it is no whole number from 1 to 65,535.
+        DataError: it is not a whole number from 1 to 65,535.
     """
     length = number(value, name, where)
     if length != int(length) or not 1 <= length <= MAX_SIDE:
@@ -59,10 +59,10 @@ def side(value: Any, name: str, where: str) -> int:
 
 
 def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray:
-    """``value`` as a finite float64 matrix ``[R, 4]`` with one of the given numbers of rows, its rotation part regular.
+    """Return ``value`` as a float64 matrix ``[R, 4]``, with R one of ``rows`` and an invertible 3 x 3 part.
 
     Raises:
-        DataError: it has another shape, entries that are not finite, or is singular.
+        DataError: it has another shape, an entry that is not finite, or is singular.
     """
     if not isinstance(value, list) or len(value) not in rows:
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
@@ -71,34 +71,34 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
             raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
         for entry in row:
             number(entry, name, where)
-    found = np.array(value, dtype=np.float64)
-    if abs(np.linalg.det(found[:3, :3])) < 1e-9:
-        raise DataError(f"{where}: {name} is singular, so it is no camera pose; leave this view out")
-    return found
+    array = np.array(value, dtype=np.float64)
+    if abs(np.linalg.det(array[:3, :3])) < 1e-9:
+        raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
+    return array
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Parse a JSON object.
+    """Parse a file with one JSON object.
 
     Raises:
-        DataError: the file is missing, or holds no JSON object.
+        DataError: the file cannot be read or does not hold a JSON object.
     """
     try:
-        found = json.loads(path.read_bytes())
+        content = json.loads(path.read_bytes())
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
-    except (ValueError, RecursionError) as error:  # bytes that are no text, digits without end, nesting without end
+    except (ValueError, RecursionError) as error:  # invalid UTF-8, endless digits, endless nesting
         reason = " ".join(str(error).split())
         raise DataError(f"{path} is not JSON ({reason[:120]}); write it again") from error
-    if not isinstance(found, dict):
-        raise DataError(f"{path} holds no JSON object; give the transforms.json of a capture")
-    return found
+    if not isinstance(content, dict):
+        raise DataError(f"{path} does not hold a JSON object; give the transforms.json of a capture")
+    return content
 
 
 def no_transforms(data: Path) -> DataError:
-    """The error for a path where a capture's ``transforms.json`` is looked for in vain: what to do with what is there."""
+    """The error for a path without a ``transforms.json``, with advice that fits its contents."""
     if data.is_file():
-        return DataError(f"{data} is no capture but a file; ns-process-data video makes a capture of a video")
+        return DataError(f"{data} is a file, not a capture; ns-process-data video makes a capture of a video")
     for model in ("sparse/0", "colmap/sparse/0", "sparse"):
         if any((data / model / name).is_file() for name in ("cameras.bin", "cameras.txt")):
             return DataError(
@@ -107,10 +107,10 @@ def no_transforms(data: Path) -> DataError:
     return DataError(f"{data} has no transforms.json; {how_to_make_one(data)}")
 
 
-def how_to_make_one(pictures: Path) -> str:
-    """The command that makes a capture of a folder of pictures."""
-    folder = shlex.quote(str(pictures))
-    return f"make a capture of pictures with `ns-process-data images --data {folder} --output-dir CAPTURE`"
+def how_to_make_one(images: Path) -> str:
+    """Advice with the command that makes a capture of a folder of images."""
+    folder = shlex.quote(str(images))
+    return f"make a capture of images with `ns-process-data images --data {folder} --output-dir CAPTURE`"
 
 
 def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: Collection[str] = ()) -> None:
@@ -118,16 +118,16 @@ def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: C
 
     Args:
         path: the file.
-        splits: splits that will be read, ``"train"`` and the like; checked where the file lists pictures by split.
-        camera_models: values of ``camera_model`` that can be used; empty for any.
+        splits: splits that will be read, such as ``"train"``; checked if the file lists images by split.
+        camera_models: supported values of ``camera_model``; empty for any.
 
     Raises:
-        DataError: the first entry that cannot be used, the frame that it stands in, and what it must be.
+        DataError: names the first unusable entry, its frame, and what it must be.
     """
     meta = read_json(path)
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise DataError(f"{path} lists no frames; a capture needs at least one picture with its pose")
+        raise DataError(f"{path} lists no frames; a capture needs at least one image with its pose")
     shared = [name for name in _INTRINSICS if name in meta]
     _check_camera(meta, shared, path.name)
     models = {meta["camera_model"]} if isinstance(meta.get("camera_model"), str) else set()
@@ -146,7 +146,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: C
         where = f"{where} ({_short(name)})"
         missing = [key for key in _INTRINSICS if key not in shared and key not in frame]
         if missing:
-            raise DataError(f"{where}: {', '.join(missing)} missing; give them for each frame, or for all at the top")
+            raise DataError(f"{where}: {', '.join(missing)} missing; give them in each frame, or for all at the top")
         _check_camera(frame, [key for key in _INTRINSICS if key not in shared], where)
         matrix(frame.get("transform_matrix"), (4,), "transform_matrix", where)
         for key in extras:
@@ -155,7 +155,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: C
                 extras[key] += 1
     for key, count in extras.items():
         if count not in (0, len(frames)):
-            raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it for all or for none")
+            raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it in all or in none")
     if models == {"FISHEYE624"}:
         _check_round_lens(meta, extras["mask_path"] > 0, path.name)
     _check_splits(meta, names, splits, path.name)
@@ -163,7 +163,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: C
 
 
 def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -> None:
-    """Check those intrinsics of an entry that will be read from it, and its distortion."""
+    """Check the intrinsics ``keys`` of an entry, and its distortion."""
     for key in keys:
         if key in ("w", "h"):
             side(entry[key], key, where)
@@ -181,7 +181,7 @@ def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -
 
 
 def _check_round_lens(meta: Mapping[str, Any], masked: bool, where: str) -> None:
-    """Check what nerfstudio makes the masks of a FISHEYE624 camera from."""
+    """Check the entries from which nerfstudio makes the masks of a FISHEYE624 camera."""
     radius = meta.get("fisheye_crop_radius")
     if not isinstance(radius, float) or not 0 < radius < math.inf:
         raise DataError(
@@ -189,7 +189,7 @@ def _check_round_lens(meta: Mapping[str, Any], masked: bool, where: str) -> None
             "pixels with a decimal point"
         )
     if masked:
-        raise DataError(f"{where}: pictures of a FISHEYE624 camera get masks of their own; leave mask_path out")
+        raise DataError(f"{where}: nerfstudio makes the masks of a FISHEYE624 camera; remove mask_path")
 
 
 def _check_splits(meta: Mapping[str, Any], names: set[str], splits: Sequence[str], where: str) -> None:
@@ -198,13 +198,15 @@ def _check_splits(meta: Mapping[str, Any], names: set[str], splits: Sequence[str
         files = meta.get(f"{split}_filenames")
         if not isinstance(files, list) or not all(isinstance(file, str) for file in files):
             raise DataError(
-                f"{where} lists pictures for {', '.join(listed)}, but none for {split}; add {split}_filenames as a list "
+                f"{where} lists images for {', '.join(listed)}, but none for {split}; add {split}_filenames as a list "
                 "of paths, or remove all such lists"
             )
         known = {str(Path(name)) for name in names}
-        strange = [file for file in files if str(Path(file)) not in known]
-        if strange:
-            raise DataError(f"{where}: {split}_filenames has {_short(strange[0])}, which is the file_path of no frame")
+        unknown = [file for file in files if str(Path(file)) not in known]
+        if unknown:
+            raise DataError(
+                f"{where}: {split}_filenames has {_short(unknown[0])}, which no frame has as its file_path; correct it"
+            )
 
 
 def _check_frame_of_capture(meta: Mapping[str, Any], where: str) -> None:
@@ -227,47 +229,47 @@ def _path(value: Any, name: str, where: str) -> str:
     return value
 
 
-def check_picture(path: Path, *, mask: bool = False) -> tuple[int, int]:
-    """Check by its header that a picture can be trained on.
+def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
+    """Check by its header that an image can be used for training.
 
     Args:
         path: the file.
-        mask: whether it is a mask, which has one channel, rather than a photograph of 8 bits a channel.
+        mask: expect a mask of one channel instead of a photograph of 8 bits per channel.
 
     Returns:
         Width and height in pixels.
 
     Raises:
-        DataError: it is missing, no picture, of another kind of pixels, or too large for its file to be whole.
+        DataError: the file is missing, not an image, of another pixel type, or too short for its size in pixels.
     """
     try:
         with Image.open(path) as image:
             size, mode = image.size, image.mode
         length = path.stat().st_size
     except OSError as error:
-        reason = error.strerror or ("it is no picture" if isinstance(error, Image.UnidentifiedImageError) else error)
-        raise DataError(f"{path} cannot be read ({reason}); mend it, or leave the view out") from error
-    except Exception as error:  # decoders raise many kinds; each means the same to the user
-        raise DataError(f"{path} is no whole picture ({_line(error)}); mend it, or leave the view out") from error
-    fitting = ("1", "L") if mask else ("L", "RGB", "RGBA")
-    if mode not in fitting:
-        wanted = "one channel of 8 bits" if mask else "RGB, RGBA or grey with 8 bits a channel"
-        raise DataError(f"{path} has pixels of kind {mode}; save it with {wanted}")
-    if size[0] * size[1] > max(_PIXELS_PER_BYTE * length, _SMALL_PICTURE):
-        raise DataError(f"{path} claims {size[0]} x {size[1]} px in {length:,} bytes; it is not whole, save it again")
+        reason = error.strerror or ("it is not an image" if isinstance(error, Image.UnidentifiedImageError) else error)
+        raise DataError(f"{path} cannot be read ({reason}); repair it or remove the view") from error
+    except Exception as error:  # decoders raise many types; each means the same to the user
+        raise DataError(f"{path} is not a complete image ({_one_line(error)}); repair it or remove the view") from error
+    modes = ("1", "L") if mask else ("L", "RGB", "RGBA")
+    if mode not in modes:
+        wanted = "one channel of 8 bits" if mask else "RGB, RGBA or grey with 8 bits per channel"
+        raise DataError(f"{path} has pixels of type {mode}; save it with {wanted}")
+    if size[0] * size[1] > max(_PIXELS_PER_BYTE * length, _SMALL_IMAGE):
+        raise DataError(f"{path} claims {size[0]} x {size[1]} px in {length:,} bytes; it is incomplete, save it again")
     return size
 
 
 def undecodable(path: Path, error: Exception) -> DataError:
-    """The error for a picture whose header was fine and whose pixels were not."""
-    return DataError(f"{path} cannot be decoded ({_line(error)}); mend it, or leave the view out")
+    """The error for an image with a valid header and broken pixels."""
+    return DataError(f"{path} cannot be decoded ({_one_line(error)}); repair it or remove the view")
 
 
-def _line(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _short(value: Any) -> str:
-    """A value for a message: one line, and not longer than a path."""
+    """A value as one line of at most 80 characters, for an error message."""
     shown = repr(value)
     return shown if len(shown) <= 80 else shown[:77] + "..."

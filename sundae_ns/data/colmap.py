@@ -1,7 +1,7 @@
-"""What a COLMAP model has to be before it is parsed: cameras, images and points, binary or text.
+"""Checks of a COLMAP model before it is parsed: cameras, images and points, binary or text.
 
-nerfstudio's readers trust every count that a file states, and allocate by it. Here the files are walked once and nothing
-is kept. The formats are those of COLMAP's documentation ("Output Format").
+nerfstudio's readers trust every count in a file and allocate by it. These checks read each file once and keep only
+names and identifiers. The formats are those of COLMAP's documentation ("Output Format").
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from sundae_ns.data.capture import number, side
 from sundae_ns.errors import DataError
 
-# Identifier, name, parameters, how many of those are focal lengths; the models that nerfstudio has a camera for.
+# Identifier: name, number of parameters, number of focal lengths; only models that nerfstudio supports.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3, 1),
     1: ("PINHOLE", 4, 2),
@@ -26,7 +26,7 @@ _MODELS = {
 }
 _CONVERT = "undistort the capture (colmap image_undistorter), or calibrate it with OPENCV"
 _SHELL = set('"$`\\\n')
-"""Characters that end a quoted word: nerfstudio hands names of pictures to a shell when it scales them down."""
+"""Characters that end a quoted word: nerfstudio passes image names to a shell when it scales images down."""
 _CAMERA, _IMAGE, _POINT, _COUNT = (
     struct.Struct("<iiQQ"),
     struct.Struct("<i7di"),
@@ -37,8 +37,8 @@ _OBSERVATION, _TRACK = 24, 8
 _MAX_NAME = 4096
 
 
-class _Bytes:
-    """A binary file that is walked from front to back and refuses to end early."""
+class _BinaryFile:
+    """A binary file, read from front to back; reading past its end raises ``DataError``."""
 
     def __init__(self, path: Path) -> None:
         self.name = path.name
@@ -46,52 +46,52 @@ class _Bytes:
             self.content = path.read_bytes()
         except OSError as error:
             raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
-        self.at = 0
+        self.position = 0
 
     def take(self, layout: struct.Struct) -> tuple[float, ...]:
-        """The next values of a layout."""
-        start = self.at
+        """Read the values of ``layout``."""
+        start = self.position
         self.skip(layout.size)
         return layout.unpack_from(self.content, start)
 
     def skip(self, length: int) -> None:
-        self.at += length
-        if self.at > len(self.content):
+        self.position += length
+        if self.position > len(self.content):
             raise DataError(f"{self.name} ends early, in a part of {length:,} bytes; copy or export it again")
 
-    def count(self, least: int, what: str) -> int:
-        """The next count, of items that take at least so many bytes each."""
-        (found,) = self.take(_COUNT)
-        if found * least > len(self.content) - self.at:
-            raise DataError(f"{self.name} states {found:,} {what}, more than it can hold; copy or export it again")
-        return int(found)
+    def count(self, item_bytes: int, items: str) -> int:
+        """Read a count of items that take at least ``item_bytes`` each."""
+        (count,) = self.take(_COUNT)
+        if count * item_bytes > len(self.content) - self.position:
+            raise DataError(f"{self.name} states {count:,} {items}, more than it can hold; copy or export it again")
+        return int(count)
 
     def text(self) -> str:
-        """The next text, which ends with a zero byte."""
-        end = self.content.find(b"\0", self.at, self.at + _MAX_NAME)
+        """Read UTF-8 text up to a zero byte."""
+        end = self.content.find(b"\0", self.position, self.position + _MAX_NAME)
         if end < 0:
             raise DataError(f"{self.name} holds a name without an end; copy or export it again")
-        start, self.at = self.at, end + 1
+        start, self.position = self.position, end + 1
         try:
             return self.content[start:end].decode("utf-8")
         except UnicodeDecodeError as error:
-            raise DataError(f"{self.name} holds a name that is no text; copy or export it again") from error
+            raise DataError(f"{self.name} holds a name that is not UTF-8; copy or export it again") from error
 
 
 def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> None:
-    """Check a COLMAP model, in the files that nerfstudio picks: text before binary, but binary points before text.
+    """Check the files of a COLMAP model that nerfstudio reads: text before binary, but binary points before text.
 
     Args:
-        model: folder of the model, ``sparse/0`` for one.
-        images: folder of its pictures; None if they will not be needed.
-        points: whether the points will be read too.
+        model: folder of the model, such as ``sparse/0``.
+        images: folder of its images; None skips the check that they exist.
+        points: also check the points.
 
     Raises:
-        DataError: the first thing that cannot be used, and where it stands.
+        DataError: names the first unusable entry and its place.
     """
     if not model.is_dir():
         raise DataError(
-            f"{model} is no folder; say where the model lies with colmap --colmap-path (sparse/0, as a rule)"
+            f"{model} is not a folder; give the folder of the model with colmap --colmap-path (usually sparse/0)"
         )
     if (model / "cameras.txt").exists():
         cameras = _cameras_text(model / "cameras.txt")
@@ -101,15 +101,15 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
         names = _images_binary(_existing(model / "images.bin"), cameras)
     else:
         raise DataError(
-            f"{model} holds neither cameras.bin nor cameras.txt; say where the model lies with --colmap-path"
+            f"{model} holds neither cameras.bin nor cameras.txt; give the folder of the model with --colmap-path"
         )
     if not names:
-        raise DataError(f"{model} has no images; the reconstruction has failed, run it again")
+        raise DataError(f"{model} has no images; the reconstruction failed, run it again")
     for name in names:
         if _SHELL & set(name):
-            raise DataError(f"{model.name} names a picture {name!r}; rename it without quotes, $, ` and backslashes")
+            raise DataError(f"{model.name} has an image named {name!r}; rename it without quotes, $, ` and backslashes")
         if images is not None and not (images / name).is_file():
-            raise DataError(f"{images / name} does not exist; check --images-path, or leave the view out of the model")
+            raise DataError(f"{images / name} does not exist; check --images-path, or remove the view from the model")
     if points:
         if (model / "points3D.bin").exists():
             count = _points_binary(model / "points3D.bin")
@@ -118,7 +118,7 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
         else:
             raise DataError(f"{model} has no points3D.bin or .txt; add it, or start with colmap --load-3D-points False")
         if count == 0:
-            raise DataError(f"{model} has no points; start without them by colmap --load-3D-points False")
+            raise DataError(f"{model} has no points; start without them with colmap --load-3D-points False")
 
 
 def _existing(path: Path) -> Path:
@@ -142,28 +142,28 @@ def _check_pose(pose: Sequence[float], camera: int, cameras: set[int], where: st
     for value in pose:
         number(value, "the pose", where)
     if not abs(math.hypot(*pose[:4]) - 1) < 0.01:
-        raise DataError(f"{where}: its quaternion is not of length 1, so it is no rotation; leave it out")
+        raise DataError(f"{where}: its quaternion is not of length 1, so it is not a rotation; remove the image")
     if camera not in cameras:
         raise DataError(f"{where}: its camera {camera} is not in the model; export it again")
 
 
 def _cameras_binary(path: Path) -> set[int]:
-    file, cameras = _Bytes(path), set()
+    file, cameras = _BinaryFile(path), set()
     for _ in range(file.count(_CAMERA.size, "cameras")):
         identifier, kind, width, height = file.take(_CAMERA)
         where = f"{path.name}, camera {identifier}"
         if kind not in _MODELS:
-            raise DataError(f"{where}: nerfstudio has no camera of model {kind}; {_CONVERT}")
+            raise DataError(f"{where}: nerfstudio does not support camera model {kind}; {_CONVERT}")
         model = _MODELS[int(kind)]
         _check_camera(model, width, height, file.take(struct.Struct(f"<{model[1]}d")), where)
         if identifier in cameras:
-            raise DataError(f"{where}: it stands there twice; export it again")
+            raise DataError(f"{where}: it is listed twice; export it again")
         cameras.add(int(identifier))
     return cameras
 
 
 def _images_binary(path: Path, cameras: set[int]) -> list[str]:
-    file, names = _Bytes(path), []
+    file, names = _BinaryFile(path), []
     for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size, "images")):
         identifier, *pose, camera = file.take(_IMAGE)
         _check_pose(pose, int(camera), cameras, f"{path.name}, image {identifier}")
@@ -173,7 +173,7 @@ def _images_binary(path: Path, cameras: set[int]) -> list[str]:
 
 
 def _points_binary(path: Path) -> int:
-    file = _Bytes(path)
+    file = _BinaryFile(path)
     count = file.count(_POINT.size + _COUNT.size, "points")
     for _ in range(count):
         file.skip(_POINT.size)
@@ -182,8 +182,8 @@ def _points_binary(path: Path) -> int:
 
 
 @contextmanager
-def _line(path: Path, index: int) -> Iterator[None]:
-    """Name the line in which a word is missing or is no number."""
+def _errors_in_line(path: Path, index: int) -> Iterator[None]:
+    """Turn a missing word or an invalid number into a ``DataError`` that names the line."""
     try:
         yield
     except DataError:
@@ -194,7 +194,7 @@ def _line(path: Path, index: int) -> Iterator[None]:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    """Lines that are neither empty nor comments, with their numbers."""
+    """Lines that are neither empty nor comments, each with its index."""
     return [(i, line) for i, line in enumerate(_all_lines(path)) if line.strip() and not line.strip().startswith("#")]
 
 
@@ -204,18 +204,18 @@ def _all_lines(path: Path) -> list[str]:
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
     except UnicodeDecodeError as error:
-        raise DataError(f"{path} is no text; export it again") from error
+        raise DataError(f"{path} is not UTF-8 text; export it again") from error
 
 
 def _cameras_text(path: Path) -> set[int]:
     models = {model[0]: model for model in _MODELS.values()}
     cameras = set()
     for index, line in _lines(path):
-        with _line(path, index):
+        with _errors_in_line(path, index):
             identifier, name, *numbers = line.split()
             where = f"{path.name}, camera {identifier}"
             if name not in models:
-                raise DataError(f"{where}: nerfstudio has no camera of model {name}; {_CONVERT}")
+                raise DataError(f"{where}: nerfstudio does not support camera model {name}; {_CONVERT}")
             width, height = int(numbers[0]), int(numbers[1])
             _check_camera(models[name], width, height, [float(value) for value in numbers[2:]], where)
             cameras.add(int(identifier))
@@ -229,18 +229,18 @@ def _images_text(path: Path, cameras: set[int]) -> list[str]:
         index += 1
         if not line or line.startswith("#"):
             continue
-        with _line(path, index - 1):
+        with _errors_in_line(path, index - 1):
             words = line.split()
             _check_pose([float(w) for w in words[1:8]], int(words[8]), cameras, f"{path.name}, image {int(words[0])}")
             if len(words) > 10:
                 raise DataError(
-                    f"{path.name}, line {index}: nerfstudio does not read names with spaces; rename the picture"
+                    f"{path.name}, line {index}: nerfstudio does not read names with spaces; rename the image"
                 )
             names.append(words[9])
-        with _line(path, index):
+        with _errors_in_line(path, index):
             observations = lines[index].split() if index < len(lines) else []
             if len(observations) % 3:
-                raise ValueError("observations come in threes")
+                raise ValueError("an observation needs three numbers")
             for x, y, point in zip(observations[0::3], observations[1::3], observations[2::3]):
                 float(x), float(y), int(point)
         index += 1
@@ -250,9 +250,9 @@ def _images_text(path: Path, cameras: set[int]) -> list[str]:
 def _points_text(path: Path) -> int:
     lines = _lines(path)
     for index, line in lines:
-        with _line(path, index):
+        with _errors_in_line(path, index):
             words = line.split()
             int(words[0]), [float(w) for w in words[1:4]], float(words[7]), [int(w) for w in words[8:]]
             if not all(0 <= int(w) <= 255 for w in words[4:7]):
-                raise ValueError("colours go from 0 to 255")
+                raise ValueError("a colour must be from 0 to 255")
     return len(lines)

@@ -1,4 +1,4 @@
-"""A sparse point cloud as structure from motion would give it."""
+"""A sparse point cloud like that of structure from motion."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ import numpy as np
 
 from sundae_ns.data.cameras import Camera, in_frame, pixel_rays, project
 from sundae_ns.data.shapes import Array
-from sundae_ns.data.tracer import Scene, first_hits, shade
+from sundae_ns.data.tracer import TracedScene, first_hits, shade
 
 MIN_VIEWS = 2
-"""Cameras that must see a point: it takes two rays to triangulate one."""
+"""Cameras that must see a point: triangulation takes two rays."""
 
 
-def _detail(picture: Array) -> Array:
-    """Chance of a feature at each pixel ``[H, W]``: strong where the brightness changes, small but not 0 elsewhere."""
-    down, right = np.gradient(picture.mean(axis=2, dtype=np.float64))
+def _detail(image: Array) -> Array:
+    """Weight of a feature at each pixel ``[H, W]``: the gradient of the brightness, plus a small constant."""
+    down, right = np.gradient(image.mean(axis=2, dtype=np.float64))
     return np.hypot(down, right) + 0.01
 
 
 def _surface_points(
-    scene: Scene, cameras: Sequence[Camera], pictures: Sequence[Array], count: int, rng: np.random.Generator
+    scene: TracedScene, cameras: Sequence[Camera], images: Sequence[Array], count: int, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
     """Points under ``count`` pixels drawn by detail: positions ``[M, 3]``, owner bodies ``[M]``, distances ``[M]``."""
     origins, directions = [], []
-    for camera, picture, share in zip(cameras, pictures, np.array_split(np.arange(count), len(cameras)), strict=True):
-        weights = _detail(picture).ravel()
-        pixels = rng.choice(len(weights), size=len(share), p=weights / weights.sum())
+    for camera, image, part in zip(cameras, images, np.array_split(np.arange(count), len(cameras)), strict=True):
+        weights = _detail(image).ravel()
+        pixels = rng.choice(len(weights), size=len(part), p=weights / weights.sum())
         o, d = pixel_rays(camera, pixels % camera.width + 0.5, pixels // camera.width + 0.5)
         origins.append(o)
         directions.append(d)
@@ -37,8 +37,8 @@ def _surface_points(
     return o[hit] + distance[hit, None] * d[hit], owner[hit], distance[hit]
 
 
-def observe(scene: Scene, cameras: Sequence[Camera], points: Array, owner: Array) -> tuple[Array, Array]:
-    """In how many views surface points are visible, and their mean colour there.
+def observe(scene: TracedScene, cameras: Sequence[Camera], points: Array, owner: Array) -> tuple[Array, Array]:
+    """Count the views that see each surface point, and average its colour over them.
 
     Args:
         scene: solids and light.
@@ -57,7 +57,7 @@ def observe(scene: Scene, cameras: Sequence[Camera], points: Array, owner: Array
         length = np.linalg.norm(rays, axis=1)
         rays /= length[:, None]
         reach, _ = first_hits(scene, np.broadcast_to(camera.position, rays.shape).astype(points.dtype), rays)
-        # The surface itself is hit at `length`, to within rounding; anything clearly nearer hides it.
+        # The ray hits the point's own surface at `length`, up to rounding; a clearly nearer hit hides the point.
         clear = reach > length * (1 - 1e-3) - 1e-3
         seen, rays = seen[clear], rays[clear]
         views[seen] += 1
@@ -66,45 +66,45 @@ def observe(scene: Scene, cameras: Sequence[Camera], points: Array, owner: Array
 
 
 def sparse_points(
-    scene: Scene,
+    scene: TracedScene,
     cameras: Sequence[Camera],
-    pictures: Sequence[Array],
+    images: Sequence[Array],
     count: int,
     *,
     noise: float,
     outliers: float,
     rng: np.random.Generator,
 ) -> tuple[Array, Array]:
-    """Draw a point cloud: surface points that two views or more share, more of them where the pictures have detail.
+    """Draw a point cloud: surface points that at least two views see, denser where the images have detail.
 
     Args:
         scene: solids and light.
         cameras: training views.
-        pictures: what they show, each ``[H, W, 3]`` in [0, 1].
-        count: points to return.
+        images: the image of each view, ``[H, W, 3]`` in [0, 1].
+        count: number of points.
         noise: standard deviation of the error of a position, as a fraction of its distance from the camera.
-        outliers: fraction of the points that are wrong matches, anywhere around the scene.
+        outliers: fraction of the points that are wrong matches, placed at random around the scene.
         rng: source of randomness.
 
     Returns:
         Positions ``[count, 3]`` float32, and RGB ``[count, 3]`` uint8.
     """
-    wrong = round(count * outliers)
-    wanted = count - wrong
-    found, colors, have = [], [], 0
-    while have < wanted:
-        points, owner, distance = _surface_points(scene, cameras, pictures, max(2 * (wanted - have), 64), rng)
+    strays = round(count * outliers)
+    inliers = count - strays
+    positions, colors, drawn = [], [], 0
+    while drawn < inliers:
+        points, owner, distance = _surface_points(scene, cameras, images, max(2 * (inliers - drawn), 64), rng)
         views, color = observe(scene, cameras, points, owner)
         good = views >= MIN_VIEWS
         jitter = rng.normal(size=points.shape) * (noise * distance)[:, None]
-        found.append((points + jitter)[good])
+        positions.append((points + jitter)[good])
         colors.append(color[good])
-        have += int(good.sum())
-    # The pixels came camera by camera: shuffle before cutting, or the last cameras would lose theirs.
-    order = rng.permutation(have)[:wanted]
-    xyz, rgb = np.concatenate(found)[order], np.concatenate(colors)[order]
-    stray = rng.uniform([-3, -3, -0.5], [3, 3, 2.5], size=(wrong, 3))
-    stray_rgb = rng.uniform(size=(wrong, 3))
+        drawn += int(good.sum())
+    # Points are ordered by camera: shuffle before cutting, or the last cameras lose theirs.
+    order = rng.permutation(drawn)[:inliers]
+    xyz, rgb = np.concatenate(positions)[order], np.concatenate(colors)[order]
+    stray = rng.uniform([-3, -3, -0.5], [3, 3, 2.5], size=(strays, 3))
+    stray_rgb = rng.uniform(size=(strays, 3))
     xyz, rgb = np.concatenate([xyz, stray]), np.concatenate([rgb, stray_rgb])
     rgb = rgb + rng.normal(scale=0.01, size=rgb.shape)
     return xyz.astype(np.float32), np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Write the embedded scene to disk in nerfstudio's format, without ever touching what somebody else put there."""
+"""Write the embedded capture in nerfstudio's format, without overwriting files of other programs."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Kind = Literal["still-life", "wall"]
 TRANSFORMS = "transforms.json"
 POINT_CLOUD = "sparse_pc.ply"
 MARKER = ".sundae_scene.json"
-"""Lists the files that we wrote: written first and by us only, so that its folder may be written over."""
+"""Lists the files of an embedded capture; its presence permits to replace them. Written first."""
 
 
 def held_out_indices(train_views: int, test_views: int) -> list[int]:
-    """Places of the test views in the orbit: evenly spread, so that each lies between training views."""
+    """Indices of the test views: evenly spread, so that each lies between training views."""
     total = train_views + test_views
     return [int((j + 0.5) * total / test_views) for j in range(test_views)]
 
@@ -69,28 +69,28 @@ def _transforms(cameras: Sequence[Camera], names: Sequence[str], held_out: Seque
 
 
 def _claim(out: Path, files: Sequence[str]) -> None:
-    """Make ``out`` ours: create it, or clear the files of an earlier scene of ours; refuse anything else."""
+    """Create ``out`` with its marker, or clear the files of an earlier embedded capture; refuse any other folder."""
     marker = out / MARKER
     if out.exists() and not out.is_dir():
-        raise DataError(f"{out} is a file; name a folder for the scene.")
+        raise DataError(f"{out} is a file; name a folder for the capture.")
     if marker.exists():
         try:
             stale = [str(name) for name in json.loads(marker.read_text())["files"]]
         except (ValueError, KeyError, TypeError) as error:
             raise DataError(
-                f"{marker} is damaged; remove it and the scene in {out}, or name another folder."
+                f"{marker} is damaged; remove it and the capture in {out}, or name another folder."
             ) from error
         for name in [*stale, TRANSFORMS]:
-            # A marker that somebody edited must not reach outside its folder.
+            # An edited marker must not delete files outside its folder.
             if (out / name).resolve().is_relative_to(out.resolve()):
                 (out / name).unlink(missing_ok=True)
     elif out.is_dir() and any(out.iterdir()):
-        raise DataError(f"{out} holds files that are not a scene of ours; name a new or an empty folder.")
+        raise DataError(f"{out} holds other files than an embedded capture; name a new or an empty folder.")
     (out / "images").mkdir(parents=True, exist_ok=True)
     marker.write_text(json.dumps({"files": list(files)}, indent=1))
 
 
-def write_scene(
+def write_embedded_capture(
     out: Path,
     *,
     seed: int = 0,
@@ -108,34 +108,33 @@ def write_scene(
 ) -> Path:
     """Render the embedded still life, or a plain wall, and write it as a nerfstudio data set.
 
-    Writes ``transforms.json`` (with its own train/test split), ``images/*.png`` and ``sparse_pc.ply``. The same
-    arguments give the same bytes on the same machine. ``transforms.json`` comes last: a folder that an interrupted run
-    left behind has none.
+    Writes ``images/*.png``, ``sparse_pc.ply`` and, last, ``transforms.json`` with its own train/test split: a folder of
+    an interrupted run has none. The same arguments give the same bytes on the same machine.
 
     Args:
-        out: folder; new, empty, or an earlier scene of ours, which is replaced.
+        out: folder; new, empty, or with an earlier embedded capture, which is replaced.
         seed: varies placement, textures, light, cameras and points.
-        train_views: number of training pictures.
-        test_views: number of held-out pictures, spread between the training ones along the orbit.
+        train_views: number of training images.
+        test_views: number of held-out images, spread between the training views.
         width: pixels.
         height: pixels.
-        points: size of the sparse point cloud.
+        points: number of points in the sparse point cloud.
         point_noise: standard deviation of a point's error, as a fraction of its distance from the camera.
         outliers: fraction of wrong points.
         samples: each pixel is the mean of ``samples`` x ``samples`` rays.
         kind: the still life, or one flat painted wall, which needs few primitives.
-        sensor_noise: standard deviation of the noise of each pixel and colour, in [0, 1]; a phone's camera in a room has
+        sensor_noise: standard deviation of the noise of each pixel and colour, in [0, 1]; a phone camera indoors has
             about 0.015.
-        progress: called with (views done, views in all) after each view.
+        progress: called with (views done, all views) after each view.
 
     Returns:
         ``out``, the value for ``--data``.
 
     Raises:
         ConfigError: a count or size is too small, or the kind is unknown.
-        DataError: ``out`` is a file, or holds files that are not ours.
+        DataError: ``out`` is a file, or holds other files.
     """
-    for name, value, least in (
+    for name, value, minimum in (
         ("seed", seed, 0),
         ("train_views", train_views, 3),
         ("test_views", test_views, 1),
@@ -147,14 +146,14 @@ def write_scene(
         ("outliers", outliers, 0),
         ("sensor_noise", sensor_noise, 0),
     ):
-        if not value >= least:
-            raise ConfigError(f"{name} is {value}; it must be {least} or more.")
+        if not value >= minimum:
+            raise ConfigError(f"{name} is {value}; it must be {minimum} or more.")
     if kind not in get_args(Kind):
         raise ConfigError(f"kind is {kind!r}; use one of {', '.join(get_args(Kind))}.")
     if not outliers <= 1:
         raise ConfigError(f"outliers is {outliers}, a fraction of the points; it must be 1 or less.")
     if test_views > train_views:
-        raise ConfigError(f"{test_views} test views cannot lie between {train_views} training views; ask for fewer.")
+        raise ConfigError(f"{test_views} test views do not fit between {train_views} training views; give fewer.")
 
     out = Path(out)
     total = train_views + test_views
@@ -164,14 +163,14 @@ def write_scene(
 
     scene, cameras_of = (still_life(seed), orbit) if kind == "still-life" else (wall(seed), facing)
     cameras = cameras_of(total, width=width, height=height, rng=np.random.default_rng([seed, 2]))
-    grain = np.random.default_rng([seed, 5])
-    pictures = []
+    noise_rng = np.random.default_rng([seed, 5])
+    images = []
     for i, (camera, name) in enumerate(zip(cameras, names, strict=True)):
-        picture = render(scene, camera, samples=samples)
+        image = render(scene, camera, samples=samples)
         if sensor_noise:
-            picture = np.clip(picture + grain.normal(scale=sensor_noise, size=picture.shape), 0, 1)
-        Image.fromarray(np.round(picture * 255).astype(np.uint8)).save(out / name)
-        pictures.append(picture)
+            image = np.clip(image + noise_rng.normal(scale=sensor_noise, size=image.shape), 0, 1)
+        Image.fromarray(np.round(image * 255).astype(np.uint8)).save(out / name)
+        images.append(image)
         if progress is not None:
             progress(i + 1, total)
 
@@ -179,7 +178,7 @@ def write_scene(
     xyz, rgb = sparse_points(
         scene,
         [cameras[i] for i in training],
-        [pictures[i] for i in training],
+        [images[i] for i in training],
         points,
         noise=point_noise,
         outliers=outliers,

@@ -1,6 +1,6 @@
-"""Analytic solids about the origin: where a ray enters them, and which way their surface faces.
+"""Analytic solids centred on the origin: ray intersections and surface normals.
 
-Every shape has ``bound``, the radius of a sphere about the origin that encloses it, and two vectorised functions:
+Every shape has ``bound``, the radius of a sphere around the origin that encloses it, and two vectorised functions:
 
 - ``intersect(origins [M, 3], directions [M, 3]) -> [M]``: distance along the (unit) direction to the nearest surface in
   front of the origin, ``inf`` where the ray misses;
@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 EPSILON = 1e-4
-"""Hits closer than this (world units) are the surface that the ray starts on."""
+"""Hits closer than this, in world units, are on the surface from which the ray starts."""
 
 
 class Shape(Protocol):
-    """What the tracer asks of a solid; see the module's docstring."""
+    """Interface of a solid for the tracer; see the module's docstring."""
 
     @property
     def bound(self) -> float:
-        """Radius of an enclosing sphere about the origin."""
+        """Radius of an enclosing sphere around the origin."""
 
     def intersect(self, origins: Array, directions: Array) -> Array:
         """Distances ``[M]`` to the first surface ahead, ``inf`` for a miss."""
@@ -49,7 +49,7 @@ def _slab(origins: Array, directions: Array, half: float) -> tuple[Array, Array]
 
 
 def _quadric(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
-    """Interval in which ``a t^2 + 2 b t + c <= 0`` for a >= 0; empty (inf, -inf) where there is none."""
+    """Interval in which ``a t^2 + 2 b t + c <= 0`` for a >= 0; (inf, -inf) if it is empty."""
     discriminant: Array = b * b - a * c
     root = np.sqrt(np.maximum(discriminant, 0))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -63,7 +63,7 @@ def _quadric(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A ball; seen from inside it is a dome."""
+    """A sphere; from inside it serves as a dome."""
 
     radius: float
 
@@ -112,7 +112,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A capped cylinder about the z axis."""
+    """A capped cylinder around the z axis."""
 
     radius: float
     half_height: float
@@ -143,7 +143,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Torus:
-    """A ring about the z axis: a tube of radius ``minor`` around a circle of radius ``major``."""
+    """A torus around the z axis: a tube of radius ``minor`` around a circle of radius ``major``."""
 
     major: float
     minor: float
@@ -173,10 +173,10 @@ class Torus:
             gap = np.abs(self.distance(origins[active] + t[:, None] * directions[active]))
             arrived = (gap < EPSILON) & (t > EPSILON)
             result[active[arrived]] = t[arrived]
-            # A ray that starts on the surface must first get away from it.
+            # A ray that starts on the surface must first leave it.
             t = t + np.maximum(gap, EPSILON)
-            going = ~arrived & (t < far[active])
-            active, t = active[going], t[going]
+            remaining = ~arrived & (t < far[active])
+            active, t = active[remaining], t[remaining]
         return result
 
     def normal(self, points: Array) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 
 from sundae_ns.data.shapes import Array, Box, Cylinder, Sphere, Torus
 from sundae_ns.data.textures import Checker, Gradient, Landscape, Marble, Speckle, Spiral, Tiles, Wood
-from sundae_ns.data.tracer import Body, Scene
+from sundae_ns.data.tracer import Body, TracedScene
 
 PLINTH_RADIUS = 2.1
 DOME_RADIUS = 24.0
@@ -22,8 +22,8 @@ def _pitch(angle: float) -> Array:
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
-def still_life(seed: int = 0) -> Scene:
-    """Build the scene; the seed moves and turns the solids a little and changes every random texture."""
+def still_life(seed: int = 0) -> TracedScene:
+    """Build the scene; the seed varies places and rotations of the solids, every random texture, and the light."""
     rng = np.random.default_rng([seed, 1])
     salt = int(rng.integers(1 << 20))
     turn = rng.uniform(0, 2 * np.pi)
@@ -96,4 +96,4 @@ def still_life(seed: int = 0) -> Scene:
     )
     sun = np.radians(rng.uniform(0, 360))
     light = np.array([0.55 * np.cos(sun), 0.55 * np.sin(sun), 0.83])
-    return Scene(bodies, light / np.linalg.norm(light))
+    return TracedScene(bodies, light / np.linalg.norm(light))

@@ -1,7 +1,7 @@
 """Procedural textures: colour as a function of a point on a solid, in the solid's own coordinates.
 
-A texture maps points ``[M, 3]`` to RGB ``[M, 3]`` in [0, 1]. Some are smooth on purpose and some fine: a pruning rule
-should spend its primitives on the second kind.
+A texture maps points ``[M, 3]`` to RGB ``[M, 3]`` in [0, 1]. Some are smooth and some are fine: a pruning rule should
+spend its primitives on the fine ones.
 """
 
 from __future__ import annotations
@@ -25,24 +25,24 @@ def _scramble(h: np.ndarray) -> np.ndarray:
 
 
 def _lattice(cell: np.ndarray, axis: int) -> np.ndarray:
-    """Integer coordinates of one axis, multiplied by that axis's odd constant (uint32, wraps around)."""
+    """Integer coordinates of one axis times the constant of this axis (uint32, wraps around)."""
     primes = (73856093, 19349663, 83492791)
     return cell.astype(np.int64).astype(np.uint32) * np.uint32(primes[axis])
 
 
 def _salt(seed: int) -> np.uint32:
-    """Bits of a seed, spread over 32 (Knuth's multiplicative hash)."""
+    """Hash of a seed to 32 bits (Knuth's multiplicative hash)."""
     return np.uint32(seed * 2654435761 % 2**32)
 
 
 def cell_random(cells: np.ndarray, seed: int) -> Array:
-    """One number in [0, 1) for each integer cell ``[M, 3]``: ``[M]`` float32, the same for the same cell and seed."""
+    """Random number in [0, 1) of each integer cell ``[M, 3]``: ``[M]`` float32, a function of cell and seed."""
     h = _lattice(cells[:, 0], 0) ^ _lattice(cells[:, 1], 1) ^ _lattice(cells[:, 2], 2)
     return _scramble(h ^ _salt(seed)).astype(np.float32) * np.float32(2**-32)
 
 
 def value_noise(points: Array, seed: int) -> Array:
-    """Smooth noise in [0, 1], features of unit size: random values on the lattice, interpolated. ``[M]``."""
+    """Smooth noise in [0, 1] ``[M]`` with features of unit size: random values on the lattice, interpolated."""
     base = np.floor(points)
     frac = (points - base).astype(np.float32)
     weight = frac * frac * (3 - 2 * frac)
@@ -60,7 +60,7 @@ def value_noise(points: Array, seed: int) -> Array:
 
 
 def fractal_noise(points: Array, seed: int, octaves: int) -> Array:
-    """Octaves of :func:`value_noise`, each twice as fine and half as strong; in [0, 1], ``[M]``."""
+    """Sum of octaves of :func:`value_noise`, each twice as fine and half as strong; in [0, 1] ``[M]``."""
     total = np.zeros(len(points), np.float32)
     for octave in range(octaves):
         total += 0.5**octave * value_noise(points * 2**octave, seed + octave)
@@ -68,7 +68,7 @@ def fractal_noise(points: Array, seed: int, octaves: int) -> Array:
 
 
 def mix(a: Color | Array, b: Color | Array, weight: Array) -> Array:
-    """Blend two colours (one, or one a point) by a weight ``[M]``, clipped to [0, 1]: ``[M, 3]``."""
+    """Blend two colours, ``[3]`` or ``[M, 3]``, by a weight ``[M]`` clipped to [0, 1]: ``[M, 3]``."""
     w = np.clip(weight, 0, 1).astype(np.float32)[:, None]
     return np.asarray(a, np.float32) * (1 - w) + np.asarray(b, np.float32) * w
 
@@ -81,7 +81,7 @@ def _ramp(x: Array, low: float, high: float) -> Array:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Two colours from the bottom to the top: the smooth one."""
+    """Linear blend of two colours from bottom to top."""
 
     low: Color
     high: Color
@@ -94,7 +94,7 @@ class Gradient:
 
 @dataclass(frozen=True)
 class Checker:
-    """A 3D checkerboard of cubes of side ``size``, with a little variation from cube to cube."""
+    """A 3D checkerboard of cubes of side ``size``, with a small variation of brightness between cubes."""
 
     dark: Color
     light: Color
@@ -103,7 +103,7 @@ class Checker:
 
     def __call__(self, points: Array) -> Array:
         """Colours ``[M, 3]`` of points ``[M, 3]``."""
-        # The shift keeps the faces of a solid off the borders of the cells.
+        # The shift keeps the faces of a solid away from the cell borders.
         cells = np.floor(points / self.size + 0.37).astype(np.int64)
         tint = 0.85 + 0.15 * cell_random(cells, self.seed)
         return mix(self.dark, self.light, (cells.sum(axis=1) % 2).astype(np.float32)) * tint[:, None]
@@ -111,7 +111,7 @@ class Checker:
 
 @dataclass(frozen=True)
 class Marble:
-    """Veins: stripes across x that noise bends."""
+    """Veins: stripes across x, distorted by noise."""
 
     body: Color
     vein: Color
@@ -145,7 +145,7 @@ class Speckle:
 
 @dataclass(frozen=True)
 class Spiral:
-    """Stripes that wind about the z axis ``turns`` times in one unit of height."""
+    """Stripes that wind around the z axis ``turns`` times per unit of height."""
 
     colors: Sequence[Color]
     turns: float
@@ -159,7 +159,7 @@ class Spiral:
 
 @dataclass(frozen=True)
 class Wood:
-    """Growth rings about a slanted axis, with fine grain along it."""
+    """Growth rings around a slanted axis, with fine grain along it."""
 
     light: Color
     dark: Color
@@ -177,7 +177,7 @@ class Wood:
 
 @dataclass(frozen=True)
 class Tiles:
-    """The floor: a fine mosaic in a ring, large plain tiles inside and out."""
+    """Floor tiles: a fine mosaic in a ring, large plain tiles inside and outside of it."""
 
     plain: Color
     grout: Color
@@ -206,7 +206,7 @@ class Tiles:
 
 @dataclass(frozen=True)
 class Landscape:
-    """The far background: sky with clouds above, hills at the horizon, a soft plain below."""
+    """The far background: sky with clouds, hills at the horizon, a smooth plain below."""
 
     seed: int
 
@@ -227,7 +227,7 @@ class Landscape:
 
 @dataclass(frozen=True)
 class Plaster:
-    """A painted wall: two tones that pass into each other over about ``size`` units, and no fine detail."""
+    """A painted wall: a smooth blend of two tones with features of about ``size`` units and no fine detail."""
 
     low: Color
     high: Color

@@ -1,4 +1,4 @@
-"""The ray tracer: first hits, lighting (Lambert and Blinn-Phong with hard shadows) and supersampled pictures."""
+"""The ray tracer: first hits, lighting (Lambert and Blinn-Phong with hard shadows) and supersampled images."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sundae_ns.data.shapes import EPSILON, Array, Shape
 from sundae_ns.data.textures import Texture
 
 RAYS_PER_BLOCK = 1 << 15
-"""Rays traced at once: few enough that the intermediate arrays stay in a core's cache."""
+"""Rays traced at once: few enough for the intermediate arrays to stay in a core's cache."""
 
 
 @dataclass(frozen=True)
 class Body:
-    """A solid in the scene: shape, texture, place, and how it answers to light."""
+    """A solid in the scene: shape, texture, pose and material."""
 
     shape: Shape
     texture: Texture
@@ -26,13 +26,13 @@ class Body:
     specular: float = 0.0
     """Strength of the highlight."""
     shininess: float = 32.0
-    """Blinn-Phong exponent: the larger, the smaller the highlight."""
+    """Blinn-Phong exponent; a larger one makes the highlight smaller."""
     luminous: bool = False
-    """Shows its texture as it is: neither shaded nor casting a shadow."""
+    """Show the texture unshaded, and cast no shadow."""
 
 
 @dataclass(frozen=True)
-class Scene:
+class TracedScene:
     """Solids and one distant light."""
 
     bodies: tuple[Body, ...]
@@ -47,7 +47,7 @@ def _to_local(body: Body, points: Array) -> Array:
 
 
 def _distances(body: Body, origins: Array, directions: Array) -> Array:
-    """Distance ``[M]`` to one solid; only rays that meet its bounding sphere are put to the shape."""
+    """Distance ``[M]`` to one solid; only rays that meet its bounding sphere are intersected."""
     result = np.full(len(origins), np.inf, origins.dtype)
     local = _to_local(body, origins)
     heading = directions @ body.rotation.astype(directions.dtype)
@@ -59,7 +59,7 @@ def _distances(body: Body, origins: Array, directions: Array) -> Array:
     return result
 
 
-def first_hits(scene: Scene, origins: Array, directions: Array) -> tuple[Array, Array]:
+def first_hits(scene: TracedScene, origins: Array, directions: Array) -> tuple[Array, Array]:
     """Nearest surfaces along rays.
 
     Args:
@@ -68,7 +68,7 @@ def first_hits(scene: Scene, origins: Array, directions: Array) -> tuple[Array, 
         directions: unit vectors ``[M, 3]``.
 
     Returns:
-        Distances ``[M]`` (``inf``: nothing there) and the index of the body hit ``[M]`` (-1: nothing).
+        Distances ``[M]`` (``inf`` for a miss) and the index of the body hit ``[M]`` (-1 for a miss).
     """
     best = np.full(len(origins), np.inf, origins.dtype)
     owner = np.full(len(origins), -1)
@@ -79,8 +79,8 @@ def first_hits(scene: Scene, origins: Array, directions: Array) -> tuple[Array, 
     return best, owner
 
 
-def _in_shadow(scene: Scene, points: Array) -> Array:
-    """True ``[M]`` where a solid stands between the point and the light."""
+def _in_shadow(scene: TracedScene, points: Array) -> Array:
+    """True ``[M]`` where a solid lies between the point and the light."""
     towards = np.broadcast_to(scene.light.astype(points.dtype), points.shape)
     dark = np.zeros(len(points), bool)
     for body in scene.bodies:
@@ -89,8 +89,8 @@ def _in_shadow(scene: Scene, points: Array) -> Array:
     return dark
 
 
-def shade(scene: Scene, points: Array, directions: Array, owner: Array) -> Array:
-    """Colours of surface points as seen along given directions.
+def shade(scene: TracedScene, points: Array, directions: Array, owner: Array) -> Array:
+    """Colours of surface points, seen along given directions.
 
     Args:
         scene: solids and light.
@@ -117,19 +117,19 @@ def shade(scene: Scene, points: Array, directions: Array, owner: Array) -> Array
         halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
         highlight = body.specular * np.maximum((normals * halfway).sum(axis=1), 0) ** body.shininess
         lit = facing > 0
-        # Off the surface by more than its own rounding error, or a solid would shadow itself in spots.
+        # Start off the surface by more than the rounding error, or a solid would shadow itself in spots.
         lit[lit] = ~_in_shadow(scene, points[mine[lit]] + 10 * EPSILON * normals[lit])
-        # Light from the sky: half of it is lost by a surface that looks down.
+        # Ambient light from the sky: a surface that faces down gets half of the amount of one that faces up.
         sky = scene.ambient * (0.75 + 0.25 * normals[:, 2])
         colors[mine] = albedo * (sky + scene.diffuse * facing * lit)[:, None] + (highlight * lit)[:, None]
     return np.clip(colors, 0, 1)
 
 
-def render(scene: Scene, camera: Camera, *, samples: int = 2) -> Array:
-    """Picture of a scene, antialiased by ``samples`` x ``samples`` rays a pixel: ``[H, W, 3]`` float32 in [0, 1]."""
+def render(scene: TracedScene, camera: Camera, *, samples: int = 2) -> Array:
+    """Image of a scene with ``samples`` x ``samples`` rays per pixel: ``[H, W, 3]`` float32 in [0, 1]."""
     columns = (np.arange(camera.width * samples) + 0.5) / samples
     rows_per_block = max(1, RAYS_PER_BLOCK // (len(columns) * samples))
-    picture = np.empty((camera.height, camera.width, 3), np.float32)
+    image = np.empty((camera.height, camera.width, 3), np.float32)
     for top in range(0, camera.height, rows_per_block):
         bottom = min(top + rows_per_block, camera.height)
         rows = (np.arange(top * samples, bottom * samples) + 0.5) / samples
@@ -139,5 +139,5 @@ def render(scene: Scene, camera: Camera, *, samples: int = 2) -> Array:
         reach = np.where(owner >= 0, distance, 0)[:, None]
         colors = shade(scene, origins + reach * directions, directions, owner)
         block = colors.reshape(bottom - top, samples, camera.width, samples, 3)
-        picture[top:bottom] = block.mean(axis=(1, 3))
-    return picture
+        image[top:bottom] = block.mean(axis=(1, 3))
+    return image

@@ -1,37 +1,22 @@
-"""One field over several ranks: who holds which primitives, and how the ranks act as one.
+"""One field on several ranks: shards, the exchange of primitives, and training as one (``docs/several_gpus.md``)."""
 
-The design is in ``docs/distributed.md``.
-"""
-
-from sundae_ns.distributed.ahead import Ahead, Look, Timetable, longest_step, slack_of_step
-from sundae_ns.distributed.batches import SharedOptimizers, average_gradients, scale_rates, shorten
-from sundae_ns.distributed.checkpoints import state_of_rank, whole_state
-from sundae_ns.distributed.pruning import GlobalPruning
-from sundae_ns.distributed.shards import DRIFT, Arrived, Course, Shards, bounds, moves
-from sundae_ns.distributed.start import check_machine, check_options, launch, take_shard, without_viewer
+from sundae_ns.distributed.shards import DRIFT, Shards, bounds, moves
+from sundae_ns.distributed.source import ReceivedPrimitives, ShardedField
+from sundae_ns.distributed.start import check_machine, check_options, launch
+from sundae_ns.distributed.team import OneProcess, Ranks, take_shard, team_of
 
 __all__ = [
     "DRIFT",
-    "Ahead",
-    "Arrived",
-    "Course",
-    "GlobalPruning",
-    "Look",
-    "SharedOptimizers",
+    "OneProcess",
+    "Ranks",
+    "ReceivedPrimitives",
+    "ShardedField",
     "Shards",
-    "Timetable",
-    "average_gradients",
     "bounds",
     "check_machine",
     "check_options",
     "launch",
-    "longest_step",
     "moves",
-    "scale_rates",
-    "shorten",
-    "slack_of_step",
-    "state_of_rank",
     "take_shard",
-    "whole_state",
-    "without_viewer",
+    "team_of",
 ]

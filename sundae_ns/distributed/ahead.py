@@ -1,8 +1,7 @@
-"""The next step's exchange of primitives, planned during this one, so that no step begins with a wait for the GPU.
+"""The exchange of the next step, planned during this step, so that no step begins with a wait for the GPU.
 
-Which picture each rank draws at a step is a function of the step, and Adam moves a parameter by no more than its rate
-allows. So during a step all ranks know where the cameras of the next one stand, and which primitives these may see, whatever
-the backward pass will say.
+The view of each rank is a function of the step, and Adam moves a parameter by a bounded multiple of its rate. So all ranks
+know the next cameras, and which primitives these may see, before the backward pass has finished.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 import torch.distributed as dist
@@ -20,34 +19,24 @@ from torch.optim import Adam, Optimizer
 
 from sundae_ns.compensation import training_window
 from sundae_ns.rasterization.sharded import Cameras, Plan, Route, Slack, camera_row, cameras_of
+from sundae_ns.rendering.source import StepResolution
 from sundae_ns.rendering.views import View, view_of
 
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras as Capture
 
 ROUNDING = 1.02
-"""Factor of what Adam may do: for rounding, and for moments that another number of ranks has gathered with other betas."""
-
-
-class Look(NamedTuple):
-    """How the ranks look at the scene at one step: a function of the step and the options, so the same on all ranks."""
-
-    step: int
-    """Of this run: batches of a picture for each rank."""
-    downscale: int
-    """What the sides of pictures are divided by."""
-    window_pixels: int
-    """Most pixels of a picture, of which larger ones show a window; 0 for no limit."""
+"""Factor on the bound of Adam's step: for rounding, and for moments from another number of ranks with other betas."""
 
 
 class Timetable:
-    """Which view each rank draws at each step of training, and what the others need to know about it.
+    """The views of all ranks at each training step.
 
     Args:
-        cameras: of the training views.
-        order: index of the view of the k-th picture; the same on all ranks.
-        device: of the field.
-        near_plane: as the rasteriser gets it.
+        cameras: cameras of the training views.
+        order: index of the view of the k-th image; the same on all ranks.
+        device: device of the field.
+        near_plane: distance of the near plane, world units.
     """
 
     def __init__(
@@ -57,42 +46,35 @@ class Timetable:
         self._cameras, self._order, self._device, self._near_plane = cameras, order, device, near_plane
         self._table: _Table | None = None
 
-    def pictures(self, step: int) -> list[int]:
+    def views(self, step: int) -> list[int]:
         """Indices of the views of a step, by rank."""
         return [self._order(step * self.ranks + rank) for rank in range(self.ranks)]
 
-    def view(self, look: Look, camera: Capture) -> View:
-        """What this rank draws, the whole picture, from a table of all: to make it anew would wait for the GPU.
+    def view(self, at: StepResolution) -> View:
+        """The whole view of this rank at a step."""
+        return self._table_of(at.downscale).views[self.views(at.step)[self.rank]]
 
-        Args:
-            look: at this step.
-            camera: what the datamanager serves at this step.
-        """
-        picture = self.pictures(look.step)[self.rank]
-        assert (camera.metadata or {}).get("cam_idx") == picture, "ranks train on the views of the timetable alone"
-        return self._at(look.downscale).views[picture]
+    def cameras(self, at: StepResolution) -> Cameras:
+        """The cameras of all ranks at a step, by rank; one launch, no collective."""
+        table = self._table_of(at.downscale)
+        return cameras_of(torch.stack([self._row(table, index, at) for index in self.views(at.step)]))
 
-    def cameras(self, look: Look) -> Cameras:
-        """The cameras of all ranks, by rank; one launch, and no collective."""
-        table = self._at(look.downscale)
-        return cameras_of(torch.stack([self._row(table, picture, look) for picture in self.pictures(look.step)]))
-
-    def _row(self, table: _Table, picture: int, look: Look) -> Tensor:
-        view = table.on_host[picture]
-        window = training_window(view.width, view.height, look.window_pixels, seed=look.step)
+    def _row(self, table: _Table, index: int, at: StepResolution) -> Tensor:
+        view = table.on_host[index]
+        window = training_window(view.width, view.height, at.window_pixels, seed=at.step)
         if window is None:
-            return table.rows[picture]
+            return table.rows[index]
         return self._row_of(view.cut(window)).to(self._device, non_blocking=True)
 
     def _row_of(self, view: View) -> Tensor:
         return camera_row(view.viewmat, view.K, view.width, view.height, self._near_plane)
 
-    def _at(self, downscale: int) -> _Table:
-        # Not before the first look: the datamanager corrects cameras in place where it straightens pictures.
+    def _table_of(self, downscale: int) -> _Table:
+        # Not before the first step: the datamanager corrects cameras in place when it undistorts images.
         if self._table is None or self._table.downscale != downscale:
             cameras = (self._cameras[i : i + 1] for i in range(len(self._cameras)))
             views = [view_of(camera, "cpu", downscale=downscale) for camera in cameras]
-            # On the host: on a GPU each of these small sums would cost a launch.
+            # On the host: on a GPU each of these small operations would cost a launch.
             rows = torch.stack([self._row_of(view) for view in views])
             self._table = _Table(downscale, views, rows.to(self._device))
         return self._table
@@ -100,12 +82,12 @@ class Timetable:
 
 @dataclass(frozen=True)
 class _Table:
-    """All training views at one size."""
+    """All training views at one resolution."""
 
     downscale: int
     on_host: list[View]
     rows: Tensor
-    """From ``camera_row``, on the device ``[V, 33]``."""
+    """Rows of ``camera_row``, on the device ``[V, 33]``."""
 
     @cached_property
     def views(self) -> list[View]:
@@ -117,23 +99,22 @@ class _Table:
 
 @dataclass(frozen=True)
 class Ahead:
-    """An exchange that has been planned for a step to come, and the field that it was planned for. It holds no graph."""
+    """An exchange planned for a later step, and the field that it was planned for. It holds no autograd graph."""
 
-    look: Look
+    at: StepResolution
     cameras: Cameras
     plan: Plan
     field: tuple[tuple[Tensor, int, int], ...]
-    """What the plan goes by, each with the place of its data and its version."""
+    """Tensors that the plan depends on, each with the address of its data and its version."""
 
     def route(self, params: Mapping[str, Tensor]) -> Route:
         """The route of the planned exchange; see :meth:`Plan.route`.
 
-        A field that has changed by anything but one step of its optimizers is an error of ours, not a reason to plan again:
-        one rank alone may see it, and the others would not plan again with it. Who changes a field says so on all ranks
-        (:meth:`sundae_ns.distributed.Shards.forget_plan`).
+        Asserts that the field changed by one step of its optimizers only. Planning again is no way out, because one rank
+        alone may see the change. Code that changes a field calls :meth:`sundae_ns.distributed.Shards.changed` on all ranks.
         """
         for (held, place, version), now in zip(self.field, _plans_by(params)):
-            # A step of Adam changes a version by one, or, fused, not at all.
+            # A step of Adam raises a version by one; fused Adam does not raise it.
             same = held is now and place == now.data_ptr() and now._version - version <= 1
             assert same, "the field has changed since the exchange was planned"
         return self.plan.route()
@@ -144,29 +125,29 @@ def _plans_by(params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def stamped(params: Mapping[str, Tensor]) -> tuple[tuple[Tensor, int, int], ...]:
-    """What a plan goes by, in the form of :attr:`Ahead.field`."""
+    """The tensors that a plan depends on, in the form of :attr:`Ahead.field`."""
     return tuple((value, value.data_ptr(), value._version) for value in _plans_by(params))
 
 
 def slack_of_step(optimizers: Mapping[str, Optimizer]) -> Slack | None:
-    """How far the next step of the optimizers moves primitives at most; None where that is not known.
+    """Bound on how far the next step of the optimizers moves primitives; None if there is no bound.
 
     Args:
-        optimizers: by name of the parameter, at the rates of that step.
+        optimizers: by parameter name, at the rates of that step.
     """
     means, scales = (longest_step(optimizers[name]) for name in ("means", "scales"))
     return Slack(means, scales) if math.isfinite(means + scales) else None
 
 
 def longest_step(optimizer: Optimizer) -> float:
-    """Most that one step may change any number of the parameter; infinite where that is not known.
+    """Bound on the change of any number of the parameter in one step; infinite if there is none.
 
-    Adam divides ``m = sum w_i g_i`` by the root of ``v = sum u_i g_i^2``. The weights go with ``b1^(t-i)`` and with
-    ``b2^(t-i)``, and add up to 1 each. By Cauchy and Schwarz the quotient is at most the root of ``sum w_i^2 / u_i``, which
-    with ``q = b1^2 / b2`` is that of ``(1-b1)^2 / ((1-b2) (1-q))`` times ``(1-b2^t) (1-q^t) / (1-b1^t)^2``; the latter is at
-    most 1, since ``b2^t + q^t >= 2 b1^t``. Gradients that grow by ``b2 / b1`` with each step come arbitrarily near: for the
-    usual betas 7.3 times the rate. The bounds in section 2.1 of Kingma & Ba (2015), lower ones, are of sparse gradients and
-    of steady ones.
+    Adam divides ``m = sum w_i g_i`` by the root of ``v = sum u_i g_i^2``. The weights are proportional to ``b1^(t-i)`` and
+    ``b2^(t-i)``, and sum to 1 each. By Cauchy and Schwarz the quotient is at most the root of ``sum w_i^2 / u_i``. With
+    ``q = b1^2 / b2`` this is the root of ``(1-b1)^2 / ((1-b2) (1-q))`` times ``(1-b2^t) (1-q^t) / (1-b1^t)^2``, and the latter
+    is at most 1, since ``b2^t + q^t >= 2 b1^t``. Gradients that grow by ``b2 / b1`` at each step come arbitrarily near: 7.3
+    times the rate for the usual betas. The lower bounds in section 2.1 of Kingma & Ba (2015) hold for sparse and for steady
+    gradients.
     """
     (group,) = optimizer.param_groups
     if type(optimizer) is not Adam or group.get("decoupled_weight_decay"):

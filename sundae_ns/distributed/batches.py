@@ -1,4 +1,4 @@
-"""A step of R ranks sees R pictures: gradients are averaged, rates grow, and there are fewer steps."""
+"""Training with R ranks: a step has R images, so gradients are averaged, rates grow, and there are fewer steps."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from torch import Tensor
 
 
 class SharedOptimizers(Optimizers):
-    """nerfstudio's optimizers, where some groups are copies of which every rank has one: their gradients are averaged."""
+    """nerfstudio's optimizers; gradients of replicated groups are averaged over the ranks."""
 
     replicated: tuple[str, ...] = ("compensation",)
+    """Groups that every rank holds a copy of."""
 
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Average, then step. Collective."""
@@ -27,12 +28,12 @@ class SharedOptimizers(Optimizers):
 
 @torch.no_grad()
 def average_gradients(params: Iterable[Tensor]) -> None:
-    """Give copies of parameters the mean of their gradients over the ranks. Collective, in one message.
+    """Average the gradients of replicated parameters over the ranks. Collective, in one message.
 
     Args:
-        params: the same on all ranks, and the same of them with a gradient; gradients lie in memory without gaps.
+        params: replicated parameters; the same ones have gradients on all ranks, without gaps in memory.
     """
-    # As they lie in memory, whatever the order of their axes, which is the same on all ranks.
+    # In memory order, which is the same on all ranks whatever the order of the axes.
     gradients = [value.grad.as_strided((value.numel(),), (1,)) for value in params if value.grad is not None]
     if not gradients:
         return
@@ -43,15 +44,15 @@ def average_gradients(params: Iterable[Tensor]) -> None:
 
 
 def scale_rates(optimizers: Optimizers, names: Iterable[str], ranks: int) -> None:
-    """Adapt Adam to batches of ``ranks`` pictures: rates by the square root, both betas to that power.
+    """Adapt Adam to batches of ``ranks`` images: rates times the square root, betas to that power.
 
-    Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024. It is a rule for primitives, each of
-    which few pictures see. A head, whose weights all take part in every picture, keeps its own (``docs/distributed.md``).
+    Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024. The rule is for primitives, which
+    few images see. The head, whose weights every image uses, keeps its own rate.
 
     Args:
-        optimizers: by name of the group.
-        names: the groups to adapt, parameters of the field.
-        ranks: pictures of a step.
+        optimizers: by group.
+        names: groups to adapt, parameters of the field.
+        ranks: number of images in a step.
     """
     for key in names:
         for group in optimizers.optimizers[key].param_groups:
@@ -62,26 +63,26 @@ def scale_rates(optimizers: Optimizers, names: Iterable[str], ranks: int) -> Non
 
 
 def scaled_group(group: Mapping[str, Any], factor: float) -> dict[str, Any]:
-    """Entries of an optimizer's group that change where batches are ``factor`` times as large."""
+    """Entries of an optimizer's group that change for batches ``factor`` times as large."""
     scaled = {name: group[name] * factor**0.5 for name in ("lr", "initial_lr") if name in group}
     if "betas" in group:
-        # Rounded, so that a power and its root give the number that they began with.
+        # Rounded, so that a power and its root return the first number.
         scaled["betas"] = tuple(round(beta**factor, 12) for beta in group["betas"])
     return scaled
 
 
 def shorten(config: Any, ranks: int) -> Any:
-    """A copy of a configuration whose steps are divided by ``ranks``: as many pictures, in larger batches.
+    """A copy of a configuration with all steps divided by ``ranks``: the same number of images in larger batches.
 
     Args:
         config: ``SundaeTrainerConfig``.
-        ranks: pictures of a step.
+        ranks: number of images in a step.
     """
     config = deepcopy(config)
     model = config.pipeline.model
     steps: tuple[tuple[Any, str], ...] = (
         (config, "max_num_iterations steps_per_save steps_per_eval_image steps_per_eval_all_images"),
-        (model.pruning, "prune_at round_every start stop every"),
+        (model.pruning, "prune_at start stop every"),
         (model.head, "start_at"),
         (model, "warmup_length refine_every resolution_schedule sh_degree_interval stop_screen_size_at stop_split_at"),
     )

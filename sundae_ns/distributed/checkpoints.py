@@ -1,4 +1,4 @@
-"""Checkpoints of several ranks are those of one process: parts are gathered when saving, and cut out when loading."""
+"""Checkpoints of several ranks, in the format of one process: shards are gathered to save and cut out to load."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from sundae_ns.distributed.batches import scaled_group
 from sundae_ns.distributed.shards import Shards, bounds
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians.surgery import per_primitive
+from sundae_ns.storage.runs.checkpoint import FORMAT
 from sundae_ns.training.schedules import NEVER
 
 _FIELD = "_model.gauss_params."
@@ -18,10 +19,10 @@ _EXTRA = "_model._extra_state"
 
 
 def whole_state(state: Mapping[str, Any], shards: Shards, names: Iterable[str]) -> dict[str, Any] | None:
-    """A checkpoint of one GPU, in host memory on rank 0, from those of all ranks; None on the others. Collective.
+    """The checkpoint of the whole field, in host memory on rank 0; None on the others. Collective.
 
     Args:
-        state: what the trainer saves, of this rank.
+        state: checkpoint of this rank.
         shards: the ranks.
         names: parameters of the field.
     """
@@ -35,21 +36,23 @@ def whole_state(state: Mapping[str, Any], shards: Shards, names: Iterable[str]) 
 
 
 def state_of_rank(loaded: Mapping[str, Any], rank: int, ranks: int, names: Iterable[str]) -> dict[str, Any]:
-    """This rank's part of a checkpoint of one GPU.
+    """The part of a checkpoint that a rank holds.
 
     Args:
-        loaded: the checkpoint.
-        rank, ranks: whose part, of how many.
+        loaded: checkpoint of the whole field.
+        rank: the rank.
+        ranks: number of ranks.
         names: parameters of the field.
 
     Returns:
-        The part, which is of no primitive where there are fewer than ranks; the checkpoint as it is if it is another
-        method's, which loading then says.
+        The part, empty if there are fewer primitives than ranks. A checkpoint of another method or format is returned
+        unchanged; loading refuses it.
 
     Raises:
-        CheckpointError: there is no primitive in the whole of it.
+        CheckpointError: the checkpoint holds no primitives.
     """
-    if not isinstance(loaded["pipeline"].get(_EXTRA), Mapping):
+    extra = loaded["pipeline"].get(_EXTRA)
+    if not isinstance(extra, Mapping) or extra.get("format") != FORMAT:
         return dict(loaded)
     n = len(loaded["pipeline"][_FIELD + "means"])
     if n == 0:
@@ -65,26 +68,29 @@ def state_of_rank(loaded: Mapping[str, Any], rank: int, ranks: int, names: Itera
 def _map_state(
     state: Mapping[str, Any], names: Iterable[str], change: Callable[[Any], Any], factor: Fraction
 ) -> dict[str, Any]:
-    """A checkpoint with every per-primitive tensor changed, and rates and steps as of batches larger by a factor.
+    """A checkpoint with every per-primitive tensor changed, and with rates and steps of batches larger by a factor.
 
-    The entries are gone through in an order that all ranks share.
+    All ranks visit the entries in the same order.
     """
 
-    def after(step: int) -> int:  # the last step of as many pictures; -1, before the first, stays
+    def after(step: int) -> int:  # the last step of as many images; -1, before the first, stays
         return math.floor((step + 1) / factor) - 1
 
     def after_prune(step: int) -> int:
-        # One in the midst of the first batch stays one: else the field would be pruned again.
+        # A prune within the first batch must not become -1, or the field would be pruned again.
         return step if step == NEVER else max(after(step), 0)
 
     pipeline = {key: change(value) if key.startswith(_FIELD) else value for key, value in state["pipeline"].items()}
     if _EXTRA in pipeline:
         extra = pipeline[_EXTRA]
+        running = extra["running"]
         pipeline[_EXTRA] = {
             **extra,
             "step": after(extra["step"]),
-            "strategy": {key: change(value) for key, value in extra["strategy"].items()},
-            "pruning": {**extra["pruning"], "pruned_at": after_prune(extra["pruning"]["pruned_at"])},
+            "running": {
+                "densification": {key: change(value) for key, value in running["densification"].items()},
+                "pruning": {**running["pruning"], "pruned_at": after_prune(running["pruning"]["pruned_at"])},
+            },
         }
     optimizers, field = {}, set(names)
     for name, held in state["optimizers"].items():

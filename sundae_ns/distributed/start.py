@@ -1,29 +1,24 @@
-"""How ranks come to be: what they cannot do yet is refused, they start, and each takes its block of the field."""
+"""Start of several ranks: options that they cannot use yet are refused, and processes on a CPU are launched."""
 
 from __future__ import annotations
 
-import random
 import tempfile
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.distributed as dist
 from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
-from sundae_ns.distributed.shards import Shards, bounds
 from sundae_ns.errors import ConfigError, rank_ended
 
-if TYPE_CHECKING:
-    from sundae_ns.model import SundaeModel
-
 TIMEOUT = timedelta(minutes=30)
-"""Of a collective. Rank 0 prunes and saves while others wait, so it is long; the death of a rank is noticed without it."""
+"""Timeout of a collective. It is long, because others wait while rank 0 prunes and saves; a dead rank is noticed anyway."""
 
 
 def check_options(config: Any) -> None:
-    """Refuse what several ranks cannot do yet, before anything is trained.
+    """Refuse options that several ranks cannot use yet.
 
     Args:
         config: ``SundaeTrainerConfig``.
@@ -48,10 +43,10 @@ def check_options(config: Any) -> None:
 
 
 def check_machine(ranks: int, device_type: str) -> None:
-    """Refuse more ranks than ``ns-train`` can start here.
+    """Refuse more ranks than ``ns-train`` can start on this machine.
 
     Raises:
-        ConfigError: the ranks are not on GPUs, or there are not so many.
+        ConfigError: the device type is not CUDA, or there are fewer GPUs than ranks.
     """
     if device_type != "cuda":
         raise ConfigError(
@@ -66,38 +61,19 @@ def check_machine(ranks: int, device_type: str) -> None:
 
 
 def without_viewer(vis: str) -> str:
-    """The same choice of loggers without the viewer, which could show one rank's primitives only."""
+    """The loggers without the viewer, which could show the primitives of one rank only."""
     return "tensorboard" if vis in ("viewer", "viewer_legacy") else vis.removeprefix("viewer+")
 
 
-def take_shard(model: SundaeModel, seed: int) -> Shards:
-    """Give all ranks the field and the head of rank 0, and let each keep its block of the field. Collective.
-
-    Args:
-        model: as it was made, with as many primitives on each rank.
-        seed: of what all ranks have to draw alike, such as the picture to evaluate.
-    """
-    shards = Shards(model.device)
-    head = [] if model.head is None else [*model.head.parameters(), *model.head.buffers()]
-    for value in [*model.gauss_params.values(), *head]:
-        dist.broadcast(value.data, 0)
-    start, end = bounds(model.num_points, shards.ranks)[shards.rank : shards.rank + 2]
-    for value in model.gauss_params.values():
-        value.data = value.data[start:end].clone()
-    shards.recount(model.gaussians)
-    random.seed(seed)
-    return shards
-
-
 def launch(config: Any, ranks: int) -> None:
-    """Train on several processes of this machine's CPU, over gloo; on GPUs ``ns-train`` starts the ranks itself.
+    """Train on several processes of this machine's CPU over gloo; on GPUs ``ns-train`` starts the ranks.
 
     Args:
         config: ``SundaeTrainerConfig`` for a CPU.
-        ranks: how many.
+        ranks: number of processes.
 
     Raises:
-        RankError: a rank has ended before its time; by then all have.
+        RankError: a rank ended early; all ranks are ended then.
     """
     with tempfile.TemporaryDirectory() as folder:
         context = torch.multiprocessing.spawn(

@@ -1,4 +1,4 @@
-"""Curves over training, from the tensorboard event files that nerfstudio leaves in a run's folder."""
+"""Training curves, read from the tensorboard event files that nerfstudio writes into a run's folder."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ class Curve:
 
 @dataclass(frozen=True)
 class Curves:
-    """What a run recorded of itself; curves that it did not record are empty."""
+    """The curves of one run; a curve that the run did not record is empty."""
 
     loss: Curve = Curve()
-    """Training loss, of the step's view."""
+    """Training loss of the step's view."""
     primitives: Curve = Curve()
+    """Number of primitives."""
     psnr: Curve = Curve()
-    """Of the training view of the step, with the head once it takes part, dB."""
+    """PSNR of the step's training view, with the head as soon as it is enabled, dB."""
     psnr_base: Curve = Curve()
-    """The same without the head, dB."""
+    """PSNR of the same view without the head, dB."""
     memory: Curve = Curve()
-    """Most device memory so far, MiB."""
+    """Peak device memory so far, MiB."""
 
     def __bool__(self) -> bool:
         return any(getattr(self, field.name) for field in fields(self))
@@ -45,29 +46,29 @@ TAGS = {
     "psnr_base": "Train Metrics Dict/psnr_base",
     "memory": "GPU Memory (MB)",
 }
-"""nerfstudio's names of the curves. Its "MB" are 2^20 bytes."""
+"""nerfstudio's tags of the curves. Its "MB" are 2^20 bytes."""
 
 
 def read_curves(folder: Path) -> Curves | None:
     """Read the curves of a run.
 
     Args:
-        folder: the run's folder; event files lie in it, several where training was resumed.
+        folder: the run's folder. A resumed run has several event files in it.
 
     Returns:
-        The curves, a resumed run's as one; None where the folder has no event file, or none that can be read.
+        The curves, with the parts of a resumed run joined; None if the folder holds no readable event file.
     """
     if not any(folder.glob("events.out.tfevents.*")):
         return None
-    # Here and not above: it loads for a second, and few need it.
+    # This import takes a second, and few commands need it.
     from tensorboard.backend.event_processing.event_accumulator import SCALARS, EventAccumulator
 
-    # It logs each odd thing that a killed run leaves behind; what can be read is read.
+    # Tensorboard logs every incomplete record that a killed run leaves; the complete ones are enough.
     logging.getLogger("tensorboard").setLevel(logging.ERROR)
     events = EventAccumulator(str(folder), size_guidance={SCALARS: 0})
     try:
         events.Reload()
-    except Exception:  # a damaged file ends in many kinds; curves are no reason to end a report
+    except Exception:  # a damaged file raises many types; a report works without curves
         return None
     known = set(events.Tags()["scalars"])
     curves = Curves(**{name: _curve(events.Scalars(tag)) for name, tag in TAGS.items() if tag in known})
@@ -75,7 +76,7 @@ def read_curves(folder: Path) -> Curves | None:
 
 
 def _curve(events: Sequence[Any]) -> Curve:
-    """A curve of tensorboard's events, each with ``step``, ``value`` and ``wall_time``."""
+    """A curve from tensorboard's events, each with ``step``, ``value`` and ``wall_time``."""
     # A resumed run repeats the steps after its checkpoint; the later record of a step counts.
     by_step = {event.step: event.value for event in sorted(events, key=lambda event: event.wall_time)}
     steps = sorted(by_step)

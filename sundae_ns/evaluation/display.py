@@ -1,4 +1,4 @@
-"""What per-primitive and per-pixel quantities look like in the viewer."""
+"""Colours for the viewer: depth, features and filter responses as values in [0, 1]."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ COMPONENTS = 3
 
 
 def fill_depth(depth: Tensor, alpha: Tensor) -> Tensor:
-    """Depth ``[H, W, 1]`` with the largest depth seen where nothing was splatted (``alpha`` 0)."""
+    """Depth ``[H, W, 1]`` with the largest rendered depth in pixels where ``alpha`` is 0."""
     return torch.where(alpha > 0, depth, depth.max())
 
 
 def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Mean ``[F]``, first three principal directions ``[F, 3]`` and standard deviations ``[3]`` of ``features`` ``[N, F]``.
 
-    With fewer than three channels the missing directions are zero. Signs are fixed, so that colours do not flip.
+    With fewer than three channels, the missing directions are zero. Signs are fixed, so the displayed colours are stable.
     """
     mean = features.mean(dim=0)
     centred = features - mean
@@ -33,15 +33,15 @@ def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Tensor, alpha: Tensor) -> Tensor:
-    """Splatted features as colours: three standard deviations of each principal component fill [0, 1].
+    """Rendered features as colours; [0, 1] spans three standard deviations to each side of the mean.
 
     Args:
-        features: ``[H, W, F]`` splatted, that is already weighted by ``alpha``.
-        mean, basis, deviations: from :func:`principal_components` of the primitives.
-        alpha: ``[H, W, 1]`` accumulation.
+        features: rendered features ``[H, W, F]``, already weighted by ``alpha``.
+        mean, basis, deviations: from :func:`principal_components` of the primitives' features.
+        alpha: accumulation ``[H, W, 1]``.
 
     Returns:
-        ``[H, W, 3]`` in [0, 1], black where nothing was splatted.
+        ``[H, W, 3]`` in [0, 1]; black where ``alpha`` is 0.
     """
     components = (features - alpha * mean) @ basis
     scaled = components / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha
@@ -49,7 +49,10 @@ def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Te
 
 
 def response_values(response: Tensor) -> Tensor:
-    """Response magnitudes ``[N]`` as values in [0, 1], float32: their rank, which shows fields of any scale; unknown is 0."""
+    """Rank of each response magnitude ``[N]``, scaled to (0, 1], float32; 0 where the response is not finite.
+
+    Ranks show fields of any scale.
+    """
     known = torch.isfinite(response)
     order = response[known].argsort().argsort()
     values = torch.zeros_like(response, dtype=torch.float32)

@@ -1,6 +1,6 @@
-"""Steadiness along a camera path: how much neighbouring frames differ once the camera's motion is taken out.
+"""Flicker along a camera path: the difference of neighbouring frames after the camera's motion is compensated.
 
-A network in screen space sees every frame by itself, so nothing makes it agree with itself from one frame to the next.
+A screen-space network processes every frame independently, so nothing enforces consistency between frames.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import torch.nn.functional as F
 from torch import Tensor
 
 DEPTH_AGREEMENT = 0.02
-"""Relative difference of depths up to which two frames are taken to see the same surface."""
+"""Largest relative depth difference at which two frames count as seeing the same surface."""
 
 
 class Frame(NamedTuple):
-    """A rendered picture and where it was seen from."""
+    """A rendered image with its camera."""
 
     rgb: Tensor
-    """``[H, W, 3]``."""
+    """Rendered colours ``[H, W, 3]``."""
     depth: Tensor
-    """Depth along the camera's axis, scene units ``[H, W, 1]``."""
+    """Depth along the optical axis, scene units ``[H, W, 1]``."""
     accumulation: Tensor
-    """``[H, W, 1]``."""
+    """Accumulated opacity ``[H, W, 1]``."""
     viewmat: Tensor
     """World-to-camera, OpenCV axes ``[4, 4]``."""
     K: Tensor
@@ -34,16 +34,16 @@ class Change(NamedTuple):
     """Difference of two neighbouring frames."""
 
     mean: float
-    """Mean absolute difference of colours over the pixels that both see; NaN if there is none."""
+    """Mean absolute colour difference over the pixels that both frames see; NaN if there are none."""
     share: float
-    """Share of the pixels that both see."""
+    """Share of the later frame's pixels that both frames see."""
 
 
 def change(before: Frame, after: Frame) -> Change:
-    """How much a frame differs from the one before it, warped to its view by the depth of both.
+    """Difference of a frame and the one before it, warped into its view by depth.
 
-    Pixels count where the surface is opaque, lies inside the earlier picture, and has the depth there that the motion
-    demands: what is newly seen is no flicker.
+    A pixel counts if its surface is opaque, lies inside the earlier frame, and has the expected depth there. Surfaces that
+    become visible are not flicker.
 
     Args:
         before: the earlier frame.
@@ -55,9 +55,9 @@ def change(before: Frame, after: Frame) -> Change:
     y, x = torch.meshgrid(rows, columns, indexing="ij")
     rays = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ torch.linalg.inv(after.K).T
     motion = before.viewmat @ torch.linalg.inv(after.viewmat)
-    there = (rays * after.depth) @ motion[:3, :3].T + motion[:3, 3]
-    depth = there[..., 2:]
-    pixels = (there @ before.K.T)[..., :2] / depth.clamp_min(1e-8)
+    points = (rays * after.depth) @ motion[:3, :3].T + motion[:3, 3]
+    depth = points[..., 2:]
+    pixels = (points @ before.K.T)[..., :2] / depth.clamp_min(1e-8)
     grid = 2 * pixels / pixels.new_tensor([width, height]) - 1
     sampled = F.grid_sample(
         torch.cat([before.rgb, before.depth, before.accumulation], dim=-1).permute(2, 0, 1)[None],

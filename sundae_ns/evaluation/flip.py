@@ -1,4 +1,4 @@
-"""FLIP, a perceptual error that needs no weights; left out where its authors' package is not installed."""
+"""FLIP, a perceptual error without learned weights; it needs the optional package of its authors."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 
 from sundae_ns.evaluation.metrics import check_pair
 
-VARIANT = "LDR-FLIP, 67 pixels a degree"
-"""What the numbers are: the low-dynamic-range metric at the viewing distance that its authors' tools assume."""
+VARIANT = "LDR-FLIP, 67 pixels per degree"
+"""Variant of the metric: low dynamic range, at the default viewing distance of the authors' tools."""
 
 INSTALL = "pip install flip-evaluator"
-"""The command that brings the package."""
+"""Command that installs the package."""
 
 
 def flip_available() -> bool:
@@ -24,7 +24,7 @@ def flip_available() -> bool:
 
 @torch.no_grad()
 def flip(pred: Tensor, target: Tensor) -> Tensor | None:
-    """Mean FLIP error of two sRGB pictures, in [0, 1]; smaller is better.
+    """Mean FLIP error of two sRGB images, in [0, 1]; lower is better.
 
     Andersson et al., "FLIP: A Difference Evaluator for Alternating Images", 2020, computed by its authors' package,
     ``flip-evaluator``, on the CPU.
@@ -34,16 +34,16 @@ def flip(pred: Tensor, target: Tensor) -> Tensor | None:
         target: ``[H, W, 3]``; clamped to [0, 1].
 
     Returns:
-        A float32 scalar on the inputs' device; None where the package is not installed.
+        A float32 scalar on the inputs' device; None if the package is not installed.
 
     Raises:
-        DataError: the shapes differ, or are not those of pictures.
+        DataError: the shapes differ, or are not ``[H, W, 3]``.
     """
     check_pair(pred, target)
     if not flip_available():
         return None
     from flip_evaluator import evaluate
 
-    reference, test = (np.ascontiguousarray(picture.float().clamp(0, 1).cpu().numpy()) for picture in (target, pred))
+    reference, test = (np.ascontiguousarray(image.float().clamp(0, 1).cpu().numpy()) for image in (target, pred))
     _, mean, _ = evaluate(reference, test, "LDR", applyMagma=False)
     return torch.tensor(mean, dtype=torch.float32, device=pred.device)

@@ -1,4 +1,4 @@
-"""What was measured of one field: ways of rendering it, each with its own time and its own error."""
+"""The measurements of one field: each configuration of rendering it has its own time and its own error."""
 
 from __future__ import annotations
 
@@ -16,31 +16,32 @@ MEGABYTE = 1e6
 
 @dataclass(frozen=True)
 class ViewQuality:
-    """One test view, rendered in one way; None is a metric that could not be taken."""
+    """Metrics of one test view; None is a metric that was not measured."""
 
     psnr: float
     """dB."""
     ssim: float
-    """pytorch_msssim's, valid window."""
+    """pytorch_msssim's variant, without padding; NaN for images smaller than its window."""
     flip: float | None = None
     lpips: float | None = None
 
 
 @dataclass(frozen=True)
 class Configuration:
-    """One way of rendering a field. ``ms`` and ``views`` are of the same calls with the same arguments."""
+    """One configuration of rendering a field. ``ms`` and ``views`` come from the same calls with the same arguments."""
 
     name: str
-    """``head on`` or ``head off``; a field without a head has the latter alone."""
+    """``head on`` or ``head off``; a field without a head has only the latter."""
     ms: float | None
-    """Milliseconds a frame, device waited for: median over the test views; None if it was not timed."""
+    """Synchronised milliseconds per frame, median over the test views; None if not timed."""
     bytes: int
-    """All that it needs on disk, in fp32: without the head neither network nor features. Of a packed scene, the file."""
+    """Bytes on disk in fp32 that this configuration needs: without the head, neither network nor features. For a packed scene,
+    the size of the file."""
     views: tuple[ViewQuality, ...]
-    """In the order of the test views."""
+    """Metrics by test view, in the order of the views."""
 
     def mean(self, metric: str) -> float | None:
-        """Mean of a metric over the test views; None where it was not taken of all of them."""
+        """Mean of a metric over the test views; None unless every view has it."""
         values = [getattr(view, metric) for view in self.views]
         known = [value for value in values if value is not None and not math.isnan(value)]
         return fmean(known) if known and len(known) == len(values) else None
@@ -48,18 +49,18 @@ class Configuration:
 
 @dataclass(frozen=True)
 class Measured:
-    """A finished field and everything that was measured of it."""
+    """A finished field with its measurements."""
 
     label: str
-    """What it is called in tables and plots; one of a kind in a report."""
+    """Name in tables and plots, unique in a report."""
     source: str
-    """File or folder that it was read from."""
+    """The file or folder that was opened."""
     scene: str
     method: str
     variant: str
     keep_ratio: float | None
     seed: int | None
-    """None where the file does not say."""
+    """None if the file does not record it."""
     steps: int
     primitives: int
     bytes_primitives: int
@@ -67,41 +68,41 @@ class Measured:
     resolution: str
     """Width x height, pixels."""
     configurations: tuple[Configuration, ...]
-    """With the head first, where there is one."""
+    """With the head, if the field has one, then without it."""
     ms_head: float | None = None
-    """The head alone; 0 without one."""
+    """Milliseconds of the head alone; 0 without a head."""
     lpips_net: str = ""
     train_s: float | None = None
     prune_s: float | None = None
     peak_primitives: int | None = None
     peak_vram_mib: float | None = None
     gpu: str = ""
-    """Device that rendered: its name; empty for a CPU."""
+    """Name of the GPU that rendered; empty for a CPU."""
     commit: str = ""
     command: str = ""
 
     @property
     def bytes_total(self) -> int:
-        """Everything that has to be stored."""
+        """Bytes of primitives and head."""
         return self.bytes_primitives + self.bytes_head
 
     @property
     def full(self) -> Configuration:
-        """The whole picture: with the head, where there is one."""
+        """The complete rendering: with the head, if the field has one."""
         return self.configurations[0]
 
     @property
-    def bare(self) -> Configuration:
-        """Base colours alone."""
+    def base(self) -> Configuration:
+        """The rendering of base colours, without the head."""
         return self.configurations[-1]
 
     @property
     def has_head(self) -> bool:
-        """Whether a head takes part."""
+        """Whether the field has an enabled head."""
         return len(self.configurations) > 1
 
     def row(self) -> RunRow:
-        """The run as a row of ``runs.csv``: ``psnr`` beside ``ms_frame``, ``psnr_base`` beside ``ms_splat``."""
+        """The measurements as a row of ``runs.csv``: ``psnr`` belongs to ``ms_frame``, ``psnr_base`` to ``ms_splat``."""
         lpips = self.full.mean("lpips")
         return RunRow(
             scene=self.scene,
@@ -113,15 +114,15 @@ class Measured:
             primitives=self.primitives,
             psnr=self.full.mean("psnr"),
             ssim=self.full.mean("ssim"),
-            psnr_base=self.bare.mean("psnr"),
-            ssim_base=self.bare.mean("ssim"),
+            psnr_base=self.base.mean("psnr"),
+            ssim_base=self.base.mean("ssim"),
             lpips=lpips,
             lpips_net=self.lpips_net if lpips is not None else "",
             bytes_primitives=self.bytes_primitives,
             bytes_head=self.bytes_head,
             bytes_total=self.bytes_total,
             ms_frame=self.full.ms,
-            ms_splat=self.bare.ms,
+            ms_splat=self.base.ms,
             ms_head=self.ms_head,
             train_s=self.train_s,
             prune_s=self.prune_s,
@@ -134,16 +135,16 @@ class Measured:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Everything, per-view figures included, as plain values; NaN becomes None, since JSON has none."""
+        """All measurements, including those of each view, as plain values for JSON; numbers that are not finite become None."""
         plain = asdict(self)
         plain["bytes_total"] = self.bytes_total
-        for configuration, own in zip(self.configurations, plain["configurations"], strict=True):
-            own["mean"] = {metric: configuration.mean(metric) for metric in ("psnr", "ssim", "flip", "lpips")}
+        for configuration, entry in zip(self.configurations, plain["configurations"], strict=True):
+            entry["mean"] = {metric: configuration.mean(metric) for metric in ("psnr", "ssim", "flip", "lpips")}
         return without_nan(plain)
 
 
 def without_nan(value: Any) -> Any:
-    """Plain values as JSON can hold them: numbers that are not finite become None."""
+    """Plain values for JSON: numbers that are not finite become None."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):

@@ -1,8 +1,8 @@
-"""Image metrics, each in one named variant; see ``lpips.py`` for the learned one.
+"""Image metrics, each in one named variant; ``lpips.py`` has the learned one.
 
-PSNR is over all pixels and channels, with a peak of 1. SSIM is that of pytorch_msssim, as splatfacto uses it: an 11 x
-11 Gaussian window of sigma 1.5 where it fits whole ("valid"), on each colour channel, averaged. Other libraries pad, or
-weigh the variance differently, and differ in the fourth digit.
+PSNR is over all pixels and channels, with a peak of 1. SSIM is pytorch_msssim's, as in splatfacto: an 11 x 11 Gaussian
+window with sigma 1.5, no padding ("valid"), averaged over pixels and colour channels. Other libraries pad or normalise the
+variance differently; their values differ in the fourth digit.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from torch import Tensor
 from sundae_ns.errors import DataError
 
 SSIM_WINDOW = 11
-"""Pixels a side of SSIM's window; smaller pictures have no SSIM."""
+"""Side of SSIM's window in pixels; smaller images have no SSIM."""
 
 
 def check_pair(pred: Tensor, target: Tensor) -> None:
-    """Raise DataError unless both are pictures ``[H, W, 3]`` of one size."""
+    """Raise DataError unless both are images ``[H, W, 3]`` of one size."""
     if pred.shape != target.shape or pred.dim() != 3 or pred.shape[-1] != 3:
         raise DataError(
-            f"Pictures have shapes {list(pred.shape)} and {list(target.shape)}; give two of one size, [H, W, 3]."
+            f"Images have shapes {list(pred.shape)} and {list(target.shape)}; give two of one size, [H, W, 3]."
         )
 
 
 def psnr(pred: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio ``-10 log10(MSE)``, in dB; infinite for equal pictures.
+    """Peak signal-to-noise ratio ``-10 log10(MSE)``, in dB; infinite for equal images.
 
     Args:
         pred: ``[H, W, 3]``, nominally in [0, 1]; not clamped here.
@@ -36,7 +36,7 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
         A scalar of the inputs' dtype and device; differentiable.
 
     Raises:
-        DataError: the shapes differ, or are not those of pictures.
+        DataError: the shapes differ, or are not ``[H, W, 3]``.
     """
     check_pair(pred, target)
     return -10 * torch.log10(torch.mean((pred - target) ** 2))
@@ -50,11 +50,11 @@ def ssim(pred: Tensor, target: Tensor) -> Tensor:
         target: ``[H, W, 3]`` in [0, 1].
 
     Returns:
-        A scalar of the inputs' dtype and device; differentiable. NaN where a side is shorter than the window, 11
-        pixels: pytorch_msssim would leave that side unsmoothed, and return another quantity.
+        A scalar of the inputs' dtype and device; differentiable. NaN if a side is shorter than the window, 11 pixels:
+        pytorch_msssim would not smooth along that side and return another quantity.
 
     Raises:
-        DataError: the shapes differ, or are not those of pictures.
+        DataError: the shapes differ, or are not ``[H, W, 3]``.
     """
     check_pair(pred, target)
     if min(pred.shape[:2]) < SSIM_WINDOW:

@@ -1,7 +1,8 @@
-"""Pictures of the primitives' centres, and of how their responses are distributed."""
+"""Images of the centres of primitives, and histograms of their filter responses."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,156 +14,169 @@ from PIL import Image
 from torch import Tensor
 
 from sundae_ns.errors import DataError
+from sundae_ns.evaluation.colors import PALETTE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PAPER = (246, 246, 244)
-"""Colour behind the points: lighter than most of what is photographed, darker than white things."""
-_COVER = 0.6
-"""Points are drawn so large that they would cover this share of the picture, if none hid another."""
-_LARGEST = 90
-"""The longer side of the picture over the side of the largest points."""
+BACKGROUND = (246, 246, 244)
+"""Colour behind the points: lighter than most captures, but darker than white objects."""
+_COVERED = 0.6
+"""Share of the image that the points would cover if none hid another; it sets the size of a point."""
+_SIZE_LIMIT = 90
+"""The largest point has 1/90 of the image's longer side."""
 
 
 @dataclass(frozen=True)
-class Look:
-    """A direction to look at points from: where they land in a picture."""
+class Projection:
+    """Points projected into an image."""
 
     name: str
+    """Caption of the viewing direction; may be empty."""
     pixels: Tensor
-    """Column and row of each point ``[N, 2]``, pixels, the first pixel's middle at 0.5; anything outside is not drawn."""
+    """Column and row of each point ``[N, 2]``, in pixels, the first pixel's centre at 0.5. Points outside are not drawn."""
     depth: Tensor
-    """Distance along the line of sight ``[N]``; nearer points hide others, and points at 0 or less are not drawn."""
+    """Depth of each point ``[N]``. Nearer points hide others; points with depth <= 0 are not drawn."""
     width: int
     height: int
 
 
-def look_through(points: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, name: str = "") -> Look:
-    """What a pinhole camera sees of points ``[N, 3]``.
+def project_through_camera(points: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int) -> Projection:
+    """Points ``[N, 3]`` projected by a pinhole camera.
 
     Args:
-        points: in world units.
+        points: centres, world units ``[N, 3]``.
         viewmat: world-to-camera, OpenCV axes ``[4, 4]`` or its first three rows.
         K: intrinsics in pixels ``[3, 3]``.
-        width, height: of the picture, pixels.
-        name: of the look.
+        width, height: size of the image in pixels.
     """
-    seen = points.double() @ viewmat[:3, :3].double().T + viewmat[:3, 3].double()
-    depth = seen[:, 2]
+    local = points.double() @ viewmat[:3, :3].double().T + viewmat[:3, 3].double()
+    depth = local[:, 2]
     safe = torch.where(depth > 0, depth, torch.ones_like(depth))
-    pixels = seen[:, :2] / safe[:, None] * torch.stack([K[0, 0], K[1, 1]]).double() + K[:2, 2].double()
-    return Look(name, pixels, depth, width, height)
+    pixels = local[:, :2] / safe[:, None] * torch.stack([K[0, 0], K[1, 1]]).double() + K[:2, 2].double()
+    return Projection("", pixels, depth, width, height)
 
 
-def look_along_axes(points: Tensor, side: int = 600) -> list[Look]:
-    """Three orthogonal views of points ``[N, 3]``: from above (along z), from the front (y) and from the side (x).
+def project_along_axes(points: Tensor, side: int = 600) -> list[Projection]:
+    """Three orthographic projections of points ``[N, 3]``: from above (along z), from the front (y) and the side (x).
 
-    Their common scale shows the middle 70% of the points along each axis and half as much again around them: a far
-    background, as captures that were walked around have, would shrink the rest to a dot.
+    The common scale fits 1.5 times the extent of the middle 70% of the points; a far background would shrink the rest to a
+    dot.
+
+    Args:
+        points: centres, world units ``[N, 3]``.
+        side: width of the images in pixels.
     """
-    low, high = (torch.quantile(_few(points.double()), share, dim=0) for share in (0.15, 0.85))
+    low, high = (torch.quantile(_sample(points.double()), share, dim=0) for share in (0.15, 0.85))
     middle, extent = (low + high) / 2, float((high - low).max()) * 1.5
     scale = side / extent if extent > 0 else 1.0
-    looks = []
+    projections = []
     for name, right, up, along, sign in (
         ("from above", 0, 1, 2, -1.0),
         ("from the front", 0, 2, 1, 1.0),
         ("from the side", 1, 2, 0, -1.0),
     ):
         moved = (points.double() - middle) * scale
-        tall = float(high[up] - low[up]) * 2.2 * scale  # more, for what stands out of a flat scene
+        tall = float(high[up] - low[up]) * 2.2 * scale  # extra height for objects that stand out of a flat scene
         height = round(min(max(tall, side / 4), side))
         pixels = torch.stack([side / 2 + moved[:, right], height / 2 - moved[:, up]], dim=1)
         depth = sign * moved[:, along]
-        looks.append(Look(name, pixels, depth - depth.min() + 1, side, height))
-    return looks
+        projections.append(Projection(name, pixels, depth - depth.min() + 1, side, height))
+    return projections
 
 
-def _few(points: Tensor, most: int = 100_000) -> Tensor:
-    """At most about so many rows, evenly spread; torch's quantiles take no more than 16 million numbers."""
+def _sample(points: Tensor, most: int = 100_000) -> Tensor:
+    """About ``most`` evenly spaced rows; torch's quantile accepts at most 16 million numbers."""
     return points[:: max(1, len(points) // most)]
 
 
-def draw_points(look: Look, colors: Tensor, mask: Tensor | None = None) -> NDArray[np.uint8]:
-    """Draw points as little squares, near ones over far ones.
+def draw_points(projection: Projection, colors: Tensor, mask: Tensor | None = None) -> NDArray[np.uint8]:
+    """Draw points as small squares, near ones over far ones.
 
     Args:
-        look: where the points are.
-        colors: ``[N, 3]`` uint8.
-        mask: draw these only, bool ``[N]``.
+        projection: of all points.
+        colors: uint8 ``[N, 3]``.
+        mask: draw only these points, bool ``[N]``.
 
     Returns:
-        ``[H, W, 3]``. The fewer points, the larger the squares, up to a 90th of the picture.
+        uint8 ``[H, W, 3]``. Fewer points are drawn as larger squares, up to 1/90 of the image.
     """
-    height, width = look.height, look.width
-    chosen = torch.ones_like(look.depth, dtype=torch.bool) if mask is None else mask.clone()
-    chosen &= (look.depth > 0) & torch.isfinite(look.pixels).all(dim=1)
-    chosen &= (look.pixels >= 0).all(dim=1) & (look.pixels[:, 0] < width) & (look.pixels[:, 1] < height)
-    rows = chosen.nonzero().squeeze(1)
-    rows = rows[torch.sort(look.depth[rows], descending=True, stable=True).indices]
-    columns, lines = look.pixels[rows].floor().long().T.numpy()
-    most = max(1, max(width, height) // _LARGEST)
-    side = int(np.clip(round((_COVER * width * height / max(len(rows), 1)) ** 0.5), 1, most))
-    # A margin, so that squares at the edge need no clipping.
-    canvas = np.full((height + 2 * most, width + 2 * most, 3), PAPER, np.uint8)
-    # Every pixel takes the last point that covers it, which is the nearest one.
+    height, width = projection.height, projection.width
+    visible = torch.ones_like(projection.depth, dtype=torch.bool) if mask is None else mask.clone()
+    visible &= (projection.depth > 0) & torch.isfinite(projection.pixels).all(dim=1)
+    visible &= (
+        (projection.pixels >= 0).all(dim=1) & (projection.pixels[:, 0] < width) & (projection.pixels[:, 1] < height)
+    )
+    rows = visible.nonzero().squeeze(1)
+    rows = rows[torch.sort(projection.depth[rows], descending=True, stable=True).indices]
+    columns, lines = projection.pixels[rows].floor().long().T.numpy()
+    most = max(1, max(width, height) // _SIZE_LIMIT)
+    side = int(np.clip(round((_COVERED * width * height / max(len(rows), 1)) ** 0.5), 1, most))
+    # A margin avoids clipping squares at the edge.
+    canvas = np.full((height + 2 * most, width + 2 * most, 3), BACKGROUND, np.uint8)
+    # Each pixel takes the last point that covers it, which is the nearest.
     front = np.full(canvas.shape[:2], -1, np.int64)
     order = np.arange(len(rows))
     for down in range(side):
         for right in range(side):
-            place = (lines + most - side // 2 + down, columns + most - side // 2 + right)
-            np.maximum.at(front, place, order)
+            pixel = (lines + most - side // 2 + down, columns + most - side // 2 + right)
+            np.maximum.at(front, pixel, order)
     covered = front >= 0
     canvas[covered] = colors[rows].numpy()[front[covered]]
     return canvas[most : most + height, most : most + width]
 
 
-def points_sheet(looks: Sequence[Look], colors: Tensor, sets: Mapping[str, Tensor], *, title: str = "") -> Image.Image:
-    """A sheet of pictures: a row for each look, a column for each set of points.
+def points_sheet(
+    projections: Sequence[Projection], colors: Tensor, sets: Mapping[str, Tensor], *, title: str = ""
+) -> Image.Image:
+    """An image with one row per projection and one column per set of points.
 
     Args:
-        looks: of all points.
-        colors: ``[N, 3]`` uint8.
-        sets: masks by their captions, bool ``[N]``.
-        title: stands above.
+        projections: of all points.
+        colors: uint8 ``[N, 3]``.
+        sets: the points of each column by its caption, bool ``[N]``.
+        title: heading of the image.
 
     Raises:
-        DataError: there is nothing to draw.
+        DataError: there is no projection or no set.
     """
     from matplotlib.figure import Figure
 
-    if not looks or not sets:
-        raise DataError("there is nothing to draw; give at least one look and one set")
+    if not projections or not sets:
+        raise DataError("there is nothing to draw; give at least one projection and one set")
     wide = 4.2
-    heights = [wide * look.height / look.width for look in looks]
-    figure = Figure(figsize=(wide * len(sets), sum(heights) + 0.1 * len(looks) + 0.7), dpi=120, layout="constrained")
-    axes = figure.subplots(len(looks), len(sets), squeeze=False, height_ratios=heights)
-    for row, look in enumerate(looks):
+    heights = [wide * projection.height / projection.width for projection in projections]
+    figure = Figure(
+        figsize=(wide * len(sets), sum(heights) + 0.1 * len(projections) + 0.7), dpi=120, layout="constrained"
+    )
+    axes = figure.subplots(len(projections), len(sets), squeeze=False, height_ratios=heights)
+    for row, projection in enumerate(projections):
         for column, (caption, mask) in enumerate(sets.items()):
             panel = axes[row][column]
-            panel.imshow(draw_points(look, colors, mask), interpolation="antialiased")
+            panel.imshow(draw_points(projection, colors, mask), interpolation="antialiased")
             panel.set_xticks([])
             panel.set_yticks([])
             if row == 0:
                 panel.set_title(caption, fontsize=11)
-            if column == 0 and look.name:
-                panel.set_ylabel(look.name, fontsize=10)
+            if column == 0 and projection.name:
+                panel.set_ylabel(projection.name, fontsize=10)
     figure.suptitle(title, fontsize=12)
-    return _picture(figure)
+    return _rendered(figure)
 
 
 def response_histogram(
     magnitude: Tensor, *, thresholds: Mapping[str, tuple[float | None, float | None]]
 ) -> Image.Image:
-    """A histogram of response magnitudes over a logarithmic axis.
+    """A histogram of response magnitudes on a logarithmic axis.
 
     Args:
-        magnitude: ``[N]``; zeros and values that are not finite have no place on the axis, and are counted in the title.
-        thresholds: for each caption the highest magnitude of the low end that is kept, and the lowest of the high end;
-            drawn as a dotted and as a solid line, or not at all for None.
+        magnitude: ``[N]``. Zeros and values that are not finite have no place on the axis; the title counts them.
+        thresholds: by caption, the largest magnitude that the low-pass rule keeps (drawn dashed) and the smallest that the
+            high-pass rule keeps (drawn solid); None draws no line.
     """
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.ticker import MaxNLocator
 
     figure = Figure(figsize=(9.5, 4.5), dpi=120, layout="constrained")
     panel = figure.subplots()
@@ -170,32 +184,37 @@ def response_histogram(
     if len(values):
         low, high = values.min(), values.max()
         edges = np.linspace(low, high, 101) if high > low else np.array([low - 0.5, low + 0.5])
-        panel.hist(10.0**values, bins=list(10.0**edges), color="#7d93a8", edgecolor="none")
+        panel.hist(10.0**values, bins=list(10.0**edges), color="0.75", edgecolor="none")
         panel.set_xscale("log")
-    for color, (caption, (lowest, highest)) in zip(_palette(len(thresholds)), thresholds.items()):
-        for place, style, label in ((lowest, ":", None), (highest, "-", caption)):
-            if place is not None and place > 0:
-                panel.axvline(place, color=color, linestyle=style, linewidth=1.4, label=label)
+    colors = dict(zip(thresholds, itertools.cycle(PALETTE)))
+    for caption, (low_pass, high_pass) in thresholds.items():
+        for limit, style in ((low_pass, "--"), (high_pass, "-")):
+            if limit is not None and limit > 0:
+                panel.axvline(limit, color=colors[caption], linestyle=style, linewidth=1.4)
     zeros, unknown = int((magnitude == 0).sum()), int((~torch.isfinite(magnitude)).sum())
     panel.set_title(
-        f"{len(magnitude):,} primitives; not shown: {unknown:,} without neighbours, {zeros:,} of no response",
+        f"High-pass response of {len(magnitude):,} primitives\n"
+        f"not shown: {unknown:,} without neighbours, {zeros:,} with response 0",
         fontsize=11,
     )
     panel.set_xlabel("squared norm of the high-pass response")
-    panel.set_ylabel("primitives")
+    panel.set_ylabel("number of primitives")
+    panel.yaxis.set_major_locator(MaxNLocator(integer=True))
+    panel.spines[["top", "right"]].set_visible(False)
     if thresholds:
-        title = "share kept; high-pass right\nof the line, low-pass left\nof the dotted one"
-        figure.legend(loc="outside right upper", title=title, fontsize=9, title_fontsize=9)
-    return _picture(figure)
+        handles = [Line2D([], [], color=color, linewidth=4, label=caption) for caption, color in colors.items()]
+        handles += [
+            Line2D([], [], color="0.3", label="high-pass keeps\nthe right side"),
+            Line2D([], [], color="0.3", linestyle="--", label="low-pass keeps\nthe left side"),
+        ]
+        figure.legend(
+            handles=handles, loc="outside right upper", title="keep ratio", fontsize=9, title_fontsize=9, frameon=False
+        )
+    return _rendered(figure)
 
 
-def _palette(count: int) -> list[str]:
-    colors = ["#c0392b", "#d68910", "#1e8449", "#6c3483", "#1f618d"]
-    return [colors[i % len(colors)] for i in range(count)]
-
-
-def _picture(figure: Figure) -> Image.Image:
-    """Draw a figure without pyplot, and so without any state that other code could share."""
+def _rendered(figure: Figure) -> Image.Image:
+    """The image of a figure, drawn without pyplot and its global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(figure)

@@ -1,4 +1,4 @@
-"""Rows of ``benchmarks/results/runs.csv``: one finished run each."""
+"""Finished runs as rows of a CSV file such as ``benchmarks/results/runs.csv``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import csv
 import io
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -19,9 +20,10 @@ with contextlib.suppress(ImportError):  # Windows has none.
 
 @dataclass(frozen=True, kw_only=True)
 class RunRow:
-    """One run. The fields are the columns, in order; None, an empty cell, is what was not measured.
+    """One run. The fields are the columns, in order; None is an empty cell and means not measured.
 
-    Metrics are means over all test views. ``psnr_base`` and ``ssim_base`` are of the base colours, without the head.
+    Metrics are means over all test views; ``psnr_base`` and ``ssim_base`` are without the head. ``bytes_*`` are in bytes,
+    ``ms_*`` in milliseconds per frame, ``train_s`` and ``prune_s`` in seconds.
     """
 
     scene: str
@@ -46,12 +48,12 @@ class RunRow:
     train_s: float | None
     prune_s: float | None = None
     peak_primitives: int | None = None
-    """Most primitives at any time during training, between growing and culling too."""
+    """Peak number of primitives during training, including between growing and culling."""
     peak_vram_mib: float | None = None
-    """Most memory that torch held on the GPU during training."""
+    """Peak GPU memory allocated by torch during training, MiB."""
     gpu: str
     resolution: str
-    """Width x height of the pictures, pixels: ``1237x822``."""
+    """Width x height of the images in pixels: ``1237x822``."""
     commit: str
     command: str
 
@@ -69,8 +71,12 @@ def _line(cells: list[str]) -> str:
 def _cell(value: object) -> str:
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return ""
-    # One line a row: it is what makes an append one write, and a difference in git readable.
+    # One line per row makes an append a single write and a git diff readable.
     return " ".join(str(value).split())
+
+
+def _cells(row: RunRow) -> list[str]:
+    return [_cell(getattr(row, name)) for name in COLUMNS]
 
 
 def _parse(name: str, text: str) -> Any:
@@ -91,21 +97,26 @@ def _check_header(path: Path, header: list[str]) -> None:
     raise DataError(f"{path} has other columns (different: {', '.join(odd)}); name another file.")
 
 
-def append_row(path: Path, row: RunRow) -> None:
-    """Append a run to a CSV file, which is created with its header where there is none.
+def csv_text(rows: Sequence[RunRow]) -> str:
+    """Runs as CSV with a header."""
+    return "".join(_line(cells) for cells in (list(COLUMNS), *map(_cells, rows)))
 
-    The line goes out in one write to the file's end, so that a crash cannot leave half a row; the file is locked
-    meanwhile (where the system has ``flock``), so that appends of several processes wait for each other.
+
+def append_row(path: Path, row: RunRow) -> None:
+    """Append a run to a CSV file; a missing file is created with its header.
+
+    The row is appended in one write, so a crash cannot leave half a row. The file is locked meanwhile where the system has
+    ``flock``, so appends of several processes wait for each other.
 
     Args:
         path: the file; missing folders are created.
-        row: the run; NaN is written as not measured.
+        row: the run; NaN is written as an empty cell.
 
     Raises:
         DataError: the file has other columns, or cannot be written.
     """
     path = Path(path)
-    line = _line([_cell(getattr(row, name)) for name in COLUMNS])
+    line = _line(_cells(row))
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a+b") as file:
@@ -114,7 +125,7 @@ def append_row(path: Path, row: RunRow) -> None:
             if first := file.readline().decode("utf-8", errors="replace"):
                 _check_header(path, next(csv.reader([first])))
                 file.seek(-1, os.SEEK_END)
-                # An editor may have dropped the last line's end.
+                # An editor may have removed the last newline.
                 line = line if file.read(1) == b"\n" else "\n" + line
             else:
                 line = _line(list(COLUMNS)) + line
@@ -124,7 +135,7 @@ def append_row(path: Path, row: RunRow) -> None:
 
 
 def wait_for_lock(descriptor: int) -> None:
-    """Wait for a file's lock, which goes with the descriptor; nothing where the system has no ``flock`` (Windows)."""
+    """Wait for the lock of an open file, and hold it until the file is closed; no lock where ``flock`` is missing (Windows)."""
     if os.name == "posix":
         fcntl.flock(descriptor, fcntl.LOCK_EX)
 
@@ -147,5 +158,5 @@ def read_rows(path: Path) -> list[RunRow]:
         try:
             rows.append(RunRow(**{name: _parse(name, text) for name, text in zip(COLUMNS, cells, strict=True)}))
         except ValueError as error:
-            raise DataError(f"{path}, row {number} does not fit the columns ({error}); mend or remove it.") from error
+            raise DataError(f"{path}, row {number} does not fit the columns ({error}); fix or remove it.") from error
     return rows

@@ -1,4 +1,4 @@
-"""Times that wait for the device to finish."""
+"""Wall-clock times that include the device's work."""
 
 from __future__ import annotations
 
@@ -17,14 +17,12 @@ class Timing:
     """Wall-clock times of repeated calls, milliseconds."""
 
     median_ms: float
-    min_ms: float
     p90_ms: float
-    """Nine calls in ten are at most this slow."""
-    repeats: int
+    """90th percentile."""
 
 
 def now(device: torch.device | str) -> float:
-    """Seconds by the host's wall clock, from any start, read once the device has done what was asked of it."""
+    """Seconds on the host's wall clock, from an arbitrary start, after waiting for the device to finish its queued work."""
     device = torch.device(device)
     if device.type == "cuda":
         torch.cuda.synchronize(device)
@@ -36,20 +34,19 @@ def now(device: torch.device | str) -> float:
 def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: int = 5, repeats: int = 20) -> Timing:
     """Time a function from its call until the device is idle again.
 
-    The wall clock is read on the host, on both sides of a synchronisation, so that the cost of launching the work
-    counts as it does for whoever waits for a picture.
+    The host's clock is read after a synchronisation on both sides of the call, so the time includes launching the work.
 
     Args:
-        fn: called without arguments; its result is dropped.
-        device: where it works.
-        warmup: untimed calls before.
-        repeats: timed calls.
+        fn: called without arguments; its result is discarded.
+        device: the device that ``fn`` uses.
+        warmup: number of untimed calls first.
+        repeats: number of timed calls.
 
     Raises:
         ConfigError: ``warmup`` is negative, or ``repeats`` less than 1.
     """
     if warmup < 0 or repeats < 1:
-        raise ConfigError(f"{warmup} warm-up calls and {repeats} timed ones; give at least 0 and 1.")
+        raise ConfigError(f"{warmup} warm-up calls and {repeats} timed calls; give at least 0 and 1.")
     for _ in range(warmup):
         fn()
     times = []
@@ -57,4 +54,4 @@ def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: i
         start = now(device)
         fn()
         times.append(1e3 * (now(device) - start))
-    return Timing(float(np.median(times)), min(times), float(np.quantile(times, 0.9, method="higher")), repeats)
+    return Timing(float(np.median(times)), float(np.quantile(times, 0.9, method="higher")))

@@ -1,4 +1,4 @@
-"""Gaussian fields: names, shapes and activations of parameters; initialisation; surgery. Floor 1."""
+"""Gaussian fields: parameters and their activations, initialisation, surgery, merging and relocation. Floor 2."""
 
 from sundae_ns.gaussians.initialization import from_points, initial_features, random_points
 from sundae_ns.gaussians.parameters import (

@@ -1,52 +1,39 @@
-"""Covariances of primitives, and back; how far two of them overlap, and how large they look."""
+"""Covariances of primitives, their decomposition into scales and rotations, and their overlap and projected area."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from sundae_ns.gaussians.rotations import rotation_matrices
+
 SURFACE_EXPONENT = 1.6075
-"""Of Thomsen's formula for the surface of an ellipsoid, which is right to 1.1% for any axes."""
+"""Exponent of Thomsen's formula for the surface area of an ellipsoid, which is exact to 1.1% for any axes."""
 
 PAIRS = 1 << 18
-"""Pairs of primitives whose overlap is computed at once: about 50 MiB of them."""
+"""Pairs of primitives whose overlap is computed at once; they take about 50 MiB."""
 
 _LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
-"""Rows and columns of the six entries of a symmetric matrix, the diagonal first."""
+"""Rows and columns of the six entries of a symmetric matrix, diagonal first."""
 
 _DIAGONAL = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 
 
-def rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices ``[N, 3, 3]`` of wxyz quaternions of any length ``[N, 4]``; all-zero ones count as the identity."""
-    lengths = torch.linalg.vector_norm(quats, dim=1, keepdim=True)
-    unit = torch.where(lengths > 0, quats / lengths, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
-    w, x, y, z = unit.unbind(dim=1)
-    rows = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - w * z),
-        2 * (x * z + w * y),
-        2 * (x * y + w * z),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - w * x),
-        2 * (x * z - w * y),
-        2 * (y * z + w * x),
-        1 - 2 * (x * x + y * y),
-    ]
-    return torch.stack(rows, dim=1).reshape(-1, 3, 3)
-
-
 def covariances(scales: Tensor, quats: Tensor) -> Tensor:
-    """``R S S^T R^T`` ``[N, 3, 3]``, squared world units, from standard deviations ``[N, 3]`` and quaternions ``[N, 4]``."""
-    half = rotations(quats) * scales[:, None, :]
+    """Covariances ``R S S^T R^T`` ``[N, 3, 3]``, squared world units.
+
+    Args:
+        scales: standard deviations, world units ``[N, 3]``.
+        quats: wxyz quaternions of any length ``[N, 4]``.
+    """
+    half = rotation_matrices(quats) * scales[:, None, :]
     return half @ half.transpose(1, 2)
 
 
 def quaternions(matrices: Tensor) -> Tensor:
     """Unit wxyz quaternions ``[N, 4]`` of rotation matrices ``[N, 3, 3]``.
 
-    The largest of the four components is found from the diagonal and the others from it, so that nothing is divided by
-    less than one half.
+    The diagonal gives the largest of the four components, which is at least one half; the others are divided by it.
     """
     m = matrices
     trace = m.diagonal(dim1=1, dim2=2)
@@ -73,16 +60,16 @@ def quaternions(matrices: Tensor) -> Tensor:
 def scales_and_quaternions(covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Standard deviations ``[N, 3]`` and unit quaternions ``[N, 4]`` of symmetric matrices ``[N, 3, 3]``."""
     eigenvalues, axes = torch.linalg.eigh(covariance)
-    # Eigenvectors have no sign; a rotation has a determinant of 1.
+    # The sign of an eigenvector is arbitrary; a rotation needs determinant 1.
     axes[:, :, 2] *= torch.sign(torch.linalg.det(axes))[:, None]
     return eigenvalues.clamp_min(0).sqrt(), quaternions(axes)
 
 
-def mean_shadow(scales: Tensor) -> Tensor:
-    """Area of an ellipsoid's shadow, averaged over all directions, squared world units ``[N]``; up to a factor of pi.
+def mean_projected_area(scales: Tensor) -> Tensor:
+    """Projected area of ellipsoids, averaged over all directions and divided by pi, squared world units ``[N]``.
 
-    A quarter of its surface (Cauchy), which is found by Thomsen's formula. What a primitive covers in pictures from
-    everywhere; its volume says nothing of that, for most primitives are flat.
+    The mean projected area is a quarter of the surface area (Cauchy), which Thomsen's formula gives. It measures how
+    much of an image a primitive covers; the volume does not, because most primitives are flat.
 
     Args:
         scales: standard deviations, the half axes ``[N, 3]``.
@@ -92,7 +79,7 @@ def mean_shadow(scales: Tensor) -> Tensor:
 
 
 def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: float) -> Tensor:
-    """Bhattacharyya coefficient of each primitive with its neighbours, in [0, 1]: 1 for two that are equal.
+    """Bhattacharyya coefficient of each primitive with its neighbours, in [0, 1]; 1 for equal primitives.
 
     ``exp(-(d^T S^-1 d) / 8) (|A| |B|)^(1/4) / |S|^(1/2)`` with ``S = (A + B) / 2`` (Bhattacharyya, 1943).
 
@@ -100,25 +87,25 @@ def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: 
         means: world units ``[N, 3]``.
         covariance: squared world units ``[N, 3, 3]``.
         indices: neighbours ``[N, K]``.
-        least_width: standard deviation that is added to all axes, world units: two flat primitives side by side should not
-            count as apart because a plane has no width.
+        least_width: standard deviation added to all axes, world units; without it, two parallel flat primitives would
+            count as separate however close they are.
 
     Returns:
         ``[N, K]``, dtype of ``means``.
     """
     indices = indices.to(means.device)
-    least = least_width**2
-    entries = covariance.double()[:, _LOWER[0], _LOWER[1]] + least * torch.tensor(
+    least_variance = least_width**2
+    entries = covariance.double()[:, _LOWER[0], _LOWER[1]] + least_variance * torch.tensor(
         _DIAGONAL, dtype=torch.float64, device=means.device
     )
-    log_det = 2 * torch.stack(_cholesky(entries, least)[:3], dim=1).log().sum(dim=1)
+    log_det = 2 * torch.stack(_cholesky(entries, least_variance)[:3], dim=1).log().sum(dim=1)
     points = means.double()
     result = torch.empty(indices.shape, dtype=means.dtype, device=means.device)
-    # Rows in pieces: all pairs of matrices at once would be the largest thing in memory.
+    # Process rows in chunks to bound the memory of all pairs.
     for rows in torch.arange(len(means), device=means.device).split(max(1, PAIRS // max(1, indices.shape[1]))):
         columns = indices[rows]
         middle = (entries[rows, None] + entries[columns]) / 2
-        a, b, c, ba, ca, cb = _cholesky(middle, least)
+        a, b, c, ba, ca, cb = _cholesky(middle, least_variance)
         x, y, z = (points[rows, None] - points[columns]).unbind(dim=-1)
         x = x / a
         y = (y - ba * x) / b
@@ -129,16 +116,23 @@ def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: 
     return result
 
 
-def _cholesky(entries: Tensor, least: float) -> tuple[Tensor, ...]:
-    """Cholesky factors of symmetric matrices, ``[..., 6]`` in the order of ``_LOWER`` to six of ``[...]`` in that order.
+def _cholesky(entries: Tensor, least_variance: float) -> tuple[Tensor, ...]:
+    """Cholesky factors of symmetric matrices.
 
-    Written out, because a batched one calls LAPACK once a matrix. No pivot is below the least eigenvalue, so ``least``, a
-    bound of it, mends what rounding leaves of the pivots of needles.
+    Written out, because the batched function calls LAPACK once per matrix. A pivot is never below the least eigenvalue,
+    so clamping at a lower bound of it repairs pivots of needles that rounding made too small.
+
+    Args:
+        entries: in the order of ``_LOWER`` ``[..., 6]``.
+        least_variance: lower bound of all eigenvalues.
+
+    Returns:
+        Six factors ``[...]`` in the order of ``_LOWER``.
     """
     xx, yy, zz, yx, zx, zy = entries.unbind(dim=-1)
-    a = xx.clamp_min(least).sqrt()
+    a = xx.clamp_min(least_variance).sqrt()
     ba, ca = yx / a, zx / a
-    b = (yy - ba * ba).clamp_min(least).sqrt()
+    b = (yy - ba * ba).clamp_min(least_variance).sqrt()
     cb = (zy - ca * ba) / b
-    c = (zz - ca * ca - cb * cb).clamp_min(least).sqrt()
+    c = (zz - ca * ca - cb * cb).clamp_min(least_variance).sqrt()
     return a, b, c, ba, ca, cb

@@ -1,4 +1,4 @@
-"""First values of a field: from a sparse point cloud, or random where there is none."""
+"""Initial parameters of a field: from a sparse point cloud, or random."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def random_quaternions(n: int, generator: torch.Generator | None = None) -> Tens
 
 
 def random_points(n: int, extent: float, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-    """Points ``[n, 3]`` uniform in a cube of side ``extent`` around the origin, and grey-level colours ``[n, 3]`` in [0, 1]."""
+    """Random points ``[n, 3]`` in a cube of side ``extent`` around the origin, and colours ``[n, 3]`` in [0, 1]."""
     points = (torch.rand(n, 3, generator=generator) - 0.5) * extent
     return points, torch.rand(n, 3, generator=generator)
 
@@ -29,23 +29,23 @@ def random_points(n: int, extent: float, generator: torch.Generator | None = Non
 def from_points(
     points: Tensor, rgb: Tensor, *, sh_degree: int, num_features: int, generator: torch.Generator | None = None
 ) -> dict[str, Tensor]:
-    """Parameters of a field with one primitive a point.
+    """Parameters of a field with one primitive per point.
 
-    A primitive is a sphere as wide as the mean distance to its three nearest neighbours (3DGS, Kerbl et al. 2023).
-    Coincident points get the smallest positive width of the cloud, where 3DGS would take the logarithm of zero.
+    The standard deviation of a primitive is the mean distance to its three nearest neighbours (3DGS, Kerbl et al.
+    2023). Coincident points get the smallest positive one of the cloud, where 3DGS would take the logarithm of zero.
 
     Args:
-        points: ``[N, 3]`` world units; rows that are not finite are left out.
+        points: ``[N, 3]`` world units; points that are not finite, in place or colour, are dropped.
         rgb: ``[N, 3]`` colours in [0, 1].
         sh_degree: degree of the spherical harmonics.
         num_features: length F of the feature vectors; 0 for none.
         generator: source of the random rotations and features.
 
     Returns:
-        The mapping that ``gaussians.parameters`` describes, float32, on the device of ``points``.
+        The field by parameter name (see ``gaussians.parameters``), float32, on the device of ``points``.
 
     Raises:
-        DataError: no finite point.
+        DataError: no point is finite.
     """
     finite = torch.isfinite(points).all(dim=1) & torch.isfinite(rgb).all(dim=1)
     points, rgb = points[finite].float(), rgb[finite].float()
@@ -72,15 +72,15 @@ def from_points(
 
 
 def initial_features(features_dc: Tensor, num_features: int, generator: torch.Generator | None = None) -> Tensor:
-    """First feature vectors ``[N, F]``: the colour in the first channels, and small noise that tells the rest apart.
+    """Initial feature vectors ``[N, F]``: the colour in the first three channels, plus small noise in all.
 
     Args:
-        features_dc: ``[N, 3]`` band-0 coefficients.
+        features_dc: SH coefficients of degree 0 ``[N, 3]``.
         num_features: F.
         generator: source of the noise.
     """
     noise = 0.05 * torch.randn(features_dc.shape[0], num_features, generator=generator)
     features = noise.to(features_dc)
-    shared = min(3, num_features)
-    features[:, :shared] += features_dc[:, :shared]
+    color_channels = min(3, num_features)
+    features[:, :color_channels] += features_dc[:, :color_channels]
     return features

@@ -1,4 +1,4 @@
-"""Nothing lost: hand on what primitives that go away have to those that stay."""
+"""Merging: replace groups of primitives by one primitive with the same moments."""
 
 from __future__ import annotations
 
@@ -8,37 +8,37 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from sundae_ns.gaussians.covariance import covariances, mean_shadow, scales_and_quaternions
+from sundae_ns.gaussians.covariance import covariances, mean_projected_area, scales_and_quaternions
 
-MOST_OPACITY = 0.99
-"""Opacities of merged primitives end here, where the logit still has a gradient."""
+MAX_OPACITY = 0.99
+"""Upper limit of merged opacities, at which the logit still has a gradient."""
 
 ROWS = 1 << 16
-"""Primitives whose harmonics are added up at once."""
+"""Primitives whose coefficients are converted to float64 at once."""
 
 
 @torch.no_grad()
 def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[str, Tensor]:
     """Replace each group of primitives by one with the same moments.
 
-    With the weights w normalised within a group, that is
+    With weights w normalised within a group:
 
-    - centre and covariance: ``m = sum w_i m_i`` and ``S = sum w_i (S_i + (m_i - m)(m_i - m)^T)``, those of the mixture;
-    - harmonics and features: ``sum w_i c_i``;
-    - opacity: optical depths ``-log(1 - alpha)`` add up where primitives lie behind each other, and what a
-      primitive takes from pictures is its depth times its shadow. So ``t A = sum t_i A_i`` with A the mean shadow over all
-      directions: a wall of many small primitives stays as dark, seen from afar, as it was. Volumes would say the same of
-      fog, but primitives are flat. At most 0.99.
+    - centre and covariance are those of the mixture: ``m = sum w_i m_i``, ``S = sum w_i (S_i + (m_i - m)(m_i - m)^T)``;
+    - SH coefficients and features are ``sum w_i c_i``;
+    - opacity follows from ``t A = sum t_i A_i``, with optical depth ``t = -log(1 - alpha)`` and mean projected area A:
+      a wall of many small primitives absorbs as much light from afar as before. Limited to ``MAX_OPACITY``. Volumes in
+      place of areas would suit fog, but primitives are flat.
 
     Args:
         params: the field, all finite, N primitives.
-        heir: index of the primitive that each one is merged into, int64 ``[N]``: the own index for those that stay, -1
-            for those that are lost. All others name one that stays.
-        weight: what each counts in the mean of its group, not negative ``[N]``.
+        heir: index of the primitive that each one is merged into, int64 ``[N]``: its own index for a primitive that
+            stays, -1 for one that is dropped, else the index of one that stays.
+        weight: weight of each primitive in its group, not negative ``[N]``.
 
     Returns:
-        Parameters of those that stay, in order, computed in float64 on the CPU and returned like ``params``
-        ``[M, ...]``. One whose group is itself alone, has no weight or overflows stays as it is, to the bit.
+        Parameters ``[M, ...]`` of the primitives that stay, in order, with dtype and device of ``params``; computed in
+        float64 on the CPU. A primitive whose group is itself alone, has no weight or overflows is unchanged, bit for
+        bit.
     """
     source = {name: value.detach().cpu() for name, value in params.items()}
     heir, w = heir.cpu(), weight.detach().double().cpu().nan_to_num(0.0, posinf=0.0).clamp_min(0)
@@ -53,36 +53,36 @@ def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[st
         return torch.zeros(count, *values.shape[1:], dtype=torch.float64).index_add_(0, group, values)
 
     w = w[members]
-    # Relative to the largest of the group, so that no sum underflows.
+    # Divide by the largest weight of the group first, so that no sum underflows.
     largest = torch.zeros(count, dtype=torch.float64).scatter_reduce_(0, group, w, "amax")
     w = torch.where(largest[group] > 0, w / largest[group], 0.0)
-    share = w / total(w)[group].clamp_min(torch.finfo(torch.float64).tiny)
+    normalized = w / total(w)[group].clamp_min(torch.finfo(torch.float64).tiny)
 
     def mean(values: Tensor) -> Tensor:
         result = torch.zeros(count, values[0].numel(), dtype=torch.float64)
-        # In pieces: all harmonics in float64 at once would be twice the field.
-        for part in torch.arange(len(members)).split(ROWS):
-            flat = values[members[part]].double().reshape(len(part), -1)
-            result.index_add_(0, group[part], share[part, None] * flat)
+        # In chunks: all coefficients in float64 would take twice the memory of the field.
+        for chunk in torch.arange(len(members)).split(ROWS):
+            flat = values[members[chunk]].double().reshape(len(chunk), -1)
+            result.index_add_(0, group[chunk], normalized[chunk, None] * flat)
         return result.reshape(count, *values.shape[1:])
 
     kept = {name: value[stays] for name, value in source.items()}
     origin = kept["means"].double()
     offset = source["means"][members].double() - origin[group]
-    shift = total(share[:, None] * offset)
+    shift = total(normalized[:, None] * offset)
     spread = offset - shift[group]
     scales = source["scales"][members].double().exp()
     covariance = covariances(scales, source["quats"][members].double()) + spread[:, :, None] * spread[:, None, :]
-    covariance = total(share[:, None, None] * covariance)
-    # Squares that overflow have no axes; the one that stays is left as it is.
+    covariance = total(normalized[:, None, None] * covariance)
+    # A covariance that overflows has no axes; its primitive stays unchanged.
     bounded = covariance.isfinite().all(dim=2).all(dim=1)
     deviations, quats = scales_and_quaternions(torch.where(bounded[:, None, None], covariance, 0.0))
-    # An axis without any width would have no logarithm; none is made thinner than the thinnest member's.
+    # A width of zero has no logarithm; limit each axis to the thinnest axis of the members.
     thinnest = torch.full((count,), torch.inf, dtype=torch.float64)
     thinnest = thinnest.scatter_reduce_(0, group, scales.amin(dim=1), "amin")
     deviations = deviations.maximum(thinnest[:, None])
     depth = softplus(source["opacities"][members].double().squeeze(1), threshold=40.0)
-    merged_depth = total(depth * mean_shadow(scales)) / mean_shadow(deviations)
+    merged_depth = total(depth * mean_projected_area(scales)) / mean_projected_area(deviations)
 
     merged = {name: mean(value) for name, value in source.items() if name not in _WITH_MOMENTS}
     merged["means"] = origin + shift
@@ -104,7 +104,7 @@ _WITH_MOMENTS = ("means", "scales", "quats", "opacities")
 
 
 def _logit_of_depth(depth: Tensor) -> Tensor:
-    """The logit of ``1 - exp(-depth)``, which is ``log(exp(depth) - 1)``; depths end at that of the most opacity."""
-    most = -torch.log1p(torch.tensor(-MOST_OPACITY, dtype=depth.dtype))
-    depth = depth.clamp(torch.finfo(depth.dtype).tiny, float(most))
+    """Logit of the opacity ``1 - exp(-depth)``, which is ``log(exp(depth) - 1)``; opacity at most ``MAX_OPACITY``."""
+    max_depth = -torch.log1p(torch.tensor(-MAX_OPACITY, dtype=depth.dtype))
+    depth = depth.clamp(torch.finfo(depth.dtype).tiny, float(max_depth))
     return depth + torch.log(-torch.expm1(-depth))

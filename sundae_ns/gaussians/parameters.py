@@ -1,7 +1,7 @@
 """Names, shapes and activations of the parameters of a Gaussian field.
 
-A field is a mapping from the names below to tensors that share their first dimension, the number of primitives N. Values
-are stored before activation, as 3DGS and splatfacto do:
+A field is a mapping from the names below to tensors that share their first dimension, the number of primitives N.
+Values are stored before activation, as 3DGS and splatfacto do:
 
 =================  ==============  ===============================================================
 name               shape           meaning
@@ -9,10 +9,10 @@ name               shape           meaning
 ``means``          ``[N, 3]``      centres, world units
 ``scales``         ``[N, 3]``      log of the standard deviations, world units
 ``quats``          ``[N, 4]``      rotation as wxyz quaternion, not normalised
-``features_dc``    ``[N, 3]``      spherical harmonics, band 0
-``features_rest``  ``[N, K, 3]``   spherical harmonics, bands 1 and up
+``features_dc``    ``[N, 3]``      spherical harmonics, degree 0
+``features_rest``  ``[N, K, 3]``   spherical harmonics, degrees 1 and up
 ``opacities``      ``[N, 1]``      logit of the opacity
-``features``       ``[N, F]``      splatted feature vectors (c_i of the paper's neural image); optional
+``features``       ``[N, F]``      splatted feature vectors (c_i in the paper's neural image); optional
 =================  ==============  ===============================================================
 """
 
@@ -27,15 +27,15 @@ SH_C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
 SPLAT_NAMES = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
-"""What every 3DGS field has; the names are those of splatfacto's checkpoints."""
+"""Parameters of every 3DGS field, named as in splatfacto's checkpoints."""
 
 _COLUMNS = {"means": 3, "scales": 3, "quats": 4, "features_dc": 3, "opacities": 1}
 
 MAX_SH_DEGREE = 4
-"""Highest degree of spherical harmonics that a field may have."""
+"""Highest SH degree of a field."""
 
 FEATURES = "features"
-"""The extra parameter that SUNDAE attaches to each primitive."""
+"""Name of the parameter that SUNDAE adds to each primitive."""
 
 
 def num_primitives(params: Mapping[str, Tensor]) -> int:
@@ -44,19 +44,20 @@ def num_primitives(params: Mapping[str, Tensor]) -> int:
 
 
 def sh_degree(features_rest: Tensor) -> int:
-    """Degree of spherical harmonics whose bands 1 and up are ``[N, K, 3]``, K = (degree + 1)^2 - 1."""
+    """SH degree of coefficients ``[N, K, 3]`` of degrees 1 and up, K = (degree + 1)^2 - 1."""
     return round((features_rest.shape[1] + 1) ** 0.5) - 1
 
 
 def sh_degree_of(coefficients: int) -> int | None:
-    """Degree whose bands 1 and up have ``coefficients`` per channel, (degree + 1)^2 - 1; None if there is none."""
+    """SH degree with (degree + 1)^2 - 1 = ``coefficients`` per channel of degrees 1 and up; None if no degree has."""
     return next((d for d in range(MAX_SH_DEGREE + 1) if (d + 1) ** 2 - 1 == coefficients), None)
 
 
 def odd_shapes(params: Mapping[str, Tensor]) -> list[str]:
-    """What is wrong with the shapes of a field that has all of :data:`SPLAT_NAMES`: a clause for each parameter.
+    """Descriptions of the parameters with a wrong shape, for an error message; N is the length of ``means``.
 
-    N is as many as there are ``means``; ``features`` are not looked at.
+    Args:
+        params: has all of :data:`SPLAT_NAMES`; ``features`` are not checked.
     """
     n = params["means"].shape[0] if params["means"].ndim else 0
     rest = params["features_rest"].shape
@@ -71,17 +72,17 @@ def odd_shapes(params: Mapping[str, Tensor]) -> list[str]:
 
 
 def rgb_to_sh(rgb: Tensor) -> Tensor:
-    """Band-0 coefficient ``[..., 3]`` whose colour is ``rgb`` ``[..., 3]`` in [0, 1]."""
+    """SH coefficient of degree 0 ``[..., 3]`` whose colour is ``rgb`` ``[..., 3]`` in [0, 1]."""
     return (rgb - 0.5) / SH_C0
 
 
 def sh_to_rgb(sh: Tensor) -> Tensor:
-    """View-independent colour ``[..., 3]`` of a band-0 coefficient ``[..., 3]``; not clamped."""
+    """View-independent colour ``[..., 3]`` of an SH coefficient of degree 0 ``[..., 3]``; not clamped."""
     return sh * SH_C0 + 0.5
 
 
 def rgb_to_logit(rgb: Tensor) -> Tensor:
-    """Logit ``[..., 3]`` of a colour ``[..., 3]``, which is kept a thousandth away from 0 and 1."""
+    """Logit ``[..., 3]`` of a colour ``[..., 3]``, clamped to [0.001, 0.999]."""
     return torch.logit(rgb.clamp(1e-3, 1 - 1e-3))
 
 

@@ -1,8 +1,8 @@
-"""Moves of "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al., 2024): relocation, growth, noise.
+"""Updates of "3D Gaussian Splatting as Markov Chain Monte Carlo" (Kheradmand et al., 2024): relocation, growth, noise.
 
-A primitive that becomes N primitives at its own place must look as before. With opacities ``o' = 1 - (1 - o)^(1/N)`` the
-centre does; its width follows from asking that a ray's integral stays the same (equation 9 there). The double sum over
-binomials is one sum, since ``sum_{i=1..N} C(i-1, k) = C(N, k+1)``:
+N copies of a primitive at its place must render like the primitive. Opacities ``o' = 1 - (1 - o)^(1/N)`` preserve the
+opacity at the centre; equation 9 of the paper gives the scale that preserves the integral along a ray. Its double sum
+over binomials is a single sum, because ``sum_{i=1..N} C(i-1, k) = C(N, k+1)``:
 
     sigma' = sigma * o / sum_{j=1..N} C(N, j) (-1)^(j-1) o'^j / sqrt(j)
 """
@@ -21,19 +21,19 @@ from torch.optim import Optimizer
 from sundae_ns.gaussians.surgery import replace_parameter
 
 MAX_COPIES = 51
-"""Copies beyond these are counted as these: the sum alternates, and its terms grow."""
+"""Larger numbers of copies are clamped to this: the terms of the alternating sum grow with N."""
 
 
 def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity and size of each of ``copies`` primitives that together look like one.
+    """Opacity and scale of each of ``copies`` primitives that together render like one.
 
     Args:
         opacities: in (0, 1) ``[M]``.
         scales: standard deviations, any unit ``[M, 3]``.
-        copies: how many there will be, the first included, at least 1 ``[M]``.
+        copies: number of copies including the original, at least 1 ``[M]``.
 
     Returns:
-        Opacities ``[M]`` and scales ``[M, 3]``, of the dtype given.
+        Opacities ``[M]`` and scales ``[M, 3]``, with the dtype of the arguments.
     """
     n = copies.clamp(1, MAX_COPIES).to(torch.float64)
     old = opacities.to(torch.float64)
@@ -50,9 +50,9 @@ def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Ten
 
 
 def draw(weights: Tensor, count: int) -> Tensor:
-    """Indices ``[count]`` drawn with replacement in proportion to ``weights`` ``[M]``; from torch's own generator.
+    """Indices ``[count]`` drawn with replacement in proportion to ``weights`` ``[M]``, with torch's global generator.
 
-    By inversion in float64, since ``torch.multinomial`` takes no more than 2^24 weights.
+    By inversion in float64, because ``torch.multinomial`` takes at most 2^24 weights.
     """
     cumulative = weights.to(torch.float64).cumsum(dim=0)
     uniform = torch.rand(count, dtype=torch.float64, device=weights.device) * cumulative[-1]
@@ -63,22 +63,22 @@ def draw(weights: Tensor, count: int) -> Tensor:
 def relocate(
     params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], dead: Tensor, min_opacity: float
 ) -> int:
-    """Move dead primitives onto living ones, drawn by opacity, so that the picture stays as it was.
+    """Move dead primitives onto living ones, drawn by opacity; the rendered image stays the same.
 
     Args:
-        params: the field; its values change, its parameters stay the same objects.
-        optimizers: the moments of all primitives that take part become 0.
-        dead: True for those to move, bool ``[N]``.
-        min_opacity: no opacity gets below this.
+        params: the field, changed in place.
+        optimizers: by parameter name; the moments of the moved primitives and of their targets become 0.
+        dead: True for primitives to move, bool ``[N]``.
+        min_opacity: lower limit of the new opacities.
 
     Returns:
-        How many were moved; 0 also where none is alive.
+        Number of primitives moved; 0 if no primitive is alive.
     """
     targets, alive = dead.nonzero().squeeze(1), (~dead).nonzero().squeeze(1)
     if len(targets) == 0 or len(alive) == 0:
         return 0
     sources = alive[draw(params["opacities"][alive].sigmoid().flatten(), len(targets))]
-    _share(params, sources, min_opacity)
+    _split_sources(params, sources, min_opacity)
     for name, value in params.items():
         value.data[targets] = value.data[sources]
         for moment in _per_row(optimizers.get(name), value).values():
@@ -91,44 +91,50 @@ def relocate(
 def grow(
     params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], count: int, min_opacity: float
 ) -> None:
-    """Add ``count`` primitives on top of others, drawn by opacity, so that the picture stays as it was.
+    """Add ``count`` copies of primitives, drawn by opacity; the rendered image stays the same.
 
-    Parameters are new objects afterwards, as after :func:`sundae_ns.gaussians.surgery.keep`.
+    Replaces the parameter objects, as :func:`sundae_ns.gaussians.surgery.keep` does.
+
+    Args:
+        params: the field, changed in place.
+        optimizers: by parameter name; the moments of the copies are 0.
+        count: number of copies.
+        min_opacity: lower limit of the new opacities.
     """
     if count <= 0:
         return
     sources = draw(params["opacities"].sigmoid().flatten(), count)
-    _share(params, sources, min_opacity)
+    _split_sources(params, sources, min_opacity)
     for name, value in list(params.items()):
         new = Parameter(torch.cat([value.data, value.data[sources]]), requires_grad=value.requires_grad)
         optimizer = optimizers.get(name)
-        held = {} if optimizer is None else optimizer.state.get(value, {})
+        state = {} if optimizer is None else optimizer.state.get(value, {})
         longer = {
             key: torch.cat([moment, torch.zeros_like(moment[sources])])
             for key, moment in _per_row(optimizer, value).items()
         }
-        replace_parameter(params, optimizers, name, new, {**held, **longer})
+        replace_parameter(params, optimizers, name, new, {**state, **longer})
 
 
 @torch.no_grad()
 def jitter(params: Mapping[str, Tensor], strength: float) -> None:
-    """Move centres by noise of each primitive's own shape: transparent ones much, opaque ones hardly at all.
+    """Add noise to the centres, shaped by each primitive's covariance and much weaker for opaque primitives.
 
     Args:
-        params: the field; its centres change.
-        strength: of the noise; the paper's is 5e5 times the learning rate of the centres.
+        params: the field; its centres change in place.
+        strength: factor of the noise; in the paper 5e5 times the learning rate of the centres.
     """
     means, scales = params["means"], params["scales"].exp()
     gate = torch.sigmoid(100 * (0.005 - params["opacities"].sigmoid()))  # 1 below an opacity of 0.005, 0 above
     rotation = _matrices(normalize(params["quats"], dim=-1))
     noise = torch.randn_like(means) * gate * strength
-    # Covariance times noise, R S^2 R^T e, without building it.
+    # R S^2 R^T e, without building the covariance.
     local = torch.einsum("nji,nj->ni", rotation, noise) * scales.square()
     means.data.add_(torch.einsum("nij,nj->ni", rotation, local))
 
 
-def _share(params: Mapping[str, Tensor], sources: Tensor, min_opacity: float) -> None:
-    """Give each source the opacity and size of one of as many as it was drawn times, and itself."""
+def _split_sources(params: Mapping[str, Tensor], sources: Tensor, min_opacity: float) -> None:
+    """Give each source that was drawn k times the opacity and scale of one of k + 1 copies."""
     times = torch.bincount(sources, minlength=len(params["means"]))
     chosen = times.nonzero().squeeze(1)
     opacities, scales = split_evenly(
@@ -140,6 +146,7 @@ def _share(params: Mapping[str, Tensor], sources: Tensor, min_opacity: float) ->
 
 
 def _per_row(optimizer: Optimizer | None, value: Tensor) -> dict[str, Tensor]:
+    """Moments of a parameter that have a row for each primitive."""
     state = {} if optimizer is None else optimizer.state.get(value, {})
     return {
         key: moment

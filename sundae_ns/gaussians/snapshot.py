@@ -1,4 +1,4 @@
-"""Copies of a field in training, to go back to; and parameters made narrower. Optimizer state goes with the tensors."""
+"""Snapshots of a field and its optimizers, their restoration, and narrower parameters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch.optim import Optimizer
 from sundae_ns.gaussians.surgery import replace_parameter
 
 Snapshot = dict[str, dict[str, Tensor]]
-"""For each parameter its ``value`` and the tensors of its optimizer's state, all on the CPU."""
+"""By parameter: its ``value`` and the tensors of its optimizer state, all on the CPU."""
 
 
 def _moments(optimizer: Optimizer | None, parameter: Tensor) -> dict[str, Tensor]:
@@ -25,11 +25,11 @@ def _copy(value: Tensor) -> Tensor:
 
 
 def snapshot(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> Snapshot:
-    """Copy a field and what its optimizers know of it.
+    """Copy a field and the state of its optimizers.
 
     Args:
         params: the field, name to parameter ``[N, ...]``.
-        optimizers: optimizers with one parameter each; a parameter may have none.
+        optimizers: by parameter name, with one parameter each; a parameter may have none.
     """
     return {
         name: {
@@ -44,9 +44,9 @@ def snapshot(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) 
 def restore(
     params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], saved: Mapping[str, dict[str, Tensor]]
 ) -> None:
-    """Go back to a snapshot of any number of primitives, in place on the mappings.
+    """Restore a snapshot with any number of primitives, in place on the mappings.
 
-    Parameters are new objects afterwards, as after :func:`sundae_ns.gaussians.surgery.keep`.
+    Replaces the parameter objects, as :func:`sundae_ns.gaussians.surgery.keep` does.
     """
     for name, entries in saved.items():
         old = params[name]
@@ -57,7 +57,7 @@ def restore(
 
 @torch.no_grad()
 def narrow(params: MutableMapping[str, Parameter], optimizers: Mapping[str, Optimizer], name: str, width: int) -> None:
-    """Keep the first ``width`` columns of one parameter ``[N, C, ...]``, and of its moments."""
+    """Keep the first ``width`` columns of one parameter ``[N, C, ...]`` and of its moments."""
     old = params[name]
     moments = {
         key: value[:, :width].clone() if value.shape == old.shape else value
@@ -79,7 +79,7 @@ def _replace(
 
 
 def _placed(moments: Mapping[str, Tensor], parameter: Tensor, optimizer: Optimizer) -> dict[str, Tensor]:
-    # Adam counts its steps on the CPU, except where it is fused.
+    # Adam keeps its step count on the CPU, unless it is fused.
     fused = bool(optimizer.param_groups[0].get("fused"))
     return {
         key: value.to(parameter.device if key != "step" or fused else "cpu", copy=True)
@@ -88,7 +88,7 @@ def _placed(moments: Mapping[str, Tensor], parameter: Tensor, optimizer: Optimiz
 
 
 def module_snapshot(parameters: Iterable[Tensor], optimizer: Optimizer) -> Snapshot:
-    """The same for the parameters of a network, which have one optimizer; keys are their places."""
+    """Copy the parameters of a network and the state of its optimizer; keys are the parameters' positions."""
     return {
         str(place): {
             "value": _copy(value),
@@ -100,7 +100,7 @@ def module_snapshot(parameters: Iterable[Tensor], optimizer: Optimizer) -> Snaps
 
 @torch.no_grad()
 def restore_module(parameters: Iterable[Tensor], optimizer: Optimizer, saved: Mapping[str, dict[str, Tensor]]) -> None:
-    """Counterpart of :func:`module_snapshot`; the parameters stay the same objects."""
+    """Restore a :func:`module_snapshot` in place; keeps the parameter objects."""
     for place, value in enumerate(parameters):
         entries = saved[str(place)]
         value.copy_(entries["value"])

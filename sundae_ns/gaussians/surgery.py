@@ -15,9 +15,9 @@ from sundae_ns.gaussians.parameters import num_primitives
 
 
 def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer]) -> None:
-    """Check that parameters share their first dimension and that optimizers of the same name hold these very tensors.
+    """Check that parameters share their first dimension and that the optimizers of their names hold these tensors.
 
-    Parameters without an optimizer are fine, and so are optimizers of other things, a network for one.
+    Parameters without an optimizer and optimizers of other names, such as a network's, are allowed.
 
     Raises:
         DataError: a parameter has another length, or an optimizer holds another tensor or more than one.
@@ -36,7 +36,7 @@ def check_wiring(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimize
 
 
 def per_primitive(value: Any, n: int) -> bool:
-    """Whether a value is a tensor with a row for each of ``n`` primitives."""
+    """Return whether a value is a tensor with a row for each of ``n`` primitives."""
     return isinstance(value, Tensor) and value.ndim > 0 and value.shape[0] == n
 
 
@@ -47,14 +47,14 @@ def replace_parameter(
     new: Parameter,
     state: Mapping[str, Any] | None,
 ) -> None:
-    """Put another parameter in the place of one, in the field and in its optimizer.
+    """Replace one parameter, in the field and in its optimizer.
 
     Args:
         params: the field.
-        optimizers: by parameter name, of one parameter each; there may be none of this name.
-        name: whose place.
-        new: the parameter.
-        state: what its optimizer is to hold for it; None or empty lets the optimizer begin anew.
+        optimizers: by parameter name, with one parameter each; may lack ``name``.
+        name: name of the parameter.
+        new: the new parameter.
+        state: optimizer state of the new parameter; None or empty resets it.
     """
     optimizer = optimizers.get(name)
     if optimizer is not None:
@@ -74,22 +74,21 @@ def keep(
 ) -> None:
     """Keep the primitives under a mask and remove all others, in place on the mappings.
 
-    Every parameter is replaced by a new, shorter ``Parameter`` with the same ``requires_grad``; optimizers of the same
-    name hold the new one, with their per-primitive state (Adam's moments) sliced and the step count kept. Gradients are
-    not carried over. The parameter objects change on purpose: resizing through ``.data`` would keep them, but a graph
-    that is still alive remembers the old shape and the next backward pass fails. Other holders of the old objects, such
-    as ``nerfstudio``'s ``Optimizers.parameters``, must be refreshed by the caller.
+    Replaces every parameter by a new, shorter ``Parameter`` with the same ``requires_grad`` and without a gradient. The
+    optimizer of the same name holds the new one, with its per-primitive state (Adam's moments) sliced and its step
+    count kept. New objects are needed: after resizing through ``.data``, the backward pass of a live graph fails on the
+    old shape. The caller must refresh other holders of the old objects, such as nerfstudio's ``Optimizers.parameters``.
 
-    Everything is checked and sliced before anything is replaced, so an error leaves all as it was.
+    Checks and slices everything before it replaces anything, so an error leaves all arguments unchanged.
 
     Args:
         params: the field, name to parameter ``[N, ...]``.
-        optimizers: optimizers with one parameter each; names that are not in ``params`` are left alone.
-        state: running state; its tensors with first dimension N are sliced, the rest is left alone.
+        optimizers: optimizers with one parameter each; names that are not in ``params`` are ignored.
+        state: running state; its tensors with first dimension N are sliced, all else stays.
         mask: True for primitives to keep, bool, any device ``[N]``.
 
     Raises:
-        DataError: the mask has a wrong shape or dtype or keeps nothing, or parameters and optimizers do not fit.
+        DataError: the mask has a wrong shape or dtype or keeps nothing, or the optimizers do not hold the parameters.
     """
     n = num_primitives(params)
     if mask.dtype != torch.bool or mask.shape != (n,):
@@ -113,7 +112,7 @@ def keep(
 
 @torch.no_grad()
 def keep_state(state: MutableMapping[str, Any], mask: Tensor) -> None:
-    """Slice the per-primitive tensors of a state mapping in place: those with as many rows as ``mask`` ``[N]``."""
+    """Slice the tensors with N rows of a state mapping in place, by a mask bool ``[N]``."""
     state.update(_sliced_entries(state, mask))
 
 
@@ -122,6 +121,6 @@ def _slice(value: Tensor, mask: Tensor) -> Tensor:
 
 
 def _sliced_entries(entries: Mapping[str, Any], mask: Tensor, skip: str | None = None) -> dict[str, Tensor]:
-    """The per-primitive tensors of a mapping, sliced; the mapping itself is not changed."""
+    """Sliced copies of the per-primitive tensors of a mapping."""
     n = mask.shape[0]
     return {name: _slice(value, mask) for name, value in entries.items() if name != skip and per_primitive(value, n)}

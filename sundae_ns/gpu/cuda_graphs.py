@@ -1,4 +1,4 @@
-"""Work of a GPU that is recorded once and played back: CUDA graphs, and which of them are kept. Floor 0."""
+"""Recording and replay of GPU work as CUDA graphs, and a cache of recorded graphs."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ import torch
 
 from sundae_ns.errors import BackendError
 
-MAX_SIZES = 4
-"""Recordings kept at a time: each holds its own pictures and activations."""
+MAX_GRAPHS = 4
+"""Graphs cached at a time: each holds its own images and activations."""
 
 RECORD_AT = 3
-"""What comes for this time in a row is recorded: a viewer that is being resized never shows one size twice."""
+"""Requests in a row after which a key is recorded: a viewer that is being resized never repeats a size."""
 
 Result = TypeVar("Result")
 
-_failed: list[torch.cuda.CUDAGraph] = []
-"""Recordings that were not finished, kept for what torch may still ask them."""
+_abandoned: list[torch.cuda.CUDAGraph] = []
+"""Unfinished graphs, kept alive because torch may still refer to them."""
 
 _thread = threading.local()
 _one_at_a_time = threading.Lock()
 
 
 @contextmanager
-def aside(device: torch.device) -> Iterator[None]:
-    """Run once what is going to be recorded: it allocates and chooses kernels, neither of which can be recorded."""
+def warm_up(device: torch.device) -> Iterator[None]:
+    """Context to run work once before it is recorded: it allocates and selects kernels, which cannot be recorded."""
     side = _side_stream(device)
     side.wait_stream(torch.cuda.current_stream(device))
     try:
-        with torch.cuda.stream(side), _recording():
+        with torch.cuda.stream(side), _mark_recording():
             yield
     finally:
         torch.cuda.current_stream(device).wait_stream(side)
 
 
-def recording() -> bool:
-    """Whether this thread is about to record something, or does: what it calls meanwhile is to make no recording of its own."""
+def is_recording() -> bool:
+    """Whether this thread is warming up or recording; code that it calls must not record a graph of its own."""
     return getattr(_thread, "recording", False)
 
 
 @contextmanager
-def _recording() -> Iterator[None]:
-    before, _thread.recording = recording(), True
+def _mark_recording() -> Iterator[None]:
+    before, _thread.recording = is_recording(), True
     try:
         yield
     finally:
@@ -55,8 +55,8 @@ def _recording() -> Iterator[None]:
 
 
 @contextmanager
-def _uncollected() -> Iterator[None]:
-    """Python collects no garbage meanwhile: a graph among it would be destroyed, and what is being recorded with it."""
+def _no_garbage_collection() -> Iterator[None]:
+    """Disable garbage collection: destroying a graph meanwhile would break the graph being recorded."""
     before = gc.isenabled()
     gc.disable()
     try:
@@ -67,8 +67,8 @@ def _uncollected() -> Iterator[None]:
 
 
 def _side_stream(device: torch.device) -> torch.cuda.Stream:
-    # One for all recordings, because memory that torch keeps for one stream does not serve another; of each thread, because
-    # what another one does on a stream would be recorded with it.
+    # One stream for all graphs, because memory cached for one stream does not serve another; one per thread, because
+    # work of another thread on the same stream would be recorded too.
     streams: dict[torch.device, torch.cuda.Stream] = _thread.__dict__.setdefault("streams", {})
     if device not in streams:
         streams[device] = torch.cuda.Stream(device)
@@ -76,33 +76,34 @@ def _side_stream(device: torch.device) -> torch.cuda.Stream:
 
 
 def record(
-    run: Callable[[], Result], device: torch.device, shares: torch.cuda.CUDAGraph | None = None
+    run: Callable[[], Result], device: torch.device, share_memory_with: torch.cuda.CUDAGraph | None = None
 ) -> tuple[torch.cuda.CUDAGraph, Result]:
-    """Record what ``run`` does, without doing it.
+    """Record the GPU work of ``run`` without executing it.
 
     Args:
-        run: must have run before (:func:`aside`), wait for nothing, and read only what stays where it is.
-        device: where it runs.
-        shares: a graph whose memory this one uses too; they are played in this order.
+        run: must have run before (:func:`warm_up`), must not wait for the GPU, and must read only memory that stays in
+            place.
+        device: CUDA device.
+        share_memory_with: a graph whose memory pool this one reuses; they must be replayed in this order.
 
     Returns:
-        The graph, and what ``run`` returned: tensors that the graph writes whenever it is played.
+        The graph, and the result of ``run``: tensors that each replay writes.
 
     Raises:
-        BackendError: it cannot be recorded. Nothing was done then, and what is done next is done as before.
-        torch.cuda.OutOfMemoryError: there is no room for what it makes.
+        BackendError: the work cannot be recorded. Nothing was executed, and later work is not affected.
+        torch.cuda.OutOfMemoryError: the device has too little memory for the results.
     """
     graph = torch.cuda.CUDAGraph()
-    # A training loop beside a viewer may allocate meanwhile; only this thread's work belongs to the recording.
-    pool = torch.cuda.graph_pool_handle() if shares is None else shares.pool()
-    # On a stream of this device: torch's own belongs to whichever device was the current one at its first recording.
+    # A training loop beside a viewer may allocate meanwhile: record this thread's work only.
+    pool = torch.cuda.graph_pool_handle() if share_memory_with is None else share_memory_with.pool()
+    # Name the stream: torch's own belongs to the device that was current at its first recording.
     side = _side_stream(device)
     errors: list[RuntimeError] = []
-    with _one_at_a_time, torch.cuda.device(device), _recording(), _uncollected():
+    with _one_at_a_time, torch.cuda.device(device), _mark_recording(), _no_garbage_collection():
         generator = torch.cuda.default_generators[torch.cuda.current_device()]
         before = generator.clone_state() if hasattr(generator, "clone_state") else None  # not in torch 2.1
         try:
-            # Torch does not leave the stream of a recording that fails; all later work would go there, unordered with gsplat's.
+            # After a failed recording torch stays on its stream, and later work would not be ordered with gsplat's.
             with torch.cuda.stream(side):
                 with torch.cuda.graph(graph, pool=pool, stream=side, capture_error_mode="thread_local"):
                     try:
@@ -111,11 +112,11 @@ def record(
                         errors.append(error)
                         raise
         except RuntimeError as error:
-            if error not in errors:  # it was not ended either
+            if error not in errors:  # ending the recording failed too
                 errors.append(error)
                 _abandon(graph, pool)
                 if before is not None:
-                    # Or random numbers would be refused, as of a recording that is not there.
+                    # Else torch refuses random numbers: its generator waits for a recording that does not exist.
                     generator.graphsafe_set_state(before)
             first = errors[0]
             if isinstance(first, torch.cuda.OutOfMemoryError):
@@ -126,42 +127,42 @@ def record(
 
 
 def _abandon(graph: torch.cuda.CUDAGraph, pool: tuple[int, int]) -> None:
-    """Tell torch's allocator that a recording is over which could not be ended: it would give no memory back."""
-    # Torch has no public way; where this one is missing, it goes on asking the graph whether an allocation is its own.
+    """Tell torch's allocator that a recording which cannot be ended is over; else it would never release memory."""
+    # Torch has no public function. Without this one, the allocator keeps asking the graph which allocations it owns.
     with suppress(AttributeError, RuntimeError):
         torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), pool)
-    _failed.append(graph)
+    _abandoned.append(graph)
 
 
-class Kept(Generic[Result]):
-    """Recordings, by what tells them apart: a few of those that were used last."""
+class GraphCache(Generic[Result]):
+    """Recorded graphs by key: the least recently used one is dropped."""
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[Hashable, Result] = OrderedDict()
+        self._graphs: OrderedDict[Hashable, Result] = OrderedDict()
         self._last: Hashable = None
-        self._in_a_row = 0
+        self._repeats = 0
 
     def __len__(self) -> int:
-        return len(self._kept)
+        return len(self._graphs)
 
     def get(self, key: Hashable, make: Callable[[], Result]) -> Result | None:
-        """The recording for ``key``, made when it is asked for often enough in a row; None before."""
-        self._in_a_row = self._in_a_row + 1 if key == self._last else 1
+        """The graph for ``key``, recorded by ``make`` at its :data:`RECORD_AT`-th request in a row; None before."""
+        self._repeats = self._repeats + 1 if key == self._last else 1
         self._last = key
-        if key not in self._kept:
-            if self._in_a_row < RECORD_AT:
+        if key not in self._graphs:
+            if self._repeats < RECORD_AT:
                 return None
-            if len(self._kept) >= MAX_SIZES:
-                self._kept.popitem(last=False)
-            self._kept[key] = make()
-        self._kept.move_to_end(key)
-        return self._kept[key]
+            if len(self._graphs) >= MAX_GRAPHS:
+                self._graphs.popitem(last=False)
+            self._graphs[key] = make()
+        self._graphs.move_to_end(key)
+        return self._graphs[key]
 
-    def put(self, key: Hashable, recording: Result) -> None:
-        """Keep another recording for a key that there is one for."""
-        self._kept[key] = recording
+    def put(self, key: Hashable, graph: Result) -> None:
+        """Replace the graph of a cached key."""
+        self._graphs[key] = graph
 
     def clear(self) -> None:
-        """Forget all, and what came last."""
-        self._kept.clear()
-        self._last, self._in_a_row = None, 0
+        """Drop all graphs, and forget the last key."""
+        self._graphs.clear()
+        self._last, self._repeats = None, 0

@@ -1,6 +1,6 @@
-"""CUDA kernels compiled from source while the program runs: NVRTC and the driver, through their C interfaces.
+"""CUDA kernels compiled at run time by NVRTC and launched through the driver, through their C interfaces.
 
-Both libraries come with every CUDA build of torch and its driver; no nvcc and no CUDA toolkit is needed.
+Both libraries come with a CUDA build of torch and its driver; neither nvcc nor a CUDA toolkit is needed.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from sundae_ns.errors import BackendError
 
 Argument = Tensor | int | float | None
 Launch = Callable[[int, Sequence[Argument]], None]
-"""Runs a kernel for so many threads, at least, with these arguments: see :meth:`Kernel.__call__`."""
+"""Launches a kernel for at least a number of threads: see :meth:`Kernel.__call__`."""
 
 
 def compile_cubin(source: str, architecture: str, options: Sequence[str] = ()) -> bytes:
     """Compile CUDA C++ to machine code. Needs no device.
 
     Args:
-        source: the program; kernels are ``extern "C"``.
-        architecture: ``sm_90`` for compute capability 9.0.
-        options: further options of the compiler.
+        source: CUDA C++; kernels are ``extern "C"``.
+        architecture: such as ``sm_90`` for compute capability 9.0.
+        options: further compiler options.
 
     Raises:
         BackendError: NVRTC is missing, or the source does not compile.
@@ -59,14 +59,14 @@ class Kernel:
         """Compile and load.
 
         Args:
-            source: the program.
-            name: its ``extern "C"`` kernel.
-            device: a CUDA device.
-            options: further options of the compiler.
-            block: threads of a block.
+            source: CUDA C++.
+            name: name of the ``extern "C"`` kernel.
+            device: CUDA device.
+            options: further compiler options.
+            block: threads per block.
 
         Raises:
-            BackendError: the kernel cannot be compiled or loaded here.
+            BackendError: the kernel cannot be compiled or loaded.
         """
         major, minor = torch.cuda.get_device_capability(device)
         code = compile_cubin(source, f"sm_{major}{minor}", options)
@@ -76,29 +76,29 @@ class Kernel:
         self._function, self._context = c_void_p(), c_void_p()
         module = c_void_p()
         with torch.cuda.device(device):
-            # The driver's calls need torch's context on this thread, and work on the device is what puts it there.
+            # The driver's calls need torch's context on this thread; work on the device creates it.
             torch.zeros(1, device=device)
             self._check(self._driver.cuCtxGetCurrent(byref(self._context)))
             self._check(self._driver.cuModuleLoadData(byref(module), code))
             self._check(self._driver.cuModuleGetFunction(byref(self._function), module, name.encode()))
 
     def __call__(self, threads: int, arguments: Sequence[Argument]) -> None:
-        """Start the kernel on the current stream, for at least so many threads.
+        """Launch the kernel on the current stream.
 
         Args:
-            threads: threads in one row of blocks.
-            arguments: tensors on the kernel's device as pointers to their first value, of whose strides the kernel has to
-                know; None as a null pointer; integers as C ints, floats as doubles.
+            threads: number of threads, rounded up to whole blocks.
+            arguments: tensors on the kernel's device, passed as pointers to their first element, without strides; None
+                as a null pointer; integers as C ints, floats as doubles.
 
         Raises:
-            BackendError: a tensor is elsewhere, or the driver refuses the call.
+            BackendError: a tensor is on another device, or the driver refuses the launch.
         """
         values = [_as_c(argument, self._device) for argument in arguments]
         pointers = (c_void_p * len(values))(*(ctypes.addressof(value) for value in values))
         grid = (c_uint(-(-threads // self._block)), c_uint(1), c_uint(1))
         block = (c_uint(self._block), c_uint(1), c_uint(1))
         with torch.cuda.device(self._device):
-            # Autograd's threads may come here before torch has done any work on them.
+            # Autograd's threads may launch kernels before torch has done any work on them.
             self._check(self._driver.cuCtxSetCurrent(self._context))
             stream = c_void_p(torch.cuda.current_stream(self._device).cuda_stream)
             self._check(
@@ -118,15 +118,15 @@ def _as_c(argument: Argument, device: torch.device) -> ctypes.c_void_p | ctypes.
         return c_void_p()
     if isinstance(argument, Tensor):
         if argument.device != device:
-            raise BackendError(f"a kernel on {device} was given a tensor on {argument.device}: pass ones there")
+            raise BackendError(f"a kernel on {device} got a tensor on {argument.device}: pass tensors on {device}")
         return c_void_p(argument.data_ptr())
     return c_int(argument) if isinstance(argument, int) else c_double(argument)
 
 
 def _library(name: str) -> ctypes.CDLL:
-    """The NVRTC of torch's CUDA version, or the driver."""
+    """Load NVRTC of torch's CUDA version, or the driver."""
     if torch.version.cuda is None:
-        raise BackendError("this torch is built without CUDA: install one with it")
+        raise BackendError("this torch is built without CUDA: install a CUDA build")
     file = "libcuda.so.1" if name == "cuda" else f"libnvrtc.so.{torch.version.cuda.split('.')[0]}"
     try:
         return ctypes.CDLL(file)

@@ -1,25 +1,19 @@
-"""Neighbour graphs on the centres of primitives: exact search, edge weights, degree and matrices. Floor 0.
+"""Neighbour graphs on the centres of primitives: exact search, edge weights and degree.
 
-The graph of the paper (section "Graph Construction") joins near primitives with Gaussian weights. It is stored as the
-fixed number of neighbours of every primitive, so memory grows with N and never with N squared.
+The graph of the paper (section "Graph Construction") joins near primitives with Gaussian weights. It stores a fixed number
+of neighbours per primitive, so memory grows with N and not with N squared.
 """
 
 from sundae_ns.graphs.bandwidth import Bandwidth, BandwidthRule, bandwidth
-from sundae_ns.graphs.graph import NeighborGraph, build_graph, graph_from_neighbors
-from sundae_ns.graphs.matrices import LapType, adjacency, laplacian
-from sundae_ns.graphs.neighbors import Neighbors, knn, radius_neighbors
+from sundae_ns.graphs.graph import NeighborGraph, build_graph
+from sundae_ns.graphs.neighbors import Neighbors, knn
 
 __all__ = [
     "Bandwidth",
     "BandwidthRule",
-    "LapType",
     "NeighborGraph",
     "Neighbors",
-    "adjacency",
     "bandwidth",
     "build_graph",
-    "graph_from_neighbors",
     "knn",
-    "laplacian",
-    "radius_neighbors",
 ]

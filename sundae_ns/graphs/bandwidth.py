@@ -1,4 +1,4 @@
-"""How far edges reach (``tau``) and how fast their weights fall (``sigma``)."""
+"""Bandwidth of a graph: how far its edges reach (``tau``) and how fast their weights fall (``sigma``)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ CUTOFF = 3.0
 """Edges of the robust rule end at this many sigma, where the weight has fallen to exp(-4.5) = 0.011."""
 
 SAMPLED = 2**16
-"""Values from which a selection on the CPU learns where to look."""
+"""Number of values that the selection on the CPU samples to narrow the range."""
 
 CHUNK = 2**18
-"""Values that a thread looks at at a time: 1 MiB in float32."""
+"""Number of values that a thread reads at a time: 1 MiB in float32."""
 
 
 class Bandwidth(NamedTuple):
-    """The two numbers of the paper's edge equation ``W_ij = exp(-d^2 / (2 sigma^2))`` where ``d^2 < tau``."""
+    """The parameters of the paper's edge weights ``W_ij = exp(-d^2 / (2 sigma^2))`` where ``d^2 < tau``."""
 
     tau: float
     """Threshold on the *squared* distance, squared scene units."""
@@ -38,21 +38,19 @@ def bandwidth(
 ) -> Bandwidth:
     """Choose ``tau`` and ``sigma`` from the distances to the nearest neighbours.
 
-    - ``robust``: ``sigma`` is the median of all positive distances, ``tau = (3 sigma)^2``. The median is a length,
-      moves with the scale of the scene, and neither clones (distance 0, left out) nor far floaters can drag it along.
-      Half of all near neighbours lie within one sigma, so weights spread over (0, 1), and only primitives lonelier than
-      three times the typical spacing are left without an edge.
-    - ``literal``: the paper's words. ``tau`` is ten times the smallest nearest-neighbour distance, compared with
-      squared distances as printed; ``sigma`` is the variance of the distances, of the nearest neighbours since the full
-      matrix has N squared of them. Units do not match, and one pair of clones makes ``tau`` 0 and the
-      graph empty: it is kept to be compared with, not to be used.
+    - ``robust``: ``sigma`` is the median of all positive distances, ``tau = (3 sigma)^2``. The median scales with the
+      scene. Clones (distance 0, left out) and far floaters do not move it. Half of all neighbours lie within one sigma, so
+      weights spread over (0, 1); only primitives beyond three times the typical spacing have no edge.
+    - ``literal``: the paper's words. ``tau`` is ten times the smallest nearest-neighbour distance, compared with squared
+      distances as printed. ``sigma`` is the variance of the distances to the nearest neighbours, because the full matrix
+      has N squared entries. The units do not match, and one pair of clones makes ``tau`` 0 and the graph empty. This rule
+      is for comparison only.
 
-    Where no distance is positive (coincident points, or none), every width gives the same graph and 1 stands in for the
-    robust sigma.
+    Without a positive distance (coincident points, or none) every width gives the same graph, and the robust sigma is 1.
 
     Args:
-        distances: ascending neighbour distances in scene units ``[N, K]``; ``inf`` where a neighbour is missing.
-        rule: which rule fills in what is not given.
+        distances: ascending neighbour distances in scene units ``[N, K]``; may be ``inf``.
+        rule: gives the values that are not set.
         tau: replaces the rule's threshold, squared scene units.
         sigma: replaces the rule's width, scene units; the robust ``tau`` follows it.
 
@@ -70,13 +68,13 @@ def bandwidth(
         sigma = _robust_sigma(distances) if rule == "robust" else _variance(distances)
     if tau is None:
         reach = CUTOFF * sigma
-        # A power that overflows is an error in Python, a product is infinite: without a threshold, as for an infinite sigma.
+        # A product, not a power: in Python a power that overflows raises, and a product becomes infinite.
         tau = reach * reach if rule == "robust" else _ten_times_smallest(distances)
     return Bandwidth(float(tau), float(sigma))
 
 
 def _robust_sigma(distances: Tensor) -> float:
-    """Median of the positive finite distances; the lower one of the two in the middle."""
+    """Median of the positive finite distances; the lower of the two middle values."""
     zeros = int((distances == 0).sum())
     positive = int(torch.isfinite(distances).sum()) - zeros
     if positive == 0:
@@ -85,7 +83,7 @@ def _robust_sigma(distances: Tensor) -> float:
 
 
 def kth_smallest(values: Tensor, k: int) -> float:
-    """The value with ``k`` values before it in ascending order, of values that are not negative, ``inf`` among them."""
+    """The value at place ``k`` in ascending order, from 0; values are not negative and may be ``inf``."""
     if values.dtype not in (torch.float32, torch.float64):
         values = values.float()
     if values.device.type == "cpu":
@@ -94,10 +92,10 @@ def kth_smallest(values: Tensor, k: int) -> float:
 
 
 def select_by_bits(values: Tensor, k: int) -> float:
-    """As :func:`kth_smallest`, of float32 or float64, by counting, which a GPU is good at.
+    """:func:`kth_smallest` of float32 or float64 values by counting, which is fast on a GPU.
 
-    The bits of such numbers, read as an integer, rise with the number. Bit by bit it takes one byte a value beside the
-    values, where a sort or a selection takes more than the values themselves or runs on one of many processors.
+    The bits of a number that is not negative, read as an integer, grow with the number. Counting bit by bit needs one byte of
+    scratch memory per value; a sort needs more than the values themselves.
     """
     integer, highest = (torch.int32, 30) if values.dtype == torch.float32 else (torch.int64, 62)
     bits = values.view(integer)
@@ -109,22 +107,22 @@ def select_by_bits(values: Tensor, k: int) -> float:
 
 
 def select_near_sample(values: NDArray[np.floating], k: int) -> float:
-    """As :func:`kth_smallest`, of ``[M]``, on all threads of a CPU.
+    """:func:`kth_smallest` of values ``[M]`` on all threads of a CPU.
 
-    A sample says between which two numbers the value should be; few others are, and those alone are put in order. Where the
-    sample misleads, all values are put in order: chance has no part in the result.
+    A sample gives a range that should hold the value, and only the few values in that range are sorted. If the range misses
+    the value, all values are sorted, so the result does not depend on the sample.
     """
     low, high = -np.inf, np.inf
     if len(values) > SAMPLED:
         sample = np.sort(values[np.random.default_rng(0).integers(len(values), size=SAMPLED)])
-        place, margin = k / len(values) * SAMPLED, 4 * SAMPLED**0.5  # eight standard deviations of the place
+        place, margin = k / len(values) * SAMPLED, 4 * SAMPLED**0.5  # 8 standard deviations of the place
         low, high = sample[max(int(place - margin), 0)], sample[min(int(place + margin), SAMPLED - 1)]
 
-    def look(part: slice) -> tuple[int, NDArray[np.floating]]:
+    def count_and_collect(part: slice) -> tuple[int, NDArray[np.floating]]:
         chunk = values[part]
         return int(np.count_nonzero(chunk < low)), chunk[(chunk >= low) & (chunk <= high)]
 
-    found = for_each(look, slices(len(values), CHUNK))
+    found = for_each(count_and_collect, slices(len(values), CHUNK))
     near, rank = np.concatenate([kept for _, kept in found]), k - sum(below for below, _ in found)
     if not 0 <= rank < len(near):
         near, rank = values, k

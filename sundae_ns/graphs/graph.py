@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from sundae_ns.graphs.bandwidth import BandwidthRule, bandwidth
-from sundae_ns.graphs.neighbors import Neighbors, knn
+from sundae_ns.graphs.neighbors import knn
 
 
 @dataclass(frozen=True, eq=False)
 class NeighborGraph:
     """Rows of the weight matrix W, one per primitive, each with at most K entries.
 
-    The graph is directed where ``i`` is among the K nearest of ``j`` but not the other way round;
-    :func:`sundae_ns.graphs.adjacency` symmetrises it.
+    The graph is directed: ``i`` may be among the K nearest of ``j`` without ``j`` being among those of ``i``.
     """
 
     indices: Tensor
@@ -23,9 +22,9 @@ class NeighborGraph:
     weights: Tensor
     """Values of W in [0, 1], 0 where there is no edge ``[N, K]``."""
     dw: Tensor
-    """Weighted degree, the row sums of W ``[N]``."""
+    """Weighted degrees, the row sums of W ``[N]``."""
     tau: float
-    """Edges join points with a squared distance below this, squared scene units."""
+    """Edges join points whose squared distance is below this, squared scene units."""
     sigma: float
     """Width of the Gaussian of the weights, scene units."""
 
@@ -36,7 +35,7 @@ class NeighborGraph:
 
     @property
     def Ne(self) -> int:
-        """Number of directed edges, that is of positive weights."""
+        """Number of directed edges (positive weights)."""
         return int((self.weights > 0).sum())
 
     @property
@@ -57,8 +56,8 @@ def build_graph(
 
     Args:
         points: centres in scene units, any floating dtype and device ``[N, 3]``.
-        num_neighbors: most edges that leave a node; must be less than N.
-        rule: how ``tau`` and ``sigma`` follow from the distances; see :func:`sundae_ns.graphs.bandwidth`.
+        num_neighbors: most edges of a node; must be less than N.
+        rule: how ``tau`` and ``sigma`` are computed from the distances; see :func:`sundae_ns.graphs.bandwidth`.
         tau: replaces the rule's threshold, squared scene units.
         sigma: replaces the rule's width, scene units.
 
@@ -67,23 +66,13 @@ def build_graph(
 
     Raises:
         ConfigError: an option is out of range.
-        DataError: there are too few points, or some are not finite.
+        DataError: too few points, or points that are not finite.
     """
-    return graph_from_neighbors(knn(points, num_neighbors), rule=rule, tau=tau, sigma=sigma)
-
-
-def graph_from_neighbors(
-    neighbors: Neighbors,
-    *,
-    rule: BandwidthRule = "robust",
-    tau: float | None = None,
-    sigma: float | None = None,
-) -> NeighborGraph:
-    """Weigh the edges of a finished neighbour search; arguments as in :func:`build_graph`."""
+    neighbors = knn(points, num_neighbors)
     distances = neighbors.distances
     tau, sigma = bandwidth(distances, rule, tau=tau, sigma=sigma)
     if sigma > 0:
-        # Divided before it is squared: the square of a small distance could underflow.
+        # Divide before squaring: the square of a small distance could underflow.
         weights = (distances / sigma).square_().mul_(-0.5).exp_()
     else:
         weights = (distances == 0).to(distances.dtype)

@@ -1,4 +1,4 @@
-"""Parts of an array, several at a time: numpy and scipy let go of the interpreter's lock while they compute."""
+"""Work on parts of an array in threads; numpy and scipy release the interpreter's lock while they compute."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ Result = TypeVar("Result")
 
 
 def for_each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """What ``work`` makes of each part, in their order, on as many threads as there are :func:`cores`.
+    """Results of ``work`` for each part, in order, computed on as many threads as there are :func:`cores`.
 
-    No part may write where another one reads or writes.
+    A part must not write to memory that another part reads or writes.
     """
     threads = min(cores(), len(parts))
     if threads <= 1:
@@ -29,5 +29,5 @@ def slices(count: int, size: int) -> list[slice]:
 
 
 def cores() -> int:
-    """Cores that this process may use: ``taskset`` says which, not ``OMP_NUM_THREADS``, which is for torch."""
+    """Number of cores that this process may use; follows ``taskset``, not ``OMP_NUM_THREADS``."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

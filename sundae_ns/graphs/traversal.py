@@ -1,7 +1,6 @@
-"""Search in a tree of boxes, one thread a point: the source of the kernel, and the call that starts it.
+"""Neighbour search in a tree of boxes, one thread per point: the kernel's source, and the function that launches it.
 
-The source is plain C apart from the few words by which a thread finds its number, so that the tests run the very same
-lines on a CPU.
+The source is plain C except for the words by which a thread finds its number, so the tests run the same lines on a CPU.
 """
 
 from __future__ import annotations
@@ -16,20 +15,20 @@ KERNEL = "nearest"
 """Name of the kernel in :data:`SOURCE`."""
 
 MAX_NEIGHBORS = 128
-"""Most neighbours that the kernel takes; up to 32 or so its list of them stays in registers."""
+"""Most neighbours that the kernel supports; lists of up to about 32 stay in registers."""
 
 BLOCK = 128
-"""Threads of a block."""
+"""Threads per block."""
 
 OPTIONS = ("--fmad=false",)
-"""Compiler options. Fused multiply-adds round otherwise, and then distances would not be those of the CPU to the bit."""
+"""Compiler options. Fused multiply-adds round differently, and distances would differ from the CPU's in the last bit."""
 
 SOURCE = r"""
-// Whether neighbour (d, i) comes before (e, j): nearer, or as near and of lower index. Index -1 marks a free place.
+// Whether neighbour (d, i) comes before (e, j): nearer, or as near with a lower index.
 __device__ __forceinline__ bool before(double d, int i, double e, int j) { return d < e || (d == e && i < j); }
 
-// Squared distance to a box. Each step rounds monotonically and in the order in which the distance to a point is summed,
-// so it never exceeds the computed distance to a point inside: pruning by it loses nothing, not even a tie.
+// Squared distance to a box. Each step rounds monotonically, in the order in which the distance to a point is summed.
+// So it never exceeds the computed distance to a point inside, and skipping boxes by it loses no neighbour and no tie.
 __device__ __forceinline__ double box_distance(const REAL* boxes, int node, double x, double y, double z) {
     const REAL* box = boxes + 6 * (long long)node;
     const double below_x = box[0] - x, above_x = x - box[3];
@@ -43,7 +42,7 @@ __device__ __forceinline__ double box_distance(const REAL* boxes, int node, doub
 
 extern "C" __global__ void nearest(const REAL* __restrict__ points, const int* __restrict__ order,
                                    const REAL* __restrict__ boxes, const int* __restrict__ lowest, int n, int depth,
-                                   double limit, double missing, long long* __restrict__ indices,
+                                   double infinity, long long* __restrict__ indices,
                                    REAL* __restrict__ distances) {
     const int self = blockIdx.x * blockDim.x + threadIdx.x;
     if (self >= n) return;
@@ -54,12 +53,12 @@ extern "C" __global__ void nearest(const REAL* __restrict__ points, const int* _
     int which[K];
 #pragma unroll
     for (int s = 0; s < K; ++s) {
-        best[s] = limit;
+        best[s] = infinity;
         which[s] = -1;
     }
 
-    // Wait on the stack: the sibling of every node from the root to the own leaf, the nearest relatives on top. Starting
-    // in the own leaf fills the list with close points at once, and the rest of the tree is mostly pruned.
+    // The stack holds the sibling of every node from the root to the own leaf, the nearest relatives on top. The search starts
+    // in the own leaf, which fills the list with close points; most of the rest of the tree is skipped.
     const int leaves = 1 << depth;
     const int home = leaves + (int)(((self + 1LL) * leaves - 1) / n);
     int waiting[32];
@@ -113,7 +112,7 @@ extern "C" __global__ void nearest(const REAL* __restrict__ points, const int* _
                 }
             }
         }
-        // A node as far as the last neighbour still counts while it holds a lower index: ties go to the lower one.
+        // A node as far as the last neighbour is visited if it holds a lower index: ties go to the lower index.
         node = 0;
         while (top && !node) {
             --top;
@@ -125,34 +124,33 @@ extern "C" __global__ void nearest(const REAL* __restrict__ points, const int* _
     const long long row = (long long)own * K;
 #pragma unroll
     for (int s = 0; s < K; ++s) {
-        indices[row + s] = which[s] < 0 ? own : which[s];
-        distances[row + s] = (REAL)(which[s] < 0 ? missing : sqrt(best[s]));
+        indices[row + s] = which[s];
+        distances[row + s] = (REAL)sqrt(best[s]);
     }
 }
 """
 
 
 def definitions(dtype: torch.dtype, k: int) -> tuple[str, ...]:
-    """What the source leaves open, as compiler options: the type of coordinates and the number of neighbours."""
+    """Compiler options that set the type of the coordinates and the number of neighbours in the source."""
     return (f"-DREAL={'double' if dtype == torch.float64 else 'float'}", f"-DK={k}")
 
 
-def search_tree(tree: BoxTree, k: int, limit: float, launch: Launch) -> tuple[Tensor, Tensor]:
+def search_tree(tree: BoxTree, k: int, launch: Launch) -> tuple[Tensor, Tensor]:
     """The ``k`` nearest neighbours of every point of the tree, ordered by squared distance and then by index.
 
     Args:
         tree: the points.
-        k: number of neighbours, 1 to :data:`MAX_NEIGHBORS`.
-        limit: squared distances of neighbours are strictly below this, squared scene units; ``inf`` for no limit.
+        k: number of neighbours, 1 to :data:`MAX_NEIGHBORS` and less than N.
         launch: runs the kernel compiled with :func:`definitions` for the tree's dtype and ``k``.
 
     Returns:
-        Indices, int64 ``[N, k]``, and distances in scene units, dtype of the tree ``[N, k]``, in the order of the
-        indices that the points had; own index and ``inf`` where a neighbour is missing.
+        Indices, int64 ``[N, k]``, and ascending distances in scene units, dtype of the tree ``[N, k]``; rows are in the
+        original order of the points.
     """
     n = len(tree.points)
     indices = torch.empty(n, k, dtype=torch.int64, device=tree.points.device)
     distances = tree.points.new_empty(n, k)
     arguments: list[Tensor | int | float] = [tree.points, tree.order, tree.boxes, tree.lowest]
-    launch(n, [*arguments, n, tree.depth, limit, torch.inf, indices, distances])
+    launch(n, [*arguments, n, tree.depth, torch.inf, indices, distances])
     return indices, distances

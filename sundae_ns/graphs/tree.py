@@ -1,8 +1,8 @@
-"""A balanced tree of boxes over points, built with torch on the points' device: what the search on a GPU walks through.
+"""A balanced tree of boxes over points, built with torch on the points' device, for the search on a GPU.
 
-Points are split at the median of the widest axis of their box, level by level, until at most 16 are left. Medians do
-not care how points are spread: clusters of 1e-5 beside a background of 1e3, or a floater at 1e20, cost no resolution,
-as the cells of a uniform grid or the bits of a Morton code would.
+Points are split at the median of the widest axis of their box, level by level, until at most 16 are left. Medians adapt to
+any spread: clusters of 1e-5 beside a background of 1e3, or a floater at 1e20, cost no resolution. A uniform grid or a
+Morton code would lose it.
 """
 
 from __future__ import annotations
@@ -13,26 +13,25 @@ import torch
 from torch import Tensor
 
 LEAF = 8
-"""Fewest points of a leaf, where the tree has more than one; leaves hold fewer than twice as many."""
+"""Fewest points of a leaf if the tree has several; leaves hold fewer than twice as many."""
 
 
 @dataclass(frozen=True, eq=False)
 class BoxTree:
-    """A complete binary tree in the order of a heap: node 1 is the root, and nodes 2 i and 2 i + 1 are below node i.
+    """A complete binary tree in heap order: node 1 is the root, nodes 2 i and 2 i + 1 are the children of node i.
 
-    There are ``L = 2^depth`` leaves, nodes L to 2 L - 1. Leaf ``j`` holds the points at the places
-    ``floor(j N / L)`` to ``floor((j + 1) N / L) - 1`` of ``points``, so sizes differ by one at most and nothing about
-    them has to be stored.
+    There are ``L = 2^depth`` leaves, nodes L to 2 L - 1. Leaf ``j`` holds the rows ``floor(j N / L)`` to
+    ``floor((j + 1) N / L) - 1`` of ``points``. Sizes of leaves differ by at most one and need not be stored.
     """
 
     points: Tensor
     """Positions in the order of the leaves ``[N, 3]``."""
     order: Tensor
-    """Index that each of them had, int32 ``[N]``; rises among coincident points."""
+    """Original index of each point, int32 ``[N]``; ascending among coincident points."""
     boxes: Tensor
-    """Lowest and highest coordinates of each node's points ``[2 L, 6]``; row 0 is not used."""
+    """Lowest and highest coordinates of the points of each node ``[2 L, 6]``; row 0 is unused."""
     lowest: Tensor
-    """Lowest index among each node's points, int32 ``[2 L]``; row 0 is not used."""
+    """Lowest original index among the points of each node, int32 ``[2 L]``; row 0 is unused."""
     depth: int
     """Levels below the root."""
 
@@ -40,14 +39,14 @@ class BoxTree:
 def build_tree(points: Tensor) -> BoxTree:
     """Build the tree.
 
-    Each level sorts all points at once, by their segment and by their rank along the segment's widest axis. Equal
-    coordinates are ranked by index, so that the result is the same from run to run and on every device.
+    Each level sorts all points at once, by segment and by rank along the segment's widest axis. Equal coordinates are ranked
+    by index, so the result is the same in every run and on every device.
 
     Args:
         points: finite positions, float32 or float64, at least one ``[N, 3]``.
 
     Returns:
-        The tree, with the dtype and on the device of the points. Scratch memory is about 130 bytes a point in float32.
+        The tree, with the dtype and device of the points. Scratch memory is about 130 bytes per point in float32.
     """
     n = len(points)
     depth = max(0, (n // LEAF).bit_length() - 1)
@@ -68,7 +67,7 @@ def build_tree(points: Tensor) -> BoxTree:
 
 
 def _with_upper_levels(points: Tensor, order: Tensor, low: Tensor, high: Tensor, lowest: Tensor, depth: int) -> BoxTree:
-    """The tree of which the leaves' boxes ``[3, L]`` and lowest indices ``[L]`` are given."""
+    """The whole tree, from the boxes ``[3, L]`` and the lowest indices ``[L]`` of its leaves."""
     boxes = points.new_empty(2 ** (depth + 1), 6)
     all_lowest = order.new_empty(2 ** (depth + 1))
     boxes[0], all_lowest[0] = 0, 0
@@ -84,8 +83,8 @@ def _with_upper_levels(points: Tensor, order: Tensor, low: Tensor, high: Tensor,
 
 
 def _ranks(values: Tensor) -> Tensor:
-    """Place of each value in ascending order, lower index first among equals, int32 ``[N]``."""
-    # Adding 0 turns -0 into 0: the two are equal, but sorts may part them.
+    """Rank of each value in ascending order, lower index first among equals, int32 ``[N]``."""
+    # Adding 0 turns -0 into 0: the two are equal, but a sort may separate them.
     order = torch.sort(values + 0.0, stable=True).indices
     ranks = torch.empty(len(values), dtype=torch.int32, device=values.device)
     ranks[order] = torch.arange(len(values), dtype=torch.int32, device=values.device)
@@ -93,7 +92,7 @@ def _ranks(values: Tensor) -> Tensor:
 
 
 def _segments(rows: Tensor, level: int) -> Tensor:
-    """Cut ``[C, N]`` into the segments of a level, ``[C, 2^level, most]``; shorter ones repeat their last value."""
+    """Split ``[C, N]`` into the segments of a level, ``[C, 2^level, most]``; shorter ones repeat their last value."""
     n, count = rows.shape[1], 2**level
     starts = torch.arange(count + 1, device=rows.device) * n // count
     most = -(-n // count)

@@ -1,4 +1,4 @@
-"""The prune itself, for those who decide when one is due: the policies, and the search for a budget."""
+"""Pruning of a field in training: what schedules and the budget search call when a prune is due."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ def drop_nonfinite(
     state: MutableMapping[str, Any],
     strategy_state: MutableMapping[str, Any] | None = None,
 ) -> int:
-    """Remove the primitives with a NaN or infinite parameter, in place; arguments are those of :func:`cut`.
+    """Remove the primitives with a NaN or infinite parameter, in place; arguments as in :func:`cut`.
 
     Returns:
-        How many these were; 0 where no other is left, which leaves the field as it is.
+        Number of removed primitives. If no primitive is finite, it is 0 and the field is unchanged.
     """
     finite = finite_mask(params)
     dropped = int((~finite).sum())
@@ -48,29 +48,29 @@ def cut(
     contribution: Contribution | None = None,
     *,
     step: int,
-    count: Callable[[int], int | None],
+    count: Callable[[int], int],
     strategy_state: MutableMapping[str, Any] | None = None,
 ) -> Decision:
-    """Prune a field in training, in place: drop what is not finite, decide, remove the others, hand on what they had.
+    """Prune a field in training, in place: drop primitives that are not finite, decide, remove, and merge.
 
     Args:
         params: the field; its parameters are replaced.
-        optimizers: optimizers by parameter name; others are left alone.
-        state: running state of a policy; says afterwards that a prune happened.
-        config: the options of this prune.
-        contribution: gives the summed blending weights over the training views for ``params`` as they are when it is
-            called, which is after NaN and infinite primitives have gone ``[N]``; called only if it is needed.
-        step: of the schedule, which has just ended.
-        count: of so many finite primitives, how many stay; None for the keep ratio.
+        optimizers: optimizers by parameter name; those of other names are not changed.
+        state: running state of a schedule; the prune is recorded in it.
+        config: options of this prune.
+        contribution: returns the summed blending weights of ``params`` over the training views ``[N]``; called only if
+            needed, after primitives that are not finite have been removed.
+        step: step of the schedule that has just ended.
+        count: maps the number of finite primitives to the number to keep.
         strategy_state: state of a densification strategy on the same primitives; sliced with them.
 
     Returns:
-        What was decided; ``mask`` and ``magnitude`` are of the finite primitives.
+        The decision; its mask is over the finite primitives.
 
     Raises:
         ConfigError, DataError: see :func:`sundae_ns.pruning.decide`.
     """
-    # Before the decision: the contribution is a render of the field, and one NaN spoils all of its pixels.
+    # Before the decision: the contribution renders the field, and one NaN spreads over the image.
     dropped = drop_nonfinite(params, optimizers, state, strategy_state)
     decision = decide(params, config, contribution, count=count(len(params["means"])))
     _keep(params, optimizers, state, strategy_state, decision.mask)

@@ -1,4 +1,4 @@
-"""Where a picture has detail that a given number of primitives would lose."""
+"""Detail of an image that a given number of primitives cannot show."""
 
 from __future__ import annotations
 
@@ -9,35 +9,34 @@ from torch.nn.functional import avg_pool2d
 from sundae_ns.errors import DataError
 
 FLOOR = 0.25
-"""A flat pixel counts this share of the picture's root mean square: a wall needs primitives too, if few."""
+"""Weight of a flat pixel, as a share of the image's root mean square: flat areas need some primitives too."""
 
 
 @torch.no_grad()
-def pixel_detail(picture: Tensor, cells: float) -> Tensor:
-    """Local deviation of a picture from its mean over a cell, for a budget of so many cells.
+def pixel_detail(image: Tensor, cells: float) -> Tensor:
+    """Local deviation of an image from its mean over a cell, as weights of the pixels.
 
-    A primitive stands for a cell of the picture, about ``H W / cells`` pixels. What it cannot show is what lies above the
-    band of that cell, and the deviation within a window of the cell's size is the size of it. To spread n cells so that the
-    squared error is least, their density has to be in proportion to the gradient (by a variation of
-    ``int |grad f|^2 / density``), to which the deviation is proportional where the picture is smooth.
+    A primitive covers a cell of about ``H W / cells`` pixels, and the deviation within a window of that size is the detail
+    that it cannot show. The squared error of n cells is least if their density is proportional to the gradient (minimise
+    ``int |grad f|^2 / density``), and in a smooth image the deviation is proportional to the gradient.
 
     Args:
-        picture: colours in [0, 1], any device ``[H, W, C]``.
-        cells: budget, positive.
+        image: colours in [0, 1], any device ``[H, W, C]``.
+        cells: number of cells, positive.
 
     Returns:
-        Weights of the pixels, positive and with mean 1 ``[H, W]``; all 1 where the picture is flat.
+        Weights of the pixels, positive with mean 1 ``[H, W]``; all 1 for a flat image.
 
     Raises:
-        DataError: the picture has no such shape.
+        DataError: the image is empty or does not have three dimensions.
     """
-    if picture.ndim != 3 or 0 in picture.shape:
-        raise DataError(f"the picture has shape {list(picture.shape)}: pass [H, W, C]")
-    height, width = picture.shape[:2]
+    if image.ndim != 3 or 0 in image.shape:
+        raise DataError(f"the image has shape {list(image.shape)}: pass [H, W, C]")
+    height, width = image.shape[:2]
     side = round((height * width / max(cells, 1.0)) ** 0.5)
-    # An odd window of at least 3 pixels, which padding of half of it still finds a picture for.
+    # An odd window of at least 3 pixels; its half is the padding, and must not exceed the image.
     half = max(1, min(side, height, width) // 2)
-    planes = picture.detach().permute(2, 0, 1).nan_to_num()[None].double()
+    planes = image.detach().permute(2, 0, 1).nan_to_num()[None].double()
 
     def local_mean(values: Tensor) -> Tensor:
         return avg_pool2d(values, 2 * half + 1, stride=1, padding=half, count_include_pad=False)
@@ -45,6 +44,6 @@ def pixel_detail(picture: Tensor, cells: float) -> Tensor:
     variance = (local_mean(planes.square()) - local_mean(planes).square()).clamp_min(0).sum(dim=1)[0]
     mean = variance.mean()
     if not mean > 0:
-        return torch.ones_like(variance).to(picture.dtype)
+        return torch.ones_like(variance).to(image.dtype)
     weights = (variance + FLOOR**2 * mean).sqrt()
-    return (weights / weights.mean()).to(picture.dtype)
+    return (weights / weights.mean()).to(image.dtype)

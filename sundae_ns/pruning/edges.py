@@ -1,4 +1,4 @@
-"""The graph of a field: which primitives are neighbours, and how alike they are."""
+"""The neighbour graph of a field, with weights by distance, or by distance, overlap and colour."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from sundae_ns.graphs import NeighborGraph, build_graph
 from sundae_ns.pruning.config import PruningConfig
 
 LEAST_WIDTH = 0.25
-"""Width that flat primitives are given where their overlap is measured, as a share of the graph's sigma."""
+"""Width added to primitives when their overlap is measured, as a share of the graph's sigma: some are flat."""
 
 MOST_UNLIKE = 8.0
-"""Differences of colour count up to this many times the typical one: weights fall to e^-32 and stay positive, or one
-primitive of a wild colour would have no neighbour, and no heir, in the middle of others."""
+"""Largest difference of colours that counts, in typical differences. Weights fall to e^-32 and stay positive; otherwise a
+primitive of an extreme colour would have no neighbour and no heir."""
 
 
 @torch.no_grad()
 def field_graph(params: Mapping[str, Tensor], config: PruningConfig) -> NeighborGraph:
     """Neighbour graph of a field, with the configured weights.
 
-    ``centres`` is the paper's: weights fall with distance. ``appearance`` multiplies them by how far two primitives overlap
-    (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean square difference over
-    all edges: what lies on either side of an edge of the picture hardly counts as neighbours, as in a bilateral filter.
+    With ``centres``, as in the paper, weights fall with distance. ``appearance`` multiplies them by the overlap of the two
+    primitives (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean square
+    difference over all edges. As in a bilateral filter, primitives on two sides of an image edge are hardly neighbours.
 
-    A field of no more primitives than neighbours has the graph of all pairs within reach.
+    A field of at most ``num_neighbors`` primitives has the graph of all pairs within reach.
 
     Args:
-        params: the field, all finite, N primitives, colours as harmonics (:func:`sundae_ns.pruning.scores.for_graph`); the
-            graph is built where the tensors are.
-        config: neighbours, width, reach and kind of edges are taken from it.
+        params: the field, all finite, N primitives, colours as harmonics (:func:`sundae_ns.pruning.scores.for_graph`). The
+            graph is built on its device.
+        config: gives number of neighbours, bandwidth and kind of edges.
 
     Raises:
-        DataError: there is only one primitive, or positions are not finite.
+        DataError: only one primitive, or positions that are not finite.
     """
     means = params["means"].detach()
     graph = build_graph(

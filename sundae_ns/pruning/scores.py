@@ -1,4 +1,4 @@
-"""How important a primitive is: one non-negative number each."""
+"""Scores: the importance of each primitive as one non-negative number."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.filters import high_pass, local_coherence, response_magnitude
-from sundae_ns.gaussians.parameters import num_primitives, rgb_to_sh
-from sundae_ns.graphs import NeighborGraph, laplacian
+from sundae_ns.filters import high_pass, response_magnitude
+from sundae_ns.gaussians.field import as_field
+from sundae_ns.gaussians.parameters import num_primitives
+from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.edges import field_graph
-from sundae_ns.pruning.signals import attribute_signal, color_signal, position_signal
+from sundae_ns.pruning.signals import attribute_signal, position_signal
 
-SIGNALS = {"attributes": attribute_signal, "colors": color_signal, "positions": position_signal}
+SIGNALS = {"attributes": attribute_signal, "positions": position_signal}
 
 Contribution = Callable[[], Tensor]
-"""Gives the summed blending weight of each primitive over the training views ``[N]``; expensive, so called on need."""
+"""Returns the summed blending weights over the training views ``[N]``; expensive, so called only if needed."""
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """High-pass response of a field, and the graph it was taken on."""
+    """High-pass response of a field, and figures of its graph."""
 
     magnitude: Tensor
     """Squared norm of the response, pi of the paper, float64 ``[N]``; NaN for primitives without neighbours."""
@@ -33,13 +34,12 @@ class Response:
     sigma: float
     """Width of the graph's weights, scene units."""
     isolated: int
-    """How many primitives have no neighbour within the threshold."""
+    """Number of primitives without a neighbour within the threshold."""
 
 
 def for_graph(params: Mapping[str, Tensor], config: PruningConfig) -> Mapping[str, Tensor]:
-    """What graphs and signals of a field are made from: colours as harmonics, on the device that the configuration names."""
-    if config.logits:
-        params = {**params, "features_dc": rgb_to_sh(params["features_dc"].detach().sigmoid())}
+    """The parameters that graphs and signals use: colours as harmonics, on the configured device."""
+    params = as_field(params).as_harmonics()
     if config.graph_device == "field":
         return params
     return {name: params[name].detach().cpu() for name in ("means", "features_dc", "opacities", "scales", "quats")}
@@ -51,28 +51,18 @@ def response(params: Mapping[str, Tensor], config: PruningConfig, graph: Neighbo
 
     Args:
         params: the field, all finite, N primitives.
-        config: graph and signal are taken from it.
-        graph: the field's graph, where it is at hand.
+        config: options of graph and signal.
+        graph: graph of the field; built if not given.
 
     Raises:
-        DataError: there is only one primitive, or positions are not finite.
+        DataError: only one primitive, or positions that are not finite.
     """
     device = params["means"].device
     params = for_graph(params, config)
     graph = field_graph(params, config) if graph is None else graph
     signal = SIGNALS[config.signal](params)
-    magnitude = response_magnitude(high_pass(graph, signal, isolated="nan")).to(device)
+    magnitude = response_magnitude(high_pass(graph, signal)).to(device)
     return Response(magnitude, graph.tau, graph.sigma, int(graph.isolated.sum()))
-
-
-@torch.no_grad()
-def coherence(graph: NeighborGraph, count: int, config: PruningConfig, device: torch.device) -> Tensor:
-    """Local coherence of a graph in the band of ``count`` frequencies, float64 ``[N]``, computed on the device.
-
-    The Laplacian is the combinatorial one: where primitives crowd, edges are many and the frequencies high, and so a crowd
-    gets no more samples than it has band. See :func:`sundae_ns.filters.local_coherence`.
-    """
-    return local_coherence(laplacian(graph), count, seed=config.seed, device=device)
 
 
 @torch.no_grad()
@@ -81,28 +71,25 @@ def score(
     config: PruningConfig,
     found: Response | None,
     contribution: Contribution | None,
-    coherent: Tensor | None = None,
 ) -> Tensor:
-    """Score of the configured name, float64 ``[N]``.
+    """Configured score of each primitive, float64 ``[N]``.
 
-    The response enters as the norm ``|f_i| = sqrt(pi_i)``. Rankings are the same for both, and for sampling the norm is
-    the right one: probabilities in proportion to it give the sampled field the least expected error (Chen et al., "Fast
-    Resampling of Three-Dimensional Point Clouds via Graphs", 2018).
+    The response enters as the norm ``|f_i| = sqrt(pi_i)``. Its ranking is that of ``pi_i``, and sampling in proportion to the
+    norm gives the least expected error (Chen et al., "Fast Resampling of Three-Dimensional Point Clouds via Graphs", 2018).
 
-    A primitive without neighbours has no response. Under ``response`` its score is NaN, which every selection ranks
-    last. Under ``response-contribution`` it gets the median response: it is judged by its contribution alone, so that a
-    lone but large patch of sky survives and a faint floater does not.
+    A primitive without neighbours has no response. Its ``response`` score is NaN, which every selection ranks last. For
+    ``response-contribution`` it gets the median response, so that its contribution decides: a large patch of sky stays and a
+    faint floater does not.
 
     Args:
         params: the field, all finite, N primitives.
         config: names the score.
-        found: result of :func:`response` on the same field; needed by the scores with a response.
-        contribution: gives the blending weights; needed by the scores with a contribution, else not called.
-        coherent: result of :func:`coherence`; needed by the scores with a coherence.
+        found: result of :func:`response` on the same field; needed by scores with a response.
+        contribution: returns the blending weights; needed by scores with a contribution, otherwise not called.
 
     Raises:
-        ConfigError: the score needs a response or a contribution and there is none.
-        DataError: the contribution has not one value per primitive.
+        ConfigError: the score needs a response or a contribution that is not given.
+        DataError: the contribution does not have one value per primitive.
     """
     n = num_primitives(params)
     if config.score == "opacity":
@@ -113,22 +100,18 @@ def score(
         return _weights(contribution, n, config)
     if config.score == "response":
         return _norm(found)
-    if config.uses_coherence:
-        if coherent is None:
-            raise ConfigError("this score needs a coherence: compute it first with coherence(graph, count, ...)")
-        return coherent if config.score == "coherence" else _weights(contribution, n, config) * coherent
     return _weights(contribution, n, config) * _filled_with_median(_norm(found))
 
 
 def _norm(found: Response | None) -> Tensor:
     if found is None:
-        raise ConfigError("this score needs a graph response: compute it first with response(params, config)")
+        raise ConfigError("this score needs a graph response: pass the result of response(params, config)")
     return found.magnitude.double().sqrt()
 
 
 def _filled_with_median(norm: Tensor) -> Tensor:
     known = norm[~norm.isnan()]
-    # On a graph without any edge nothing is known of anyone, and the same value for all leaves the contribution.
+    # On a graph without edges no response is known: one value for all leaves the choice to the contribution.
     filling = known.median() if known.numel() else norm.new_tensor(1.0)
     return torch.where(norm.isnan(), filling, norm)
 

@@ -1,9 +1,9 @@
-"""Exact selection: turn scores into a mask that keeps precisely the asked number of primitives.
+"""Exact selection: turn scores into a mask that keeps exactly a given number of primitives.
 
-All functions take scores ``[N]`` of any floating dtype on any device and return a bool mask ``[N]`` on that device with
-exactly ``count`` True entries. Equal scores are taken by lower index first. NaN means "unknown" and is taken only when
-nothing else is left; ``+inf`` is the highest score. The work is done on the CPU in float64, so that the same scores
-give the same mask on each device.
+All functions take scores ``[N]`` of any floating dtype on any device, and return a bool mask ``[N]`` on that device with
+exactly ``count`` True entries. Among equal scores the lower index is selected first. NaN means "unknown" and is selected
+last; ``+inf`` is the highest score. All work is done on the CPU in float64, so the same scores give the same mask on every
+device.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from sundae_ns.errors import ConfigError, DataError
 
 
 def kept_count(keep_ratio: float, n: int) -> int:
-    """How many of ``n`` primitives a share keeps: ``round(keep_ratio * n)``, but at least 1."""
+    """Number of ``n`` primitives that one prune keeps: ``round(keep_ratio * n)``, at least 1."""
     return max(1, round(keep_ratio * n))
 
 
 def select_top(score: Tensor, count: int) -> Tensor:
-    """Keep the ``count`` highest scores; ``[N]`` to bool ``[N]``."""
+    """Select the ``count`` highest scores: ``[N]`` to bool ``[N]``."""
     values = _prepared(score, count)
     return _mask(_ranked(values)[:count], score)
 
 
 def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
-    """Keep ``round(gamma * count)`` of the highest magnitudes and fill up with the lowest.
+    """Select the ``round(gamma * count)`` highest magnitudes, and the lowest for the rest.
 
-    The paper's rule (paragraph "Controlling bandwidth with gamma"). The two ends never overlap. NaN
-    magnitudes, those of isolated primitives, belong to neither end.
+    The paper's rule (paragraph "Controlling bandwidth with gamma"). The two ends never overlap. NaN magnitudes, those of
+    isolated primitives, belong to neither end.
 
     Args:
         magnitude: response magnitudes ``[N]``.
@@ -54,9 +54,9 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
 def select_sampled(score: Tensor, count: int, seed: int) -> Tensor:
     """Draw ``count`` primitives without replacement, each draw with probability proportional to the scores left.
 
-    Gumbel top-k: adding independent Gumbel noise to the log scores and taking the highest is the same as drawing one by
-    one (Efraimidis and Spirakis, 2006). In logarithms the scale of the scores does not matter. Scores of zero or less
-    and NaN are drawn uniformly, and only after all positive ones.
+    Gumbel top-k: the highest sums of log scores and independent Gumbel noise are distributed like successive draws
+    (Efraimidis and Spirakis, 2006). The scale of the scores does not matter. Scores that are NaN or at most 0 are drawn
+    uniformly, after all positive ones.
 
     Args:
         score: scores ``[N]``; need not sum to 1.
@@ -79,7 +79,7 @@ def select_sampled(score: Tensor, count: int, seed: int) -> Tensor:
 
 
 def select_random(n: int, count: int, seed: int, device: torch.device | str = "cpu") -> Tensor:
-    """Draw ``count`` of ``n`` primitives uniformly: the control that every score has to beat; bool ``[n]``."""
+    """Draw ``count`` of ``n`` primitives uniformly, as a control for scores; bool ``[n]``."""
     return select_sampled(torch.ones(n, device=device), count, seed)
 
 
@@ -95,7 +95,7 @@ def _ranked(values: Tensor) -> Tensor:
     """Indices by falling value, lower index first among equals, NaN after everything else."""
     unknown = values.isnan()
     order = torch.sort(values.masked_fill(unknown, -torch.inf), descending=True, stable=True).indices
-    # -inf and NaN tie in the sort, so NaN is moved behind in a second stable pass.
+    # -inf and NaN tie in the sort, so a second stable pass moves NaN to the end.
     late = unknown[order]
     return torch.cat([order[~late], order[late]])
 

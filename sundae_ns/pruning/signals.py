@@ -1,4 +1,4 @@
-"""Graph signals of a Gaussian field: what the filters look at."""
+"""Graph signals of a Gaussian field, the input of the filters."""
 
 from __future__ import annotations
 
@@ -15,16 +15,11 @@ def position_signal(params: Mapping[str, Tensor]) -> Tensor:
     return params["means"].detach()
 
 
-def color_signal(params: Mapping[str, Tensor]) -> Tensor:
-    """View-independent colours ``[N, 3]``."""
-    return sh_to_rgb(params["features_dc"].detach())
-
-
 def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
-    """Position, colour, opacity and log size, each without unit and of like spread ``[N, 10]``.
+    """Position, colour, opacity and log size, each without a unit and of similar spread ``[N, 10]``.
 
-    Each group is divided by its own spread, so that none dominates the response by its unit. The channels of one group
-    share one spread: where a field is flat, the flat axis must not be blown up to the size of the others.
+    Each group is divided by its own spread, so that no group dominates the response. The channels of a group share one
+    spread: in a flat field, the flat axis must not be scaled up to the others.
     """
     groups = (
         params["means"],
@@ -38,8 +33,8 @@ def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
 def _standardise(values: Tensor) -> Tensor:
     """Centre ``[N, C]`` on its medians and divide by the median norm; a constant group becomes 0.
 
-    Medians, because a few floaters or saturated colours would set a mean or a variance on their own. Where more than
-    half of the rows are equal the median norm is 0, and the mean of the norms stands in for it.
+    A few floaters or saturated colours would dominate a mean or a variance, but not a median. If more than half of the rows
+    are equal, the median norm is 0 and the mean of the norms replaces it.
     """
     centred = values - values.median(dim=0).values
     norms = torch.linalg.vector_norm(centred, dim=1, dtype=torch.float64)

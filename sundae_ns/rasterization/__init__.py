@@ -1,13 +1,13 @@
 """Gaussian splatting of one view: one interface, three backends.
 
 :func:`rasterize`, :func:`spherical_harmonics` and :func:`blending_weights` are the whole interface; each takes a
-:class:`Backend` from :func:`select_backend`. ``gsplat`` runs the CUDA kernels of the package of that name;
-``reference`` is pure torch with the same thresholds, runs on any device in float32 or float64, and is differentiable;
-``cpu`` computes what the reference does in loops that numba compiles, several times as fast, on a CPU.
+:class:`Backend` from :func:`select_backend`. ``gsplat`` runs the CUDA kernels of the gsplat package. ``reference`` is
+differentiable pure torch with the same thresholds, on any device, in float32 or float64. ``cpu`` computes the same as
+the reference in loops compiled by numba, several times as fast.
 """
 
 from sundae_ns.rasterization.gsplat_backend import GsplatBackend
-from sundae_ns.rasterization.gsplat_tiles import Room
+from sundae_ns.rasterization.gsplat_tiles import Capacity
 from sundae_ns.rasterization.interface import blending_weights, rasterize, spherical_harmonics
 from sundae_ns.rasterization.select import BackendName, numba_problem, select_backend
 from sundae_ns.rasterization.types import Backend, Rasterization
@@ -15,9 +15,9 @@ from sundae_ns.rasterization.types import Backend, Rasterization
 __all__ = [
     "Backend",
     "BackendName",
+    "Capacity",
     "GsplatBackend",
     "Rasterization",
-    "Room",
     "blending_weights",
     "numba_problem",
     "rasterize",

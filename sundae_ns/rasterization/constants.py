@@ -1,4 +1,4 @@
-"""Small tensors that are made once."""
+"""Small constant tensors, created once."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ from torch import Tensor
 
 @cache
 def constant(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Some numbers as a tensor that nobody changes; a fresh one would be copied to the GPU, and waited for, at each use."""
-    with torch.inference_mode(False):  # one made in that mode could not take part in training later
+    """A cached, read-only tensor of numbers; a new one would be copied to the GPU, and waited for, at each use."""
+    with torch.inference_mode(False):  # autograd refuses tensors created in inference mode
         return torch.tensor(values, dtype=dtype, device=device)

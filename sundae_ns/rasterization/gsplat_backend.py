@@ -1,4 +1,4 @@
-"""The CUDA backend: gsplat 1.4 and 1.5 behind one interface. gsplat is imported only inside these functions."""
+"""The CUDA backend: gsplat 1.4 and 1.5 behind one interface. gsplat is imported only inside functions."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from torch import Tensor
 from sundae_ns.errors import BackendError
 from sundae_ns.rasterization.constants import constant
 from sundae_ns.rasterization.gsplat_harmonics import harmonics
-from sundae_ns.rasterization.gsplat_tiles import TILE, Room, tile_lists
-from sundae_ns.rasterization.reference import ReferenceBackend, largest_axis
+from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, tile_lists
+from sundae_ns.rasterization.reference import ReferenceBackend, largest_axis, strategy_info
 from sundae_ns.rasterization.types import Rasterization
 
 _CHANNELS_PER_PASS = 32
 
 
 class GsplatBackend:
-    """The kernels of gsplat; float32 tensors on a CUDA device.
+    """gsplat's kernels, for float32 tensors on a CUDA device.
 
     Args:
-        room: for pairs of a tile and a primitive, where views are to be recorded: the tiles get lists of our own, which are
-            shorter than gsplat's, and nothing has to be waited for; harmonics have no gradients. None: gsplat's kernels.
+        capacity: for tile/primitive pairs, to record frames: tiles get our own lists, shorter than gsplat's, nothing
+            waits for the GPU, and harmonics have no gradients. None for gsplat's own lists and harmonics.
     """
 
     name = "gsplat"
 
-    def __init__(self, room: Room | None = None) -> None:
-        self._room = room
+    def __init__(self, capacity: Capacity | None = None) -> None:
+        self._capacity = capacity
 
     def rasterize(
         self,
@@ -89,13 +89,13 @@ class GsplatBackend:
         )
         starts, primitives = self._lists(means2d, conics, seen_opacities, depths, radii, width, height)
         channels = torch.cat([colors, depths[0, :, None]], dim=1) if render_depth else colors
-        # Each pass overwrites absgrad with that of its own channels, so with absgrad there must be one pass only.
+        # Each pass overwrites absgrad with that of its own channels, so absgrad allows one pass only.
         passes = [channels] if absgrad else channels.split(_CHANNELS_PER_PASS, dim=1)
         blended = [
             rasterize_to_pixels(
                 means2d,
                 conics,
-                some[None],
+                part[None],
                 seen_opacities,
                 width,
                 height,
@@ -104,35 +104,30 @@ class GsplatBackend:
                 primitives,
                 absgrad=absgrad,
             )
-            for some in passes
+            for part in passes
         ]
         alpha = blended[0][1][0]
-        picture = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
+        image = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
         depth = None
         if render_depth:
-            picture, depth = picture[..., :-1], picture[..., -1:] / alpha.clamp(min=1e-10)
+            image, depth = image[..., :-1], image[..., -1:] / alpha.clamp(min=1e-10)
         return Rasterization(
-            colors=picture,
+            colors=image,
             depth=depth,
             alpha=alpha,
             radii=largest_axis(radii[0]),
-            info={
-                "means2d": means2d,
-                "radii": radii,
-                "width": width,
-                "height": height,
-                "n_cameras": 1,
-                "gaussian_ids": None,
-            },
+            info=strategy_info(means2d, radii, width, height),
         )
 
     def _lists(
         self, means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, radii: Tensor, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
-        """Where the list of each tile begins, and the primitives of all lists."""
-        if self._room is None:
+        """Start of each tile's list, and the primitives of all lists."""
+        if self._capacity is None:
             return square_lists(means2d, radii, depths, width, height)
-        lists = tile_lists(means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, room=self._room)
+        lists = tile_lists(
+            means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, capacity=self._capacity
+        )
         return lists.starts, lists.primitives
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
@@ -146,7 +141,7 @@ class GsplatBackend:
         _check_kernels_take(directions)
         if directions.shape[0] == 0:
             return ReferenceBackend().spherical_harmonics(degree, directions, coeffs)
-        if self._room is not None:
+        if self._capacity is not None:
             return harmonics(degree, directions, coeffs)
         return spherical_harmonics(degree, directions, coeffs)
 
@@ -165,11 +160,11 @@ def project(
     far_plane: float = 1e10,
     antialiased: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """How primitives lie in a picture, as gsplat's projection has it; arguments are those of ``rasterize``.
+    """Project primitives to the screen with gsplat; arguments are those of ``rasterize``.
 
     Returns:
-        Radii ``[1, N]`` (``[1, N, 2]`` from gsplat 1.5 on), centres ``[1, N, 2]``, depths ``[1, N]``, conics ``[1, N, 3]``, and
-        the opacities that are blended ``[1, N]``.
+        Radii ``[1, N]`` (``[1, N, 2]`` from gsplat 1.5 on), centres ``[1, N, 2]``, depths ``[1, N]``,
+        conics ``[1, N, 3]``, and the opacities to blend ``[1, N]``.
     """
     from gsplat import fully_fused_projection
 
@@ -191,18 +186,17 @@ def project(
 
 
 def square_lists(means2d: Tensor, radii: Tensor, depths: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """gsplat's own lists, of all tiles that a primitive's square touches.
+    """gsplat's own lists: every tile that a primitive's bounding square touches.
 
     Args:
-        means2d: centres in each of C pictures ``[C, N, 2]``, pixels.
-        radii: ``[C, N]``, or one for each axis ``[C, N, 2]``.
+        means2d: centres in each of C images ``[C, N, 2]``, pixels.
+        radii: ``[C, N]``, or one per axis ``[C, N, 2]``.
         depths: camera z ``[C, N]``.
-        width: of the pictures, pixels.
-        height: likewise.
+        width: image width in pixels.
+        height: image height in pixels.
 
     Returns:
-        Where the list of each tile begins ``[C, rows, columns]``, and the primitives of all lists, numbered through all
-        pictures.
+        Start of each tile's list ``[C, rows, columns]``, and the primitives of all lists, numbered across all images.
     """
     from gsplat import isect_offset_encode, isect_tiles
 
@@ -213,7 +207,7 @@ def square_lists(means2d: Tensor, radii: Tensor, depths: Tensor, width: int, hei
 
 @functools.cache
 def _projection_takes_opacities() -> bool:
-    """Whether this gsplat (from 1.5 on) fits radii to them."""
+    """Whether this gsplat (1.5 or newer) fits radii to opacities."""
     from gsplat import fully_fused_projection
 
     return "opacities" in inspect.signature(fully_fused_projection).parameters
@@ -227,6 +221,6 @@ def _check_kernels_take(tensor: Tensor) -> None:
 
 
 def _without_zeros(quats: Tensor) -> Tensor:
-    """Replace all-zero quaternions by the identity; the kernels would divide by their length."""
+    """Replace all-zero quaternions by the identity, because the kernels divide by the length."""
     is_zero = (quats == 0).all(dim=-1, keepdim=True)
     return torch.where(is_zero, constant((1.0, 0.0, 0.0, 0.0), quats.dtype, quats.device), quats)

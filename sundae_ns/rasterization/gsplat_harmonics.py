@@ -1,7 +1,7 @@
-"""Spherical harmonics without gradients, on the stream that torch works on.
+"""Spherical harmonics without gradients, on torch's current stream.
 
-gsplat 1.4 starts its kernel for them on CUDA's default stream. Work that is being recorded into a CUDA graph goes to another
-one, and the recording would lack the colours. Formulas are those of :mod:`sundae_ns.rasterization.harmonics`.
+gsplat 1.4 launches its own kernel on CUDA's default stream. A CUDA graph records another stream, so the recorded frame
+would lack the colours. The formulas are those of :mod:`sundae_ns.rasterization.harmonics`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 from sundae_ns.gpu.nvrtc import Kernel
 
 SOURCE = r"""
-// Each thread has one channel of one primitive.
+// One thread computes one channel of one primitive.
 extern "C" __global__ void harmonics(int n, int degree, const float* __restrict__ directions,
                                      const float* __restrict__ coeffs, int num_coeffs, float* __restrict__ out) {
     const long long thread = blockIdx.x * (long long)blockDim.x + threadIdx.x;
@@ -49,15 +49,15 @@ extern "C" __global__ void harmonics(int n, int degree, const float* __restrict_
 
 
 def harmonics(degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-    """Weighted sum ``[N, 3]`` of harmonics, without a graph of gradients.
+    """Weighted sum ``[N, 3]`` of harmonics, without gradients.
 
     Args:
         degree: 0 to 4.
-        directions: not zero, of any length; float32 on a CUDA device ``[N, 3]``.
-        coeffs: likewise ``[N, K, 3]``.
+        directions: of any length except zero; float32 on a CUDA device ``[N, 3]``.
+        coeffs: float32 on the same device ``[N, K, 3]``.
 
     Raises:
-        BackendError: the kernel cannot be compiled or loaded here.
+        BackendError: the kernel cannot be compiled or loaded.
     """
     out = torch.empty_like(directions, memory_format=torch.contiguous_format)
     kernel = _compiled(directions.device)

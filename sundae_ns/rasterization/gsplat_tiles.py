@@ -1,8 +1,8 @@
-"""Which primitives each 16-pixel tile blends under gsplat: only those that reach an alpha of 1/255 in one of its pixels.
+"""Lists of the primitives that each 16-pixel tile blends under gsplat: alpha is at least 1/255 in one of its pixels.
 
-gsplat 1.4 gives a primitive to every tile of its three-sigma square. A needle across the picture, or a faint blob, is in
-hundreds of tiles where no pixel would blend it, and each pixel of them looks at it all the same. The lists made here leave
-those pairs out. What is blended, in which order, stays the same to the bit.
+gsplat 1.4 lists a primitive in every tile of its three-sigma square. A thin or faint primitive is then in hundreds of
+tiles where no pixel blends it, and every pixel still evaluates it. The lists here leave those pairs out; which
+primitives are blended, and in which order, stays the same to the bit.
 
 :mod:`sundae_ns.rasterization.tiles` does the same for the reference.
 """
@@ -21,14 +21,14 @@ TILE = 16
 """Side of gsplat's tiles, pixels."""
 
 ROUNDING = 1e-5
-"""Slack on exponents, in proportion to the terms they are made of, so that rounding never drops what would be blended."""
+"""Slack on exponents, relative to the terms of their sum, so that rounding never drops a blended primitive."""
 
 SOURCE = r"""
 struct Footprint {
-    float x, y, a, b, c;           // centre, pixels; its exponent is a dx^2 + 2 b dx dy + c dy^2
+    float x, y, a, b, c;           // centre in pixels; the exponent is a dx^2 + 2 b dx dy + c dy^2
     float down, across;            // where it is least: dy = down dx in a column, dx = across dy in a row
-    float reach;                   // largest exponent that still counts
-    int first, last, top, bottom;  // tiles of its square; columns and rows, the last ones excluded
+    float reach;                   // largest exponent that is still blended
+    int first, last, top, bottom;  // tiles of the bounding square: columns and rows, ends excluded
 };
 
 __device__ __forceinline__ int clamped(float value, int most) {
@@ -41,14 +41,14 @@ __device__ __forceinline__ float within(float value, float low, float high) {
     return value < low ? low : value > high ? high : value;
 }
 
-// Whether no pixel of a tile can blend it. The least exponent over the box of the tile's pixel centres lies, off the box,
-// on an edge that faces the primitive's centre. NaN answers no, so that gsplat decides.
+// Whether no pixel of a tile blends the primitive. If the centre is outside the box of pixel centres, the least
+// exponent lies on an edge of the box that faces the centre. NaN returns false, which leaves the decision to gsplat.
 __device__ __forceinline__ bool misses(const Footprint& f, int column, int row, int width, int height) {
     const int wide = width - column * TILE, high = height - row * TILE;
     const float left = column * TILE + 0.5f - f.x, right = left + (wide < TILE ? wide : TILE) - 1;
     const float up = row * TILE + 0.5f - f.y, down = up + (high < TILE ? high : TILE) - 1;
     const float near_x = nearest(left, right), near_y = nearest(up, down);
-    float squares = 0, least = 0;  // of a needle large terms cancel: what rounding may have made of them is granted
+    float squares = 0, least = 0;  // in thin primitives large terms cancel: the slack grows with them
     if (near_x != 0) {
         const float dy = within(f.down * near_x, up, down);
         squares = f.a * near_x * near_x + f.c * dy * dy;
@@ -65,8 +65,8 @@ __device__ __forceinline__ bool misses(const Footprint& f, int column, int row, 
     return least > f.reach + ROUNDING * (1 + squares);
 }
 
-// The tiles of one row that it reaches are next to each other, since the exponent is convex. They are found from the one
-// where it is least, by halving what lies on either side.
+// The touched tiles of one row. They are adjacent, because the exponent is convex. Bisect on both sides of the tile
+// where it is least.
 __device__ __forceinline__ void span(const Footprint& f, int row, int width, int height, int* from, int* to) {
     const int high = height - row * TILE;
     const float up = row * TILE + 0.5f - f.y, near_y = nearest(up, up + (high < TILE ? high : TILE) - 1);
@@ -74,7 +74,7 @@ __device__ __forceinline__ void span(const Footprint& f, int row, int width, int
     if (seed < f.first) seed = f.first;
     *from = *to = seed;
     if (misses(f, seed, row, width, height)) {
-        // Between the pixel centres of two tiles is a gap of one pixel: where it is least in there, either may be nearer.
+        // The least exponent may lie in the one-pixel gap between two tiles, and either may be nearer.
         if (seed + 1 < f.last && !misses(f, seed + 1, row, width, height))
             ++seed;
         else if (seed > f.first && !misses(f, seed - 1, row, width, height))
@@ -125,9 +125,9 @@ __device__ __forceinline__ Footprint footprint(int i, const float* __restrict__ 
     const float* __restrict__ conics, const float* __restrict__ opacities, const int* __restrict__ radii, int axes, \
     int width, int height, int columns, int rows
 
-// The tiles of one thread, which has every so many-th row of one primitive, primitives being taken in order of depth.
-// Returns their number; where there is a list, they are written down from `at` on, as far as there is room.
-__device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* primitives, long long at, int room) {
+// The tiles of one thread, which takes every `lanes`-th row of one primitive; primitives are in order of depth.
+// Returns the number of tiles; with `tiles`, also writes them from `at` on, up to the capacity.
+__device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* primitives, long long at, int capacity) {
     const int i = (int)order[thread / lanes];
     const Footprint f = footprint(i, means, conics, opacities, radii, axes, columns, rows);
     if (f.first >= f.last) return 0;
@@ -138,7 +138,7 @@ __device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* primi
         if (!tiles)
             at += to - from;
         else
-            for (; from < to && at < room; ++from, ++at) {
+            for (; from < to && at < capacity; ++from, ++at) {
                 tiles[at] = (TileId)(row * columns + from);
                 primitives[at] = i;
             }
@@ -146,41 +146,42 @@ __device__ __forceinline__ int walk(FIELD, int thread, TileId* tiles, int* primi
     return (int)(at - start);
 }
 
-#define WALK(...) walk(n, lanes, order, means, conics, opacities, radii, axes, width, height, columns, rows, __VA_ARGS__)
+#define WALK(...) \
+    walk(n, lanes, order, means, conics, opacities, radii, axes, width, height, columns, rows, __VA_ARGS__)
 
 extern "C" __global__ void count_tiles(FIELD, int* __restrict__ counts) {
     const long long thread = blockIdx.x * (long long)blockDim.x + threadIdx.x;
     if (thread < (long long)n * lanes) counts[thread] = WALK((int)thread, 0, 0, 0, 0);
 }
 
-// `ends`: the counts, added up to each thread and with it.
-extern "C" __global__ void list_tiles(FIELD, const int* __restrict__ counts, const long long* __restrict__ ends, int room,
-                                      TileId* __restrict__ tiles, int* __restrict__ primitives) {
+// `ends` is the inclusive prefix sum of `counts`.
+extern "C" __global__ void list_tiles(FIELD, const int* __restrict__ counts, const long long* __restrict__ ends,
+                                      int capacity, TileId* __restrict__ tiles, int* __restrict__ primitives) {
     const long long thread = blockIdx.x * (long long)blockDim.x + threadIdx.x;
     if (thread < (long long)n * lanes)
-        WALK((int)thread, tiles, primitives, ends[thread] - counts[thread], room);
+        WALK((int)thread, tiles, primitives, ends[thread] - counts[thread], capacity);
 }
 """
 
 
 @dataclass
-class Room:
-    """How many pairs of a tile and a primitive there is room for, so that nobody has to wait to learn how many there are."""
+class Capacity:
+    """Number of tile/primitive pairs to allocate, so that nothing waits for the GPU to count them."""
 
     pairs: int | None = None
-    """Longest lists that are made; None: as long as needed."""
+    """Length of the lists; None for as many as needed."""
     needed: list[Tensor] = field(default_factory=list)
-    """How many pairs there were, int64 ``[]`` each, for every list since; where that is more than the room, it lacks some."""
+    """Number of pairs of each call so far, int64 ``[]`` each; lists that needed more than ``pairs`` are incomplete."""
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """Primitives of each tile, tiles row by row, front to back within each, as gsplat's ``rasterize_to_pixels`` reads them."""
+    """Lists of tiles in row-major order, each front to back, as gsplat's ``rasterize_to_pixels`` reads them."""
 
     starts: Tensor
-    """Where the list of each tile begins, int32 ``[1, rows, columns]``."""
+    """Start of each tile's list, int32 ``[1, rows, columns]``."""
     primitives: Tensor
-    """int32 ``[L]``"""
+    """Indices, int32 ``[L]``."""
 
 
 @torch.no_grad()
@@ -193,54 +194,55 @@ def tile_lists(
     width: int,
     height: int,
     *,
-    room: Room,
+    capacity: Capacity,
 ) -> TileLists:
-    """Lists for one view.
+    """Tile lists of one view.
 
     Args:
-        means2d: centres in pixels ``[N, 2]``; all float32 on a CUDA device, contiguous, as gsplat's projection returns them.
-        conics: inverse covariances in the picture, upper triangle ``[N, 3]``.
-        opacities: those that will be blended ``[N]``.
+        means2d: centres in pixels ``[N, 2]``; all float32 on a CUDA device, contiguous, as returned by gsplat's
+            projection.
+        conics: inverse covariances on the screen, upper triangle ``[N, 3]``.
+        opacities: opacities to blend ``[N]``.
         depths: camera z ``[N]``.
-        radii: int32 ``[N]``, or one for each axis ``[N, 2]``; 0 where a primitive is culled.
-        width: of the picture, pixels.
-        height: likewise.
-        room: for how many pairs; without a limit, the device is waited for once. Is told how many there were. With a limit,
-            a row of tiles below the picture takes what is left of it.
+        radii: int32 ``[N]``, or one per axis ``[N, 2]``; 0 where a primitive is culled.
+        width: image width in pixels.
+        height: image height in pixels.
+        capacity: number of pairs to allocate; the number needed is appended to it. Without a limit this waits once for
+            the device. With a limit, an extra row of tiles below the image takes the unused pairs.
 
     Raises:
-        BackendError: the kernels cannot be compiled or loaded here.
+        BackendError: the kernels cannot be compiled or loaded.
     """
     device = means2d.device
     columns, rows = -(-width // TILE), -(-height // TILE)
     dtype = torch.int16 if columns * (rows + 1) <= torch.iinfo(torch.int16).max else torch.int32
     count, fill = _compiled(device, dtype)
     n = len(means2d)
-    lanes = lanes_of(n)
+    lanes = lanes_per_primitive(n)
     order = depths.argsort(stable=True)
     axes = 1 if radii.ndim == 1 else 2
-    seen = (n, lanes, order, means2d, conics, opacities, radii, axes, width, height, columns, rows)
+    geometry = (n, lanes, order, means2d, conics, opacities, radii, axes, width, height, columns, rows)
     counts = torch.empty(n * lanes, dtype=torch.int32, device=device)
-    count(n * lanes, [*seen, counts])
+    count(n * lanes, [*geometry, counts])
     ends = counts.cumsum(0)
-    room.needed.append(ends[-1])
-    if room.pairs is None:
+    capacity.needed.append(ends[-1])
+    if capacity.pairs is None:
         pairs, below = int(ends[-1]), 0
         tiles = torch.empty(pairs, dtype=dtype, device=device)
         primitives = torch.empty(pairs, dtype=torch.int32, device=device)
     else:
-        pairs, below = room.pairs, 1
+        pairs, below = capacity.pairs, 1
         tiles = torch.full((pairs,), columns * rows, dtype=dtype, device=device)
         primitives = torch.zeros(pairs, dtype=torch.int32, device=device)
-    fill(n * lanes, [*seen, counts, ends, pairs, tiles, primitives])
-    tiles, by_tile = torch.sort(tiles, stable=True)  # stable, so that each list stays in order of depth
-    every = torch.arange(columns * (rows + below), dtype=dtype, device=device)
-    starts = torch.searchsorted(tiles, every, out_int32=True)
+    fill(n * lanes, [*geometry, counts, ends, pairs, tiles, primitives])
+    tiles, by_tile = torch.sort(tiles, stable=True)  # stable, so each list stays in order of depth
+    numbers = torch.arange(columns * (rows + below), dtype=dtype, device=device)
+    starts = torch.searchsorted(tiles, numbers, out_int32=True)
     return TileLists(starts.view(1, rows + below, columns), primitives.index_select(0, by_tile))
 
 
-def lanes_of(n: int) -> int:
-    """Threads of each primitive, which share its rows of tiles: few primitives may be as large as the picture."""
+def lanes_per_primitive(n: int) -> int:
+    """Threads that share the rows of tiles of a primitive: few primitives may each be as large as the image."""
     return 32 if n < 2**17 else 8
 
 
@@ -251,6 +253,6 @@ def _compiled(device: torch.device, dtype: torch.dtype) -> tuple[Kernel, Kernel]
 
 
 def definitions(dtype: torch.dtype) -> tuple[str, ...]:
-    """Compiler options of :data:`SOURCE`, for tiles numbered in a dtype, int16 or int32."""
+    """Compiler options of :data:`SOURCE` for tile numbers of a dtype, int16 or int32."""
     number = "short" if dtype == torch.int16 else "int"
     return (f"-DTILE={TILE}", f"-DROUNDING={ROUNDING}f", f"-DTileId={number}")

@@ -1,7 +1,7 @@
 """Real spherical harmonics as polynomials of the unit direction.
 
-Constants follow from normalising each polynomial over the sphere (P.-P. Sloan, "Efficient Spherical Harmonic
-Evaluation", JCGT 2013). The signs are those of 3DGS: odd orders m carry the Condon-Shortley phase.
+The constants normalise each polynomial over the sphere (P.-P. Sloan, "Efficient Spherical Harmonic Evaluation", JCGT
+2013). The signs are those of 3DGS: odd orders m carry the Condon-Shortley phase.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from torch.nn.functional import normalize
 
 
 def harmonic_basis(degree: int, directions: Tensor) -> Tensor:
-    """Values ``[N, (degree + 1) ** 2]`` of the harmonics in the unit directions ``[N, 3]``; degree 0 to 4.
+    """Values ``[N, (degree + 1) ** 2]`` of the harmonics for unit directions ``[N, 3]``; degree 0 to 4.
 
-    Within a band the order m runs from -l to l.
+    Within a degree l the order m runs from -l to l.
     """
     x, y, z = directions.unbind(-1)
     values = [torch.full_like(x, 0.5 / sqrt(pi))]

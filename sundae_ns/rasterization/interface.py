@@ -1,4 +1,4 @@
-"""The interface of the room: arguments are checked here, the backend does the work."""
+"""The public functions: they check the arguments, a backend computes."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def rasterize(
 ) -> Rasterization:
     """Splat N Gaussian primitives into one pinhole view (EWA splatting, front-to-back blending; Kerbl et al. 2023).
 
-    Differentiable with respect to the primitives; not to ``K``, and to ``viewmat`` not under gsplat.
+    Differentiable with respect to the primitives, and to ``viewmat`` except under gsplat; not to ``K``.
 
     Args:
         means: Centres in world units. ``[N, 3]``
-        quats: Rotations as wxyz quaternions of any length; all-zero ones count as the identity. ``[N, 4]``
+        quats: Rotations as wxyz quaternions of any length; all-zero ones are the identity. ``[N, 4]``
         scales: Standard deviations in world units, post-activation. ``[N, 3]``
         opacities: Opacities in [0, 1], post-activation. ``[N]``
-        colors: Any per-primitive vector to blend: colours, features. ``[N, C]`` with C >= 1
+        colors: Per-primitive vectors to blend, such as colours and features. ``[N, C]`` with C >= 1
         viewmat: World-to-camera transform, OpenCV axes (x right, y down, z forward). ``[4, 4]``
         K: Intrinsics in pixels. ``[3, 3]``
         width: Image width in pixels.
@@ -47,7 +47,7 @@ def rasterize(
         near_plane: Primitives with a smaller camera z are culled. World units.
         far_plane: Primitives with a larger camera z are culled. World units.
         antialiased: Scale opacities by the ratio of screen areas without and with blur (Mip-Splatting).
-        absgrad: Have the backward pass set ``info["means2d"].absgrad`` (AbsGS): per-pixel gradients, absolute, summed.
+        absgrad: Let the backward pass set ``info["means2d"].absgrad`` (AbsGS): absolute per-pixel gradients, summed.
         render_depth: Also blend camera z.
         backend: From :func:`sundae_ns.rasterization.select_backend`.
 
@@ -87,17 +87,17 @@ def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, back
     """Evaluate real spherical harmonics up to ``degree``: the raw sum, without the 0.5 that colours add.
 
     Args:
-        degree: 0 to 4; only the first ``(degree + 1) ** 2`` coefficients are read.
-        directions: From the camera to the primitive, any length; zero vectors count as +z, without gradient.
+        degree: SH degree, 0 to 4; only the first ``(degree + 1) ** 2`` coefficients are read.
+        directions: From the camera to the primitive, of any length; zero vectors are taken as +z, without gradient.
             ``[N, 3]``
-        coeffs: Coefficients, bands in the order and with the signs of 3DGS. ``[N, K, 3]``
+        coeffs: Coefficients in the order and with the signs of 3DGS. ``[N, K, 3]``
         backend: From :func:`sundae_ns.rasterization.select_backend`.
 
     Returns:
         ``[N, 3]``
 
     Raises:
-        DataError: The degree is out of range or a shape does not fit.
+        DataError: The degree is out of range or a shape is wrong.
     """
     if not 0 <= degree <= MAX_SH_DEGREE:
         raise DataError(f"spherical harmonics of degree {degree} are unknown; use 0 to {MAX_SH_DEGREE}")
@@ -107,7 +107,7 @@ def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, back
     if coeffs.dim() != 3 or coeffs.shape[0] != n or coeffs.shape[1] < needed or coeffs.shape[2] != 3:
         raise DataError(f"coeffs has shape {list(coeffs.shape)}; degree {degree} needs [{n}, {needed} or more, 3]")
     _check_alike("directions", directions, coeffs=coeffs)
-    # Replaced before any backend normalises: the CUDA kernel would return NaN for a camera inside a primitive's centre.
+    # Replace them here: gsplat's kernel returns NaN where the camera is at a primitive's centre.
     is_zero = (directions == 0).all(dim=-1, keepdim=True)
     ahead = constant((0.0, 0.0, 1.0), directions.dtype, directions.device)
     directions = torch.where(is_zero, ahead, directions)
@@ -133,16 +133,16 @@ def blending_weights(
     """Contribution of each primitive to one view: its alpha times transmittance, summed over the pixels.
 
     Blending is linear in the colours, so this is exactly the gradient of the summed image with respect to a one-channel
-    colour; no backend needs code for it. Arguments are those of :func:`rasterize`, and:
+    colour, and no backend needs code for it. Arguments are those of :func:`rasterize`, and:
 
     Args:
-        pixels: What each pixel counts; 1 where it is not given. ``[H, W]``
+        pixels: Weight of each pixel; None for 1. ``[H, W]``
 
     Returns:
         ``[N]``, in pixels, detached; 0 for primitives that are invisible.
 
     Raises:
-        DataError: As there, or ``pixels`` has another size than the image.
+        DataError: As :func:`rasterize`, or ``pixels`` has another size than the image.
     """
     if pixels is not None:
         _check_shape("pixels", pixels, (height, width))

@@ -1,8 +1,8 @@
 """EWA projection of 3D Gaussians to the screen, in plain autograd torch.
 
-Zwicker et al., "EWA Splatting", 2002, with the conventions of 3DGS: the Jacobian of the perspective map is taken at
-the centre, its slope is held within the image plus 0.15 of its size on each side, and every footprint is blurred by
-0.3 square pixels.
+Zwicker et al., "EWA Splatting", 2002, with the conventions of 3DGS: the perspective map is linearised at the centre,
+with its slope clamped to the image plus 0.15 of its size on each side, and every footprint is blurred by 0.3 square
+pixels.
 """
 
 from __future__ import annotations
@@ -11,18 +11,19 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
+
+from sundae_ns.gaussians.rotations import rotation_matrices
 
 BLUR = 0.3
 """Variance in square pixels added to each footprint."""
 
 FOV_MARGIN = 0.3
-MAX_RADIUS = 1e9  # keeps footprints of any size inside int32
+MAX_RADIUS = 1e9  # keeps radii within int32
 
 
 @dataclass(frozen=True)
 class Projection:
-    """N primitives on the screen, in pixels; entries of culled primitives (radius 0) are finite and mean nothing."""
+    """N primitives on the screen, in pixels; entries of culled primitives (radius 0) are finite and meaningless."""
 
     means2d: Tensor  # [N, 2]
     covars2d: Tensor  # [N, 3]: xx, xy, yy after the blur
@@ -33,19 +34,8 @@ class Projection:
 
 
 def camera_center(viewmat: Tensor) -> Tensor:
-    """Where a camera stands ``[3]``, from its world-to-camera transform ``[4, 4]``."""
+    """Position of a camera ``[3]``, from its world-to-camera transform ``[4, 4]``."""
     return -viewmat[:3, :3].T @ viewmat[:3, 3]
-
-
-def rotation_matrices(quats: Tensor) -> Tensor:
-    """Rotations ``[N, 3, 3]`` of wxyz quaternions ``[N, 4]`` of any length; all-zero ones give the identity."""
-    w, x, y, z = normalize(quats, dim=-1).unbind(-1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([entry for row in rows for entry in row], dim=-1).reshape(-1, 3, 3)
 
 
 def project(
@@ -64,14 +54,15 @@ def project(
     camera = means @ rotation.T + translation
     z = camera[:, 2]
     in_range = (z >= near_plane) & (z <= far_plane) & (z > 0)
-    # A harmless stand-in for culled centres: where() alone would still send NaN from 1 / z into the gradients.
+    # Replace culled centres first: where() alone would still pass NaN from 1 / z to the gradients.
     camera = torch.where(in_range[:, None], camera, camera.new_tensor([0.0, 0.0, 1.0]))
     x, y, z = camera.unbind(-1)
 
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
 
-    # A splat is the image of the unit sphere under a 3x3 root of its covariance; its screen rows are a 2x3 root.
+    # A 3x3 root of the covariance maps the unit sphere to the primitive; the root's two screen rows map it to the
+    # footprint.
     root = (rotation @ rotation_matrices(quats)) * scales[:, None, :]
     slope_x = _limit_slope(x / z, fx, cx, width)
     slope_y = _limit_slope(y / z, fy, cy, height)
@@ -79,7 +70,7 @@ def project(
     row_y = (fy / z)[:, None] * (root[:, 1] - slope_y[:, None] * root[:, 2])
     xx, xy, yy = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
 
-    # Lagrange's identity: a sum of squares, where xx * yy - xy * xy would cancel for thin splats.
+    # Lagrange's identity: a sum of squares, where xx * yy - xy * xy would cancel for thin primitives.
     sharp_det = torch.linalg.cross(row_x, row_y).square().sum(-1)
     det = sharp_det + BLUR * (xx + yy) + BLUR * BLUR
     xx, yy = xx + BLUR, yy + BLUR
@@ -100,7 +91,7 @@ def _limit_slope(slope: Tensor, focal: Tensor, centre: Tensor, size: int) -> Ten
 
 
 def _screen_radii(means2d: Tensor, covars2d: Tensor, width: int, height: int) -> Tensor:
-    """Three standard deviations of the longer axis, rounded up; 0 where that square misses the image."""
+    """Three standard deviations of the longer axis, rounded up; 0 where that square does not touch the image."""
     xx, xy, yy = covars2d.unbind(-1)
     spread = (0.25 * (xx - yy).square() + xy * xy).clamp(min=0.01).sqrt()
     radii = torch.ceil(3.0 * (0.5 * (xx + yy) + spread).sqrt()).clamp(max=MAX_RADIUS)

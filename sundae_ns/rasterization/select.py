@@ -1,5 +1,4 @@
-"""Which backend runs where. Nothing of gsplat is imported, and no kernel built, before a CUDA device is asked for; nor numba
-before a CPU is."""
+"""The choice of a backend. Only a CUDA device imports gsplat and builds its kernels; only a CPU imports numba."""
 
 from __future__ import annotations
 
@@ -19,11 +18,11 @@ BackendName = Literal["auto", "gsplat", "cpu", "reference"]
 def select_backend(name: BackendName, device: torch.device | str) -> Backend:
     """Choose the rasteriser for tensors on ``device``.
 
-    ``auto`` takes gsplat on a CUDA device where its kernels run, and cpu on a CPU where numba imports, else the reference.
-    Each check is made once per process; where gsplat has no prebuilt kernels, it builds them during that check.
+    ``auto`` chooses gsplat on a CUDA device where its kernels run, cpu on a CPU where numba works, and else the
+    reference. Each check runs once per process; it builds gsplat's kernels if none are prebuilt.
 
     Raises:
-        BackendError: ``gsplat`` or ``cpu`` was asked for and cannot run on ``device``.
+        BackendError: ``gsplat`` or ``cpu`` was requested and cannot run on ``device``.
         ConfigError: The name is unknown.
     """
     device = torch.device(device)
@@ -52,9 +51,9 @@ def _cpu_problem_on(device: torch.device) -> str | None:
 
 @lru_cache(maxsize=1)
 def numba_problem() -> str | None:
-    """Render one pixel with compiled loops; the cause and mend if that fails, else None.
+    """Render one pixel with the compiled loops; the cause and remedy if that fails, else None.
 
-    It takes half a second, or some seconds where the loops were never compiled before.
+    This takes half a second, or some seconds if the loops were never compiled before.
     """
     try:
         ones = torch.ones(1, 4)
@@ -76,9 +75,7 @@ def numba_problem() -> str | None:
         )
     except ImportError as error:
         return f"numba does not import ({_first_line(error)}); pip install numba"
-    except (
-        Exception
-    ) as error:  # numba refuses versions of Python and numpy, processors and settings with errors of many kinds
+    except Exception as error:  # versions, processors and settings that numba refuses raise errors of many kinds
         mend = "pip install --force-reinstall numba, and unset NUMBA_DISABLE_JIT"
         return f"numba does not compile ({_first_line(error)}); {mend}"
     return None
@@ -100,14 +97,14 @@ def _gsplat_problem_on(device: torch.device) -> str | None:
 
 @lru_cache(maxsize=1)
 def _kernel_problem() -> str | None:
-    """Run gsplat's smallest kernel; the cause and mend if it fails, else None."""
+    """Run gsplat's smallest kernel; the cause and remedy if it fails, else None."""
     try:
         GsplatBackend().spherical_harmonics(
             0, torch.ones(1, 3, device="cuda"), torch.ones(1, 1, 3, device="cuda")
         ).sum().item()
     except ImportError as error:
         return f"gsplat does not import ({_first_line(error)}); install gsplat"
-    except Exception as error:  # a failed build or a missing kernel image raises whatever the tool chain raises
+    except Exception as error:  # a failed build or a missing kernel image raises errors of many kinds
         return f"its kernels do not run ({_first_line(error)}); install a gsplat wheel for this torch, or nvcc"
     return None
 

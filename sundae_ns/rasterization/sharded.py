@@ -1,8 +1,8 @@
-"""Primitives sharded over ranks, a camera on each: which primitives a camera may see, and how they get there and back.
+"""Primitives sharded over ranks, one camera per rank: which primitives a camera may see, and their exchange.
 
-Rank r holds N_r primitives and draws one picture. Rows of primitives travel to the ranks whose cameras may see them, before
-projection, so that every backend draws them as it draws any others. Collectives are those of ``torch.distributed``, on the
-default process group; each function that says "collective" is to be called by all ranks, in the same order.
+Rank r holds N_r primitives and renders one image. Before projection, rows of primitives are sent to the ranks whose
+cameras may see them, so any backend can render them. Collectives use the default process group of
+``torch.distributed``; all ranks must call each function marked "Collective", in the same order.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN, camera_center
 
 
 class Cameras(NamedTuple):
-    """What ranks know of each other's cameras: where they stand, and what they cannot see."""
+    """The cameras of all ranks, as far as other ranks need them."""
 
     centers: Tensor
-    """Where they stand ``[R, 3]``."""
+    """Positions ``[R, 3]``."""
     bounds: Tensor
-    """From :func:`frustum_bounds` ``[R, 5, 6]``."""
+    """Bounds from :func:`frustum_bounds` ``[R, 5, 6]``."""
 
 
 class Slack(NamedTuple):
-    """How far primitives may move before they are drawn."""
+    """Bounds on how far primitives move before they are rendered."""
 
     means: float
-    """Most that a coordinate of a centre changes by."""
+    """Largest change of a coordinate of a centre."""
     scales: float
-    """Most that the logarithm of a standard deviation changes by."""
+    """Largest change of the logarithm of a standard deviation."""
 
 
 UNMOVED = Slack(0.0, 0.0)
@@ -42,25 +42,25 @@ UNMOVED = Slack(0.0, 0.0)
 
 @torch.no_grad()
 def frustum_bounds(viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float) -> Tensor:
-    """Five linear forms of ``(x, y, z, 1, s)``, s the largest scale; no primitive with one above 0 is drawn ``[5, 6]``.
+    """Five linear forms of ``(x, y, z, 1, s)``, s the largest scale; a primitive with one above 0 is culled ``[5, 6]``.
 
-    A backend draws nothing whose distance from the picture is more than its radius, at most three standard deviations of
-    the footprint, whose variance is at most its trace. A row of the perspective map's Jacobian has length
-    ``f / z * sqrt(1 + k^2)`` for a slope k, which is held to what the picture shows and a margin beside it, so the trace is at
-    most ``(s / z)^2 C^2`` with one C for a camera, plus the blur. Multiplied by z, this is linear. The fifth is the near plane.
-    The sixth column is what a form changes by at most where each of x, y, z changes by up to 1.
+    A backend culls a primitive whose distance from the image exceeds its radius, at most three standard deviations of
+    the footprint, whose variance is at most its trace. A row of the perspective map's Jacobian has the length
+    ``f / z * sqrt(1 + k^2)`` for a slope k, which is clamped to the image and a margin, so the trace is at most
+    ``(s / z)^2 C^2`` with one C per camera, plus the blur. Multiplied by z, this is linear. The fifth form is the near
+    plane. The sixth column is the largest change of a form if x, y and z each change by up to 1.
 
     Args:
         viewmat: world-to-camera transform ``[4, 4]``.
         K: intrinsics in pixels ``[3, 3]``.
-        width, height: size of the picture in pixels.
-        near_plane: as the rasteriser gets it.
+        width, height: size of the image in pixels.
+        near_plane: near plane of the rasteriser, world units.
     """
     size = K.new_tensor([width, height])
     off_axis = K[:2, 2] - size / 2
-    held = off_axis.abs() + (0.5 + 0.5 * FOV_MARGIN) * size
-    reach = 3.003 * (K[:2, :2].square().sum() + held.square().sum()).sqrt()  # a bit more, for rounding
-    # From the middle of the picture: half of its size, the blur, the rounding up of the radius, and a pixel for rounding.
+    limit = off_axis.abs() + (0.5 + 0.5 * FOV_MARGIN) * size
+    reach = 3.003 * (K[:2, :2].square().sum() + limit.square().sum()).sqrt()  # slightly more than 3, for rounding
+    # From the image centre: half the size, the blur, the rounding up of the radius, and a pixel for rounding errors.
     rows = torch.cat([K[:2], -K[:2]])
     rows[:, 2] = torch.cat([off_axis, -off_axis]) - (size / 2 + 3 * (2 * BLUR) ** 0.5 + 2).repeat(2)
     sides = torch.cat([rows @ viewmat[:3], -reach.expand(4, 1)], dim=1)
@@ -72,7 +72,7 @@ def frustum_bounds(viewmat: Tensor, K: Tensor, width: int, height: int, near_pla
 
 @torch.no_grad()
 def camera_row(viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float) -> Tensor:
-    """One camera of :class:`Cameras` as numbers that can be sent and kept ``[33]``; see :func:`frustum_bounds`."""
+    """One camera of :class:`Cameras` as a row of numbers ``[33]``; see :func:`frustum_bounds`."""
     return torch.cat([camera_center(viewmat), frustum_bounds(viewmat, K, width, height, near_plane).flatten()])
 
 
@@ -83,100 +83,100 @@ def cameras_of(rows: Tensor) -> Cameras:
 
 @torch.no_grad()
 def gather_cameras(viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float) -> Cameras:
-    """The cameras of all ranks by rank, detached. Collective. Arguments are this rank's; see :func:`frustum_bounds`."""
+    """The cameras of all ranks in rank order, detached. Collective. Arguments are those of :func:`frustum_bounds`."""
     own = camera_row(viewmat, K, width, height, near_plane)
-    every = own.new_empty(dist.get_world_size() * len(own))
-    dist.all_gather_into_tensor(every, own)
-    return cameras_of(every.view(-1, len(own)))
+    rows = own.new_empty(dist.get_world_size() * len(own))
+    dist.all_gather_into_tensor(rows, own)
+    return cameras_of(rows.view(-1, len(own)))
 
 
 @torch.no_grad()
 def may_be_seen(means: Tensor, scales: Tensor, bounds: Tensor, slack: Slack = UNMOVED) -> Tensor:
-    """True for every primitive that a backend gives a radius above 0, and for some others; bool ``[R, N]``.
+    """Conservative visibility: True for all primitives that a backend renders, and some others; bool ``[R, N]``.
 
     Args:
         means: centres ``[N, 3]``.
         scales: logarithms of the standard deviations ``[N, 3]``.
-        bounds: of R cameras, from :func:`frustum_bounds` ``[R, 5, 6]``.
-        slack: how far both may still move; whatever they do within it, what is then drawn has been found.
+        bounds: bounds of R cameras, from :func:`frustum_bounds` ``[R, 5, 6]``.
+        slack: how far centres and scales may still move; the result holds for any move within it.
     """
     forms = bounds.flatten(0, 1)
-    # Lowered by what the slack can lower them by: x, y, z take part with their sizes, s with a weight that is never above 0.
+    # Lower the forms by what the slack allows: x, y, z by their sizes, s by a weight that is never above 0.
     offsets = torch.sub(forms[:, 3:4], forms[:, 5:6], alpha=slack.means)
     largest = scales.amax(dim=1).exp_()
     above = torch.addmm(offsets, forms[:, :3], means.T).addr_(forms[:, 4], largest, alpha=math.exp(slack.scales))
     above = above.view(len(bounds), 5, len(means))
-    # Asked so that what is not a number may be seen, where backends disagree, but not in depth, where none draws it.
+    # NaN compares as visible in the side planes, where backends disagree, but not in depth, where none renders it.
     return (above[:, 4] <= 0) > (above[:, :4] > 0).any(dim=1)
 
 
 @dataclass
 class Route:
-    """Who sent what where in one exchange."""
+    """Destinations and sizes of one exchange."""
 
     ids: Tensor
-    """Rows of this rank's shard in the order in which they were sent: camera by camera ``[S]``."""
+    """Rows of this rank's shard in the order in which they were sent, camera by camera ``[S]``."""
     cameras: Tensor
-    """Which camera each of them went to ``[S]``."""
+    """Destination camera of each row ``[S]``."""
     sent: list[int]
-    """How many went to each rank; the sum is S."""
+    """Number of rows sent to each rank; the sum is S."""
     received: list[int]
-    """How many came from each rank; the sum is M."""
+    """Number of rows received from each rank; the sum is M."""
     ask: Callable[[], Tensor] | None = None
-    """Called in the backward pass: what was found about the rows that came ``[M, E]``, to travel with their gradients."""
+    """Called in the backward pass: values of the received rows ``[M, E]``, to be sent back with their gradients."""
     told: Tensor | None = None
-    """What the others' ``ask`` said about the rows that went, not divided by anything ``[S, E]``."""
+    """The values that other ranks returned from ``ask`` for the rows sent, undivided ``[S, E]``."""
 
 
 @dataclass
 class Plan:
-    """An exchange whose sizes are on their way to the host, which goes on in the meantime."""
+    """An exchange whose sizes are being copied to the host asynchronously."""
 
     seen: Tensor
-    """Whether a row of this shard goes to a rank, bool ``[R, N]``."""
+    """Whether each row of this shard goes to each rank, bool ``[R, N]``."""
     counts: Tensor
-    """Rows that go to each rank and that come from each, in host memory once they are ``ready`` ``[2, R]``."""
+    """Number of rows sent to and received from each rank, valid in host memory once ``ready`` has passed ``[2, R]``."""
     ready: torch.cuda.Event | None
-    """None where there is nothing to wait for."""
+    """None if the counts are already valid."""
 
     def route(self) -> Route:
-        """The route; this waits for the counts, and for nothing that the GPU was given after them."""
+        """The route; waits for the counts, but for no later work of the GPU."""
         if self.ready is not None:
             self.ready.synchronize()
         sent, received = self.counts.tolist()
-        # Their number is known, so that looking for them does not wait for the GPU.
-        found = torch.nonzero_static(self.seen, size=sum(sent))
-        return Route(found[:, 1], found[:, 0], sent, received)
+        # The number of rows is known, so the search does not wait for the GPU.
+        rows = torch.nonzero_static(self.seen, size=sum(sent))
+        return Route(rows[:, 1], rows[:, 0], sent, received)
 
 
 @torch.no_grad()
 def plan_exchange(seen: Tensor) -> Plan:
-    """Count the rows that go to each rank, and hear how many come, without waiting for either. Collective.
+    """Count the rows to send and receive, without waiting for the result. Collective.
 
     Args:
-        seen: whether a row of this shard goes to a rank, bool ``[R, N]``.
+        seen: whether each row of this shard goes to each rank, bool ``[R, N]``.
     """
     both = torch.empty(2, len(seen), dtype=torch.long, device=seen.device)
     torch.sum(seen, dim=1, out=both[0])
     dist.all_to_all_single(both[1], both[0])
     if not seen.is_cuda:
         return Plan(seen, both, None)
-    counts = both.to("cpu", non_blocking=True)  # into pinned memory, which torch takes for such copies
+    counts = both.to("cpu", non_blocking=True)  # torch copies to pinned memory
     ready = torch.cuda.Event()
     ready.record()
     return Plan(seen, counts, ready)
 
 
 def swap(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
-    """Send blocks of rows to all ranks, and get one from each. Collective.
+    """Send a block of rows to each rank and receive one from each. Collective.
 
     Args:
-        rows: the blocks in order of the ranks that they go to ``[sum(sent), ...]``.
-        sent: rows for each rank.
-        received: rows from each rank.
+        rows: the blocks in order of their destination rank ``[sum(sent), ...]``.
+        sent: number of rows for each rank.
+        received: number of rows from each rank.
 
     Returns:
-        ``[sum(received), ...]``, in order of the ranks that they come from.
+        ``[sum(received), ...]``, in order of the source rank.
     """
     incoming = rows.new_empty(sum(received), *rows.shape[1:])
     dist.all_to_all_single(incoming, rows.contiguous(), received, sent)
@@ -195,37 +195,37 @@ class _Exchange(torch.autograd.Function):
         gradient = gradient / len(route.sent)
         if route.ask is None:
             return swap(gradient, route.received, route.sent), None
-        found, route.ask = route.ask(), None  # it may hold on to this very graph, which no one would ever free
-        both = swap(torch.cat([gradient, found], dim=1), route.received, route.sent)
-        gradient, route.told = both.split([gradient.shape[1], found.shape[1]], dim=1)
+        values, route.ask = route.ask(), None  # the callback may refer to this graph: break the cycle
+        both = swap(torch.cat([gradient, values], dim=1), route.received, route.sent)
+        gradient, route.told = both.split([gradient.shape[1], values.shape[1]], dim=1)
         return gradient, None
 
 
 def exchange(rows: Tensor, route: Route) -> Tensor:
     """Send rows to the ranks of their cameras. Collective, and so is the backward pass.
 
-    Gradients come back divided by the number of ranks: what all ranks' losses together do to a row is what their mean
-    does to it on one process. They bring along what ``route.ask`` says, which is set on all ranks or on none.
+    Gradients come back divided by the number of ranks, so that they are those of the mean of all ranks' losses. The
+    values of ``route.ask`` come back with them; it must be set on all ranks or on none.
 
     Args:
-        rows: in the order of ``route.ids`` ``[S, D]``.
-        route: of a :class:`Plan`.
+        rows: rows in the order of ``route.ids`` ``[S, D]``.
+        route: route of a :class:`Plan`.
 
     Returns:
-        ``[M, D]``, in order of the ranks that hold them, and within each in the order of its shard.
+        ``[M, D]``, in order of the source rank, and within each in the order of its shard.
     """
     return _Exchange.apply(rows, route)  # type: ignore[no-untyped-call]
 
 
 @torch.no_grad()
 def give_back(values: Tensor, route: Route) -> Tensor:
-    """Send what was found about received rows back to their holders. Collective.
+    """Send values of received rows back to their owners. Collective.
 
     Args:
-        values: in the order of what :func:`exchange` gave ``[M, D]``.
-        route: the one of that exchange.
+        values: in the order of the result of :func:`exchange` ``[M, D]``.
+        route: route of that exchange.
 
     Returns:
-        ``[S, D]`` in the order of ``route.ids``, not divided by anything.
+        ``[S, D]`` in the order of ``route.ids``, undivided.
     """
     return swap(values, route.received, route.sent)

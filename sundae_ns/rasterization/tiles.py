@@ -1,9 +1,9 @@
 """Depth-ordered lists of the primitives that can touch each tile of the image.
 
 gsplat 1.4 bins primitives into 16-pixel tiles by their three-sigma square and blends them in every pixel of those
-tiles, so its images depend on that grid. The lists here are on a finer grid, and leave out only what cannot reach an
-alpha of 1/255 in a tile: blending them gives the image of the 16-pixel grid with fewer pixels looked at. (gsplat 1.5
-fits the bins to the opacity instead, and so also keeps the rim of opaque primitives from 3 to 3.33 sigma.)
+tiles, so its images depend on that grid. The lists here use a finer grid and leave out only primitives that cannot
+reach an alpha of 1/255 in a tile: the image is that of the 16-pixel grid, with fewer evaluations. (gsplat 1.5 fits the
+bins to the opacity instead, which also keeps the rim of opaque primitives from 3 to 3.33 sigma.)
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ TILE = 8
 """Side of a tile in pixels."""
 
 MIN_ALPHA = 1.0 / 255.0
-"""Fainter contributions to a pixel are skipped."""
+"""Contributions fainter than this are skipped."""
 
 BIN = 16  # side of gsplat's tiles
-ROUNDING = 1e-3  # slack on exponents, so that rounding here never drops what the blending would still count
+ROUNDING = 1e-3  # slack on exponents, so that rounding never drops a primitive that is blended
 
 
 @dataclass(frozen=True)
@@ -33,18 +33,18 @@ class TileLists:
     rows: int
     gaussian_ids: Tensor  # [L], int64
     tile_ids: Tensor  # [L], int64
-    starts: Tensor  # [columns * rows], int64: where the list of each tile begins
+    starts: Tensor  # [columns * rows], int64: start of each tile's list
     lengths: Tensor  # [columns * rows], int64
 
 
 @torch.no_grad()
 def build_tile_lists(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
-    """List the primitives of each tile; ``opacities`` ``[N]`` are those that will be blended."""
+    """List the primitives of each tile; ``opacities`` ``[N]`` are those to blend."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     visible = ((projection.radii > 0) & (opacities >= MIN_ALPHA)).nonzero()[:, 0]
     ids = visible[projection.depths[visible].argsort(stable=True)]
     centres, covars = projection.means2d[ids], projection.covars2d[ids]
-    reach = torch.log(opacities[ids] / MIN_ALPHA) + ROUNDING  # largest exponent that still counts
+    reach = torch.log(opacities[ids] / MIN_ALPHA) + ROUNDING  # largest exponent that is still blended
 
     half = (2 * reach[:, None] * covars[:, [0, 2]]).sqrt()
     radii = projection.radii[ids, None].to(centres.dtype)
@@ -55,7 +55,7 @@ def build_tile_lists(projection: Projection, opacities: Tensor, width: int, heig
     low, high = low.clamp(min=0).minimum(grid), high.clamp(min=0).minimum(grid)
     spans = (high - low).clamp(min=0).long()
 
-    # One row for each cell of each rectangle of tiles, in order of depth.
+    # One row per tile of each primitive's rectangle of tiles, in order of depth.
     counts = spans[:, 0] * spans[:, 1]
     owner = torch.repeat_interleave(counts)
     within = torch.arange(owner.shape[0], device=ids.device) - (counts.cumsum(0) - counts).index_select(0, owner)
@@ -82,8 +82,8 @@ def tile_centres(tile_ids: Tensor, columns: int) -> Tensor:
 def _least_exponent(left: Tensor, top: Tensor, xx: Tensor, xy: Tensor, yy: Tensor) -> Tensor:
     """Minimum of half the squared Mahalanobis distance over a tile with its corner at (left, top): ``[L]``.
 
-    It is taken over the box of the tile's pixel centres. The distance is convex, so off the box its minimum lies on an
-    edge that faces the centre: the nearer vertical or the nearer horizontal one.
+    The minimum is over the box of the tile's pixel centres. The distance is convex, so if the centre is outside the
+    box, the minimum lies on an edge that faces the centre: the nearer vertical or the nearer horizontal one.
     """
     x0, y0 = left + 0.5, top + 0.5
     x1, y1 = x0 + (TILE - 1), y0 + (TILE - 1)

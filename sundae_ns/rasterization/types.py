@@ -1,4 +1,4 @@
-"""What goes in and out of every backend."""
+"""The result of a rasterisation, and the protocol of a backend."""
 
 from __future__ import annotations
 
@@ -10,31 +10,31 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Rasterization:
-    """One rendered view; every tensor has the dtype and device of the primitives, ``radii`` is int32."""
+    """One rendered view; all tensors have the dtype and device of the primitives, except ``radii``."""
 
     colors: Tensor
-    """Blended colours ``[H, W, C]``; no background is added."""
+    """Blended colours ``[H, W, C]``, without background."""
 
     depth: Tensor | None
-    """Expected camera z ``[H, W, 1]``, world units, 0 where nothing was blended; None unless asked for."""
+    """Expected camera z ``[H, W, 1]``, world units, 0 where nothing was blended; None unless requested."""
 
     alpha: Tensor
     """Accumulated opacity ``[H, W, 1]`` in [0, 1]."""
 
     radii: Tensor
-    """Screen radius ``[N]`` in whole pixels, 0 where the primitive was culled; not differentiable."""
+    """Screen radius ``[N]`` in whole pixels, int32, 0 where the primitive was culled; not differentiable."""
 
     info: dict[str, Any]
-    """What the ``DefaultStrategy`` of the installed gsplat reads, in the shapes it expects.
+    """Statistics that the ``DefaultStrategy`` of the installed gsplat reads, in the shapes it expects.
 
-    ``means2d`` ``[1, N, 2]`` in pixels is part of the graph (``retain_grad()`` works; ``.absgrad`` is set by the
-    backward pass if asked for); ``radii`` is ``[1, N]`` under gsplat 1.4 and ``[1, N, 2]`` from 1.5; ``width``,
-    ``height`` and ``n_cameras`` are ints; ``gaussian_ids`` is None, because nothing is packed.
+    ``means2d`` ``[1, N, 2]`` in pixels is part of the graph: ``retain_grad()`` works, and the backward pass sets
+    ``.absgrad`` if requested. ``radii`` is ``[1, N]`` under gsplat 1.4 and ``[1, N, 2]`` from 1.5. ``width``,
+    ``height`` and ``n_cameras`` are ints. ``gaussian_ids`` is None, because nothing is packed.
     """
 
 
 class Backend(Protocol):
-    """A rasteriser. Call it through :mod:`sundae_ns.rasterization.interface`, which checks the arguments first."""
+    """A rasteriser. Call it through :mod:`sundae_ns.rasterization.interface`, which checks the arguments."""
 
     @property
     def name(self) -> str:

@@ -1,1 +1,49 @@
-"""From a field to images: views, render settings, one splatting pass, the head, replay of recorded frames. Floor 4."""
+"""From a field to images: views, sources of primitives, one splatting pass, the head, contribution, recorded frames."""
+
+from sundae_ns.rendering.contribution import contribution, view_weights, weights_by_batch
+from sundae_ns.rendering.lazy import Later, LazyOutputs
+from sundae_ns.rendering.outputs import OUTPUTS, ShownResponse, empty_outputs, late_outputs
+from sundae_ns.rendering.render import RenderSettings, compensate, draw, render, scale_plan, splat
+from sundae_ns.rendering.replay import FrameReplay
+from sundae_ns.rendering.source import (
+    NEAR_PLANE,
+    ColorSettings,
+    FieldSource,
+    LocalField,
+    Primitives,
+    StepResolution,
+    TrainingView,
+    ViewBatch,
+)
+from sundae_ns.rendering.views import View, cut, view_of, zoomed
+
+__all__ = [
+    "NEAR_PLANE",
+    "OUTPUTS",
+    "ColorSettings",
+    "FieldSource",
+    "FrameReplay",
+    "Later",
+    "LazyOutputs",
+    "LocalField",
+    "Primitives",
+    "RenderSettings",
+    "ShownResponse",
+    "StepResolution",
+    "TrainingView",
+    "View",
+    "ViewBatch",
+    "compensate",
+    "contribution",
+    "cut",
+    "draw",
+    "empty_outputs",
+    "late_outputs",
+    "render",
+    "scale_plan",
+    "splat",
+    "view_of",
+    "view_weights",
+    "weights_by_batch",
+    "zoomed",
+]

@@ -1,4 +1,4 @@
-"""Outputs of a model that are made when they are first asked for."""
+"""Outputs of a model that are computed on first access."""
 
 from __future__ import annotations
 
@@ -12,18 +12,17 @@ import torch
 
 @dataclass(frozen=True)
 class Later:
-    """An output to be."""
+    """An output that is not computed yet."""
 
     make: Callable[[], Any]
-    """Computes it. This may run in another thread, after the model has changed, so that it must hold what it reads."""
+    """Computes it. It may run in another thread after the model has changed, so it must hold what it reads."""
 
 
 class LazyOutputs(UserDict[str, Any]):
-    """Named outputs; one that is :class:`Later` is computed at its first access, without gradients, and then kept.
+    """Named outputs. One that is :class:`Later` is computed on first access, without gradients, and then kept.
 
-    nerfstudio's commands take one or two pictures of a frame and leave the rest; what nobody looks at costs nothing.
-    Listing names, counting and ``in`` compute nothing. Not a ``dict``, because ``dict(outputs)`` and ``{**outputs}`` would
-    then pass by the computing.
+    nerfstudio's commands read one or two outputs of a frame; the others cost nothing. Listing names, counting and ``in``
+    compute nothing. It is not a ``dict``, because ``dict(outputs)`` and ``{**outputs}`` would then skip the computation.
     """
 
     def __getitem__(self, name: str) -> Any:

@@ -1,81 +1,43 @@
-"""How a field becomes pictures of a view: colours, one splatting pass, and the head's correction. Nothing is remembered."""
+"""From a field to the images of a view: colours, one splatting pass, and the head's correction."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, ScalePlan, over_phases, plan, resize
-from sundae_ns.distributed import Arrived
-from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.gaussians.parameters import sh_degree
-from sundae_ns.pruning import pixel_detail
-from sundae_ns.rasterization import Backend, Rasterization, blending_weights, rasterize, spherical_harmonics
-from sundae_ns.rasterization.sharded import Route
+from sundae_ns.rasterization import Rasterization, rasterize
+from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, FieldSource, Primitives
 from sundae_ns.rendering.views import View
-
-NEAR_PLANE = 0.01
-
-
-class Arrivals(Protocol):
-    """What a view needs of primitives that several ranks hold."""
-
-    def __call__(self, params: Mapping[str, Tensor], view: View, *, features: bool = ...) -> Arrived:
-        """The primitives of all ranks that the view may see, from this rank's own. Collective."""
 
 
 @dataclass(frozen=True)
-class Style:
-    """What pictures depend on beside field and view."""
+class RenderSettings(ColorSettings):
+    """What images depend on beside field and view."""
 
-    backend: Backend
     antialiased: bool = False
-    """Whether opacities make up for the least size of footprints (``rasterize_mode`` of splatfacto)."""
-    logits: bool = False
-    """Whether band 0 holds logits of colours, and there are no others."""
-    most_bands: int | None = None
-    """Highest degree of the harmonics that takes part so far; None for all that there are."""
+    """Whether opacities compensate for the smallest footprint (``rasterize_mode`` of splatfacto)."""
     training: bool = False
-    """Whether the pictures are to be learned from: gradients are not cut off, and the head looks at what it is given."""
+    """Whether gradients are needed. The image is then not clamped, and the head runs at the scale of the image."""
     absgrad: bool = False
-    """Whether gradients of centres in the picture are summed by their absolute values too."""
+    """Whether to sum absolute gradients of the projected centres."""
     head: CompensationHead | None = None
-    """None where no head takes part."""
+    """The head; None while it is disabled."""
     trained_focal: tuple[float, float] | None = None
-    """Shortest and longest focal length, pixels, of the pictures that the head was trained on."""
-    arrivals: Arrivals | None = None
-    """Fetches primitives from other ranks; None where one process holds them all."""
-    follow: Callable[[MutableMapping[str, Any], Route], None] | None = None
-    """Told of ``info`` and route of what was fetched, before the backward pass, where ranks densify."""
+    """Shortest and longest focal length of the images that the head was trained on, pixels."""
+
+    def without_head(self) -> RenderSettings:
+        """The same settings with the head disabled."""
+        return replace(self, head=None)
 
 
-def degree_in_use(features_rest: Tensor, most_bands: int | None) -> int:
-    """Degree of the harmonics that pictures are made with.
-
-    Args:
-        features_rest: bands 1 and up ``[N, K, 3]``.
-        most_bands: highest degree that takes part so far; None for all that there are.
-    """
-    degree = sh_degree(features_rest)
-    return degree if most_bands is None else min(most_bands, degree)
-
-
-def colors_of(params: Mapping[str, Tensor], center: Tensor, style: Style) -> Tensor:
-    """Colours ``[N, 3]`` of the primitives as seen from a place ``[3]``, or from one each ``[N, 3]``."""
-    if style.logits:
-        return params["features_dc"].sigmoid()
-    degree = degree_in_use(params["features_rest"], style.most_bands)
-    coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
-    return (spherical_harmonics(degree, params["means"] - center, coeffs, backend=style.backend) + 0.5).clamp_min(0)
-
-
-def _pass(params: Mapping[str, Tensor], view: View, style: Style) -> dict[str, Any]:
-    """What every pass over a view tells the rasteriser: how primitives lie, and how they are seen."""
+def pass_options(params: Mapping[str, Tensor], view: View, settings: RenderSettings) -> dict[str, Any]:
+    """Arguments that every pass over a view hands to the rasteriser: activated parameters, camera and settings."""
     return {
         "means": params["means"],
         "quats": params["quats"],
@@ -86,111 +48,111 @@ def _pass(params: Mapping[str, Tensor], view: View, style: Style) -> dict[str, A
         "width": view.width,
         "height": view.height,
         "near_plane": NEAR_PLANE,
-        "antialiased": style.antialiased,
-        "backend": style.backend,
+        "antialiased": settings.antialiased,
+        "backend": settings.backend,
     }
 
 
-def splat(params: Mapping[str, Tensor], view: View, channels: Tensor, style: Style, **options: Any) -> Rasterization:
+def splat(
+    params: Mapping[str, Tensor], view: View, channels: Tensor, settings: RenderSettings, **options: Any
+) -> Rasterization:
     """Splat values of the primitives ``[N, C]``; options are those of ``rasterize``."""
-    return rasterize(colors=channels, **_pass(params, view, style), **options)
+    return rasterize(colors=channels, **pass_options(params, view, settings), **options)
 
 
-def plan_of(view: View, trained_focal: tuple[float, float] | None) -> ScalePlan:
-    """How a view's picture is compensated by a head that was trained at these focal lengths."""
+def scale_plan(view: View, trained_focal: tuple[float, float] | None) -> ScalePlan:
+    """Scale and strength of the correction for a view, given the focal lengths that the head was trained at."""
     return plan(view.focal, trained_focal, view.width * view.height)
 
 
-def render(
-    params: Mapping[str, Tensor],
-    view: View,
-    background: Tensor,
-    style: Style,
-    *,
-    depth: bool = True,
-    compensate: bool = True,
+def draw(
+    primitives: Primitives, view: View, background: Tensor, settings: RenderSettings, *, depth: bool
 ) -> tuple[dict[str, Any], Rasterization]:
-    """The pictures of one view: one splatting pass for colours, features and depth, then the head.
+    """Splat colours, features and depth in one pass, and let the head correct the image at its own scale.
 
     Args:
-        params: the field, or a part of it; with ranks, this rank's, or what has arrived.
+        primitives: from a :class:`FieldSource`; with ``features`` if the head is enabled.
         view: the camera.
-        background: ``[3]`` colour behind everything.
-        style: all else.
+        background: colour ``[3]``.
+        settings: everything else.
         depth: whether to render depth.
-        compensate: whether the head may take part.
 
     Returns:
-        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
+        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result. Without a
+        head ``rgb`` is ``base_rgb``.
     """
-    field, head = params, style.head if compensate else None
-    if style.arrivals is not None and not isinstance(params, Arrived):
-        params = style.arrivals(params, view, features=head is not None)
-    channels = params["colors"] if isinstance(params, Arrived) else colors_of(params, view.center, style)
-    if head is not None:
-        channels = torch.cat([channels, params[FEATURES]], dim=1)
-    splatted = splat(params, view, channels, style, render_depth=depth, absgrad=style.absgrad)
+    channels = primitives["colors"]
+    if settings.head is not None:
+        channels = torch.cat([channels, primitives[FEATURES]], dim=1)
+    splatted = splat(primitives, view, channels, settings, render_depth=depth, absgrad=settings.absgrad)
     blended, features = splatted.colors[..., :3], splatted.colors[..., 3:]
     base = (blended + (1 - splatted.alpha) * background).clamp(0.0, 1.0)
-    rgb = base
-    if head is not None:
-        zoom, weight = ScalePlan(1.0, 1.0) if style.training else plan_of(view, style.trained_focal)
-        if zoom == 1.0:
-            seen = (base, splatted.colors, splatted.alpha)
-            rgb = head(*seen) if style.training else over_phases(head, *seen)
-            if head.config.mode == "features":
-                # It knows neither background nor accumulation, and would show something where nothing is.
-                rgb = splatted.alpha * rgb + (1 - splatted.alpha) * background
-        elif weight > 0:
-            at_scale, _ = render(field, view.zoomed(zoom), background, style, depth=False)
-            correction = at_scale["rgb"] - at_scale["base_rgb"]
-            rgb = base + weight * resize(correction, view.height, view.width)
-        if not style.training:
-            rgb = rgb.clamp(0.0, 1.0)
-    pictures = {
-        "rgb": rgb,
+    images = {
+        "rgb": base,
         "base_rgb": base,
         "depth": splatted.depth,
         "accumulation": splatted.alpha,
         "feature_image": features,
     }
-    if style.follow is not None and isinstance(params, Arrived):
-        style.follow(splatted.info, params.route)
-    return pictures, splatted
+    return images, splatted
 
 
-def weights_of(
-    params: Mapping[str, Tensor],
-    view: View,
-    background: Tensor,
-    style: Style,
-    keep_ratio: float | None = None,
-    mask: Tensor | None = None,
+def compensate(
+    head: CompensationHead, base: Tensor, splatted: Rasterization, background: Tensor, *, training: bool
 ) -> Tensor:
-    """Blending weight of each primitive, summed over the pixels of one view ``[N]``.
+    """The compensated image of one splatting pass ``[H, W, 3]``, not clamped. This is the one place that runs the head.
 
     Args:
-        params: the field; with ranks, what has arrived.
-        view: the camera.
-        background: ``[3]`` colour behind everything.
-        style: how pictures are made.
-        keep_ratio: share of the primitives that will stay; given, pixels count by the detail that so many can show.
-        mask: the pixels that count at all, bool ``[H, W, 1]``; None for all.
-
-    Raises:
-        DataError: the mask has another size than the view.
+        head: the head.
+        base: image without the head, ``[H, W, 3]``.
+        splatted: colours and features without background.
+        background: colour ``[3]``.
+        training: run once; otherwise as often as ``head.config.phases`` says.
     """
-    if mask is not None and tuple(mask.shape) != (view.height, view.width, 1):
-        raise DataError(
-            f"a mask is {list(mask.shape)} where its view is {view.width} x {view.height} px; "
-            "make masks of their pictures' sizes"
-        )
-    pixels = None
-    if keep_ratio is not None:
-        background = background.to(params["means"].device)
-        pictures, splatted = render(params, view, background, style, depth=False, compensate=False)
-        pixels = pixel_detail(pictures["base_rgb"], keep_ratio * float((splatted.radii > 0).sum()))
-    if mask is not None:
-        counts = mask[..., 0].to(params["means"])
-        pixels = counts if pixels is None else pixels * counts
-    return blending_weights(pixels=pixels, **_pass(params, view, style))
+    seen = (base, splatted.colors, splatted.alpha)
+    image = head(*seen) if training else over_phases(head, *seen)
+    if head.config.mode == "features":
+        # This head sees neither background nor accumulation; without blending it would paint empty space.
+        image = splatted.alpha * image + (1 - splatted.alpha) * background
+    return image
+
+
+def render(
+    source: FieldSource,
+    view: View,
+    background: Tensor,
+    settings: RenderSettings,
+    *,
+    depth: bool = True,
+) -> tuple[dict[str, Any], Rasterization]:
+    """The images of one view.
+
+    An image of another scale than the head was trained at is rendered at the trained scale too, and gets the resized
+    correction (:mod:`sundae_ns.compensation.scale`).
+
+    Args:
+        source: of the primitives.
+        view: the camera.
+        background: colour ``[3]``.
+        settings: everything else; ``head=None`` leaves the head out.
+        depth: whether to render depth.
+
+    Returns:
+        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
+    """
+    head = settings.head
+    primitives = source.primitives(view, settings, features=head is not None)
+    images, splatted = draw(primitives, view, background, settings, depth=depth)
+    if head is None:
+        return images, splatted
+    zoom, weight = ScalePlan(1.0, 1.0) if settings.training else scale_plan(view, settings.trained_focal)
+    base = images["base_rgb"]
+    if zoom == 1.0:
+        images["rgb"] = compensate(head, base, splatted, background, training=settings.training)
+    elif weight > 0:
+        at_scale, _ = render(source, view.zoomed(zoom), background, settings, depth=False)
+        correction = at_scale["rgb"] - at_scale["base_rgb"]
+        images["rgb"] = base + weight * resize(correction, view.height, view.width)
+    if not settings.training:
+        images["rgb"] = images["rgb"].clamp(0.0, 1.0)
+    return images, splatted

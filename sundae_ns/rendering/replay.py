@@ -1,14 +1,13 @@
-"""Pictures that are only looked at, played back: all that the GPU does for a frame, recorded once for each size.
+"""Frames of a finished field as recorded CUDA graphs, one for each image size.
 
-A frame is many small kernels, each started from Python; as one CUDA graph they are started at once. What a recording reads
-stays where it is: the field, which may be trained meanwhile, the head's weights, and the three tensors that camera and
-background are written to.
+A frame is many small kernels, each launched from Python. A CUDA graph launches them together. A recorded frame reads its
+inputs where they were when it was recorded: the field, which may be trained meanwhile, the head's weights, and the three
+tensors that hold camera and background.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from threading import Lock
@@ -18,155 +17,150 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
-from sundae_ns.gpu.cuda_graphs import Kept, aside, record
-from sundae_ns.rasterization import GsplatBackend, Room
-from sundae_ns.rendering.render import Style, degree_in_use, plan_of, render
+from sundae_ns.gpu.cuda_graphs import GraphCache, record, warm_up
+from sundae_ns.rasterization import Capacity, GsplatBackend
+from sundae_ns.rendering.render import RenderSettings, render, scale_plan
+from sundae_ns.rendering.source import FieldSource, degree_in_use
 from sundae_ns.rendering.views import View
 
 SPARE = 1.5
-"""Room for so many times the pairs of a tile and a primitive of the view that is recorded; another view may have more."""
+"""Capacity for tile and primitive pairs, as a multiple of those of the recorded view. Another view may have more."""
 
-SHOWN = ("rgb", "base_rgb", "accumulation")
+REPLAYED = ("rgb", "base_rgb", "accumulation")
+"""Images of a recorded frame."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class _Recording:
+class _Frame:
     graph: torch.cuda.CUDAGraph
-    given: tuple[Tensor, Tensor, Tensor]
-    """Where it reads: world-to-camera, intrinsics, background."""
-    made: dict[str, Tensor]
-    """Where it writes."""
-    pairs: int
-    """How many it has room for."""
+    inputs: tuple[Tensor, Tensor, Tensor]
+    """World-to-camera, intrinsics and background: the graph reads them here."""
+    images: dict[str, Tensor]
+    """The graph writes them here."""
+    capacity: int
+    """Pairs that fit."""
     needed: Tensor
-    """How many there were, int64 ``[]``."""
+    """Pairs of the last replay, int64 ``[]``."""
 
 
-class Recordings:
-    """The recordings of one field, made as they are needed, and forgotten when the field is another."""
+class FrameReplay:
+    """Recorded frames of one field. They are made when first needed and dropped when the field changes."""
 
     def __init__(self) -> None:
-        self._kept: Kept[_Recording] = Kept()
-        self._of: object = None
+        self._frames: GraphCache[_Frame] = GraphCache()
+        self._field: object = None
         self._can_record = True
-        # A viewer renders in its own thread, and a recording reads what it was given last.
+        # A viewer renders in its own thread; a replay and its inputs belong together.
         self._lock = Lock()
 
-    def render(
-        self, field: Mapping[str, Tensor], view: View, background: Tensor, style: Style, *, compensate: bool = True
-    ) -> dict[str, Any]:
-        """The pictures of a view, as :func:`sundae_ns.rendering.render.render` makes them without depth.
+    def render(self, source: FieldSource, view: View, background: Tensor, settings: RenderSettings) -> dict[str, Any]:
+        """The images of a view, as :func:`sundae_ns.rendering.render.render` makes them.
 
-        Played back where that is possible: on CUDA by gsplat, without gradients, of a field that one process holds. Other
-        pictures, and those of a size that is new, are rendered kernel by kernel. They are the same up to the order in which
-        kernels add up.
+        Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of a whole local field. Other frames,
+        and the first of a size, are rendered kernel by kernel. Both agree up to the order in which kernels sum.
 
         Args:
-            field: the primitives; all of them, for a part is somewhere else each time.
+            source: of the primitives.
             view: the camera.
-            background: ``[3]`` colour behind everything.
-            style: all else.
-            compensate: whether the head may take part.
+            background: colour ``[3]``.
+            settings: everything else.
 
         Returns:
-            ``rgb, base_rgb, accumulation``, each ``[H, W, C]``, the caller's own.
+            ``rgb, base_rgb, accumulation``, each ``[H, W, C]``, owned by the caller; if the source is collective also
+            ``depth`` and ``feature_image``, which cannot be rendered later by one rank alone.
         """
-        if self._can_record and _recordable(field, style):
+        if self._can_record and _recordable(source, settings):
             with self._lock:
                 try:
-                    made = self._played(field, view, background, style, compensate)
-                # No compiler, no memory, or whatever a driver says of a recording.
+                    images = self._replayed(source, view, background, settings)
+                # No compiler, no memory, or any failure of a driver to record.
                 except (BackendError, RuntimeError) as error:
-                    _log.warning("frames are rendered kernel by kernel, for they cannot be recorded: %s", error)
+                    _log.warning("frames cannot be recorded and are rendered kernel by kernel: %s", error)
                     _log.debug("", exc_info=True)
-                    self._kept.clear()
-                    self._can_record, made = False, None
-            if made is not None:
-                return made
-        pictures = render(field, view, background, style, depth=False, compensate=compensate)[0]
-        return {name: pictures[name] for name in SHOWN}
+                    self._frames.clear()
+                    self._can_record, images = False, None
+            if images is not None:
+                return images
+        images = render(source, view, background, settings, depth=source.collective)[0]
+        return images if source.collective else {name: images[name] for name in REPLAYED}
 
-    def _played(
-        self, field: Mapping[str, Tensor], view: View, background: Tensor, style: Style, compensate: bool
+    def _replayed(
+        self, source: FieldSource, view: View, background: Tensor, settings: RenderSettings
     ) -> dict[str, Any] | None:
-        record_for = partial(_record, field, view, background, style, compensate)
-        key = self._key(field, view, style, compensate)
-        recording = self._kept.get(key, record_for)
-        if recording is None:
+        record_frame = partial(_record, source, view, background, settings)
+        key = self._key(source, view, settings)
+        frame = self._frames.get(key, record_frame)
+        if frame is None:
             return None
-        made, needed = _play(recording, view, background)
-        if needed > recording.pairs:
-            recording = record_for(pairs=int(SPARE * needed))
-            self._kept.put(key, recording)
-            made, _ = _play(recording, view, background)
-        return made
+        images, needed = _replay(frame, view, background)
+        if needed > frame.capacity:
+            frame = record_frame(capacity=int(SPARE * needed))
+            self._frames.put(key, frame)
+            images, _ = _replay(frame, view, background)
+        return images
 
-    def _key(self, field: Mapping[str, Tensor], view: View, style: Style, compensate: bool) -> object:
-        """What a recording has fixed. The field is told by where it lies, which is what a recording reads."""
-        of = tuple((name, value.data_ptr(), value.shape) for name, value in field.items())
-        if of != self._of:
-            self._kept.clear()
-            self._of = of
-        head = style.head if compensate else None
+    def _key(self, source: FieldSource, view: View, settings: RenderSettings) -> object:
+        """What a recorded frame has fixed. The field is identified by its addresses, because these are what it reads."""
+        field = source.field
+        addresses = tuple((name, value.data_ptr(), value.shape) for name, value in field.items())
+        if addresses != self._field:
+            self._frames.clear()
+            self._field = addresses
+        head = settings.head
         of_head: tuple[object, ...] | None = None
         if head is not None:
-            # The network itself, not its number, which a later one might be given; and where its weights lie.
-            lie = tuple(value.data_ptr() for value in head.net.parameters())
-            of_head = (head.net, lie, astuple(head.config), *plan_of(view, style.trained_focal))
-        degree = degree_in_use(field["features_rest"], style.most_bands)
-        return view.width, view.height, style.antialiased, style.logits, degree, of_head
+            # The network itself and not its id, which a later network could reuse.
+            weights = tuple(value.data_ptr() for value in head.net.parameters())
+            of_head = (head.net, weights, astuple(head.config), *scale_plan(view, settings.trained_focal))
+        degree = degree_in_use(field.sh_degree, settings.active_sh_degree)
+        return view.width, view.height, settings.antialiased, field.encoding, degree, of_head
 
 
-def _recordable(field: Mapping[str, Tensor], style: Style) -> bool:
+def _recordable(source: FieldSource, settings: RenderSettings) -> bool:
     return (
-        style.backend.name == "gsplat"
-        and style.arrivals is None
-        and not style.training
+        settings.backend.name == "gsplat"
+        and source.replayable
+        and not settings.training
         and not torch.is_grad_enabled()
-        and len(field["means"]) > 0
+        and source.field.num_primitives > 0
     )
 
 
 def _record(
-    field: Mapping[str, Tensor],
-    view: View,
-    background: Tensor,
-    style: Style,
-    compensate: bool,
-    pairs: int | None = None,
-) -> _Recording:
-    """Record a frame with room for so many pairs; by default for what this view needs, and to spare."""
+    source: FieldSource, view: View, background: Tensor, settings: RenderSettings, capacity: int | None = None
+) -> _Frame:
+    """Record a frame with a capacity for tile and primitive pairs; by default measured on this view, with a reserve."""
     with torch.inference_mode(False), torch.no_grad():
-        given = (view.viewmat.clone(), view.K.clone(), background.to(view.viewmat).clone())
-        here = view._replace(viewmat=given[0], K=given[1])
+        inputs = (view.viewmat.clone(), view.K.clone(), background.to(view.viewmat).clone())
+        here = view._replace(viewmat=inputs[0], K=inputs[1])
 
-        def run(room: Room) -> dict[str, Any]:
-            by = replace(style, backend=GsplatBackend(room))
-            return render(field, here, given[2], by, depth=False, compensate=compensate)[0]
+        def run(pairs: Capacity) -> dict[str, Any]:
+            limited = replace(settings, backend=GsplatBackend(pairs))
+            return render(source, here, inputs[2], limited, depth=False)[0]
 
         device = view.viewmat.device
-        if pairs is None:
-            measured = Room()
-            with aside(device):
+        if capacity is None:
+            measured = Capacity()
+            with warm_up(device):
                 run(measured)
-            pairs = int(SPARE * max(int(needed) for needed in measured.needed)) + 1
-        with aside(device):
-            run(Room(pairs))
+            capacity = int(SPARE * max(int(needed) for needed in measured.needed)) + 1
+        with warm_up(device):
+            run(Capacity(capacity))
 
-        def shown() -> tuple[dict[str, Any], Tensor]:
-            room = Room(pairs)
-            pictures = run(room)
-            return {name: pictures[name] for name in SHOWN}, torch.stack(room.needed).amax()
+        def frame() -> tuple[dict[str, Any], Tensor]:
+            pairs = Capacity(capacity)
+            images = run(pairs)
+            return {name: images[name] for name in REPLAYED}, torch.stack(pairs.needed).amax()
 
-        graph, (made, needed) = record(shown, device)
-    return _Recording(graph, given, made, pairs, needed)
+        graph, (images, needed) = record(frame, device)
+    return _Frame(graph, inputs, images, capacity, needed)
 
 
-def _play(recording: _Recording, view: View, background: Tensor) -> tuple[dict[str, Any], int]:
-    """Pictures, and how many pairs there were: with more than there is room for, the pictures are wrong."""
-    torch._foreach_copy_(list(recording.given), [view.viewmat, view.K, background.to(view.viewmat)])
-    recording.graph.replay()
-    made = {name: picture.clone() for name, picture in recording.made.items()}
-    return made, int(recording.needed)
+def _replay(frame: _Frame, view: View, background: Tensor) -> tuple[dict[str, Any], int]:
+    """Images, and the number of pairs; the images are wrong if these exceed the capacity."""
+    torch._foreach_copy_(list(frame.inputs), [view.viewmat, view.K, background.to(view.viewmat)])
+    frame.graph.replay()
+    images = {name: image.clone() for name, image in frame.images.items()}
+    return images, int(frame.needed)

@@ -1,9 +1,9 @@
-"""A short fine-tune of a finished run with the packer's own rounding in the loop, so that it learns to live with it.
+"""A short fine-tune of a finished run with the packer's rounding in the loop.
 
-The model holds rounded values, those that a reader of the packed file will decode; the optimizer moves exact ones beside them,
-by the gradients at the rounded ones (the straight-through estimator of Bengio, Leonard and Courville, 2013). So the model,
-its losses and its rasteriser need know nothing of rounding. Grids, bases and steps are fitted once, before the first step, and
-the file is written by the same: what was trained is what is stored.
+The model holds rounded values, the ones that a reader decodes. The optimizer moves exact values beside them, by the gradients
+at the rounded ones (the straight-through estimator of Bengio, Leonard and Courville, 2013). So model, losses and rasteriser
+do not know of rounding. Grids, bases and steps are fitted once before the first step, and the file is written with them:
+what was trained is what is stored.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ RATES = {
     "features": 5e-4,
     "head": 2e-4,
 }
-"""Rates of Adam at their highest: about a fifth of those that a run begins with. Positions are rounded once and stay: at the
-end of training they hardly move any more, and everything else learns around where they ended up."""
+"""Peak rates of Adam, about a fifth of the initial rates of a run. Positions are rounded once and fixed: at the end of
+training they hardly move."""
 RISE = 0.05
-"""Share of the steps in which rates rise: Adam knows no gradients at first. They then fall to 0, so that values settle."""
+"""Share of the steps in which rates rise, because Adam has no moments yet. Then they fall to 0, so that values settle."""
 
 
 def rate_factor(step: int, steps: int) -> float:
-    """Share of the highest rate at a step of 0 to ``steps`` - 1: a short rise, then half a cosine."""
+    """Share of the peak rate at a step from 0 to ``steps`` - 1: a short rise, then half a cosine."""
     rise = max(round(RISE * steps), 1)
     if step < rise:
         return (step + 1) / (rise + 1)
@@ -57,23 +57,23 @@ def finetune(
     data: Path | None = None,
     progress: Callable[[float], object] | None = None,
 ) -> tuple[Scene, Codecs]:
-    """Train what a run shows with the rounding of its pack in the loop. The run itself is only read.
+    """Train the field and head of a run with the rounding of its pack in the loop. The run is only read.
 
     Args:
         run: folder of a run of sundae or splatfacto, or its ``config.yml``.
-        scene: the same run, as ``packed_run.scene_of_run`` gives it.
-        config: in how many bits it will be packed.
-        steps: how many, at least 1.
-        data: the capture, if it is not where the run says.
+        scene: the same run, from ``scenes.packed.scene_of_run``.
+        config: bits of the pack.
+        steps: number of steps, at least 1.
+        data: the capture, if it has moved.
         progress: called after each step with its loss.
 
     Returns:
-        The trained scene and the codecs it was trained with, for ``storage.packing.write_fitted``.
+        The trained scene, and its codecs for ``storage.packing.write_fitted``.
 
     Raises:
         ConfigError: an option cannot work.
         CheckpointError: the run still densifies, was unpacked from a scene, or cannot be opened.
-        DataError: its capture is gone, or cannot be used.
+        DataError: its capture is missing, or cannot be used.
         MemoryExhaustedError: the GPU's memory is full.
     """
     if steps < 1:
@@ -86,8 +86,10 @@ def finetune(
     scene, codecs = fit_scene(scene, config)
     opened = open_pipeline(path, data=data, test_mode="val")
     pipeline, model = opened.pipeline, opened.model
-    if model.densifying:
-        raise CheckpointError(f"{run} was still growing when it was saved; train it to its end, or pack it as it is")
+    if model.state.densifying:
+        raise CheckpointError(
+            f"{run} was saved during densification; train it to its end, or pack it without a fine-tune"
+        )
     _place(model, scene.field)
     codecs = codecs.to(model.device)
     pipeline.train()
@@ -131,7 +133,7 @@ def finetune(
 
 
 class _Through(NamedTuple):
-    """Parameters of the model, which hold rounded values, and the exact values that are trained beside them."""
+    """Parameters of the model, which hold rounded values, and the exact values that are trained."""
 
     shown: Mapping[str, Tensor]
     exact: dict[str, Tensor]
@@ -141,38 +143,38 @@ class _Through(NamedTuple):
     def of(
         cls, shown: Mapping[str, Tensor], rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
     ) -> _Through:
-        """Exact values begin as those of the parameters."""
+        """Start with the values of the parameters."""
         return cls(shown, {name: value.detach().clone().requires_grad_() for name, value in shown.items()}, rounded)
 
     @torch.no_grad()
     def show(self) -> None:
-        """Round into the parameters, in place: recorded graphs of the head read them where they are."""
+        """Round into the parameters in place, because recorded graphs of the head read them there."""
         rounded = self.rounded(self.exact)
         for name, value in self.shown.items():
             value.copy_(rounded[name])
 
     @torch.no_grad()
     def take_gradients(self) -> None:
-        """Gradients at the rounded values become those of the exact ones."""
+        """Use the gradients at the rounded values for the exact ones."""
         for name, value in self.exact.items():
             gradient = self.shown[name].grad
             if gradient is not None and name == "quats":
-                # Rounding may have turned a quaternion to its negative, the same rotation.
+                # Rounding may have negated a quaternion, which is the same rotation.
                 gradient = gradient * (value * self.shown[name]).sum(dim=1, keepdim=True).sign()
             if gradient is not None and name == "features_rest":
-                # Primitives that have no bands, because they look the same from everywhere, cost next to nothing.
+                # Keep view-independent colours so: their coefficients cost next to nothing in the pack.
                 gradient = gradient.masked_fill((value == 0).flatten(1).all(dim=1)[:, None, None], 0.0)
             value.grad = gradient
 
 
 def _place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
-    """Give the model this field, in this order; what the field does not have takes no part in the pictures."""
+    """Load a field into the model in its order; parameters that it lacks become 0."""
     n = len(field["means"])
     for name, value in model.gauss_params.items():
         new = field.get(name)
         value.data = value.data.new_zeros(n, *value.shape[1:]) if new is None else new.to(value.data)
         value.requires_grad_(name in field and name != "means")
-    # Lengths of quaternions are free, and rounded ones are of length 1, to which gradients belong.
+    # Rounded quaternions have length 1, and gradients refer to them.
     model.gauss_params["quats"].data = torch.nn.functional.normalize(model.gauss_params["quats"].data)
 
 

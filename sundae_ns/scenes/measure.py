@@ -1,4 +1,4 @@
-"""Figures of a finished run: quality, bytes and synchronised times, taken from the run itself."""
+"""Measurements of a finished scene: quality, bytes and synchronised times."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from sundae_ns.compensation import over_phases, resize
+from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.evaluation import (
     HEAD_OFF,
@@ -33,32 +33,30 @@ from sundae_ns.evaluation import (
 )
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering.render import plan_of
-from sundae_ns.rendering.views import zoomed
+from sundae_ns.rendering import compensate, draw, scale_plan, zoomed
 from sundae_ns.scenes.opening import Opened
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
 
 MOST_ZOOM = 1000
-"""Pictures of so many times their size have more pixels than fit into any memory."""
+"""Factor on the sides of an image beyond which no memory holds it."""
 
 
 @dataclass(frozen=True)
 class FrameTimes:
-    """Milliseconds a frame, device waited for, median over the given cameras."""
+    """Synchronised milliseconds of a frame, median over the cameras."""
 
     frame: float
-    """The whole picture, as nerfstudio's commands ask for it: camera, harmonics, splatting of colours and features, and the
-    head."""
+    """The whole image as nerfstudio's commands request it: camera, colours, splatting of colours and features, head."""
     splat: float
-    """The same without the head, and so without features."""
+    """The same without head and features."""
     head: float
-    """The head alone, on what it sees of the frame; 0 where it does not run. Pictures of another scale than the trained one are
-    splatted at that one too, with features, which is in ``frame`` only."""
+    """The head alone; 0 if it does not run. At another scale than the trained one a second splatting pass is needed, which
+    only ``frame`` contains."""
 
 
 @contextmanager
 def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
-    """Give pictures of ``model`` the head's correction, or not, outside of a viewer, whose check box is its own."""
+    """Enable or disable the head's correction inside a block, except in a viewer, which has its own check box."""
     before, model.compensated = model.compensated, on
     try:
         yield
@@ -68,13 +66,13 @@ def compensation(model: SundaeModel, on: bool) -> Iterator[None]:
 
 @torch.no_grad()
 def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int = 3, repeats: int = 5) -> FrameTimes:
-    """Time the rendering of ``cameras`` at their own resolution.
+    """Time the rendering of cameras at their own resolution.
 
     Args:
-        model: in evaluation mode, on the device that is to be timed.
+        model: in evaluation mode, on the device to time.
         cameras: each of shape ``(1,)``.
-        warmup: untimed runs of each picture.
-        repeats: timed runs of each picture.
+        warmup: untimed renders of each camera.
+        repeats: timed renders of each camera.
     """
     background = model._get_background_color()
 
@@ -91,32 +89,36 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
         for on, times in ((True, frames), (False, splats)):
             with compensation(model, on):
                 times.append(milliseconds(partial(show, camera)))
-        view = model.view_of(camera)
-        zoom, weight = plan_of(view, model.trained_focal)
-        if model.head is None or not model.head_active or weight == 0:
+        settings = model.render_settings(training=False)
+        zoom, weight = scale_plan(model.view_of(camera), settings.trained_focal)
+        if settings.head is None or weight == 0:
             heads.append(0.0)
             continue
-        pictures, splat = model.render(model.gaussians, view.zoomed(zoom), background, depth=False)
-        heads.append(milliseconds(partial(over_phases, model.head, pictures["base_rgb"], splat.colors, splat.alpha)))
+        view = model.view_of(camera).zoomed(zoom)
+        images, splatted = draw(
+            model.source.primitives(view, settings, features=True), view, background, settings, depth=False
+        )
+        run_head = partial(compensate, settings.head, images["base_rgb"], splatted, background, training=False)
+        heads.append(milliseconds(run_head))
     return FrameTimes(median(frames), median(splats), median(heads))
 
 
 def sizes(model: SundaeModel) -> Sizes:
-    """Bytes of everything that is needed to render: primitives in fp32, features and head included."""
+    """Bytes of everything that a render needs: primitives in fp32 with features, and the head."""
     return Sizes(bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head))
 
 
 @dataclass(frozen=True)
 class FrameFigures:
-    """Speed of a configuration beside its own error; means over the test views."""
+    """Speed of a configuration beside its error; means over the test views."""
 
     width: int
     height: int
-    """Size of the first picture, pixels."""
+    """Size of the first image, pixels."""
     precision: str
     """Arithmetic of the head."""
     phases: int
-    """How often the head ran for a frame."""
+    """Runs of the head for a frame."""
     views: int
     ms_frame: float
     ms_splat: float
@@ -137,13 +139,13 @@ def frame_figures(
     warmup: int = 3,
     repeats: int = 5,
 ) -> FrameFigures:
-    """Time the frames of a run at a size, and compare these very frames with the truth resized alike.
+    """Time the frames of a run at a size, and compare the same frames with the resized truth.
 
     Args:
         run: a finished run.
-        factor: on the pictures' sides.
+        factor: factor on the sides of the images.
         precision: of the head, one of ``PRECISIONS``; by default the run's own, and fp32 on a CPU.
-        phases: how often the head runs for a frame, one of ``PHASES``; by default the run's own.
+        phases: runs of the head for a frame, one of ``PHASES``; by default the run's own.
         warmup, repeats: as for :func:`frame_times`.
 
     Raises:
@@ -152,9 +154,7 @@ def frame_figures(
     """
     model = run.model
     if not 0 < factor < MOST_ZOOM:
-        raise ConfigError(
-            f"no picture is {factor} times the size of another; give a factor above 0, and below {MOST_ZOOM}"
-        )
+        raise ConfigError(f"images cannot be {factor} times as large; give a factor above 0 and below {MOST_ZOOM}")
     on_cpu = model.device.type == "cpu"
     precision = precision or ("fp32" if on_cpu or model.head is None else model.head.config.precision)
     if on_cpu and precision != "fp32":
@@ -168,9 +168,9 @@ def frame_figures(
             outputs = model.get_outputs_for_camera(camera)
             height, width = outputs["rgb"].shape[:2]
             target = truth if truth.shape[:2] == (height, width) else resize(truth, height, width)
-            for suffix, picture in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
-                errors["psnr" + suffix] += float(psnr(picture, target)) / len(cameras)
-                errors["ssim" + suffix] += float(ssim(picture, target)) / len(cameras)
+            for suffix, image in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
+                errors["psnr" + suffix] += float(psnr(image, target)) / len(cameras)
+                errors["ssim" + suffix] += float(ssim(image, target)) / len(cameras)
     return FrameFigures(
         width=int(cameras[0].width),
         height=int(cameras[0].height),
@@ -210,29 +210,29 @@ def measure_scene(
     progress: Callable[[], object] | None = None,
     command: str = "",
 ) -> Measured:
-    """Evaluate and time a field on its test views, with the head and without.
+    """Evaluate and time a scene on its test views, with the head and without.
 
-    What is timed is the very call whose picture is evaluated, view by view.
+    The timed call is the one whose image is evaluated, view by view.
 
     Args:
-        opened: the field.
+        opened: the scene.
         label: its name in tables.
         lpips: LPIPS; None leaves it out.
-        warmup: untimed renderings of each picture.
-        repeats: timed renderings of each picture; 0 leaves times out.
+        warmup: untimed renders of each view.
+        repeats: timed renders of each view; 0 leaves times out.
         progress: called after each view.
-        command: the command to note as the origin of the figures.
+        command: command to record as the origin of the figures.
     """
     model = opened.model
-    has_head = model.head is not None and model.head_active
+    has_head = model.state.head_enabled
     ways = {HEAD_ON: True, HEAD_OFF: False} if has_head else {HEAD_OFF: False}
     times: dict[str, list[float]] = {name: [] for name in (*ways, "head")}
     views: dict[str, list[ViewQuality]] = {name: [] for name in ways}
     for camera, truth in zip(opened.cameras, opened.truths, strict=True):
         for name, on in ways.items():
             with compensation(model, on):
-                picture = model.get_outputs_for_camera(camera)["rgb"]
-            views[name].append(quality(picture, truth, lpips))
+                image = model.get_outputs_for_camera(camera)["rgb"]
+            views[name].append(quality(image, truth, lpips))
         if repeats:
             found = frame_times(model, [camera], warmup=warmup, repeats=repeats)
             for name, on in ways.items():
@@ -244,7 +244,7 @@ def measure_scene(
     bare = {name: value for name, value in model.gauss_params.items() if name != FEATURES}
     needed = {HEAD_ON: stored.total, HEAD_OFF: bytes_of(bare)}
     if opened.packed_bytes is not None:
-        # A packed file is read as a whole, whatever is shown of it.
+        # A packed file is read as a whole, with the head enabled or disabled.
         stored, needed = Sizes(opened.packed_bytes), dict.fromkeys(needed, opened.packed_bytes)
     return Measured(
         label=label,
@@ -252,7 +252,7 @@ def measure_scene(
         scene=opened.scene,
         method=opened.method,
         variant=opened.variant,
-        keep_ratio=opened.keep_ratio,
+        keep_ratio=opened.kept,
         seed=opened.seed,
         steps=opened.steps,
         primitives=model.num_points,
@@ -266,35 +266,35 @@ def measure_scene(
         ms_head=median(times["head"]) if repeats else None,
         lpips_net=lpips.net if lpips is not None else "",
         prune_s=opened.prune_s,
-        peak_primitives=model.pruning_state["peak"] or None,
+        peak_primitives=model.state.pruning["peak"] or None,
         gpu=torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "",
         commit=revision(),
         command=command,
     )
 
 
-def quality(picture: Tensor, truth: Tensor, lpips: Lpips | None = None) -> ViewQuality:
-    """Every metric of one picture ``[H, W, 3]`` against its truth."""
-    errors = (flip(picture, truth), None if lpips is None else lpips(picture, truth))
+def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None) -> ViewQuality:
+    """Every metric of one image ``[H, W, 3]`` against its truth."""
+    errors = (flip(image, truth), None if lpips is None else lpips(image, truth))
     return ViewQuality(
-        float(psnr(picture, truth)), float(ssim(picture, truth)), *(None if e is None else float(e) for e in errors)
+        float(psnr(image, truth)), float(ssim(image, truth)), *(None if e is None else float(e) for e in errors)
     )
 
 
 @torch.no_grad()
-def pictures_of(opened: Opened, index: int) -> ComparisonRow:
-    """Truth, base colours and whole picture of one test view."""
+def comparison_of(opened: Opened, index: int) -> ComparisonRow:
+    """Ground truth, base colours and complete rendering of one test view."""
     outputs = opened.model.get_outputs_for_camera(opened.cameras[index])
     return ComparisonRow(opened.truths[index], outputs["base_rgb"], outputs["rgb"])
 
 
 def revision() -> str:
-    """Commit of the checkout that runs, or what ``BENCHMARK_COMMIT`` says where the tree travelled without git; or empty."""
+    """Commit of the running checkout, or ``BENCHMARK_COMMIT`` for a tree that was copied without git; empty if unknown."""
     told = os.environ.get("BENCHMARK_COMMIT")
     if told:
         return told
     folder = Path(__file__).parent
-    # An installed package may lie inside somebody else's repository, whose commit says nothing.
+    # An installed package may lie inside another repository.
     if not (folder.parent / ".git").exists():
         return ""
     command = ["git", "-C", str(folder), "rev-parse", "--short", "HEAD"]
@@ -305,7 +305,7 @@ def revision() -> str:
 
 
 def _resolution(cameras: Sequence[Cameras]) -> str:
-    """Width x height of the first camera; captures of several sizes say so."""
+    """Width x height of the first camera, and a note if others differ."""
     found = {(int(camera.width), int(camera.height)) for camera in cameras}
     width, height = int(cameras[0].width), int(cameras[0].height)
     return f"{width}x{height}" + (" and others" if len(found) > 1 else "")

@@ -1,7 +1,7 @@
 """Finished runs as packed scenes, and packed scenes as runs that nerfstudio's commands open.
 
-A run's ``config.yml`` is a program to nerfstudio, so nothing of it travels: a packed scene states plain values, each is
-checked, and a fresh configuration is made around them.
+A ``config.yml`` can run code in nerfstudio, so no part of it is packed: a packed scene states plain values. Each value is
+checked, and a new configuration is made from them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import Any, cast, get_args, get_type_hints
 import torch
 import yaml
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -28,11 +27,12 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, without_pictures
+from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, no_images_error
 from sundae_ns.errors import CheckpointError, PackError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
-from sundae_ns.rendering.render import degree_in_use
+from sundae_ns.rendering.source import degree_in_use
+from sundae_ns.scenes import stock
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.kinds import refuse
 from sundae_ns.storage.packing import Scene
@@ -49,22 +49,22 @@ _PARSERS: dict[str, type[DataParserConfig]] = {
     "nerfstudio-data": NerfstudioDataParserConfig,
 }
 _FOLDER = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*")
-"""Paths that a packed scene may name: below the capture, and without a character that a shell would act on, for nerfstudio
-hands paths of pictures to ffmpeg through one."""
+"""Paths that a packed scene may name: below the capture, without special characters of a shell, because nerfstudio passes
+paths of images to ffmpeg through one."""
 
 
 # -------------------------------------------------------------------------------------------------------------- packing
 
 
 def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> Scene:
-    """What is needed to show a finished run: the field, the head if it takes part, and some training cameras.
+    """A finished run as a scene: the field, the head if it is enabled, and some training cameras.
 
-    Spherical harmonics that were not trained yet are left out, and so are the features of a head that takes no part.
+    SH coefficients that were not trained yet are left out, and so are the features of a disabled head.
 
     Args:
         run: folder of a run of sundae or splatfacto, or its ``config.yml``, which is not run.
-        max_cameras: most training cameras, evenly chosen; with 0, the capture need not be there any more.
-        data: the capture, if it is not where the run says.
+        max_cameras: highest number of training cameras, evenly chosen; with 0 the capture is not needed.
+        data: the capture, if it has moved.
 
     Raises:
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
@@ -81,19 +81,19 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
     loaded = checkpoint.load(source)
     model = _restored(cast(SplatfactoModelConfig, config.pipeline.model), loaded, source)
     field = {name: value.detach() for name, value in model.gauss_params.items()}
-    coefficients = (degree_in_use(field["features_rest"], model.most_bands) + 1) ** 2 - 1
+    coefficients = (degree_in_use(model.state.field.sh_degree, model.state.active_sh_degree) + 1) ** 2 - 1
     field["features_rest"] = field["features_rest"][:, :coefficients]
     head: dict[str, Tensor] = {}
     kind: dict[str, Any] | None = None
-    if model.head is not None and model.head_active:
+    if model.head is not None and model.state.head_enabled:
         head = dict(model.head.state_dict())
-        # The head's own: a budget may have chosen a smaller one than the model's configuration names.
+        # Options of the head itself: a budget search may have chosen a smaller one than the configuration names.
         kind = {name: getattr(model.head.config, name) for name in _HEAD_OPTIONS}
     else:
         field.pop(FEATURES, None)
     manager = _manager(config)
-    if data is not None and not manager.pictures:
-        raise without_pictures(path.parent)
+    if data is not None and not manager.images:
+        raise no_images_error(path.parent)
     manager.data = data or manager.data
     meta = {
         "source": {"method": config.method_name, "step": int(loaded["step"])},
@@ -102,7 +102,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
             "rasterize_mode": model.config.rasterize_mode,
             "background_color": model.config.background_color,
             "head": kind,
-            "trained_focal": list(model.trained_focal) if head and model.trained_focal else None,
+            "trained_focal": list(model.state.trained_focal) if head and model.state.trained_focal else None,
         },
         "frame": _frame(path.parent / _FRAME_FILE),
         "capture": _describe(manager),
@@ -120,8 +120,8 @@ def _read_config(path: Path) -> TrainerConfig:
 
 
 def _setup(config: SundaeModelConfig) -> SundaeModel:
-    """The model of a configuration around a field that is about to be replaced."""
-    # Two points rather than none, which would start a random field of tens of thousands.
+    """A model around a field that is replaced afterwards."""
+    # Two points; without any, the model would start from tens of thousands of random points.
     seeds = (torch.eye(3)[:2], torch.zeros(2, 3))
     box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
     model: SundaeModel = config.setup(scene_box=box, num_train_data=0, metadata={}, seed_points=seeds)
@@ -134,13 +134,9 @@ def _restored(found: SplatfactoModelConfig, loaded: Mapping[str, Any], source: P
     for name, value in loaded["pipeline"].items():
         if name.startswith("_model."):
             state[name.removeprefix("_model.").removeprefix("module.")] = value
-    config = copy.deepcopy(found)
-    ours = isinstance(config, SundaeModelConfig)
-    if not isinstance(config, SundaeModelConfig):
-        shared = {field.name: getattr(found, field.name) for field in fields(SplatfactoModelConfig)}
-        config = SundaeModelConfig(**{**shared, "_target": SundaeModel}, head=HeadConfig(mode="off"))
-    config.camera_optimizer.mode = "off"  # moves the cameras of training, not what is shown
-    config.use_bilateral_grid = False
+    ours = isinstance(found, SundaeModelConfig)
+    config = copy.deepcopy(found) if isinstance(found, SundaeModelConfig) else stock.model_config(copy.deepcopy(found))
+    config.camera_optimizer.mode = "off"  # it moves the cameras of training only
     config.random_init = False
     model = _setup(config)
     if not ours:
@@ -155,7 +151,7 @@ def _restored(found: SplatfactoModelConfig, loaded: Mapping[str, Any], source: P
 
 
 def _frame(path: Path) -> dict[str, Any] | None:
-    """The way from the capture's own coordinates to the model's, as nerfstudio wrote it beside the run."""
+    """Transform from the capture's coordinates to the model's, which nerfstudio writes into the run's folder."""
     try:
         frame = json.loads(path.read_text(encoding="utf-8"))
         return {"transform": frame["transform"], "scale": float(frame["scale"])}
@@ -164,13 +160,8 @@ def _frame(path: Path) -> dict[str, Any] | None:
 
 
 def _manager(config: TrainerConfig) -> SundaeDatamanagerConfig:
-    """Ours, also for a run that was trained with splatfacto's."""
-    manager = copy.deepcopy(config.pipeline.datamanager)
-    if not isinstance(manager, SundaeDatamanagerConfig):
-        stock = cast(FullImageDatamanagerConfig, manager)
-        manager = SundaeDatamanagerConfig(
-            data=stock.data, dataparser=stock.dataparser, camera_res_scale_factor=stock.camera_res_scale_factor
-        )
+    """Configuration of our datamanager for a run of sundae or splatfacto."""
+    manager = stock.datamanager_config(copy.deepcopy(config.pipeline.datamanager))
     manager.data = manager.data or config.data
     return manager
 
@@ -186,13 +177,13 @@ def _cameras(manager: SundaeDatamanagerConfig, most: int) -> dict[str, Tensor]:
 
 
 def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
-    """Plain values by which the same capture is read, split and scaled again; None for one of a rare parser.
+    """Plain values to parse, split and scale the same capture again.
 
-    Neither is there one of a run without its capture, whose cameras are not where those of the capture are.
+    None for another parser, and for a run without its capture, whose cameras have other coordinates.
     """
     parser = manager.dataparser
     kind = next((name for name, known in _PARSERS.items() if type(parser) is known), None)
-    if kind is None or not manager.pictures:
+    if kind is None or not manager.images:
         return None
     options: dict[str, Any] = {}
     for name, default in _options(_PARSERS[kind]).items():
@@ -206,7 +197,7 @@ def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
 
 
 def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
-    """Options of a parser that matter to a finished run, with their defaults."""
+    """Options of a parser that a finished run needs, with their defaults."""
     left_out = {"_target", "data", "masks_path", "depths_path", "mask_color", "load_3D_points"}
     return {field.name: getattr(kind(), field.name) for field in fields(kind) if field.name not in left_out}
 
@@ -218,18 +209,18 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
     """Write a packed scene as a run that ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval`` open.
 
     Args:
-        scene: from ``read_scene``; what it states of itself is checked.
-        output_dir: folder of runs, made if need be; the run is ``output_dir/name/sundae/unpacked``.
+        scene: from ``read_scene``; its values are checked.
+        output_dir: folder of runs; the run is ``output_dir/name/sundae/unpacked``.
         name: of the experiment: letters, digits, ``_``, ``.``, ``-``.
-        data: the capture, where it is at hand; without it there are cameras and no pictures.
+        data: the capture; without it the run has cameras without images.
 
     Returns:
         The run's ``config.yml``, which is written last.
 
     Raises:
-        DataError: the capture is not there, or cannot be used.
-        PackError: the scene states what cannot be, or there is a run of that name already.
-        StorageError: no room or no right to write.
+        DataError: the capture is missing, or cannot be used.
+        PackError: the scene has impossible values, or a run of that name exists.
+        StorageError: no space or no right to write.
     """
     from nerfstudio.configs.method_configs import all_methods
 
@@ -253,7 +244,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
             auto_scale_poses=False,
             eval_mode="all",
         )
-        manager.pictures = False
+        manager.images = False
         config.data = folder / "cameras"
     else:
         manager.dataparser, manager.camera_res_scale_factor = _capture(scene.meta.get("capture"))
@@ -277,7 +268,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
 
 
 def is_unpacked(config: TrainerConfig) -> bool:
-    """Whether a run was written by :func:`write_run`: it has a field to show, and nothing that training goes on from."""
+    """Whether a run was written by :func:`write_run`; it cannot be trained on."""
     return config.timestamp == TIMESTAMP
 
 
@@ -286,7 +277,7 @@ def _refusal(reason: str) -> PackError:
 
 
 def _choices(kind: type, name: str) -> tuple[Any, ...]:
-    """Values of an option that is one of a few."""
+    """The values that an option may have."""
     return get_args(get_type_hints(kind)[name])
 
 
@@ -305,7 +296,7 @@ def _whole(stated: Mapping[str, Any], name: str, least: int, most: int) -> int:
 
 
 def _model_of(scene: Scene) -> SundaeModel:
-    """The model that shows a scene, on the CPU."""
+    """The model of a scene, on the CPU."""
     stated = scene.meta.get("model")
     if not isinstance(stated, dict):
         raise _refusal("no model")
@@ -321,16 +312,16 @@ def _model_of(scene: Scene) -> SundaeModel:
     n, found = field["features_rest"].shape[:2]
     wanted = (config.sh_degree + 1) ** 2 - 1
     if found > wanted:
-        raise _refusal("harmonics of a lower degree than it has")
+        raise _refusal("a lower SH degree than it has")
     field["features_rest"] = torch.cat([field["features_rest"], torch.zeros(n, wanted - found, 3)], dim=1)
     model = _setup(config)
-    # A step at which all harmonics take part, and so does the head.
+    # A step at which all SH degrees are active and the head is enabled.
     step = max(config.sh_degree, 1)
     extra = {**model.get_extra_state(), "step": step, "trained_focal": _focal(stated.get("trained_focal"))}
     state: dict[str, Any] = {name: value for name, value in model.state_dict().items() if "." not in name}
     state[checkpoint.EXTRA_STATE] = extra
     state |= {f"gauss_params.{name}": value for name, value in field.items()}
-    state |= {f"head.{name}": value for name, value in scene.head.items()}
+    state |= {f"networks.head.{name}": value for name, value in scene.head.items()}
     try:
         model.load_state_dict(state)
     except (CheckpointError, RuntimeError) as error:
@@ -361,7 +352,7 @@ def _focal(stated: Any) -> list[float] | None:
     if stated is None:
         return None
     if not isinstance(stated, list) or len(stated) != 2 or not all(_is_number(v) and v > 0 for v in stated):
-        raise _refusal("focal lengths that cannot be")
+        raise _refusal("impossible focal lengths")
     return [float(value) for value in stated]
 
 
@@ -373,14 +364,14 @@ def _is_frame(stated: Any) -> bool:
 
 
 def _capture(stated: Any) -> tuple[DataParserConfig, float]:
-    """Counterpart of :func:`_describe`: the parser, and the factor on the sides of its pictures."""
+    """Counterpart of :func:`_describe`: the parser, and the scale of its images."""
     kind = stated.get("parser") if isinstance(stated, dict) else None
     options = stated.get("options") if isinstance(stated, dict) else None
     if kind not in _PARSERS or not isinstance(options, dict):
         raise PackError("the packed scene does not say how its capture is read; unpack it without --data")
     scale = stated.get("scale")
     if not _is_number(scale) or not 0 < scale <= 1:
-        raise _refusal("pictures of a scale that cannot be")
+        raise _refusal("an impossible scale of its images")
     parser = _PARSERS[kind](load_3D_points=False)  # type: ignore[call-arg]
     known = _options(_PARSERS[kind])
     for name, value in options.items():
@@ -395,13 +386,13 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
             or (isinstance(default, Path) and isinstance(value, str) and _FOLDER.fullmatch(value) is not None)
         )
         if not fits:
-            raise _refusal(f"an option {str(name)[:40]!r} of its capture that cannot be")
+            raise _refusal(f"an impossible option {str(name)[:40]!r} of its capture")
         setattr(parser, name, Path(value) if isinstance(default, Path) else value)
     return parser, float(scale)
 
 
 def _transforms(scene: Scene) -> dict[str, Any]:
-    """The cameras as a capture of nerfstudio's layout, in the model's coordinates; lenses are left out, as in rendering."""
+    """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
     cameras = scene.cameras
     if cameras is None or len(cameras["poses"]) == 0:
         cameras = _outside_camera(scene.field["means"])
@@ -425,7 +416,7 @@ def _transforms(scene: Scene) -> dict[str, Any]:
 
 
 def _outside_camera(means: Tensor) -> dict[str, Tensor]:
-    """One camera in front of a scene of which no camera is known: it looks along y, with z upwards."""
+    """A camera in front of a scene without cameras: it looks along y, with z upwards."""
     center = means.median(dim=0).values
     away = 3 * (means - center).norm(dim=1).median().clamp_min(1e-6)
     pose = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])

@@ -1,4 +1,4 @@
-"""Fields on disk and in other frames: .ply, .spz and .sog files, bytes of primitives and head, similarities. Floor 2."""
+"""Files: .ply, .spz, .sog and packed scenes; runs; atomic writes, sizes in bytes, similarity transforms. Floor 3."""
 
 from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module, megabytes
 from sundae_ns.storage.atomic import replacing, write_text

@@ -1,4 +1,4 @@
-"""Bytes of what has to be stored: the primitives and the head. MB means 1e6 bytes."""
+"""Stored bytes of the primitives and of the head. MB means 1e6 bytes."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ MEGABYTE = 1_000_000
 
 
 def bytes_of(params: Mapping[str, Tensor]) -> int:
-    """Bytes of a field's parameters stored in fp32, feature vectors included, whatever their dtype in memory."""
+    """Bytes of a field's parameters in fp32, feature vectors included, for any dtype in memory."""
     return sum(value.numel() for value in params.values()) * BYTES_PER_FLOAT
 
 
 def bytes_of_module(module: nn.Module) -> int:
-    """Bytes of a module's parameters and buffers, each in its own dtype; a tensor that is shared counts once."""
+    """Bytes of a module's parameters and buffers, each in its own dtype; a shared tensor counts once."""
     return sum(tensor.numel() * tensor.element_size() for tensor in chain(module.parameters(), module.buffers()))
 
 
 def rows_within(params: Mapping[str, Tensor], limit: int, count_bytes: Callable[[Mapping[str, Tensor]], int]) -> int:
-    """Most primitives of a field, from the first on, that are stored in at most ``limit`` bytes; 0 if not one is.
+    """Largest n for which the first n primitives of a field take at most ``limit`` bytes; may be 0.
 
     Args:
         params: the field, each parameter ``[N, ...]``.
         limit: bytes.
-        count_bytes: bytes of a field; must not fall where primitives are added.
+        count_bytes: bytes of a field; must not decrease with the number of primitives.
     """
     low, high = 0, len(params["means"])
     while low < high:
@@ -41,18 +41,18 @@ def rows_within(params: Mapping[str, Tensor], limit: int, count_bytes: Callable[
 
 
 def megabytes(count: int) -> str:
-    """Bytes as text in MB = 1e6 bytes: ``31.10 MB``."""
+    """Format bytes in MB = 1e6 bytes: ``31.10 MB``."""
     return f"{count / MEGABYTE:.2f} MB"
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What a compensated field takes on disk."""
+    """Stored bytes of a compensated field."""
 
     primitives: int
     """Bytes of the primitives."""
     head: int = 0
-    """Bytes of the compensation network."""
+    """Bytes of the head."""
 
     @property
     def total(self) -> int:

@@ -1,4 +1,4 @@
-"""What a file is by its first bytes, whatever its name: commands tell a user what they were given, and what to give."""
+"""Kinds of files by their first bytes, for error messages that say what to give instead."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NAMES: dict[Kind, str] = {"packed": "a packed scene", "ply": "a .ply file"}
 
 
 def kind_of(path: Path) -> Kind | None:
-    """What a path leads to: a packed scene, a .ply, or None for anything else, a folder and nothing at all among them."""
+    """Kind of the file at a path; None for any other file, a folder or a missing file."""
     try:
         with path.open("rb") as file:
             first = file.read(max(map(len, _FIRST_BYTES)))
@@ -25,15 +25,15 @@ def kind_of(path: Path) -> Kind | None:
 
 
 def refuse(path: Path, *, packed: str | None = None, ply: str | None = None) -> None:
-    """Refuse a file of a kind that cannot be used here.
+    """Raise an error for a file of a refused kind.
 
     Args:
-        path: what a user gave.
-        packed: what to give instead of a packed scene; None where one is as good as anything else.
-        ply: what to give instead of a .ply; likewise.
+        path: given by the user.
+        packed: advice on what to give instead of a packed scene; None accepts packed scenes.
+        ply: advice on what to give instead of a .ply; None accepts .ply files.
 
     Raises:
-        CheckpointError: it is a file of a kind that something else is to be given for.
+        CheckpointError: the file is of a refused kind.
     """
     advice: dict[Kind, str | None] = {"packed": packed, "ply": ply}
     kind = kind_of(path)

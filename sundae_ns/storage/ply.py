@@ -1,9 +1,9 @@
 """The .ply of 3D Gaussian splatting, which viewers and converters read.
 
-One binary vertex a primitive, all properties float32, values before activation as in
+One binary vertex per primitive, all properties float32, values before activation as in
 :mod:`sundae_ns.gaussians.parameters`: ``x y z  nx ny nz  f_dc_0..2  f_rest_*  opacity  scale_0..2  rot_0..3``. Normals
-are zero. ``f_rest`` is channel-major: all coefficients of red, then green, then blue. The format has no place for
-feature vectors, nor for a head: what it shows are base colours.
+are zero. ``f_rest`` is channel-major: all coefficients of red, then green, then blue. The format stores base colours
+only: no feature vectors and no head.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ _NORMALS = ("nx", "ny", "nz")
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 MAX_HEADER = 1 << 16
-"""Bytes of a file in which its header must end."""
+"""The header must end within this many bytes."""
 
 
 def _rest_columns(count: int) -> tuple[str, ...]:
-    """Names of the ``count`` properties that hold SH bands 1 and up."""
+    """Names of the ``count`` properties with SH coefficients of degrees 1 and up."""
     return tuple(f"f_rest_{i}" for i in range(count))
 
 
 def check_field(params: Mapping[str, Tensor]) -> None:
-    """Raise ``DataError`` unless all parameters of primitives with base colours are there, in their shapes."""
+    """Raise ``DataError`` unless a field has all of ``SPLAT_NAMES``, in their shapes."""
     missing = [name for name in SPLAT_NAMES if name not in params]
     if missing:
         raise DataError(
@@ -52,18 +52,18 @@ def check_field(params: Mapping[str, Tensor]) -> None:
 
 
 def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[str] = ()) -> None:
-    """Write the base colours of a field as a 3DGS .ply; an existing file is replaced only once the new one is whole.
+    """Write the base colours of a field as a 3DGS .ply, atomically.
 
     Args:
         path: the file; its folder must exist.
-        params: a field; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are left out. Non-finite values are
-            written as they are: drop them before (``finite_mask``), for viewers do not.
+        params: a field; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not written. Values that are not
+            finite are written unchanged: drop such primitives first (``finite_mask``), because viewers do not.
         comments: lines for the header: ``storage.MODEL_FRAME`` for the field of a nerfstudio model, ``SplatRenderMode:
             mip`` for an antialiased scene.
 
     Raises:
         DataError: a parameter is missing or has the wrong shape.
-        StorageError: the disk is full, or may not be written to.
+        StorageError: the disk is full or not writable.
     """
     path = Path(path)
     check_field(params)
@@ -91,14 +91,14 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
 
 
 def _damage(path: Path) -> str | None:
-    """Why a file cannot hold what its header states, or None; the parser allocates by what is stated."""
+    """Why a file is shorter than its header states, or None; the parser allocates by the header."""
     with path.open("rb") as file:
-        header, found, _ = file.read(MAX_HEADER).partition(b"end_header")
+        header, end, _ = file.read(MAX_HEADER).partition(b"end_header")
     lines = [line.split() for line in header.splitlines()]
-    if not found or lines[:1] != [[b"ply"]]:
-        return "it has no header of a .ply"
+    if not end or lines[:1] != [[b"ply"]]:
+        return "it has no .ply header"
     text = [b"format", b"ascii", b"1.0"] in lines
-    # In ascii, each value takes a digit and a space.
+    # In ascii, each value takes at least a digit and a space.
     elements: list[tuple[int, int]] = []
     for words in lines:
         if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
@@ -109,38 +109,38 @@ def _damage(path: Path) -> str | None:
             elements[-1] = (count, size + (2 if text else _SIZES.get(kind.decode("latin-1"), 1)))
     if any(count > 0 and size == 0 for count, size in elements):
         return "an element has no properties"
-    least = sum(count * size for count, size in elements)
-    room = path.stat().st_size - len(header)
-    return f"its header states at least {least:,} bytes, it has {room:,}" if least > room else None
+    stated = sum(count * size for count, size in elements)
+    available = path.stat().st_size - len(header)
+    return f"its header states at least {stated:,} bytes, it has {available:,}" if stated > available else None
 
 
 def load_ply(path: Path) -> PlyData:
-    """Parse a .ply file of any kind, allocating no more than a few times its size.
+    """Parse any .ply file, allocating no more than a few times its size.
 
     Raises:
-        DataError: the file is missing, no .ply, cut short, or has no vertices.
+        DataError: the file is missing, not a .ply, truncated, or has no vertices.
     """
     try:
         reason = _damage(path)
         if reason is not None:
-            raise DataError(f"{path} is not a whole .ply file ({reason}); export it again.")
-        # Maps the file: without a map, plyfile reads one vertex at a time (90 s a million instead of 1).
+            raise DataError(f"{path} is not a complete .ply file ({reason}); export it again.")
+        # plyfile maps the file given a path; from a stream it reads single vertices (90 s per million instead of 1 s).
         data = PlyData.read(str(path))
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path.") from error
     except (PlyParseError, ValueError) as error:
         if isinstance(error, DataError):
             raise
-        # Among the ValueErrors are bytes that are no text, where a header should be.
+        # A header that is not text raises ValueError.
         reason = " ".join(str(error).split())[:200]
-        raise DataError(f"{path} is not a whole .ply file ({reason}); export it again.") from error
+        raise DataError(f"{path} is not a complete .ply file ({reason}); export it again.") from error
     if "vertex" not in data:
         raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussian primitives.")
     return data
 
 
 def stack_columns(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
-    """Properties of all vertices side by side: ``[N, len(columns)]`` float32.
+    """Properties of all vertices as columns: ``[N, len(columns)]`` float32.
 
     Raises:
         DataError: a property is a list.
@@ -149,7 +149,7 @@ def stack_columns(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
     for i, name in enumerate(columns):
         if vertex[name].dtype.kind not in "iuf":
             raise DataError(f"property {name} of the vertices is a list, not a number; export the .ply again.")
-        with np.errstate(over="ignore"):  # numbers beyond float32 become infinite, and those are left out later
+        with np.errstate(over="ignore"):  # values beyond float32 become infinite; callers drop them
             table[:, i] = vertex[name]
     return torch.from_numpy(table)
 
@@ -162,10 +162,10 @@ def read_ply(path: Path) -> dict[str, Tensor]:
 
     Returns:
         A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU. The SH degree
-        follows from the number of ``f_rest_*``; ``features_rest`` is ``[N, 0, 3]`` where there are none.
+        follows from the number of ``f_rest_*``; without any, ``features_rest`` is ``[N, 0, 3]``.
 
     Raises:
-        DataError: the file is missing, no binary .ply, cut short, or not one of Gaussian primitives.
+        DataError: the file is missing, not a binary .ply, truncated, or does not hold Gaussian primitives.
     """
     data = load_ply(path)
     if data.text:
@@ -187,21 +187,21 @@ def read_ply(path: Path) -> dict[str, Tensor]:
 
 
 def keep_vertices(source: Path, out: Path, mask: Tensor) -> None:
-    """Copy a .ply with some of its vertices; properties, comments and other elements stay as they are.
+    """Copy a .ply with only some of its vertices; properties, comments and other elements are unchanged.
 
     Args:
         source: any .ply.
-        out: the file to write, whole or not at all; may be ``source``.
-        mask: which vertices stay, bool ``[N]``.
+        out: the file to write atomically; may be ``source``.
+        mask: True for vertices to keep, bool ``[N]``.
 
     Raises:
         DataError: the file cannot be read, or has another number of vertices.
-        StorageError: the disk is full, or may not be written to.
+        StorageError: the disk is full or not writable.
     """
     data = load_ply(source)
     vertex = data["vertex"]
     if vertex.count != len(mask):
-        raise DataError(f"{source} has {vertex.count} vertices, {len(mask)} were expected; it was changed meanwhile.")
+        raise DataError(f"{source} has {vertex.count} vertices, not {len(mask)}: it was changed meanwhile; run again.")
     kept = PlyElement.describe(np.asarray(vertex.data[mask.cpu().numpy()]), "vertex", comments=vertex.comments)
     elements = [kept if element.name == "vertex" else element for element in data.elements]
     copy = PlyData(elements, text=data.text, byte_order=data.byte_order, comments=data.comments, obj_info=data.obj_info)

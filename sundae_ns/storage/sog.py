@@ -1,12 +1,15 @@
-"""The .sog of PlayCanvas, version 2: a zip of lossless WebP pictures with one pixel a primitive, and ``meta.json``.
+"""The .sog of PlayCanvas, version 2: a zip of lossless WebP images with one pixel per primitive, and ``meta.json``.
 
-Written from the format's public description, for no package of Python that is kept up writes it. What is rounded: positions
-to 65,536 levels an axis after ``sign(x) log(1 + |x|)``; log-scales, colours of band 0 and coefficients of further bands to
-256 values each, found by k-means in one dimension; opacities to 256 levels after activation; rotations to the smallest three of
-8 bits. Bands 1 to 3 of a primitive are a row of a palette of at most 65,536 rows: each its own while there are no more
-primitives, else centres of a k-means in two levels.
+Written from the format's public description, because no maintained Python package writes it. The format rounds
 
-Coordinates are those of a .ply, unturned, as in the files of ``splat-transform``.
+- positions to 65,536 levels per axis after ``sign(x) log(1 + |x|)``;
+- log-scales, SH coefficients of degree 0 and those of higher degrees to 256 values each, by k-means in one dimension;
+- opacities to 256 levels after activation;
+- rotations to the three smallest components, 8 bits each.
+
+SH coefficients of degrees 1 to 3 of a primitive are a row of a palette of at most 65,536 rows. With more primitives
+than rows, the rows are centres of a two-level k-means. Coordinates are those of a .ply, as in files of
+``splat-transform``.
 """
 
 from __future__ import annotations
@@ -30,30 +33,30 @@ from sundae_ns.storage.packing.morton import scene_order
 from sundae_ns.storage.spz import checked
 
 MAX_PALETTE = 1 << 16
-"""Rows of harmonics that two bytes can name."""
-_ROW_ENTRIES = 64  # rows of the palette in a row of its picture
-_ENTRIES = 256  # numbers that a byte can name
-_COARSE = 256  # cells that share out the rows of a large palette
-_ROUNDS = 30  # of Lloyd's, for numbers on a line
-_LEVELS = 65535  # highest level of a position, of two bytes
-_FIRST_MODE = 252  # alpha of a rotation whose first component is left out; the others follow
+"""Palette rows that two bytes can index."""
+_ROW_ENTRIES = 64  # palette rows in a row of the palette's image
+_ENTRIES = 256  # codebook entries that a byte can index
+_COARSE = 256  # coarse cells of a large palette
+_ROUNDS = 30  # Lloyd iterations of a one-dimensional codebook
+_LEVELS = 65535  # highest level of a position, in two bytes
+_FIRST_MODE = 252  # alpha of a rotation without its first component; the next values stand for the other components
 
 
 def write_sog(
     path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, max_palette: int = MAX_PALETTE
 ) -> None:
-    """Write the base colours of a field as a bundled .sog; an existing file is replaced only once the new one is whole.
+    """Write the base colours of a field as a bundled .sog, atomically.
 
     Args:
         path: the file; its folder must exist.
-        params: a field of finite values and SH degree 3 at most; see :mod:`sundae_ns.gaussians.parameters`. ``features``
-            are left out, and the order of primitives changes.
+        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not
+            written, and the order of primitives changes.
         antialiased: mark the scene as trained with antialiasing.
-        max_palette: most rows of the palette of harmonics, 512 to 65,536.
+        max_palette: maximum number of rows of the SH palette, 512 to 65,536.
 
     Raises:
-        DataError: the field has no primitives, a degree that the format cannot hold, or wrong shapes.
-        StorageError: the disk is full, or may not be written to.
+        DataError: the field has no primitives, an SH degree above 3, or wrong shapes.
+        StorageError: the disk is full or not writable.
     """
     field = checked(path, params)
     order = scene_order(field["means"].numpy())
@@ -67,7 +70,7 @@ def write_sog(
     color_values, color_codes = codebook(arrays["features_dc"])
     alphas = np.rint(255 / (1 + np.exp(-arrays["opacities"].astype(np.float64)))).astype(np.uint8)
 
-    pictures = {
+    images = {
         "means_l": _square((levels & 255).astype(np.uint8)),
         "means_u": _square((levels >> 8).astype(np.uint8)),
         "scales": _square(scale_codes),
@@ -79,7 +82,7 @@ def write_sog(
         "asset": {"generator": "sundae-ns"},
         "count": n,
         "antialias": antialiased,
-        # splat-transform of 2026 reads this entry instead of the one before.
+        # splat-transform reads this entry instead of the previous one (2026).
         **({"model": "antialiased"} if antialiased else {}),
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_values.tolist(), "files": ["scales.webp"]},
@@ -92,9 +95,9 @@ def write_sog(
         values, codes = codebook(rows.reshape(len(rows), coefficients, 3))
         padded = np.zeros((math.ceil(len(rows) / _ROW_ENTRIES) * _ROW_ENTRIES, coefficients, 3), np.uint8)
         padded[: len(rows)] = codes
-        pictures["shN_centroids"] = padded.reshape(-1, _ROW_ENTRIES * coefficients, 3)
-        named = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
-        pictures["shN_labels"] = _square(named.astype(np.uint8))
+        images["shN_centroids"] = padded.reshape(-1, _ROW_ENTRIES * coefficients, 3)
+        label_bytes = np.stack([labels & 255, labels >> 8, np.zeros_like(labels)], axis=1)
+        images["shN_labels"] = _square(label_bytes.astype(np.uint8))
         meta["shN"] = {
             "count": len(rows),
             "bands": math.isqrt(coefficients + 1) - 1,
@@ -102,30 +105,30 @@ def write_sog(
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
     with replacing(Path(path)) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as bundle:
-        # A fixed date: the same field gives the same bytes.
+        # ZipInfo has a fixed date, so that equal fields give equal bytes.
         bundle.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
-        for name, pixels in pictures.items():
+        for name, pixels in images.items():
             bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))
 
 
 def codebook(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """The 256 numbers that stand for many with a small squared error, by Lloyd's rounds on the line (1957).
+    """Fit 256 numbers to values, minimising the squared error by one-dimensional k-means (Lloyd, 1957).
 
     Args:
-        values: of any shape, at least one, finite.
+        values: of any shape, not empty, finite.
 
     Returns:
-        The numbers, rising, ``[256]``, and which of them is nearest to each value, in the shape of ``values``.
+        The numbers in ascending order ``[256]``, and the index of the nearest one, in the shape of ``values``.
     """
-    rising = np.sort(values, axis=None).astype(np.float64)
-    sums = np.concatenate([[0.0], np.cumsum(rising)])
-    # Half where the values are many, half over the whole range, for the few at its ends.
-    usual = np.quantile(rising, (np.arange(_ENTRIES // 2) + 0.5) / (_ENTRIES // 2))
-    centres = np.sort(np.concatenate([usual, np.linspace(rising[0], rising[-1], _ENTRIES // 2)]))
+    ordered = np.sort(values, axis=None).astype(np.float64)
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    # Start with half of the centres at quantiles and half spread evenly, for the few values at the ends.
+    quantiles = np.quantile(ordered, (np.arange(_ENTRIES // 2) + 0.5) / (_ENTRIES // 2))
+    centres = np.sort(np.concatenate([quantiles, np.linspace(ordered[0], ordered[-1], _ENTRIES // 2)]))
     for _ in range(_ROUNDS):
-        bounds = np.concatenate([[0], np.searchsorted(rising, _middles(centres)), [len(rising)]])
+        bounds = np.concatenate([[0], np.searchsorted(ordered, _middles(centres)), [len(ordered)]])
         number = np.diff(bounds)
-        # Sorted: means of rounded sums may pass each other.
+        # Sort again: rounding of the sums may swap neighbouring means.
         centres = np.sort(np.where(number > 0, np.diff(sums[bounds]) / np.maximum(number, 1), centres))
     numbers = centres.astype(np.float32)
     return numbers, np.searchsorted(_middles(numbers.astype(np.float64)), values).astype(np.uint8)
@@ -136,44 +139,44 @@ def _middles(centres: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def palette(
-    rows: NDArray[np.float32], most: int = MAX_PALETTE, *, seed: int = 0
+    rows: NDArray[np.float32], max_rows: int = MAX_PALETTE, *, seed: int = 0
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """At most ``most`` rows that stand for all, and which one stands for each.
+    """Fit at most ``max_rows`` palette rows to the given rows.
 
-    A k-means of 65,536 centres over a million rows would take hours, so it has two levels: 256 coarse centres share the
-    rows out, and each cell gets centres of its own in proportion to its rows.
+    A k-means of 65,536 centres over a million rows would take hours. So it has two levels: 256 coarse cells, and in
+    each cell centres in proportion to its rows.
 
     Args:
         rows: ``[N, D]``.
-        most: at least 512; with as few rows as that, each stands for itself.
-        seed: of the first centres.
+        max_rows: maximum number of palette rows, at least 512; if N is not larger, the rows are the palette.
+        seed: seed of the initial centres.
 
     Returns:
-        Rows ``[P, D]`` and indices ``[N]``.
+        Palette ``[P, D]`` and the palette index of each row ``[N]``.
     """
     n = len(rows)
-    if n <= most:
+    if n <= max_rows:
         return rows, np.arange(n)
     generator = torch.Generator().manual_seed(seed)
     vectors = torch.from_numpy(np.ascontiguousarray(rows)).double()
     cell_of = nearest_centre(vectors, kmeans(vectors, _COARSE, generator))
     centres: list[Tensor] = []
     labels = torch.empty(n, dtype=torch.int64)
-    found = 0
+    count_before = 0
     for cell in range(_COARSE):
         (members,) = torch.nonzero(cell_of == cell, as_tuple=True)
         if not len(members):
             continue
-        count = min(1 + (most - _COARSE) * len(members) // n, len(members))
+        count = min(1 + (max_rows - _COARSE) * len(members) // n, len(members))
         fine = kmeans(vectors[members], count, generator)
-        labels[members] = found + nearest_centre(vectors[members], fine)
+        labels[members] = count_before + nearest_centre(vectors[members], fine)
         centres.append(fine)
-        found += count
+        count_before += count
     return torch.cat(centres).float().numpy(), labels.numpy()
 
 
 def _smallest_three(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Unit quaternions wxyz ``[N, 4]`` as pixels ``[N, 4]``: the three smaller components, and which is left out."""
+    """Unit quaternions wxyz as pixels, both ``[N, 4]``: the three smallest components, and the index of the largest."""
     largest = np.abs(quats).argmax(axis=1)
     rows = np.arange(len(quats))
     positive = quats * np.where(quats[rows, largest] < 0, -1, 1)[:, None]
@@ -183,18 +186,18 @@ def _smallest_three(quats: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _square(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Pixels ``[N, C]`` as a nearly square picture ``[H, W, C]``, the last row filled with zeros."""
+    """Pixels ``[N, C]`` as a nearly square image ``[H, W, C]``, with zeros at the end of the last row."""
     n, channels = pixels.shape
     width = math.isqrt(n - 1) + 1
-    picture = np.zeros((math.ceil(n / width) * width, channels), np.uint8)
-    picture[:n] = pixels
-    return picture.reshape(-1, width, channels)
+    image = np.zeros((math.ceil(n / width) * width, channels), np.uint8)
+    image[:n] = pixels
+    return image.reshape(-1, width, channels)
 
 
 def _webp(pixels: NDArray[np.uint8]) -> bytes:
     from PIL import Image
 
     file = io.BytesIO()
-    # exact: colours stay where alpha, an opacity here, is 0.
+    # exact: keep colours where alpha, here the opacity, is 0.
     Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True)
     return file.getvalue()

@@ -1,11 +1,15 @@
-"""The .spz of Niantic: quantised primitives, deflated, which most web viewers read; written by ``gsply``.
+"""The .spz of Niantic: quantised, deflated primitives, which most web viewers read; written by ``gsply``.
 
-What the format itself rounds, of each value before activation unless said otherwise: positions to a fixed point of 24 bits,
-log-scales to steps of 1/16 within [-10, 5.94], opacities to 256 levels after activation, colours of band 0 to 1/38, further
-bands to 1/128 within [-1, 1], rotations to the smallest three of 9 bits and a sign. There are bands to 3.
+The format rounds values before activation, except opacities:
 
-The format's text asks for axes right-up-back, but its own converter from .ply does not turn anything, nor do ``gsply`` and
-``splat-transform`` (nianticlabs/spz, issue 84). So the numbers here are the .ply's too: both files show the same scene.
+- positions to fixed point in 24 bits;
+- log-scales to steps of 1/16 within [-10, 5.94];
+- opacities to 256 levels after activation;
+- SH coefficients of degree 0 to 1/38, of degrees 1 to 3 to 1/128 within [-1, 1]; higher degrees do not fit;
+- rotations to the three smallest components, 9 bits and a sign each.
+
+The specification asks for right-up-back axes, but its own converter from .ply does not rotate, nor do ``gsply`` and
+``splat-transform`` (nianticlabs/spz, issue 84). Neither does this module: a .ply and a .spz show the same scene.
 """
 
 from __future__ import annotations
@@ -23,53 +27,53 @@ from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.ply import check_field
 
 MAX_SH_DEGREE = 3
-"""Bands of harmonics that .spz and .sog have places for."""
+"""Highest SH degree that .spz and .sog can store."""
 HARMONICS_STEP = 1 / 64
-"""Costs 0.03 dB where the finest step costs 0.01 and the one twice as coarse 0.12; see docs/packing.md."""
+"""Costs 0.03 dB; the finest step costs 0.01 dB, twice this step 0.12 dB (docs/formats.md)."""
 _VERSION = 3  # one gzip stream; more programs read it than version 4
-_HEADER_FLAGS = 14  # byte of the header
-_ANTIALIASED = 0x1  # one of these flags
-_LARGEST = (1 << 23) - 1  # coordinate in steps, of 24 bits with a sign
-_MOST_BITS = 24  # binary places of a coordinate
+_HEADER_FLAGS = 14  # offset of the flags in the header
+_ANTIALIASED = 0x1  # flag
+_LARGEST = (1 << 23) - 1  # largest coordinate in steps, 24 bits with a sign
+_MOST_BITS = 24  # fractional bits of a coordinate
 _FEWEST_BITS = 8
 
 
 def fractional_bits(means: Tensor) -> int:
-    """Binary places of the positions: as many as let the farthest primitive fit, at most 24.
+    """Fractional bits of the positions: the largest number, at most 24, with which the farthest primitive fits.
 
-    The error of a coordinate is at most ``2^-(bits + 1)``, beside float32's own.
+    The error of a coordinate is at most ``2^-(bits + 1)``, plus the rounding of float32.
 
     Args:
         means: centres ``[N, 3]``, finite, N at least 1.
 
     Raises:
-        DataError: a primitive is so far away that fewer than 8 places are left for all.
+        DataError: a primitive is so far away that fewer than 8 bits are left.
     """
     farthest = float(means.abs().max())
     for bits in range(_MOST_BITS, _FEWEST_BITS - 1, -1):
         if round(farthest * 2**bits) <= _LARGEST:
             return bits
     raise DataError(
-        f"a primitive is {farthest:.3g} from the origin, which leaves a .spz too few bits for the others; write a .sog or .ply"
+        f"a primitive is {farthest:.3g} from the origin, too far for the fixed point of a .spz; write a .sog or .ply"
     )
 
 
 def write_spz(
     path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, harmonics_step: float = HARMONICS_STEP
 ) -> None:
-    """Write the base colours of a field as a .spz; an existing file is replaced only once the new one is whole.
+    """Write the base colours of a field as a .spz, atomically.
 
     Args:
         path: the file; its folder must exist.
-        params: a field of finite values and SH degree 3 at most; see :mod:`sundae_ns.gaussians.parameters`. ``features``
-            are left out.
-        antialiased: set the flag of scenes that were trained with antialiasing.
-        harmonics_step: bands 1 and up are rounded to multiples of it, a power of two of at least 1/128, before they are
-            written as bytes; coarser steps deflate better.
+        params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not
+            written.
+        antialiased: mark the scene as trained with antialiasing.
+        harmonics_step: SH coefficients of degrees 1 and up are rounded to multiples of this power of two, at least
+            1/128; coarser steps compress better.
 
     Raises:
-        DataError: the field has no primitives, what the format cannot hold, or wrong shapes.
-        StorageError: the disk is full, or may not be written to.
+        DataError: the field has no primitives, an SH degree above 3, a primitive too far away, or wrong shapes.
+        StorageError: the disk is full or not writable.
     """
     from gsply import GSData
     from gsply.spz import write_spz as write
@@ -96,23 +100,23 @@ def write_spz(
 
 
 def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """What .spz and .sog take of a field: float32 on the CPU, unit quaternions, zero ones turned into no rotation.
+    """The parameters that .spz and .sog store, float32 on the CPU; quaternions are normalised, zero ones the identity.
 
     Raises:
-        DataError: as :func:`write_spz`.
+        DataError: the field has no primitives, values that are not finite, an SH degree above 3, or wrong shapes.
     """
     check_field(params)
     names = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
     field = {name: params[name].detach().to(device="cpu", dtype=torch.float32).contiguous() for name in names}
     if not len(field["means"]):
-        raise DataError(f"the field has no primitives, and {Path(path).suffix} no way to say so; check the run")
+        raise DataError(f"the field has no primitives, which a {Path(path).suffix} cannot store; check the run")
     if not all(bool(value.isfinite().all()) for value in field.values()):
         raise DataError("some values are NaN or infinite; drop those primitives first (finite_mask)")
     if field["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
         raise DataError(
-            f"{Path(path).suffix} holds harmonics to degree {MAX_SH_DEGREE}; cut features_rest, or write a .ply"
+            f"a {Path(path).suffix} stores SH degrees up to {MAX_SH_DEGREE}; cut features_rest, or write a .ply"
         )
-    # In float64: squares of 1e-30 are 0 in float32.
+    # Normalise in float64: the square of 1e-30 is 0 in float32.
     quats = field["quats"].double()
     norms = quats.norm(dim=1, keepdim=True)
     identity = torch.tensor(np.eye(1, 4)[0])

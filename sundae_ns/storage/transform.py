@@ -1,4 +1,4 @@
-"""Similarity transforms of a field: centres, sizes, rotations and spherical harmonics together."""
+"""Similarity transforms of a field: centres, scales, rotations and spherical harmonics."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from sundae_ns.rasterization.harmonics import harmonic_basis
 def rotation_to_quaternion(rotation: Tensor) -> Tensor:
     """Unit quaternion wxyz ``[4]`` of a rotation matrix ``[3, 3]``.
 
-    The quaternion is the eigenvector of the largest eigenvalue of Bar-Itzhack's symmetric 4 x 4 matrix (2000), which has
-    no special cases.
+    It is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Bar-Itzhack, 2000); no rotation is a
+    special case.
     """
     m = rotation.double()
     k = torch.zeros(4, 4, dtype=torch.float64, device=m.device)
@@ -27,46 +27,46 @@ def rotation_to_quaternion(rotation: Tensor) -> Tensor:
 
 
 def multiply_quaternions(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product of wxyz quaternions ``[..., 4]``: first ``b``, then ``a``."""
+    """Hamilton product of wxyz quaternions ``[..., 4]``: rotates by ``b``, then by ``a``."""
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     w = aw * bw - (av * bv).sum(dim=-1, keepdim=True)
     return torch.cat([w, aw * bv + bw * av + torch.linalg.cross(av.expand_as(bv), bv)], dim=-1)
 
 
 def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tensor:
-    """Coefficients of the rotated function: ``f'(R d) = f(d)``.
+    """SH coefficients of the rotated function: ``f'(R d) = f(d)``.
 
-    A rotation maps each band onto itself, so its matrix is found exactly by evaluating the band's functions on a few
+    A rotation maps the functions of each degree onto themselves. Its matrix follows exactly from their values on 64
     directions before and after the rotation.
 
     Args:
-        features_rest: ``[N, K, 3]`` bands 1 and up, K = (degree + 1)^2 - 1.
+        features_rest: ``[N, K, 3]`` coefficients of degrees 1 and up, K = (degree + 1)^2 - 1.
         rotation: ``[3, 3]``.
     """
-    degree = sh_degree(features_rest)
+    max_degree = sh_degree(features_rest)
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(64, 3, generator=generator, dtype=torch.float64), dim=1)
-    before = harmonic_basis(degree, directions)
-    after = harmonic_basis(degree, directions @ rotation.double().cpu().T)
+    before = harmonic_basis(max_degree, directions)
+    after = harmonic_basis(max_degree, directions @ rotation.double().cpu().T)
     rotated = features_rest.clone()
-    for band in range(1, degree + 1):
-        columns = slice(band**2, (band + 1) ** 2)
+    for degree in range(1, max_degree + 1):
+        columns = slice(degree**2, (degree + 1) ** 2)
         matrix = torch.linalg.lstsq(after[:, columns], before[:, columns]).solution
-        rows = slice(band**2 - 1, (band + 1) ** 2 - 1)
+        rows = slice(degree**2 - 1, (degree + 1) ** 2 - 1)
         rotated[:, rows] = torch.einsum("ij,njc->nic", matrix.to(features_rest), features_rest[:, rows])
     return rotated
 
 
 def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) -> dict[str, Tensor]:
-    """Move a field by ``x -> scale * (R x + t)``.
+    """Transform a field by ``x -> scale * (R x + t)``.
 
     Args:
-        params: the mapping that ``gaussians.parameters`` describes.
-        transform: ``[3, 4]``, a rotation R beside a translation t.
+        params: a field; see :mod:`sundae_ns.gaussians.parameters`.
+        transform: rotation R and translation t ``[3, 4]``.
         scale: factor.
 
     Returns:
-        New parameters; opacities, band 0 and features are shared with ``params``.
+        New parameters; opacities, SH coefficients of degree 0 and features are the tensors of ``params``.
     """
     rotation, translation = transform[:, :3].to(params["means"]), transform[:, 3].to(params["means"])
     moved = dict(params)

@@ -1,4 +1,4 @@
-"""Fields as the files that other people's viewers open: which one a name asks for, and what each cannot hold."""
+"""Write a field for other viewers, in the format of the file's suffix: .ply, .spz or .sog."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ FORMATS = (".ply", ".spz", ".sog")
 ANTIALIASED = "SplatRenderMode: mip"
 """Header comment of a .ply whose scene was trained with antialiasing."""
 
-# nerfstudio's z is up, and so is -y of a 3DGS .ply.
+# In nerfstudio, z points up; in a 3DGS .ply, -y does.
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
 
 
 class ViewerFile(NamedTuple):
-    """What was written."""
+    """Summary of a written file."""
 
     primitives: int
     dropped: int
-    """Primitives that were not finite, and are left out."""
+    """Primitives left out because they are not finite."""
     degree: int
-    """Of the harmonics in the file."""
+    """SH degree of the file."""
     cut: bool
-    """Whether the field has more of them, for which the format has no place."""
+    """Whether the field has a higher SH degree than the file."""
     bytes: int
 
 
 def check_format(path: Path) -> None:
-    """Raise ``ConfigError`` unless the name of a file says one of the formats."""
+    """Raise ``ConfigError`` unless the suffix of a file names a supported format."""
     if path.suffix.lower() not in FORMATS:
-        raise ConfigError(f"{path} is not named {' or '.join(FORMATS)}, which are what is written; rename it")
+        raise ConfigError(f"{path} has no supported suffix; name it {' or '.join(FORMATS)}")
 
 
 def write_for_viewers(
@@ -53,19 +53,21 @@ def write_for_viewers(
     sigmoid_colors: bool = False,
     upright: bool = False,
 ) -> ViewerFile:
-    """Write the base colours of a nerfstudio model's field in the format that the file's name says.
+    """Write the base colours of a nerfstudio model's field in the format of the file's suffix, atomically.
+
+    Drops primitives that are not finite, and SH coefficients above the format's degree.
 
     Args:
-        path: a .ply, .spz or .sog; its folder must exist. An older file is replaced once the new one is whole.
+        path: a .ply, .spz or .sog; its folder must exist.
         params: the field; see :mod:`sundae_ns.gaussians.parameters`.
         antialiased: mark the scene as trained with antialiasing.
-        sigmoid_colors: ``features_dc`` are logits of colours, as in a model of SH degree 0, and no harmonics.
-        upright: turn the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright.
+        sigmoid_colors: ``features_dc`` are logits of colours, as in a model of SH degree 0, not SH coefficients.
+        upright: rotate the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright.
 
     Raises:
-        ConfigError: the name says no format that is written.
-        DataError: the field has wrong shapes, or what the format cannot hold.
-        StorageError: the disk is full, or may not be written to.
+        ConfigError: the suffix is not supported.
+        DataError: the field has wrong shapes, or the format cannot store it.
+        StorageError: the disk is full or not writable.
     """
     check_format(path)
     finite = finite_mask(params)
@@ -74,7 +76,7 @@ def write_for_viewers(
         field["features_dc"] = rgb_to_sh(field["features_dc"].sigmoid())
     if upright:
         field = similarity(field, _UPRIGHT, 1.0)
-    found = field["features_rest"].shape[1]
+    coefficients = field["features_rest"].shape[1]
     kind = path.suffix.lower()
     if kind == ".ply":
         write_ply(path, field, comments=[*([] if upright else [MODEL_FRAME]), *([ANTIALIASED] if antialiased else [])])
@@ -83,5 +85,5 @@ def write_for_viewers(
         (write_spz if kind == ".spz" else write_sog)(path, field, antialiased=antialiased)
     kept = field["features_rest"].shape[1]
     return ViewerFile(
-        len(field["means"]), int((~finite).sum()), sh_degree_of(kept) or 0, kept < found, path.stat().st_size
+        len(field["means"]), int((~finite).sum()), sh_degree_of(kept) or 0, kept < coefficients, path.stat().st_size
     )

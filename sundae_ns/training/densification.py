@@ -1,7 +1,7 @@
-"""How a field grows during the warm-up: gsplat's densification under a cap, or Markov chain Monte Carlo with one.
+"""Growth of a field during the warm-up: gsplat's densification under a cap, or Markov chain Monte Carlo.
 
-Both have the verbs of gsplat's strategies, and their running state holds ``peak``, the most primitives right after
-growing, before anything is culled.
+Both have the verbs of gsplat's strategies. Their running state holds ``peak``, the number of primitives right after
+growing and before culling.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -18,22 +18,22 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from sundae_ns.gaussians.relocation import grow, jitter, relocate
-
-if TYPE_CHECKING:
-    from sundae_ns.model import SundaeModelConfig
+from sundae_ns.pruning import PruningConfig
+from sundae_ns.training.extension import Extension, TrainingRun
+from sundae_ns.training.field_state import FieldState
 
 
 def limit_growth(
-    state: MutableMapping[str, Any], small: Tensor, room: int, threshold: float, radius: float | None
+    state: MutableMapping[str, Any], small: Tensor, capacity: int, threshold: float, radius: float | None
 ) -> None:
-    """Let at most ``room`` primitives be added: those with the highest gradients grow, others lose their statistics.
+    """Let at most ``capacity`` primitives be added: those with the highest gradients grow, others lose their statistics.
 
     Args:
         state: of gsplat's strategy, with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used.
-        small: those that a high gradient duplicates; it splits the others, bool ``[N]``.
-        room: how many may be added: one by each that is duplicated or split, two by one that is both.
+        small: primitives that a high gradient duplicates; it splits the others, bool ``[N]``.
+        capacity: number of primitives that may be added: one for each duplicated or split, two for one that is both.
         threshold: mean gradient above which a primitive grows.
-        radius: share of the picture above which it is split, None where it is not looked at.
+        radius: radius above which it is split, as a share of the image; None ignores the radius.
     """
     gradients = state["grad2d"] / state["count"].clamp_min(1)
     high = gradients > threshold
@@ -43,37 +43,37 @@ def limit_growth(
     added = (high & small).long() + ((high & ~small) | wide).long()
     candidates = added.nonzero().squeeze(1)
     candidates = candidates[gradients[candidates].argsort(descending=True, stable=True)]
-    left_out = candidates[added[candidates].cumsum(0) > room]
+    left_out = candidates[added[candidates].cumsum(0) > capacity]
     state["grad2d"][left_out] = 0
     if radius is not None and state.get("radii") is not None:
         state["radii"][left_out] = state["radii"][left_out].clamp_max(radius)
 
 
 class Statistics(NamedTuple):
-    """What a backward pass has said about primitives in the views of several ranks; one may be in several rows."""
+    """Statistics of primitives in the views of several ranks; a primitive may have several rows."""
 
     ids: Tensor
-    """Which primitive ``[S]``."""
+    """Index of the primitive ``[S]``."""
     norms: Tensor
-    """Length of the gradient of its centre, in units of half the picture; 0 where it is not drawn ``[S]``."""
+    """Norm of the gradient of its centre, in units of half the image; 0 if it is not drawn ``[S]``."""
     radii: Tensor
-    """Its radius as a share of the picture's longer side; 0 where it is not drawn ``[S]``."""
+    """Radius as a share of the longer side of the image; 0 if it is not drawn ``[S]``."""
 
 
 @dataclass
 class CappedStrategy(DefaultStrategy):
-    """gsplat's densification, with an exact cap: where more would grow, those with the highest gradients do."""
+    """gsplat's densification with an exact cap: under it, the primitives with the highest gradients grow first."""
 
     cap: int | None = None
-    """Most primitives at any time; None for no cap."""
+    """Highest number of primitives; None for no cap."""
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """gsplat's state, and the peak."""
+        """State of gsplat's strategy, and the peak."""
         return {**super().initialize_state(scene_scale), "peak": 0}
 
     @torch.no_grad()
     def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
-        """gsplat's; ``statistics`` of several ranks are added as they are, rows of zeros too, which waits for no GPU."""
+        """Add the statistics of a step; those of several ranks include rows of zeros, so that nothing waits for the GPU."""
         found: Statistics | None = info.get("statistics")
         if found is None:
             super()._update_state(params, state, info, packed=packed)
@@ -99,10 +99,10 @@ class CappedStrategy(DefaultStrategy):
 
 
 def start_of_chain(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The field that the chain starts from: opacities of one half, and a tenth of the width, as in its paper.
+    """Start of the chain: opacity one half and a tenth of the width, as in the paper of 3DGS-MCMC.
 
     Args:
-        params: the field from points ``[N, ...]``; it is not changed.
+        params: the field from points ``[N, ...]``; it does not change.
     """
     scales = params["scales"] + math.log(0.1)
     return {**params, "opacities": torch.zeros_like(params["opacities"]), "scales": scales}
@@ -110,33 +110,33 @@ def start_of_chain(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 @dataclass
 class ChainStrategy:
-    """3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al., 2024), in plain PyTorch, on any device.
+    """3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al., 2024), in PyTorch on any device.
 
-    Transparent primitives are moved onto visible ones, a twentieth is added at a time until the cap is reached, and
-    centres are moved by noise. Numbers are the paper's.
+    It moves transparent primitives onto visible ones, adds a twentieth at a time up to the cap, and adds noise to the
+    centres. Numbers are the paper's.
     """
 
     cap: int
-    """Most primitives at any time."""
+    """Highest number of primitives."""
     refine_start_iter: int = 500
     """First step after which primitives are moved and added."""
     refine_stop_iter: int = 25000
-    """Step from which on nothing is done any more."""
+    """Step at which all of this ends."""
     refine_every: int = 100
-    """Steps from one round to the next."""
+    """Steps between rounds."""
     min_opacity: float = 0.005
-    """Primitives below this are moved."""
+    """Opacity below which a primitive is moved."""
     growth: float = 0.05
-    """Share that is added in a round."""
+    """Share of the primitives that a round adds."""
     noise: float = 5e5
     """Noise of the centres, in units of their learning rate."""
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
-        """The peak; nothing else is remembered from step to step."""
+        """The peak; the chain needs no other state."""
         return {"peak": 0}
 
     def step_pre_backward(self, *_: Any, **__: Any) -> None:
-        """Nothing: no gradient is looked at."""
+        """Nothing to keep: the chain reads no gradients."""
 
     @torch.no_grad()
     def step_post_backward(
@@ -148,7 +148,7 @@ class ChainStrategy:
         info: Mapping[str, Any] | None = None,
         packed: bool = False,
     ) -> None:
-        """Move, add, and shake; call it after the optimizer's step."""
+        """Move, add and jitter primitives; call it after the optimizer's step."""
         if step >= self.refine_stop_iter:
             return
         if step > self.refine_start_iter and step % self.refine_every == 0:
@@ -160,40 +160,103 @@ class ChainStrategy:
         jitter(params, self.noise * optimizers["means"].param_groups[0]["lr"])
 
 
-def make_strategy(config: SundaeModelConfig, pictures: int) -> CappedStrategy | ChainStrategy:
-    """How the field of a model grows, until the prune that would be undone by it.
+class Densification(Extension):
+    """Grows the field until the schedule's prune would undo it.
 
     Args:
-        config: of the model.
-        pictures: how many the field is trained on; each is seen once after opacities are reset, before anything grows.
+        strategy: gsplat's verbs, on the parameters of the field.
     """
-    pruning, stop = config.pruning, config.stop_split_at
+
+    name = "densification"
+
+    def __init__(self, strategy: CappedStrategy | ChainStrategy) -> None:
+        self.strategy = strategy
+
+    def initialize(self, state: FieldState) -> None:
+        """Start the running state anew, as for a field that has not been trained."""
+        state.densification.clear()
+        state.densification.update(self.strategy.initialize_state(scene_scale=1.0))
+
+    def before_backward(self, state: FieldState) -> None:
+        """Keep the gradients that densification reads."""
+        if state.densifying:
+            self.strategy.step_pre_backward(
+                state.field.params, state.optimizers, state.densification, state.schedule_step, state.info
+            )
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Densify."""
+        state = run.state
+        if state.densifying:
+            self.densify(state)
+
+    def densify(self, state: FieldState) -> None:
+        """Let the strategy add, move and remove primitives."""
+        self.strategy.step_post_backward(
+            params=state.field.params,
+            optimizers=state.optimizers,
+            state=state.densification,
+            step=state.schedule_step,
+            info=state.info,
+            packed=False,
+        )
+
+
+class GrowthOptions(Protocol):
+    """Options of splatfacto that control the growth of the field."""
+
+    warmup_length: int
+    refine_every: int
+    cull_alpha_thresh: float
+    densify_grad_thresh: float
+    densify_size_thresh: float
+    split_screen_size: float
+    cull_scale_thresh: float
+    cull_screen_size: float
+    stop_screen_size_at: int
+    stop_split_at: int
+    reset_alpha_every: int
+    use_absgrad: bool
+
+
+def make_strategy(
+    options: GrowthOptions, pruning: PruningConfig, *, mcmc_cap: int | None, num_images: int
+) -> CappedStrategy | ChainStrategy:
+    """Strategy of the warm-up. It ends before the prune that would undo it.
+
+    Args:
+        options: of splatfacto.
+        pruning: gives the end of growth and, for continuous pruning, the cap.
+        mcmc_cap: most primitives of a warm-up by MCMC; None densifies by gradients.
+        num_images: training images. Each is seen once after opacities are reset, before anything grows.
+    """
+    stop = options.stop_split_at
     continuous = pruning.mode == "continuous"
     ends = pruning.stop if continuous else pruning.ends_growth_at
     if ends is not None:
         stop = min(stop, ends)
     cap = pruning.max_primitives if continuous else None
-    if config.warmup == "mcmc":
+    if mcmc_cap is not None:
         return ChainStrategy(
-            cap=min(config.mcmc_cap, cap or config.mcmc_cap),
-            refine_start_iter=config.warmup_length,
+            cap=min(mcmc_cap, cap or mcmc_cap),
+            refine_start_iter=options.warmup_length,
             refine_stop_iter=stop,
-            refine_every=config.refine_every,
+            refine_every=options.refine_every,
         )
     return CappedStrategy(
         cap=cap,
-        prune_opa=config.cull_alpha_thresh,
-        grow_grad2d=config.densify_grad_thresh,
-        grow_scale3d=config.densify_size_thresh,
-        grow_scale2d=config.split_screen_size,
-        prune_scale3d=config.cull_scale_thresh,
-        prune_scale2d=config.cull_screen_size,
-        refine_scale2d_stop_iter=config.stop_screen_size_at,
-        refine_start_iter=config.warmup_length,
+        prune_opa=options.cull_alpha_thresh,
+        grow_grad2d=options.densify_grad_thresh,
+        grow_scale3d=options.densify_size_thresh,
+        grow_scale2d=options.split_screen_size,
+        prune_scale3d=options.cull_scale_thresh,
+        prune_scale2d=options.cull_screen_size,
+        refine_scale2d_stop_iter=options.stop_screen_size_at,
+        refine_start_iter=options.warmup_length,
         refine_stop_iter=stop,
-        reset_every=config.reset_alpha_every * config.refine_every,
-        refine_every=config.refine_every,
-        pause_refine_after_reset=pictures + config.refine_every,
-        absgrad=config.use_absgrad,
+        reset_every=options.reset_alpha_every * options.refine_every,
+        refine_every=options.refine_every,
+        pause_refine_after_reset=num_images + options.refine_every,
+        absgrad=options.use_absgrad,
         verbose=False,
     )

@@ -1,42 +1,60 @@
-"""The field that a model is built with: from the capture's sparse points, at random, or from a finished field."""
+"""The field that a model starts from: sparse points of the capture, random points, or a finished field."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Protocol
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from sundae_ns.datamanager import DATASET_FRAME
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.gaussians.parameters import rgb_to_logit, sh_to_rgb
 from sundae_ns.pruning import select_random
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage.runs.checkpoint import read_field
 from sundae_ns.storage.transform import similarity
 from sundae_ns.training.densification import start_of_chain
 
-if TYPE_CHECKING:
-    from sundae_ns.model import SundaeModelConfig
-
 Points = tuple[Tensor, Tensor]
-"""Places ``[N, 3]`` and colours in 0 to 255 ``[N, 3]``."""
+"""Positions ``[N, 3]`` and colours in 0 to 255 ``[N, 3]``."""
+
+Frame = tuple[Tensor, float]
+"""Transform ``[3, 4]`` and scale from the capture's coordinates to those of the model."""
+
+
+class PointOptions(Protocol):
+    """Options of the model that control its first field."""
+
+    sh_degree: int
+    random_init: bool
+    """Whether to start from random points although the capture has a sparse cloud."""
+    num_random: int
+    """Number of random points."""
+    random_scale: float
+    """Side of the cube of random points, scene units."""
+
+    @property
+    def warm_start(self) -> Path | None:
+        """A splatfacto or sundae checkpoint, the folder of checkpoints, or a 3DGS ``.ply`` to start from."""
+
+    @property
+    def warm_start_frame(self) -> str:
+        """Coordinates of the warm start: ``model``, ``capture``, or ``auto`` by the kind of file."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """What there is to say of the field that a model is built with, should it be trained: a checkpoint may take its place."""
+    """Warnings, or an error, to report when training starts. A checkpoint that is loaded first makes them irrelevant."""
 
     warnings: tuple[str, ...] = ()
     failure: CheckpointError | None = None
-    """Why the model could not start from where it was told to."""
+    """Why the model could not start from its warm start."""
 
     def announce(self) -> None:
-        """Say so, before the first step.
+        """Print the warnings.
 
         Raises:
             CheckpointError: the failure.
@@ -48,74 +66,78 @@ class Start:
 
 
 def initial_field(
-    config: SundaeModelConfig,
+    options: PointOptions,
     points: Points | None,
-    metadata: Mapping[str, Any],
+    frame: Frame | None,
     *,
     num_features: int,
     cap: int | None,
+    chain: bool,
+    seed: int,
 ) -> tuple[dict[str, Tensor], Start]:
-    """The parameters of a new model, float32 on the CPU, and what is to be said of them if they are trained.
+    """Parameters of a new model, float32 on the CPU, and what to report if it is trained.
 
-    A finished run must open without what it once started from, so the field is then that of the sparse points.
+    A finished run must open without the file that it started from. The field then comes from the sparse points, and the
+    error is reported only when training starts.
 
     Args:
-        config: of the model.
-        points: the capture's sparse points, if there are any.
-        metadata: of the capture.
+        options: of the model.
+        points: sparse points of the capture, if it has any.
+        frame: of the capture, if known.
         num_features: length of the feature vectors; 0 for none.
-        cap: most primitives to start with.
+        cap: highest number of primitives to start with; None for no cap.
+        chain: whether the field grows by MCMC, which starts from small, half transparent primitives.
+        seed: of the choice under the cap.
     """
     start = Start()
     try:
-        if config.warm_start is None:
-            params, start = _sparse_field(config, points, num_features, cap)
+        if options.warm_start is None:
+            params, start = _sparse_field(options, points, num_features, cap, seed)
         else:
-            params = _warm_field(config, config.warm_start, metadata, num_features)
+            params = _warm_field(options, options.warm_start, frame, num_features)
     except CheckpointError as error:
-        params, start = _sparse_field(config, points, num_features, cap)[0], Start(failure=error)
-    if config.sh_degree == 0:
-        # splatfacto's models without harmonics, and nerfstudio's exporter, know colours by their logits.
+        params, start = _sparse_field(options, points, num_features, cap, seed)[0], Start(failure=error)
+    if chain and options.warm_start is None:
+        params = start_of_chain(params)
+    if options.sh_degree == 0:
+        # splatfacto and nerfstudio's exporter store logits of colours at SH degree 0.
         params["features_dc"] = rgb_to_logit(sh_to_rgb(params["features_dc"]))
     return params, start
 
 
 def _sparse_field(
-    config: SundaeModelConfig, points: Points | None, num_features: int, cap: int | None
+    options: PointOptions, points: Points | None, num_features: int, cap: int | None, seed: int
 ) -> tuple[dict[str, Tensor], Start]:
     warnings: list[str] = []
-    if points is not None and len(points[0]) > 0 and not config.random_init:
+    if points is not None and len(points[0]) > 0 and not options.random_init:
         xyz, rgb = points[0], points[1].float() / 255 if len(points[1]) else torch.full_like(points[0], 0.5)
     else:
-        if not config.random_init:
+        if not options.random_init:
             warnings.append(
-                f"the capture has no sparse point cloud; starting from {config.num_random} random points. Results are "
+                f"the capture has no sparse point cloud; starting from {options.num_random} random points. Results are "
                 "better with one (COLMAP, or ply_file_path in transforms.json)."
             )
-        xyz, rgb = random_points(config.num_random, config.random_scale)
+        xyz, rgb = random_points(options.num_random, options.random_scale)
     if cap is not None and len(xyz) > cap:
         warnings.append(f"{len(xyz):,} points are more than the cap; starting from {cap:,} of them")
-        chosen = select_random(len(xyz), cap, config.pruning.seed, xyz.device)
+        chosen = select_random(len(xyz), cap, seed, xyz.device)
         xyz, rgb = xyz[chosen], rgb[chosen]
-    params = from_points(xyz, rgb, sh_degree=config.sh_degree, num_features=num_features)
-    return start_of_chain(params) if config.warmup == "mcmc" else params, Start(tuple(warnings))
+    params = from_points(xyz, rgb, sh_degree=options.sh_degree, num_features=num_features)
+    return params, Start(tuple(warnings))
 
 
-def _warm_field(
-    config: SundaeModelConfig, source: Path, metadata: Mapping[str, Any], num_features: int
-) -> dict[str, Tensor]:
-    params, in_model_frame = checkpoint.read_field(source)
-    if config.warm_start_frame != "auto":
-        in_model_frame = config.warm_start_frame == "model"
+def _warm_field(options: PointOptions, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
+    params, in_model_frame = read_field(source)
+    if options.warm_start_frame != "auto":
+        in_model_frame = options.warm_start_frame == "model"
     if not in_model_frame:
-        frame = metadata.get(DATASET_FRAME)
         if frame is None:
             raise CheckpointError(
-                "the warm start is in the capture's coordinates, and only the sundae datamanager knows the way from "
-                "there; train with its own datamanager, or say --pipeline.model.warm-start-frame model"
+                "the warm start is in the capture's coordinates, and only sundae's datamanager knows their transform; "
+                "train with it, or give --pipeline.model.warm-start-frame model"
             )
         params = similarity(params, *frame)
-    wanted, found = (config.sh_degree + 1) ** 2 - 1, params["features_rest"].shape[1]
+    wanted, found = (options.sh_degree + 1) ** 2 - 1, params["features_rest"].shape[1]
     rest = params["features_rest"].new_zeros(len(params["means"]), wanted, 3)
     rest[:, : min(wanted, found)] = params["features_rest"][:, : min(wanted, found)]
     params["features_rest"] = rest

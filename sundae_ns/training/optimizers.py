@@ -1,4 +1,4 @@
-"""Adam in one kernel a parameter, where there is CUDA, and as networks without normalisation bear it."""
+"""Adam with one fused kernel for each parameter on CUDA, and Adam for a network without normalisation layers."""
 
 from __future__ import annotations
 
@@ -11,43 +11,43 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 
 @dataclass
 class FusedAdamConfig(AdamOptimizerConfig):
-    """nerfstudio's Adam; parameters on CUDA are updated by one fused kernel instead of a dozen.
+    """nerfstudio's Adam; on CUDA one fused kernel updates a parameter instead of a dozen.
 
-    A field has an optimizer for each of its seven parameters, so launching their kernels takes a good part of a step.
+    A field has seven parameters with an optimizer each, and launching their kernels takes much of a step.
     """
 
     betas: tuple[float, float] = (0.9, 0.999)
-    """Decay of the means of gradients and of their squares, a step."""
+    """Decay rates of the running means of gradients and of their squares."""
 
     def setup(self, params: Any) -> torch.optim.Optimizer:
-        """The optimizer of one group of parameters."""
+        """Optimizer of one group of parameters."""
         params = list(params)
         options = {name: getattr(self, name) for name in ("eps", "betas", "weight_decay")}
         return torch.optim.Adam(self._groups(params), fused=all(value.is_cuda for value in params), **options)
 
     def _groups(self, params: list[torch.Tensor]) -> list[dict[str, Any]]:
-        """Parameters by their learning rate."""
+        """Parameter groups by learning rate."""
         return [{"params": params, "lr": self.lr}]
 
 
 @dataclass
 class NetworkAdamConfig(FusedAdamConfig):
-    """Adam for a network without normalisation layers, which bursts at a rate that others bear.
+    """Adam for a network without normalisation layers, whose loss bursts at usual settings.
 
-    Its output is a product of its layers, so that steps of all weights in the direction that they agree upon can multiply it.
-    Two things keep such steps short. The mean of squares forgets so fast that it follows gradients that suddenly grow: with the
-    usual betas a weight moves by 3.2 times the rate at the first long gradient after short ones, and by up to 7.3 while they
-    grow; with these by 0.4 and by up to 1.2 (``sundae_ns.distributed.ahead.longest_step``). And weights of layers with many
-    inputs move by less, since what they add up to grows with the inputs (Yang et al. 2022, "Tensor Programs V").
+    The output is a product of layers, so aligned steps of all weights multiply it. Two measures keep such steps short. The
+    mean of squares forgets fast and follows gradients that suddenly grow: with the usual betas a weight moves by 3.2 times
+    the rate at the first large gradient after small ones, and by up to 7.3 while they grow; with these by 0.4 and up to 1.2
+    (``sundae_ns.distributed.ahead.longest_step``). Weights of layers with many inputs get a smaller rate, because their sum
+    grows with the inputs (Yang et al. 2022, "Tensor Programs V").
 
-    Rates are those of the shapes at setup: a head that a search makes smaller keeps those of the larger one.
+    Rates follow the shapes at setup: a head that a budget search shrinks keeps the rates of the larger one.
     """
 
     betas: tuple[float, float] = (0.9, 0.95)
-    """Decay of the means of gradients and of their squares, a step."""
+    """Decay rates of the running means of gradients and of their squares."""
     full_rate_inputs: int = 1152
-    """Weights that sum up more inputs than this have a smaller rate, in proportion. 1152 is 3 x 3 of 128 channels, the most in
-    the default head, for which the rate is known."""
+    """Weights with more inputs than this get a proportionally smaller rate. 1152 is 3 x 3 of 128 channels, the most in the
+    default head."""
 
     def _groups(self, params: list[torch.Tensor]) -> list[dict[str, Any]]:
         by_rate: dict[float, list[torch.Tensor]] = {}

@@ -1,32 +1,42 @@
-"""What a prune did, for logs and result tables."""
+"""Reports of prunes: one line for the log, numbers for the event file, ``prune.json`` in the run's folder."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from sundae_ns.evaluation import peak_memory
+from sundae_ns.storage.atomic import write_text
+from sundae_ns.storage.runs.folder import prunes_before
+from sundae_ns.training.extension import TrainingRun
 
 
 @dataclass(frozen=True)
 class PruneReport:
-    """Plain numbers of one prune."""
+    """Numbers of one prune."""
 
     step: int
     """Training step after which it happened."""
     before: int
-    """Primitives before it, NaN and infinite ones included."""
+    """Number of primitives before it, including those that are not finite."""
     after: int
-    """Primitives after it."""
+    """Number of primitives after it."""
     dropped_nonfinite: int
-    """Primitives that went because a parameter of theirs was NaN or infinite."""
+    """Primitives removed because a parameter was NaN or infinite."""
     peak: int
-    """Most primitives at any step so far."""
+    """Highest number of primitives at any step so far."""
     seconds: float
-    """Wall-clock time of decision and surgery, the device waited for."""
+    """Wall-clock time of decision and surgery, synchronised."""
     tau: float | None
-    """Threshold of the graph on squared distances, squared scene units; None if no graph was needed."""
+    """Threshold of the graph on squared distances, squared scene units; None without a graph."""
     sigma: float | None
-    """Width of the graph's weights, scene units; None if no graph was needed."""
+    """Width of the edge weights, scene units; None without a graph."""
     isolated: int | None
-    """Primitives without a neighbour within the threshold; None if no graph was needed."""
+    """Primitives without a neighbour within the threshold; None without a graph."""
 
     def summary(self) -> str:
         """One line for the log."""
@@ -37,3 +47,38 @@ class PruneReport:
         if self.sigma is not None and self.tau is not None:
             parts.append(f"sigma {self.sigma:.3g}, tau {self.tau:.3g}, {self.isolated:,} isolated")
         return "; ".join(parts)
+
+
+def write_report(
+    run: TrainingRun, report: PruneReport, *, before: Mapping[str, float], after: Mapping[str, float]
+) -> None:
+    """Write a report to the event file and to ``prune.json``.
+
+    Args:
+        run: the run.
+        report: numbers of the prune.
+        before, after: metrics of the test views on both sides of the prune; empty if they were not evaluated.
+
+    Raises:
+        StorageError: no space or no right to write.
+    """
+    scalars = {"before": report.before, "after": report.after, "seconds": report.seconds, "peak": report.peak}
+    run.log_scalars("Prune", scalars)
+    if run.folder is not None:
+        _append(run.folder / "prune.json", report, before, after)
+
+
+def _append(path: Path, report: PruneReport, before: Mapping[str, float], after: Mapping[str, float]) -> None:
+    # A run that was killed between a prune and the next save repeats that prune.
+    reports = prunes_before(path, report.step)
+    reports.append({**asdict(report), "warm_up": dict(before), "pruned": dict(after)})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, json.dumps(reports, indent=2))
+
+
+def report_peak(run: TrainingRun) -> None:
+    """Log the highest number of primitives and the peak memory of the training."""
+    state = run.state
+    primitives, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
+    CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {state.device.type} memory")
+    run.log_scalars("Peak", {"primitives": primitives, "memory_mb": memory})

@@ -1,12 +1,13 @@
-"""Learning rates of SUNDAE: decay, exponential or along a cosine, that can begin anew at the prune.
+"""Learning-rate schedules: exponential or cosine decay that can restart at the prune.
 
-nerfstudio's own exponential decay leaves numpy numbers in its state, and checkpoints that hold them cannot be read with
-plain ``torch.load`` from torch 2.6 on. This one deals in Python floats only.
+nerfstudio's exponential decay leaves numpy numbers in its state, which a weights-only ``torch.load`` refuses from torch 2.6
+on. This one holds Python floats only.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -18,11 +19,11 @@ Shape = Literal["exponential", "cosine"]
 
 
 class Decay:
-    """Multiplier of the learning rate as a function of the step; picklable state, plain numbers only.
+    """Multiplier of the learning rate as a function of the step. Its state is plain numbers.
 
-    Before the prune the rate decays from 1 to ``final`` over ``max_steps``, or stays at 1 where ``hold_until_prune`` is set.
-    The prune may restart it: from ``restart`` at the prune down to ``final`` at ``max_steps``, after rising for
-    ``warmup_steps``. ``shape`` is an exponential, or half a cosine (Loshchilov & Hutter 2017, "SGDR"), whose mean is higher.
+    Before the prune the rate decays from 1 to ``final`` over ``max_steps``; with ``hold_until_prune`` it stays at 1. The prune
+    may restart it: a rise over ``warmup_steps``, then a decay from ``restart`` to ``final`` at ``max_steps``. ``shape`` is
+    exponential, or half a cosine (Loshchilov & Hutter 2017, "SGDR").
     """
 
     def __init__(
@@ -69,13 +70,13 @@ class PruneAwareDecayConfig(SchedulerConfig):
     max_steps: int = 30000
     """Step at which the decay ends."""
     lr_restart: float | None = None
-    """Learning rate right after the prune, from which the decay begins anew; None goes on as if nothing happened."""
+    """Learning rate right after the prune, where the decay restarts; None does not restart it."""
     hold_until_prune: bool = False
-    """Whether the rate stays constant until pruning has ended and the head starts, which counts as the prune then."""
+    """Whether the rate stays constant until pruning has ended and the head is enabled; the decay starts there."""
     warmup_steps: int = 0
     """Steps over which the rate rises after the prune."""
     shape: Shape = "exponential"
-    """How it decays: exponential, or cosine, half a wave of it."""
+    """Decay by an exponential, or along half a cosine."""
 
 
 class PruneAwareDecay(Scheduler):
@@ -97,10 +98,13 @@ class PruneAwareDecay(Scheduler):
         return LambdaLR(optimizer, lr_lambda=decay)
 
 
-def notify_pruned(schedulers: dict[str, LRScheduler], step: int, *, last: bool = True) -> None:
-    """Tell every :class:`Decay` among ``schedulers`` that the field was pruned at ``step``; the first prune counts.
+def notify_pruned(schedulers: Mapping[str, LRScheduler], step: int, *, last: bool = True) -> None:
+    """Restart every :class:`Decay` among ``schedulers`` at ``step``; later calls change nothing.
 
-    Where pruning goes on or the head does not take part yet (``last`` is False), those that hold their rate are not told.
+    Args:
+        schedulers: by name.
+        step: training step of the prune.
+        last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
     """
     for scheduler in schedulers.values():
         for multiplier in getattr(scheduler, "lr_lambdas", []):

@@ -1,8 +1,8 @@
-"""When to prune: policies of plain numbers whose running state lives in a dict.
+"""Pruning schedules: when a field is pruned, and to how many primitives.
 
-Their verbs, ``initialize_state`` and ``step_post_backward``, are called as those of gsplat's densification strategies. A
-policy says when, :func:`sundae_ns.pruning.cutting.cut` does it. The state holds integers only, so that it can be stored in
-a checkpoint and a resumed run neither prunes twice nor forgets its peak.
+A schedule decides, :func:`sundae_ns.pruning.cutting.cut` prunes. Its verbs, ``initialize_state`` and
+``step_post_backward``, are those of gsplat's densification strategies. The running state is a dict of integers, so that a
+checkpoint can carry it: a resumed run neither prunes twice nor forgets its peak.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -30,12 +29,12 @@ from sundae_ns.training.report import PruneReport
 NEVER = -1
 """Value of ``state["pruned_at"]`` before the first prune."""
 LEAST_OPACITY = 0.005
-"""Of primitives that share one's looks; 3DGS-MCMC takes those below it for dead."""
+"""Lowest opacity of primitives that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
 
 
 @dataclass(frozen=True)
-class PruningPolicy:
-    """Base of the policies: the running state with its peak, and the report. Subclasses say when a prune is due."""
+class PruningSchedule:
+    """Base of the schedules: running state, peak and report. Subclasses say when a prune is due, and how many it keeps."""
 
     config: PruningConfig
     """Options; not changed."""
@@ -44,8 +43,12 @@ class PruningPolicy:
         """Whether a field of ``n`` primitives is to be pruned after this step."""
         raise NotImplementedError
 
+    def target(self, n: int) -> int:
+        """Number of primitives that a prune keeps of ``n`` finite ones. The one place that decides this number."""
+        raise NotImplementedError
+
     def initialize_state(self) -> dict[str, Any]:
-        """Running state: step of the last prune (-1 for none), number of prunes, most primitives so far."""
+        """Running state: step of the last prune (-1 for none), number of prunes, peak number of primitives."""
         return {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
 
     @torch.no_grad()
@@ -67,18 +70,17 @@ class PruningPolicy:
             optimizers: optimizers by parameter name; others are left alone.
             state: from :meth:`initialize_state`, or from a checkpoint.
             step: training step that has just ended.
-            info: taken for the sake of the common signature, not read.
-            contribution: gives the summed blending weights over the training views for ``params`` as they are when it
-                is called, which is after NaN and infinite primitives have gone ``[N]``; called only if the score needs
-                it.
+            info: part of the common signature, not read.
+            contribution: gives the blending weights over the training views ``[N]``. It is called only if the score needs
+                it, after primitives that are not finite have been removed.
             strategy_state: state of a densification strategy on the same primitives; sliced with them.
 
         Returns:
-            What was done, or None if nothing was due.
+            A report, or None if no prune was due.
 
         Raises:
             ConfigError: the score needs a contribution and there is none.
-            DataError: the field cannot be pruned, see :func:`decide`.
+            DataError: the field cannot be pruned, see :func:`sundae_ns.pruning.decide`.
         """
         before = num_primitives(params)
         state["peak"] = max(state["peak"], before)
@@ -92,7 +94,7 @@ class PruningPolicy:
             self._config_at(step),
             contribution,
             step=step,
-            count=partial(self._count, state),
+            count=self.target,
             strategy_state=strategy_state,
         )
         return PruneReport(
@@ -111,61 +113,44 @@ class PruningPolicy:
         """Options of the prune at a step."""
         return self.config
 
-    def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
-        """Number of primitives to keep of ``n`` finite ones, or None for the keep ratio."""
-        return None
 
-
-class NoPruning(PruningPolicy):
-    """Never prunes; the state still counts the peak, to compare with."""
+class NoPruning(PruningSchedule):
+    """Never prunes; the running state still records the peak."""
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
         """Never."""
         return False
 
+    def target(self, n: int) -> int:
+        """All of them."""
+        return n
 
-class OneShotPruning(PruningPolicy):
-    """Training, then one prune down to ``keep_ratio``, then fine-tuning: the paper's main strategy.
 
-    With ``rounds`` the prune is taken in that many steps, each by the same factor, ``round_every`` steps of training apart.
-    The state holds how many primitives there were at first, so that the last round ends at the exact count.
+class OneShotPruning(PruningSchedule):
+    """Training, one prune that keeps ``keep_ratio``, then fine-tuning: the paper's main strategy."""
+
+    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
+        """After ``prune_at``, or at once if training was resumed from a later step without a prune."""
+        return state["pruned_at"] == NEVER and step >= self.config.prune_at
+
+    def target(self, n: int) -> int:
+        """``round(keep_ratio * n)``, at least 1."""
+        return kept_count(self.config.keep_ratio, n)
+
+
+class ContinuousPruning(PruningSchedule):
+    """Periodic pruning during densification, for a lower peak of memory.
+
+    The paper's alternative (section "Continuous Pruning as a Strategy"): each prune keeps ``keep_ratio``, so that the final
+    number is only roughly known. With ``target_primitives`` each prune goes down to exactly that number; the last one comes
+    after densification, so this is the final number. ``max_primitives`` is a cap on every prune, and on every step in
+    between through :class:`sundae_ns.training.densification.CappedStrategy`.
     """
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """At ``prune_at``, or at once, if training went on from a later step without having pruned; then at the rounds."""
-        config, done = self.config, state["num_prunes"]
-        if state["pruned_at"] == NEVER:
-            return step >= config.prune_at
-        return done < config.rounds and step >= state["pruned_at"] + config.round_every
+        """At ``start`` and every ``every`` steps until ``stop``; with a target only if there are more primitives.
 
-    def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
-        config = self.config
-        if config.rounds == 1:
-            return None
-        first = state.setdefault("first", n)
-        done = state["num_prunes"] + 1
-        return kept_count(config.keep_ratio ** (done / config.rounds), first)
-
-    def _config_at(self, step: int) -> PruningConfig:
-        if self.config.rounds == 1:
-            return self.config
-        # Another draw in each round, and after a resume the same as without it.
-        return replace(self.config, seed=self.config.seed + step)
-
-
-class ContinuousPruning(PruningPolicy):
-    """Periodic pruning while densification goes on: a lower peak of memory.
-
-    The alternative strategy of the paper (section "Continuous Pruning as a Strategy"), whose final count is loosely held:
-    each prune goes by ``keep_ratio``. With ``target_primitives`` each goes down to exactly that count, the last one when
-    densification has ended, which makes it the final count. ``max_primitives`` caps what a prune leaves, and every step in
-    between, where densification has to be bounded by it (:class:`sundae_ns.training.densification.CappedStrategy`).
-    """
-
-    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """At ``start`` and each ``every`` steps from there until ``stop``, towards a target only where there are more.
-
-        From ``stop`` on whenever there are more than the target, or without one than the cap.
+        From ``stop`` on at every step with more primitives than the target or, without a target, the cap.
         """
         config, target = self.config, self.config.target_primitives
         scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
@@ -176,7 +161,7 @@ class ContinuousPruning(PruningPolicy):
         return (by_share or by_count) and step > state["pruned_at"]
 
     def _config_at(self, step: int) -> PruningConfig:
-        # Another draw each time, and after a resume the same as without it.
+        # A new draw at each prune, and the same one after a resume.
         return replace(self.config, seed=self.config.seed + step)
 
     @torch.no_grad()
@@ -191,10 +176,10 @@ class ContinuousPruning(PruningPolicy):
         contribution: Contribution | None = None,
         strategy_state: MutableMapping[str, Any] | None = None,
     ) -> PruneReport | None:
-        """Prune if it is due; where densification has ended with too few for ``target_primitives``, add those that lack.
+        """Prune if it is due. If densification has ended with fewer than ``target_primitives``, add the missing ones.
 
-        They are added on top of others, whose looks they share, so that no picture changes. What densification counted per
-        primitive is forgotten then: it has ended.
+        They are added on top of others and share their opacity, so that no image changes. Per-primitive statistics of
+        densification are dropped then, because it has ended.
         """
         report = super().step_post_backward(
             params, optimizers, state, step, info, contribution=contribution, strategy_state=strategy_state
@@ -209,28 +194,29 @@ class ContinuousPruning(PruningPolicy):
             state["peak"] = max(state["peak"], n + lacking)
         return report
 
-    def _count(self, state: MutableMapping[str, Any], n: int) -> int | None:
+    def target(self, n: int) -> int:
+        """``target_primitives``, or the keep ratio's share under the cap."""
         config = self.config
         if config.target_primitives is not None:
-            return config.target_primitives
+            return min(config.target_primitives, n)
         count = kept_count(config.keep_ratio, n)
         return count if config.max_primitives is None else min(count, config.max_primitives)
 
 
-def make_policy(config: PruningConfig) -> PruningPolicy:
-    """Policy of the configured mode.
+def make_schedule(config: PruningConfig) -> PruningSchedule:
+    """Schedule of the configured mode.
 
     Raises:
         ConfigError: an option cannot work.
     """
     config.validate()
-    # Under auto a search cuts (pruning.search), and the policy counts.
-    policies = {"off": NoPruning, "auto": NoPruning, "one-shot": OneShotPruning, "continuous": ContinuousPruning}
-    return policies[config.mode](config)
+    # In auto mode the budget search prunes; the schedule only records the peak.
+    schedules = {"off": NoPruning, "auto": NoPruning, "one-shot": OneShotPruning, "continuous": ContinuousPruning}
+    return schedules[config.mode](config)
 
 
 def _now(params: Mapping[str, Tensor]) -> float:
-    """Wall-clock seconds, after all work queued on the field's device."""
+    """Wall-clock seconds after all queued work on the field's device."""
     device = params["means"].device
     if device.type == "cuda":
         torch.cuda.synchronize(device)

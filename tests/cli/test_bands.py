@@ -1,4 +1,4 @@
-"""``sundae bands`` on a field alone: what it writes, what its figures say, and how it refuses."""
+"""``sundae bands`` on a field without a run: files, statistics and error messages."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData
+from prunes import decide_share
 from torch import Tensor
 
 from sundae_ns.cli import main
 from sundae_ns.cli.bands import base_colors
 from sundae_ns.gaussians import from_points
-from sundae_ns.pruning import PruningConfig, band_rule, decide, response
+from sundae_ns.pruning import PruningConfig, band_rule, response
 from sundae_ns.storage import read_ply, read_point_cloud, write_ply
 
 N = 300
@@ -43,7 +44,7 @@ def ply(tmp_path: Path) -> Path:
     return tmp_path / "field.ply"
 
 
-def test_everything_is_written_and_agrees(ply: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_and_statistics_agree(ply: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "deep" / "er"
     assert run(ply, "-o", out, "--keep-ratio", 0.1, 0.5, "--gamma", 0.3, "--neighbors", 9) == 0
     result: dict[str, Any] = json.loads((out / "bands.json").read_text())
@@ -51,7 +52,7 @@ def test_everything_is_written_and_agrees(ply: Path, tmp_path: Path, capsys: pyt
     assert (result["primitives"], result["not_finite"], result["num_neighbors"]) == (N, 2, 9)
     assert "wrote bands.json" in capsys.readouterr().out
 
-    params = {name: value[torch.isfinite(value_of_means(ply))] for name, value in read_ply(ply).items()}
+    params = {name: value[torch.isfinite(x_of(ply))] for name, value in read_ply(ply).items()}
     config = PruningConfig(signal="positions", num_neighbors=9)
     magnitude = response(params, band_rule(config, 0.1, 0.3)).magnitude
     known = magnitude[magnitude.isfinite()]
@@ -60,12 +61,12 @@ def test_everything_is_written_and_agrees(ply: Path, tmp_path: Path, capsys: pyt
     assert result["response"]["quantiles"]["0.5"] == pytest.approx(float(known.median()), rel=0.02)
     points, colors = read_point_cloud(out / "all.ply")
     assert torch.equal(points, params["means"])
-    assert torch.equal(colors, base_colors(params, logits=False))
+    assert torch.equal(colors, base_colors(params["features_dc"]))
     for figures, keep_ratio in zip(result["bands"], (0.1, 0.5), strict=True):
         count = round(keep_ratio * (N - 2))
         masks = {}
         for name, gamma in (("high", 1.0), ("low", 0.0), ("combined", 0.3)):
-            masks[name] = decide(params, band_rule(config, keep_ratio, gamma)).mask
+            masks[name] = decide_share(params, band_rule(config, keep_ratio, gamma)).mask
             found = PlyData.read(str(out / f"{name}-{keep_ratio}.ply"))["vertex"]
             kept = torch.from_numpy(np.stack([found["x"], found["y"], found["z"]], axis=1))
             assert torch.equal(kept, params["means"][masks[name]])
@@ -81,8 +82,8 @@ def test_everything_is_written_and_agrees(ply: Path, tmp_path: Path, capsys: pyt
         assert histogram.width > 500
 
 
-def value_of_means(ply: Path) -> Tensor:
-    """The x of each primitive ``[N]``: NaN where the primitive is not finite."""
+def x_of(ply: Path) -> Tensor:
+    """The x coordinate of each primitive ``[N]``; NaN if the primitive is not finite."""
     return read_ply(ply)["means"][:, 0]
 
 
@@ -93,15 +94,25 @@ def test_the_signal_changes_the_choice(ply: Path, tmp_path: Path) -> None:
     assert not torch.equal(*clouds)
 
 
-def test_colours_of_files_and_of_checkpoints_without_harmonics() -> None:
-    params = field()
+def test_colours_are_those_of_degree_0_harmonics() -> None:
+    assert base_colors(torch.tensor([[0.0, 1e9, -1e9]])).tolist() == [[128, 255, 0]]
+    assert base_colors(torch.ones(2, 3)).tolist() == [[round(255 * (0.5 + 0.28209479))] * 3] * 2
+
+
+@pytest.mark.parametrize("source", ["checkpoint", "folder"])
+def test_colours_of_checkpoints_without_harmonics_are_read_from_logits(tmp_path: Path, source: str) -> None:
+    """A stock checkpoint of SH degree 0 stores logits; the point cloud has the colours that splatfacto renders."""
+    params = field(30)
     params["features_rest"] = params["features_rest"][:, :0]
-    params["features_dc"] = torch.tensor([[0.0, 1e9, -1e9]]).repeat(N, 1)
-    assert base_colors(params, logits=True)[0].tolist() == [128, 255, 0]
-    assert base_colors(params, logits=False)[0].tolist() == [128, 255, 0]
-    params["features_dc"][:] = 1.0
-    assert base_colors(params, logits=True)[0].tolist() == [round(255 / (1 + np.exp(-1)))] * 3
-    assert base_colors(params, logits=False)[0].tolist() == [round(255 * (0.5 + 0.28209479))] * 3
+    params["features_dc"] = torch.randn(30, 3, generator=torch.Generator().manual_seed(1))
+    checkpoint = tmp_path / "step-000000100.ckpt"
+    state = {f"_model.gauss_params.{name}": value for name, value in params.items()}
+    torch.save({"step": 100, "pipeline": state}, checkpoint)
+    path = checkpoint if source == "checkpoint" else tmp_path
+    assert run(path, "-o", tmp_path / "out", "--keep-ratio", 0.5) == 0
+    _, colors = read_point_cloud(tmp_path / "out" / "all.ply")
+    expected = 255 * params["features_dc"].sigmoid()
+    assert (colors - expected).abs().max() <= 0.5 + 1e-3
 
 
 @pytest.mark.parametrize(
@@ -112,7 +123,7 @@ def test_colours_of_files_and_of_checkpoints_without_harmonics() -> None:
         (("--keep-ratio",), "nothing to keep"),
         (("--gamma", "2"), "gamma is 2.0"),
         (("--neighbors", "0"), "num_neighbors is 0"),
-        (("--view", "1"), "no training view 1: the field comes without a run"),
+        (("--view", "1"), "no training view 1: the field has no run"),
     ],
 )
 def test_options_that_cannot_work(
@@ -140,5 +151,5 @@ def test_fields_that_cannot_be_shown(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert len(errors) == 4
     assert all(error.startswith("sundae: ") for error in errors)
     assert "none of the 5 primitives" in errors[2]
-    # Fewer than the neighbours asked for are enough.
+    # A field with fewer primitives than neighbours works.
     assert run(tmp_path / "few.ply", "-o", tmp_path / "out") == 0

@@ -15,8 +15,8 @@ from sundae_ns.cli.bench.plan import Job, done_file, job_folder
 from sundae_ns.errors import BackendError, CheckpointError, DataError
 
 
-def a_job(kind: str = "branch", needs: str | None = "warm") -> Job:
-    return Job("a", kind, "still-life", "sundae", "data", "sundae-tiny", 10, 42, 0.25, needs)  # type: ignore[arg-type]
+def a_job(kind: str = "branch", needs: str | None = "warm", method: str = "sundae-tiny") -> Job:
+    return Job("a", kind, "still-life", "an-arm", "data", method, 10, 42, 0.25, needs)  # type: ignore[arg-type]
 
 
 def test_a_result_is_whole_missing_or_said_to_be_damaged(tmp_path: Path) -> None:
@@ -38,8 +38,8 @@ def test_what_a_job_needs_has_to_be_done_first(tmp_path: Path, kind: str) -> Non
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device here")
 def test_stock_splatfacto_needs_a_gpu(tmp_path: Path) -> None:
-    with pytest.raises(BackendError, match="sundae needs a CUDA device.*--arms"):
-        jobs.train_and_measure(a_job("stock", None), tmp_path)
+    with pytest.raises(BackendError, match="an-arm needs a CUDA device.*--arms"):
+        jobs.train_and_measure(a_job("whole", None, "splatfacto"), tmp_path)
 
 
 def test_a_job_that_is_done_is_not_done_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

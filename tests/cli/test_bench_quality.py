@@ -15,16 +15,17 @@ import pytest
 import tyro
 from rich.console import Console
 
+from sundae_ns.cli.bench.arms import Lengths, choose_arms
 from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
-from sundae_ns.cli.bench.plan import ARMS, Job, Schedule, done_file, jobs_of_shard, parser_of, plan_scene, schedule_of
+from sundae_ns.cli.bench.paper import PAPER_SCENES, find_scene
+from sundae_ns.cli.bench.plan import Arm, Job, done_file, jobs_of_shard, parser_of, plan_scene
 from sundae_ns.cli.bench.quality import run_paper, run_quality
-from sundae_ns.cli.bench.recipes import RECIPES, find_scene
 from sundae_ns.cli.bench.results import read_results, spread
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.evaluation import COLUMNS, HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality, read_rows
 from sundae_ns.evaluation.published import RESOLUTIONS
 
-PSNR = {"warm-up": 24.0, "sundae": 27.0, "random": 25.0, "mcmc": 26.0, "splatfacto": 28.0}
+PSNR = {"sundae-warm-up": 24.0, "sundae": 27.0, "random": 25.0, "mcmc": 26.0, "splatfacto": 28.0}
 
 
 class Runner:
@@ -93,7 +94,9 @@ def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[i
     "options",
     [
         QualityOptions(Path("a b"), Path("out")),
-        QualityOptions(Path("a"), Path("o"), arms=("random",), warmup_steps=7, steps_scale=0.5, downscale=4),
+        QualityOptions(
+            Path("a"), Path("o"), arms=("random", "my arms.yaml"), warmup_steps=7, steps_scale=0.5, downscale=4
+        ),
         PaperOptions(Path("a b"), Path("out")),
         PaperOptions(Path("a"), Path("o"), scenes=("garden", "room"), seed=1, finetune_steps=9, method="sundae-tiny"),
     ],
@@ -109,28 +112,33 @@ def test_a_page_names_the_command_of_the_whole(options: QualityOptions | PaperOp
 # ----------------------------------------------------------------------------------------------------------------- plans
 
 
-def plan(**changed: Any) -> list[Job]:
-    options: dict[str, Any] = {"arms": ARMS, "keep_ratios": [0.01, 0.1], "seeds": [42, 43], "repeat_at": [0.1]}
-    schedule = Schedule("sundae", 15_000, 15_000)
-    return plan_scene("fox", Path("fox"), (), schedule, **{**options, **changed})
+@pytest.fixture(scope="module")
+def arms() -> list[Arm]:
+    """All default arms."""
+    return choose_arms([], "sundae", Lengths())
 
 
-def test_seeds_repeat_only_what_is_asked_for() -> None:
-    jobs = plan()
+def plan(arms: list[Arm], **changed: Any) -> list[Job]:
+    options: dict[str, Any] = {"keep_ratios": [0.01, 0.1], "seeds": [42, 43], "repeat_at": [0.1]}
+    return plan_scene("fox", Path("fox"), (), arms, **{**options, **changed})
+
+
+def test_seeds_repeat_only_what_is_asked_for(arms: list[Arm]) -> None:
+    jobs = plan(arms)
     assert len({job.key for job in jobs}) == len(jobs)
-    arms = [arm for arm in ARMS if not arm.startswith("splatfacto")]
+    names = [arm.name for arm in arms if arm.kind != "whole"]
     for seed, ratios in ((42, {0.01, 0.1}), (43, {0.1})):
         own = [job for job in jobs if job.seed == seed]
-        assert {(job.arm, job.keep_ratio) for job in own if job.needs} == {(a, r) for a in arms for r in ratios}
+        assert {(job.arm, job.keep_ratio) for job in own if job.needs} == {(a, r) for a in names for r in ratios}
         assert [job.kind for job in own].count("warm-up") == 1
-        assert {job.arm: job.steps for job in own if job.kind == "stock"} == {
+        assert {job.arm: job.steps for job in own if job.kind == "whole"} == {
             "splatfacto": 30_000,
             "splatfacto-7k": 7_000,
         }
 
 
-def test_every_arm_of_a_seed_starts_from_its_warm_up_and_trains_as_long() -> None:
-    jobs = plan()
+def test_every_arm_of_a_seed_starts_from_its_warm_up_and_trains_as_long(arms: list[Arm]) -> None:
+    jobs = plan(arms)
     place = {job.key: index for index, job in enumerate(jobs)}
     for job in jobs:
         if job.needs is not None:
@@ -141,8 +149,8 @@ def test_every_arm_of_a_seed_starts_from_its_warm_up_and_trains_as_long() -> Non
             assert (job.steps if job.kind == "mcmc" else warm_up.steps + job.steps) == 30_000
 
 
-def test_arms_differ_in_their_rule_alone() -> None:
-    by_arm = {job.arm: job.options for job in plan(keep_ratios=[0.1], seeds=[42])}
+def test_arms_differ_in_their_rule_alone(arms: list[Arm]) -> None:
+    by_arm = {job.arm: job.options for job in plan(arms, keep_ratios=[0.1], seeds=[42])}
     head = ("--pipeline.model.head.mode", "off")
     for arm in ("sundae", "band", "contribution", "random"):
         assert by_arm[arm + "-no-head"] == (*by_arm[arm], *head)
@@ -150,8 +158,8 @@ def test_arms_differ_in_their_rule_alone() -> None:
 
 
 @pytest.mark.parametrize("parts", [1, 2, 5, 40])
-def test_shards_divide_the_jobs_and_bring_the_warm_ups_they_need(parts: int) -> None:
-    jobs = plan()
+def test_shards_divide_the_jobs_and_bring_the_warm_ups_they_need(parts: int, arms: list[Arm]) -> None:
+    jobs = plan(arms)
     shards = [jobs_of_shard(jobs, index, parts) for index in range(parts)]
     dealt = sorted(job.key for shard in shards for job in shard if job.kind != "warm-up")
     assert dealt == sorted(job.key for job in jobs if job.kind != "warm-up")
@@ -164,26 +172,15 @@ def test_shards_divide_the_jobs_and_bring_the_warm_ups_they_need(parts: int) -> 
 @pytest.mark.parametrize(
     "odd",
     [
-        {"arms": ["best"]},
-        {"arms": []},
-        {"arms": ["sundae", "sundae"]},
         {"keep_ratios": [0]},
         {"keep_ratios": []},
         {"seeds": [1, 1]},
         {"repeat_at": [0.5]},
     ],
 )
-def test_plans_that_cannot_be(odd: dict[str, Any]) -> None:
+def test_plans_that_cannot_be(odd: dict[str, Any], arms: list[Arm]) -> None:
     with pytest.raises(ConfigError):
-        plan(**odd)
-
-
-def test_lengths_come_from_the_method() -> None:
-    assert schedule_of("sundae", warmup=None, finetune=None, scale=1) == Schedule("sundae", 15_000, 15_000)
-    assert schedule_of("sundae", warmup=7, finetune=None, scale=0.5) == Schedule("sundae", 4, 7500, 15_000, 3_500)
-    for method, scale in (("nerfacto", 1.0), ("sundae-continuous", 1.0), ("sundae", 0.0)):
-        with pytest.raises(ConfigError):
-            schedule_of(method, warmup=None, finetune=None, scale=scale)
+        plan(arms, **odd)
 
 
 # ------------------------------------------------------------------------------------------------------- carried out
@@ -194,7 +191,7 @@ def test_stopped_and_continued(capture: Path, tmp_path: Path) -> None:
     first = Runner(stop_after=3)
     code, said = quality(capture, out, first)
     assert code == 130
-    assert "the same command goes on" in said
+    assert "the same command resumes" in said
     second = Runner()
     assert quality(capture, out, second)[0] == 0
     assert len(first.ran) == 3
@@ -247,17 +244,17 @@ def test_parts_merge_by_concatenation(capture: Path, tmp_path: Path) -> None:
 def test_a_branch_needs_the_warm_up_and_not_its_result_alone(capture: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     quality(capture, out, Runner(), arms=("sundae",), seeds=(42,))
-    (out / "done" / "fox-warm-up-s42.json").unlink()
+    (out / "done" / "fox-sundae-warm-up-s42.json").unlink()
     runner = Runner()
     quality(capture, out, runner, arms=("sundae", "mcmc"), keep_ratios=(0.1,), seeds=(42,))
-    assert runner.ran == ["fox-warm-up-s42", "fox-mcmc-10pct-s42"]
+    assert runner.ran == ["fox-sundae-warm-up-s42", "fox-mcmc-10pct-s42"]
 
 
 def test_a_job_that_fails_stops_only_what_needs_it(capture: Path, tmp_path: Path) -> None:
-    runner = Runner(broken="warm-up-s43")
+    runner = Runner(broken="sundae-warm-up-s43")
     code, said = quality(capture, tmp_path / "out", runner)
     assert code == 1
-    assert "fox-warm-up-s43 failed: it broke" in said
+    assert "fox-sundae-warm-up-s43 failed: it broke" in said
     assert not any(key.endswith("s43") and "splatfacto" not in key for key in runner.ran)
     assert "fox-sundae-10pct-s44" in runner.ran
     assert quality(capture, tmp_path / "out", Runner())[0] == 0
@@ -295,9 +292,11 @@ def scene_folder(folder: Path, *pictures: str) -> None:
 @pytest.fixture
 def archives(tmp_path: Path) -> Path:
     """Empty folders, laid out as the archives unpack."""
-    for recipe in RECIPES:
+    for paper_scene in PAPER_SCENES:
         parent = {"Mip-NeRF 360": "360_v2", "Tanks and Temples": "tandt_db/tandt", "Deep Blending": "tandt_db/db"}
-        scene_folder(tmp_path / "data" / parent[recipe.dataset] / recipe.scene, "images", "images_2", "images_4")
+        scene_folder(
+            tmp_path / "data" / parent[paper_scene.dataset] / paper_scene.scene, "images", "images_2", "images_4"
+        )
     return tmp_path / "data"
 
 
@@ -315,9 +314,9 @@ def cells_of(page: str, first: str) -> list[str]:
     return [cell.strip() for cell in line.split("|")[2:-1]]
 
 
-def test_recipes_are_the_papers_eleven_at_its_pictures() -> None:
-    assert len(RECIPES) == 11
-    factors = {recipe.scene: recipe.downscale for recipe in RECIPES}
+def test_scenes_are_the_papers_eleven_at_its_resolutions() -> None:
+    assert len(PAPER_SCENES) == 11
+    factors = {paper_scene.scene: paper_scene.downscale for paper_scene in PAPER_SCENES}
     assert (factors["bicycle"], factors["counter"], factors["truck"], factors["playroom"]) == (4, 2, 1, 1)
     assert set(RESOLUTIONS) <= set(factors)
 
@@ -340,7 +339,7 @@ def test_scenes_that_are_not_there_are_said_and_left_out(archives: Path, tmp_pat
     assert code == 0
     assert "left out: garden" in said
     page = (tmp_path / "out" / "table.md").read_text()
-    assert "Not there: garden." in page
+    assert "Missing: garden." in page
     # A mean of six of seven is not the data set's.
     assert cells_of(page, "**Mip-NeRF 360**")[:2] == ["-", "-"]
 

@@ -55,7 +55,7 @@ def test_errors_are_seen() -> None:
     exact = render(case, *draw_view(case), pulls, backend)
     assert measure(case, exact, 1)["gradient_error"] > 0.1  # of another loss
     assert measure(case, exact, 1)["max_error"] < 1e-12
-    exact["picture"][3, 4, 1] += 0.25
+    exact["image"][3, 4, 1] += 0.25
     found = measure(case, exact, 1)
     assert found["max_error"] == pytest.approx(0.25)
     assert found["mean_error"] == pytest.approx(0.25 / (16 * 16 * 3), rel=1e-3)

@@ -1,4 +1,4 @@
-"""The demo's own parts; the commands that it calls are tested in integration/."""
+"""Parts of the demo; the commands that it calls are tested in integration/."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sundae_ns.cli.process import run_logged
 from sundae_ns.errors import SundaeError
 
 
-def test_a_failing_command_shows_its_end_and_keeps_its_log(tmp_path: Path) -> None:
+def test_a_failing_command_shows_its_last_lines_and_keeps_its_log(tmp_path: Path) -> None:
     log = tmp_path / "train.log"
     script = "import sys; print('first'); print('the cause', file=sys.stderr); sys.exit(3)"
     with pytest.raises(SundaeError, match="failed with 3") as error:
@@ -30,8 +30,8 @@ def test_lines_reach_the_progress_bar(tmp_path: Path) -> None:
     assert [line.strip() for line in lines] == ["10 (50.00%)", "20 (100.00%)"]
 
 
-def test_comparison_takes_the_pictures_apart(tmp_path: Path) -> None:
-    """Truth is white, the base grey, the compensated light grey: the sheet must show all of them, and their error."""
+def test_comparison_splits_the_images_of_ns_eval(tmp_path: Path) -> None:
+    """Truth is white, the base grey, the compensated light grey; the sheet shows all of them and their error."""
     for index in range(2):
         truth, compensated = np.full((40, 40, 3), 255, np.uint8), np.full((40, 40, 3), 245, np.uint8)
         Image.fromarray(np.concatenate([truth, compensated], axis=1)).save(tmp_path / f"eval_img_{index:04d}.png")
@@ -43,21 +43,21 @@ def test_comparison_takes_the_pictures_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("steps", "said"),
+    ("steps", "message"),
     [(steps, f"steps is {steps}: the demo prunes after step 600; give more") for steps in (-3, 0, 300, 600)]
     + [(601, "made"), (None, "made")],
 )
-def test_too_few_steps_for_the_prune_are_refused_before_anything_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int | None, said: str
+def test_too_few_steps_for_the_prune_are_refused_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int | None, message: str
 ) -> None:
     def make(*_: object, **__: object) -> None:
         raise SundaeError("made")
 
-    monkeypatch.setattr("sundae_ns.cli.demo.write_scene", make)
-    with pytest.raises(SundaeError, match=said) as error:
+    monkeypatch.setattr("sundae_ns.cli.demo.write_embedded_capture", make)
+    with pytest.raises(SundaeError, match=message) as error:
         run_demo(tmp_path / "demo", steps=steps)
     assert "\n" not in str(error.value)
-    assert (tmp_path / "demo").exists() == (said == "made")
+    assert (tmp_path / "demo").exists() == (message == "made")
 
 
 def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
@@ -75,9 +75,7 @@ def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 has no safe path")
-def test_a_folder_that_is_called_like_a_package_does_not_take_its_place(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_named_like_a_package_does_not_replace_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "json").mkdir()
     (tmp_path / "json" / "__init__.py").write_text("raise RuntimeError")
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""The doctor's findings on machines that it is told about, and what it advises."""
+"""The doctor's findings and advice on simulated machines."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def no_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A CUDA device that exists in torch's answers only."""
+    """A CUDA device that only torch's answers simulate."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
     monkeypatch.setattr("sundae_ns.gpu.nvrtc.Kernel", lambda *_: None)
@@ -47,40 +47,40 @@ def _kernels(monkeypatch: pytest.MonkeyPatch, problem: str | None) -> None:
     monkeypatch.setattr("sundae_ns.rasterization.select_backend", select)
 
 
-def test_without_cuda_auto_takes_the_compiled_loops(no_cuda: None) -> None:
+def test_without_cuda_auto_selects_the_compiled_loops(no_cuda: None) -> None:
     found = finding("CUDA")
     assert not found.ok
     assert not found.needed
-    assert found.mend
-    assert "auto takes cpu" in finding("rasteriser").detail
+    assert found.fix
+    assert "auto selects cpu" in finding("rasteriser").detail
     assert not finding("gsplat kernels", compile_kernels=True).ok
 
 
-def test_without_numba_auto_takes_the_reference(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_numba_auto_selects_the_reference(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = "numba does not import (x; y); pip install numba"
     monkeypatch.setattr("sundae_ns.rasterization.numba_problem", lambda: problem)
     found = finding("rasteriser")
     assert not found.ok
     assert not found.needed
-    assert "auto takes reference" in found.detail
+    assert "auto selects reference" in found.detail
     assert "numba does not import (x; y)" in found.detail
-    assert found.mend == "pip install numba"
+    assert found.fix == "pip install numba"
 
 
-def test_with_running_kernels_auto_takes_gsplat(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_with_working_kernels_auto_selects_gsplat(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     _kernels(monkeypatch, None)
     assert "Imaginary 9000" in finding("CUDA").detail
     assert finding("gsplat kernels", compile_kernels=True).ok
-    assert finding("rasteriser", compile_kernels=True).detail == "auto takes gsplat"
+    assert finding("rasteriser", compile_kernels=True).detail == "auto selects gsplat"
 
 
-def test_kernels_that_are_not_built_are_built_on_request_only(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_kernels_are_built_only_on_request(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "kernels_built", lambda: False)
-    _kernels(monkeypatch, "this must not have been tried")
+    _kernels(monkeypatch, "must not be tried")
     found = finding("gsplat kernels")
     assert found.detail == "not built yet"
-    assert found.mend.startswith("sundae doctor --compile")
-    assert "auto takes gsplat, after it has built its kernels" in finding("rasteriser").detail
+    assert found.fix.startswith("sundae doctor --compile")
+    assert "auto selects gsplat, after its kernels are built" in finding("rasteriser").detail
 
 
 def test_kernels_that_do_not_run(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,7 +88,7 @@ def test_kernels_that_do_not_run(cuda: None, monkeypatch: pytest.MonkeyPatch) ->
     found = finding("gsplat kernels", compile_kernels=True)
     assert not found.ok
     assert "no nvcc" in found.detail
-    assert "auto takes reference" in finding("rasteriser", compile_kernels=True).detail
+    assert "auto selects reference" in finding("rasteriser", compile_kernels=True).detail
 
 
 def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,10 +109,10 @@ def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
         assert not found.ok
         assert not found.needed
         assert "layer by layer" in found.detail
-        assert found.mend == "update the driver"
+        assert found.fix == "update the driver"
 
 
-def test_built_kernels_are_found_where_torch_puts_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_built_kernels_are_found_in_torchs_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / "gsplat" / "__init__.py"
     package.parent.mkdir()
     package.touch()
@@ -129,18 +129,18 @@ def test_built_kernels_are_found_where_torch_puts_them(tmp_path: Path, monkeypat
     assert doctor.kernels_built()
 
 
-def compiler(folder: Path, says: str) -> Path:
-    """A program that says which CUDA it is of, as nvcc does."""
+def compiler(folder: Path, output: str) -> Path:
+    """A program that reports its CUDA version like nvcc."""
     folder.mkdir(parents=True, exist_ok=True)
     made = folder / "nvcc"
-    made.write_text(f"#!/bin/sh\necho '{says}'\n")
+    made.write_text(f"#!/bin/sh\necho '{output}'\n")
     made.chmod(0o755)
     return made
 
 
 @pytest.fixture
 def no_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder that is the whole PATH, of a torch that is built for CUDA 13.0."""
+    """An empty folder as PATH, for a torch built for CUDA 13.0."""
     folder = tmp_path / "bin"
     folder.mkdir()
     monkeypatch.setenv("PATH", str(folder))
@@ -151,33 +151,33 @@ def no_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("release", ["13.0", "13.1"])
-def test_nvcc_of_the_same_major_version_will_do(no_compiler: Path, release: str) -> None:
+def test_nvcc_of_the_same_major_version_suffices(no_compiler: Path, release: str) -> None:
     nvcc = compiler(no_compiler, f"Cuda compilation tools, release {release}, V{release}.88")
     assert finding("nvcc") == doctor.Finding("nvcc", True, f"{nvcc} {release}, for gsplat's kernels")
 
 
-@pytest.mark.parametrize("said", ["Cuda compilation tools, release 12.0, V12.0.140", "release 3.0", "hello"])
-def test_nvcc_of_another_version_is_refused_by_torch(no_compiler: Path, said: str) -> None:
-    compiler(no_compiler, said)
+@pytest.mark.parametrize("output", ["Cuda compilation tools, release 12.0, V12.0.140", "release 3.0", "hello"])
+def test_nvcc_of_another_version_is_refused_by_torch(no_compiler: Path, output: str) -> None:
+    compiler(no_compiler, output)
     found = finding("nvcc")
     assert not found.ok
     assert not found.needed
     assert "this torch is built for 13.0" in found.detail
-    assert found.mend.startswith("apt-get install cuda-toolkit-13-0 ")
-    assert "export CUDA_HOME=/usr/local/cuda-13.0" in found.mend
+    assert found.fix.startswith("apt-get install cuda-toolkit-13-0 ")
+    assert "export CUDA_HOME=/usr/local/cuda-13.0" in found.fix
 
 
 def test_torch_without_cuda_has_no_version_to_compare(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.version, "cuda", None)
     monkeypatch.setenv("CUDA_HOME", str(no_compiler / "nowhere"))
-    assert "CUDA toolkit of torch's version" in finding("nvcc").mend
+    assert "CUDA toolkit of torch's version" in finding("nvcc").fix
     monkeypatch.setenv("CUDA_HOME", str(no_compiler.parent))
     compiler(no_compiler, "release 12.0")
     assert finding("nvcc").ok
 
 
-def test_nvcc_is_looked_for_as_torch_and_gsplat_do(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """gsplat calls what is in PATH, torch what is in CUDA_HOME: both have to be there, and torch's version counts."""
+def test_nvcc_is_searched_like_torch_and_gsplat_do(no_compiler: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """gsplat calls nvcc from PATH, torch the one in CUDA_HOME; both must exist, and torch's version counts."""
     home = no_compiler.parent / "cuda"
     monkeypatch.setenv("CUDA_HOME", str(home))
     compiler(no_compiler, "release 12.0")
@@ -185,48 +185,48 @@ def test_nvcc_is_looked_for_as_torch_and_gsplat_do(no_compiler: Path, monkeypatc
     nvcc = compiler(home / "bin", "release 13.0")
     assert finding("nvcc").detail.startswith(f"{nvcc} 13.0")
     (no_compiler / "nvcc").unlink()
-    assert finding("nvcc").mend == f"export PATH={home / 'bin'}:$PATH"
+    assert finding("nvcc").fix == f"export PATH={home / 'bin'}:$PATH"
 
 
-def test_a_driver_has_to_be_new_enough(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_oldest_driver_is_named(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    assert "built for CUDA 13.0, which needs 580 or newer" in finding("CUDA").mend
+    assert "built for CUDA 13.0, which needs 580 or newer" in finding("CUDA").fix
     monkeypatch.setattr(torch.version, "cuda", "99.0")
-    assert "needs" not in finding("CUDA").mend
+    assert "needs" not in finding("CUDA").fix
 
 
 def test_programs_of_nerfstudios_commands(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert finding("COLMAP").mend == "apt-get install colmap"
-    assert finding("ffmpeg").mend == "apt-get install ffmpeg"
+    assert finding("COLMAP").fix == "apt-get install colmap"
+    assert finding("ffmpeg").fix == "apt-get install ffmpeg"
     for name in ("colmap", "ffmpeg"):
         (tmp_path / name).touch(mode=0o755)
     assert finding("COLMAP").detail.startswith(f"{tmp_path / 'colmap'}, for ns-process-data")
     assert finding("ffmpeg").detail == f"{tmp_path / 'ffmpeg'}, for ns-process-data and ns-render"
 
 
-@pytest.mark.parametrize("at_hand", [True, False])
-def test_lpips_weights(monkeypatch: pytest.MonkeyPatch, at_hand: bool) -> None:
-    monkeypatch.setattr(evaluation, "lpips_weights_available", lambda: at_hand)
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_lpips_weights(monkeypatch: pytest.MonkeyPatch, on_disk: bool) -> None:
+    monkeypatch.setattr(evaluation, "lpips_weights_available", lambda: on_disk)
     found = finding("LPIPS weights")
-    assert found.ok == at_hand
-    if not at_hand:
+    assert found.ok == on_disk
+    if not on_disk:
         assert not found.needed
-        # A command that puts the right file where it is looked for.
-        *_, path, url = found.mend.split()
+        # The command puts the file at the expected path.
+        *_, path, url = found.fix.split()
         assert Path(path) == evaluation.lpips_weights_path()
         assert url == evaluation.lpips_weights_url()
 
 
 def test_libraries_of_the_exporter(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ctypes.util, "find_library", lambda _: None)
-    assert finding("libusb-1.0").mend == "apt-get install libusb-1.0-0"
-    assert finding("libGL").mend == "apt-get install libgl1"
+    assert finding("libusb-1.0").fix == "apt-get install libusb-1.0-0"
+    assert finding("libGL").fix == "apt-get install libgl1"
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
     assert finding("libGL").ok
 
 
-def test_versions_of_what_matters() -> None:
+def test_versions_of_packages() -> None:
     found = {one.name: one.detail for one in doctor.versions()}
     assert found["torch"] == metadata.version("torch")
     assert found["gsplat"] == metadata.version("gsplat")
@@ -239,23 +239,23 @@ def report(**options: Any) -> tuple[int, str]:
     return code, out.getvalue()
 
 
-def test_a_machine_without_a_gpu_is_fine(no_cuda: None) -> None:
+def test_a_machine_without_a_gpu_passes(no_cuda: None) -> None:
     code, text = report()
     assert code == 0
-    assert "auto takes cpu" in text
+    assert "auto selects cpu" in text
     for one in doctor.examine():
         assert one.name in text
-        assert one.ok or f"{one.name}: {one.mend}" in text
+        assert one.ok or f"{one.name}: {one.fix}" in text
 
 
-def test_a_package_that_is_missing_is_not(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_fails(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "PACKAGES", ("torch", "no-such-package"))
     code, text = report()
     assert code == 1
     assert "no-such-package: pip install no-such-package" in text
 
 
-def test_everything_at_hand_needs_no_advice(cuda: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_everything_on_disk_needs_no_advice(cuda: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     _kernels(monkeypatch, None)
     monkeypatch.setattr(evaluation, "lpips_weights_available", lambda: True)
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")
@@ -265,7 +265,7 @@ def test_everything_at_hand_needs_no_advice(cuda: None, monkeypatch: pytest.Monk
     compiler(tmp_path / "bin", "release 13.0")
     code, text = report(compile_kernels=True)
     assert code == 0
-    assert "To mend" not in text
+    assert "To fix" not in text
 
 
 def test_command(no_cuda: None, capsys: pytest.CaptureFixture[str]) -> None:

@@ -49,8 +49,8 @@ def test_export_to_other_formats(tmp_path: Path, kind: str, capsys: pytest.Captu
     write_scene(tmp_path / "a.sundae", Scene(field(), meta={"model": model}))
     out = tmp_path / f"a{kind}"
     assert run("export", tmp_path / "a.sundae", "-o", out) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert f"a{kind}: 200 primitives, degree 1, antialiased, {out.stat().st_size:,} bytes" in said
+    output = " ".join(capsys.readouterr().out.split())
+    assert f"a{kind}: 200 primitives, degree 1, antialiased, {out.stat().st_size:,} bytes" in output
     assert out.read_bytes()[:2] == {".spz": b"\x1f\x8b", ".sog": b"PK"}[kind]
 
 
@@ -59,15 +59,18 @@ def test_export_to_other_formats(tmp_path: Path, kind: str, capsys: pytest.Captu
 def test_export_of_a_ply_of_any_program(
     tmp_path: Path, kind: str, comments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By whatever name, and like the same field out of a packed scene: a .ply knows the harmonics' first band."""
+    """The file's name does not matter, and the result equals that of the same field as a packed scene."""
     given = field()
     given["means"][3] = torch.nan
-    write_ply(tmp_path / "stranger.bin", given, comments=comments)
+    write_ply(tmp_path / "unnamed.bin", given, comments=comments)
     out, same = tmp_path / f"a{kind}", tmp_path / f"b{kind}"
-    assert run("export", tmp_path / "stranger.bin", "-o", out) == 0
-    said = " ".join(capsys.readouterr().out.split())
+    assert run("export", tmp_path / "unnamed.bin", "-o", out) == 0
+    output = " ".join(capsys.readouterr().out.split())
     mode = ", antialiased" if comments else ""
-    assert f"a{kind}: 199 primitives, degree 1{mode}, {out.stat().st_size:,} bytes 1 were not finite" in said
+    assert (
+        f"a{kind}: 199 primitives, degree 1{mode}, {out.stat().st_size:,} bytes left out 1 primitives that were not finite"
+        in output
+    )
     finite = {name: value[torch.arange(200) != 3] for name, value in given.items()}
     write_for_viewers(same, finite, antialiased=bool(comments))
     assert out.read_bytes() == same.read_bytes()
@@ -87,7 +90,7 @@ def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply", "--upright") == 0
     truth = read_scene(tmp_path / "a.sundae").field
     found = read_ply(tmp_path / "a.ply")
-    # Such a model keeps logits of colours, and a .ply the harmonic of band 0.
+    # Such a model stores logits of colours, a .ply the SH coefficient of degree 0.
     torch.testing.assert_close(0.5 + SH_C0 * found["features_dc"], truth["features_dc"].sigmoid(), rtol=0, atol=1e-6)
     torch.testing.assert_close(found["means"][:, 1], -truth["means"][:, 2])
 
@@ -95,10 +98,12 @@ def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "options", [[], ["--score", "opacity", "--selection", "top"], ["--score", "response", "--selection", "band"]]
 )
-def test_prune_keeps_rows_as_they_are(tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_prune_does_not_change_kept_rows(
+    tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     source, out = tmp_path / "in.ply", tmp_path / "out.ply"
-    write_ply(source, field(), comments=["SplatRenderMode: mip", "by a stranger"])
-    # A property that 3DGS does not know, and an element beside the vertices.
+    write_ply(source, field(), comments=["SplatRenderMode: mip", "by another program"])
+    # Add a property that is not part of 3DGS, and an element beside the vertices.
     data = PlyData.read(source)
     rows = data["vertex"].data
     more = np.empty(len(rows), [*rows.dtype.descr, ("label", "<i4")])
@@ -112,9 +117,9 @@ def test_prune_keeps_rows_as_they_are(tmp_path: Path, options: list[str], capsys
     assert run("prune", source, "-o", out, "--keep", "0.25", *options) == 0
     text = capsys.readouterr().out
     assert "50 of 200 primitives" in text
-    assert "1 were not finite" in text
+    assert "dropped 1 primitives that were not finite" in text
     found = PlyData.read(out)
-    assert found.comments == ["SplatRenderMode: mip", "by a stranger"]
+    assert found.comments == ["SplatRenderMode: mip", "by another program"]
     assert found["extra"].data["number"].tolist() == [7]
     kept = found["vertex"].data
     assert len(kept) == 50
@@ -126,15 +131,18 @@ def test_prune_keeps_rows_as_they_are(tmp_path: Path, options: list[str], capsys
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["prune", "nothing.ply", "-o", "a.ply"], "nothing.ply cannot be read"),
         (["prune", "in.ply", "-o", "a.ply", "--keep", "0"], "keep_ratio is 0.0"),
-        (["prune", "in.ply", "-o", "a.spz"], "not named .ply"),
+        (["prune", "in.ply", "-o", "a.spz"], "a.spz does not end in .ply"),
         (["prune", "in.ply", "-o", "no/a.ply"], "no is no folder"),
-        (["export", "in.ply", "-o", "a.splat"], "not named .ply or .spz or .sog"),
+        (["export", "in.ply", "-o", "a.splat"], "name it .ply or .spz or .sog"),
         (["export", "in.ply", "-o", "no/a.sog"], "no is no folder"),
-        (["export", "in.ply", "-o", "a.ply"], "in.ply is a .ply already; give a name that ends in .spz or .sog"),
+        (
+            ["export", "in.ply", "-o", "a.ply"],
+            "in.ply is a .ply already; give an output name that ends in .spz or .sog",
+        ),
         (["export", "in.ply", "-o", "a.sog", "--upright"], "not in nerfstudio's coordinates"),
         (
             ["export", "in.bin", "-o", "a.ply"],
@@ -143,7 +151,7 @@ def test_prune_keeps_rows_as_they_are(tmp_path: Path, options: list[str], capsys
         (["prune", "in.sundae", "-o", "a.ply"], "in.sundae is a packed scene; sundae export makes a .ply of it"),
         (["pack", "in.sundae", "-o", "a.sundae"], "in.sundae is a packed scene; give the run that was packed"),
         (["pack", "in.ply", "-o", "a.sundae"], "in.ply is a .ply file; give the folder of a run"),
-        (["unpack", "in.ply"], "in.ply is no packed scene; give a file that sundae pack wrote"),
+        (["unpack", "in.ply"], "in.ply is not a packed scene; give a file that sundae pack wrote"),
         (["bands", "in.sundae", "-o", "."], "in.sundae is a packed scene; sundae unpack makes a run of it"),
         (["bench", "graph", "--field", "in.sundae"], "in.sundae is a packed scene; sundae unpack makes a run of it"),
         (["bench", "frame", "--load-config", "in.sundae"], "in.sundae is a packed scene; give the folder of a run"),
@@ -157,7 +165,7 @@ def test_refusals_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     arguments: list[str],
-    says: str,
+    message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_ply(Path("in.ply"), field())
@@ -166,5 +174,5 @@ def test_refusals_are_one_line(
     before = sorted(tmp_path.iterdir())
     assert run(*arguments) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
-    assert says in line
+    assert message in line
     assert sorted(tmp_path.iterdir()) == before

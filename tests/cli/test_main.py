@@ -29,7 +29,7 @@ def test_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "wrote 3 training and 1 test views" in capsys.readouterr().out
 
 
-def test_scene_is_a_function_of_its_seed(tmp_path: Path) -> None:
+def test_the_seed_determines_the_scene(tmp_path: Path) -> None:
     clouds = []
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         assert run("scene", tmp_path / name, "--seed", seed, *SMALL) == 0
@@ -57,7 +57,7 @@ def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str],
         assert [path.name for path in out.iterdir()] == ["thesis.txt"]
 
 
-def test_an_error_that_is_not_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(**_: object) -> int:
         raise ZeroDivisionError
 

@@ -24,10 +24,10 @@ def run(*arguments: object) -> int:
 
 
 def test_options_are_those_of_the_configuration() -> None:
-    """They are written out a second time so that ``sundae --help`` need not import torch."""
+    """They are repeated in the command, so that ``sundae --help`` does not import torch."""
     options = inspect.signature(pack).parameters
     for field in fields(PackConfig):
-        # Those that a fine-tune changes are only known when it is known whether there is one.
+        # The defaults that a fine-tune changes depend on --finetune.
         assert options[field.name].default == (None if field.name in FINETUNED else field.default), field.name
         if field.name in FINETUNED:
             (line,) = re.findall(rf"^ +{field.name}: (.*)$", pack.__doc__ or "", re.MULTILINE)
@@ -38,7 +38,7 @@ def test_options_are_those_of_the_configuration() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["pack", "nothing", "-o", "a.sundae"], "nothing cannot be read"),
         (["pack", "nothing", "-o", "a.sundae", "--scale-bits", "2"], "scale-bits is 2; give 4 to 16"),
@@ -55,7 +55,7 @@ def test_refusals_are_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     arguments: list[str],
-    says: str,
+    message: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     points = torch.rand(20, 3)
@@ -67,5 +67,5 @@ def test_refusals_are_one_line(
     assert run(*arguments) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert line.startswith("sundae: ")
-    assert says in line
+    assert message in line
     assert sorted(tmp_path.iterdir()) == before

@@ -1,4 +1,4 @@
-"""The head: its two modes, its start, and what it must not depend on."""
+"""The head: its two modes, its initialisation, and its invariances."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_features_mode_sees_features_alone() -> None:
 @pytest.mark.parametrize("mode", ["residual", "features"])
 def test_a_few_steps_learn(mode: str) -> None:
     base, splatted, _ = inputs()
-    alpha = torch.ones(33, 40, 1)  # the residual head has no say where nothing was splatted
+    alpha = torch.ones(33, 40, 1)  # the residual head corrects nothing where nothing was splatted
     target = (base * 0.8).detach()
     module = head(mode=mode)
     splatted.requires_grad_()
@@ -100,7 +100,7 @@ WILD = {
 
 @pytest.mark.parametrize("kind", WILD)
 @pytest.mark.parametrize("mode", ["residual", "features"])
-def test_wild_inputs_give_finite_pictures(mode: str, kind: str) -> None:
+def test_wild_inputs_give_finite_images(mode: str, kind: str) -> None:
     base, splatted, alpha = inputs()
     module = head(mode=mode)
     perturb(module)
@@ -112,22 +112,22 @@ def test_wild_inputs_give_finite_pictures(mode: str, kind: str) -> None:
 
 
 @pytest.mark.parametrize("mode", ["residual", "features"])
-def test_training_ten_times_too_fast_may_be_bad_but_not_broken(mode: str) -> None:
+def test_training_with_ten_times_the_rate_stays_finite(mode: str) -> None:
     torch.manual_seed(0)
     module = head(mode=mode, pixel_unshuffle=2)
     optimizer = torch.optim.Adam(module.parameters(), lr=1e-2)  # the methods have 1e-3 at most
-    pictures = [inputs(16, 16) for _ in range(4)]
-    truths = [torch.rand(16, 16, 3) for _ in pictures]
+    images = [inputs(16, 16) for _ in range(4)]
+    truths = [torch.rand(16, 16, 3) for _ in images]
     for step in range(1000):
         optimizer.zero_grad()
-        (module(*pictures[step % 4]) - truths[step % 4]).abs().mean().backward()
+        (module(*images[step % 4]) - truths[step % 4]).abs().mean().backward()
         optimizer.step()
-    assert all(torch.isfinite(module(*picture)).all() for picture in pictures)
+    assert all(torch.isfinite(module(*image)).all() for image in images)
 
 
 @pytest.mark.parametrize(("capability", "dtype"), [((9, 0), torch.bfloat16), ((7, 5), torch.float32)])
 def test_fp16_does_not_train(monkeypatch: pytest.MonkeyPatch, capability: tuple[int, int], dtype: torch.dtype) -> None:
-    """What overflows in fp16 would be NaN in the gradients of all layers before."""
+    """Overflow in fp16 would be NaN in the gradients of all earlier layers."""
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
     module, gpu = head(precision="fp16"), torch.device("cuda")
     assert module._dtype(gpu) == dtype
@@ -142,7 +142,7 @@ def test_fp16_does_not_train(monkeypatch: pytest.MonkeyPatch, capability: tuple[
 @pytest.mark.parametrize("precision", ["bf16", "fp16"])
 @torch.no_grad()
 def test_half_precision_of_wild_inputs_is_finite(precision: str, kind: str) -> None:
-    """What does not fit into the numbers of half precision is left uncompensated."""
+    """Values that overflow half precision are left uncompensated."""
     base, splatted, alpha = (t.cuda() for t in inputs())
     module = head(precision=precision).cuda()
     perturb(module)
@@ -164,22 +164,22 @@ def test_half_precision_is_close(precision: str) -> None:
     assert (out - exact(*tensors)).abs().mean() < 0.03 * scale
 
 
-def test_a_resized_head_is_one_of_that_size_with_the_same_parameters() -> None:
+def test_a_resized_head_keeps_its_parameter_objects() -> None:
     head, wanted = (
         CompensationHead(HeadConfig(size="small")),
         HeadConfig(size="tiny", num_features=5, pixel_unshuffle=1),
     )
-    optimizer, held = torch.optim.Adam(head.parameters(), lr=0.01), list(head.parameters())
+    optimizer, before = torch.optim.Adam(head.parameters(), lr=0.01), list(head.parameters())
     head.eval()
     head.resize(wanted)
     fresh = CompensationHead(wanted)
-    assert all(a is b for a, b in zip(held, head.parameters(), strict=True))
+    assert all(a is b for a, b in zip(before, head.parameters(), strict=True))
     assert [p.shape for p in head.parameters()] == [p.shape for p in fresh.parameters()]
-    assert str(head.net) == str(fresh.eval().net), "layers say of themselves what they are"
+    assert str(head.net) == str(fresh.eval().net), "layers describe themselves"
     assert not any(module.training for module in head.modules())
     fresh.load_state_dict(head.state_dict())
-    pictures = [torch.rand(9, 11, channels) for channels in (3, 3 + 5, 1)]
-    assert torch.equal(head(*pictures), fresh(*pictures))
-    head.train()(*pictures).square().mean().backward()
+    images = [torch.rand(9, 11, channels) for channels in (3, 3 + 5, 1)]
+    assert torch.equal(head(*images), fresh(*images))
+    head.train()(*images).square().mean().backward()
     optimizer.step()
-    assert not torch.equal(head(*pictures), fresh(*pictures))
+    assert not torch.equal(head(*images), fresh(*images))

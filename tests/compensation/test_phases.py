@@ -1,4 +1,4 @@
-"""The mean over places of the head's grid of pixels: what it leaves alone, and that it hangs less on them."""
+"""The mean over shifts of the head's pixel grid: invariants, and less dependence on the grid."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from sundae_ns.compensation import PHASES, CompensationHead, HeadConfig, over_phases
 from sundae_ns.errors import ConfigError
 
-Pictures = tuple[Tensor, Tensor, Tensor]
+Images = tuple[Tensor, Tensor, Tensor]
 
 
 def head(phases: int = 4, **options: object) -> CompensationHead:
@@ -20,30 +20,30 @@ def head(phases: int = 4, **options: object) -> CompensationHead:
     return made
 
 
-def pictures(height: int = 64, width: int = 80) -> Pictures:
-    """Smooth ones, as those of a scene are."""
+def images(height: int = 64, width: int = 80) -> Images:
+    """Smooth images, like those of a scene."""
     noise = torch.randn(1, 9, height // 4, width // 4)
     everything = F.interpolate(noise, size=(height, width), mode="bicubic").sigmoid()[0].permute(1, 2, 0)
     return everything[..., :3], torch.cat([everything[..., :3], everything[..., 3:8]], dim=-1), everything[..., 8:]
 
 
 @torch.no_grad()
-def moves(made: CompensationHead, seen: Pictures, pixels: int) -> float:
-    """Mean change of a picture that is seen from one pixel beside, edges left out."""
-    here = over_phases(made, *seen)
-    there = over_phases(made, *(picture[:, pixels:] for picture in seen))
+def change(made: CompensationHead, inputs: Images, pixels: int) -> float:
+    """Mean change of the image when the camera shifts by some pixels, edges excluded."""
+    here = over_phases(made, *inputs)
+    there = over_phases(made, *(image[:, pixels:] for image in inputs))
     return float((here[16:-16, pixels + 16 : -16] - there[16:-16, 16:-16]).abs().mean())
 
 
 @pytest.mark.parametrize("unshuffle", [1, 2, 4])
 @pytest.mark.parametrize("mode", ["residual", "features"])
-def test_more_phases_hang_less_on_the_grid(mode: str, unshuffle: int) -> None:
+def test_more_phases_depend_less_on_the_grid(mode: str, unshuffle: int) -> None:
     step = max(unshuffle // 2, 1)
-    seen = pictures()
+    inputs = images()
     made = {phases: head(phases, mode=mode, pixel_unshuffle=unshuffle) for phases in PHASES}
     for other in made.values():
         other.load_state_dict(made[1].state_dict())
-    errors = {phases: moves(other, seen, step) for phases, other in made.items()}
+    errors = {phases: change(other, inputs, step) for phases, other in made.items()}
     assert errors[4] < 0.9 * errors[2]
     assert errors[4] < 0.8 * errors[1]
     assert errors[2] < errors[1]
@@ -51,24 +51,24 @@ def test_more_phases_hang_less_on_the_grid(mode: str, unshuffle: int) -> None:
 
 @torch.no_grad()
 def test_one_phase_is_the_head() -> None:
-    made, seen = head(1), pictures()
-    assert torch.equal(over_phases(made, *seen), made(*seen))
+    made, inputs = head(1), images()
+    assert torch.equal(over_phases(made, *inputs), made(*inputs))
 
 
 @torch.no_grad()
-def test_a_head_that_knows_no_neighbours_is_the_same_in_all_phases() -> None:
-    made, seen = head(1, mode="features", pixel_unshuffle=1), pictures()
+def test_a_pointwise_head_is_the_same_in_all_phases() -> None:
+    made, inputs = head(1, mode="features", pixel_unshuffle=1), images()
     made.net = nn.Conv2d(5, 3, 1)  # type: ignore[assignment]
-    alone = made(*seen)
+    alone = made(*inputs)
     for phases in PHASES:
         made.config.phases = phases  # type: ignore[assignment]
-        torch.testing.assert_close(over_phases(made, *seen), alone)
+        torch.testing.assert_close(over_phases(made, *inputs), alone)
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("phases", PHASES)
 @pytest.mark.parametrize(("height", "width"), [(1, 1), (17, 30), (1, 40)])
-def test_any_size_and_nothing_where_nothing_was_splatted(phases: int, height: int, width: int) -> None:
+def test_any_size_and_no_correction_where_nothing_was_splatted(phases: int, height: int, width: int) -> None:
     made = head(phases)
     base, splatted, alpha = torch.rand(height, width, 3), torch.rand(height, width, 8), torch.rand(height, width, 1)
     alpha[: height // 2] = 0

@@ -1,4 +1,4 @@
-"""The U-Net: the paper's sizes, any picture size, gradients."""
+"""The U-Net: the paper's sizes, any image size, gradients."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def test_any_size(unshuffle: int, height: int, width: int) -> None:
     assert out.isfinite().all()
 
 
-def test_padding_reaches_the_edge_alone() -> None:
-    """A picture cut down to an odd size keeps its values far from the cut."""
+def test_padding_affects_the_edge_only() -> None:
+    """An image cropped to an odd size keeps its values far from the crop."""
     net = UNet(3, 3, 8)
-    picture = torch.rand(1, 3, 128, 128)
-    whole, cut = net(picture), net(picture[..., :117, :115])
+    image = torch.rand(1, 3, 128, 128)
+    whole, cut = net(image), net(image[..., :117, :115])
     assert cut.shape[-2:] == (117, 115)
     assert torch.allclose(cut[..., :24, :24], whole[..., :24, :24], atol=1e-6)
     assert not torch.allclose(cut[..., -4:, -4:], whole[..., 113:117, 111:115], atol=1e-6)
@@ -49,15 +49,15 @@ def test_zero_start_is_exactly_zero() -> None:
 
 def test_gradcheck() -> None:
     net = UNet(2, 1, 2).double()
-    picture = torch.rand(1, 2, 9, 11, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(net, (picture,), fast_mode=True)
+    image = torch.rand(1, 2, 9, 11, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(net, (image,), fast_mode=True)
 
 
 def test_coarse_levels_reach_far() -> None:
-    """A change in one corner reaches pixels further away than the finest level's own convolutions could see."""
+    """The receptive field is larger than that of the finest level's own convolutions."""
     torch.manual_seed(1)
     net = UNet(1, 1, 8)
-    picture = torch.zeros(1, 1, 64, 64, requires_grad=True)
-    (gradient,) = torch.autograd.grad(net(picture)[0, 0, 32, 32], picture)
+    image = torch.zeros(1, 1, 64, 64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(net(image)[0, 0, 32, 32], image)
     rows = gradient[0, 0].abs().sum(dim=1).nonzero().squeeze(1)
     assert int(rows.max() - rows.min()) > 40

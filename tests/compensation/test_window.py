@@ -1,4 +1,4 @@
-"""Training windows: inside the picture, within the limit, of every part, the same for the same seed."""
+"""Training windows: inside the image, within the limit, covering every part, deterministic by seed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SIDES = st.integers(1, 5000)
 
 
 @given(SIDES, SIDES, st.integers(1, 2**22), st.integers(0, 2**31))
-def test_inside_the_picture(width: int, height: int, limit: int, seed: int) -> None:
+def test_inside_the_image(width: int, height: int, limit: int, seed: int) -> None:
     window = training_window(width, height, limit, seed)
     assert (window is None) == (width * height <= limit)
     if window is None:
@@ -22,7 +22,7 @@ def test_inside_the_picture(width: int, height: int, limit: int, seed: int) -> N
     assert 0 <= window.top <= window.top + window.height <= height
     assert 1 <= window.width
     assert 1 <= window.height
-    # A window is at least the grid a side, however low the limit.
+    # A side of a window is at least the grid, however low the limit.
     assert window.width * window.height <= limit or min(window.width, window.height) <= 16
 
 
@@ -30,7 +30,7 @@ def test_no_limit() -> None:
     assert training_window(10_000, 10_000, 0, seed=1) is None
 
 
-def test_a_function_of_the_seed() -> None:
+def test_determined_by_the_seed() -> None:
     windows = [training_window(1061, 1893, 2**20, seed) for seed in (3, 3, 4)]
     assert windows[0] == windows[1] != windows[2]
 

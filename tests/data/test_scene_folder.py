@@ -7,7 +7,7 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from sundae_ns.data import Camera, first_hits, held_out_indices, in_frame, project, still_life, write_scene
+from sundae_ns.data import Camera, first_hits, held_out_indices, in_frame, project, still_life, write_embedded_capture
 from sundae_ns.errors import ConfigError, DataError
 
 SIZE = {"train_views": 12, "test_views": 2, "width": 128, "height": 96, "points": 400}
@@ -15,7 +15,7 @@ SIZE = {"train_views": 12, "test_views": 2, "width": 128, "height": 96, "points"
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return write_scene(tmp_path_factory.mktemp("scene") / "new" / "folder", **SIZE)
+    return write_embedded_capture(tmp_path_factory.mktemp("scene") / "new" / "folder", **SIZE)
 
 
 def _digest(folder):
@@ -23,7 +23,7 @@ def _digest(folder):
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def _picture(path):
+def _image(path):
     return np.asarray(Image.open(path), np.float64) / 255
 
 
@@ -34,20 +34,20 @@ def _points(scene):
 
 
 def test_same_seed_same_bytes(scene, tmp_path):
-    assert _digest(write_scene(tmp_path / "again", **SIZE)) == _digest(scene)
-    other = _digest(write_scene(tmp_path / "other", seed=1, **SIZE))
+    assert _digest(write_embedded_capture(tmp_path / "again", **SIZE)) == _digest(scene)
+    other = _digest(write_embedded_capture(tmp_path / "other", seed=1, **SIZE))
     assert other["images/frame_00001.png"] != _digest(scene)["images/frame_00001.png"]
     assert other["sparse_pc.ply"] != _digest(scene)["sparse_pc.ply"]
 
 
-def test_pictures(scene):
+def test_images(scene):
     paths = sorted((scene / "images").glob("*.png"))
     assert len(paths) == 14
     for path in paths:
-        picture = _picture(path)
-        assert picture.shape == (96, 128, 3)
-        assert picture.std() > 0.1
-        assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
+        image = _image(path)
+        assert image.shape == (96, 128, 3)
+        assert image.std() > 0.1
+        assert len(np.unique(image.reshape(-1, 3), axis=0)) > 500
 
 
 def test_held_out_views_lie_between_training_views():
@@ -72,7 +72,7 @@ def test_split_as_nerfstudio_reads_it(scene):
     assert (train.cameras.width == 128).all()
     assert (train.cameras.height == 96).all()
     assert (train.cameras.cx == 64).all()
-    # nerfstudio's rays through a pixel's centre against ours, in its own frame of the world.
+    # Project a ray of nerfstudio, transformed from its world frame, and compare with its pixel.
     frame = json.loads((scene / "transforms.json").read_text())["frames"][3]
     ray = test.cameras.generate_rays(camera_indices=0, coords=torch.tensor([[10.5, 20.5]])).directions[0].numpy()
     camera = Camera(np.array(frame["transform_matrix"]), float(test.cameras.fx[0]), 128, 96)
@@ -110,19 +110,19 @@ def _colour_error(folder, mirrored):
         reach, _ = first_hits(still_life(0), origins, rays / length[:, None])
         seen = seen[reach > 0.98 * length]
         column, row = image[seen].astype(int).T
-        colours = _picture(folder / frame["file_path"])[row, column]
+        colours = _image(folder / frame["file_path"])[row, column]
         errors.append(np.abs(colours - rgb[seen] / 255).mean(axis=1))
     return np.median(np.concatenate(errors))
 
 
 def test_points_match_the_colours_under_them(scene):
-    # Measured: 0.046, for points lie on edges on purpose; 0.212 with the pictures upside down.
+    # Measured: 0.046, not 0, because points are drawn near edges; 0.212 with the images upside down.
     assert _colour_error(scene, mirrored=False) < 0.08
     assert _colour_error(scene, mirrored=True) > 0.15
 
 
 def _on_a_surface(points):
-    """True where a short ray that ends at the point meets a surface right there."""
+    """True where a short ray towards the point hits a surface at the point."""
     rng = np.random.default_rng(0)
     away = rng.normal(size=points.shape)
     away /= np.linalg.norm(away, axis=1, keepdims=True)
@@ -130,19 +130,19 @@ def _on_a_surface(points):
     return np.abs(distance - 0.01) < 2e-3
 
 
-def test_outliers_are_the_given_share(tmp_path):
+def test_outliers_are_the_given_fraction(tmp_path):
     size = {"train_views": 4, "test_views": 1, "width": 32, "height": 32, "points": 400, "point_noise": 0.0}
-    clean, _ = _points(write_scene(tmp_path / "clean", outliers=0.0, **size))
+    clean, _ = _points(write_embedded_capture(tmp_path / "clean", outliers=0.0, **size))
     assert _on_a_surface(clean).mean() > 0.97
-    dirty, _ = _points(write_scene(tmp_path / "dirty", outliers=0.25, **size))
+    dirty, _ = _points(write_embedded_capture(tmp_path / "dirty", outliers=0.25, **size))
     assert _on_a_surface(dirty[:300]).mean() > 0.97
     assert _on_a_surface(dirty[300:]).mean() < 0.05
 
 
 def test_noise_grows_with_the_distance(tmp_path):
     size = {"train_views": 14, "test_views": 1, "width": 32, "height": 32, "points": 400, "outliers": 0.0}
-    exact, _ = _points(write_scene(tmp_path / "exact", point_noise=0.0, **size))
-    noisy, _ = _points(write_scene(tmp_path / "noisy", point_noise=0.01, **size))
+    exact, _ = _points(write_embedded_capture(tmp_path / "exact", point_noise=0.0, **size))
+    noisy, _ = _points(write_embedded_capture(tmp_path / "noisy", point_noise=0.01, **size))
     error = np.abs(noisy - exact)
     far = np.linalg.norm(exact, axis=1) > 15
     assert 10 < far.sum() < 390
@@ -153,37 +153,37 @@ def test_noise_grows_with_the_distance(tmp_path):
 def test_progress_counts_views(tmp_path):
     calls = []
     size = {"train_views": 3, "test_views": 1, "width": 16, "height": 16, "points": 8}
-    write_scene(tmp_path, progress=lambda *call: calls.append(call), **size)
+    write_embedded_capture(tmp_path, progress=lambda *call: calls.append(call), **size)
     assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
-def test_own_scene_is_replaced_and_foreign_files_stay(tmp_path):
+def test_earlier_capture_is_replaced_and_other_files_stay(tmp_path):
     size = {"width": 16, "height": 16, "points": 8}
-    write_scene(tmp_path, train_views=4, test_views=1, **size)
+    write_embedded_capture(tmp_path, train_views=4, test_views=1, **size)
     (tmp_path / "notes.txt").write_text("mine")
-    write_scene(tmp_path, train_views=3, test_views=1, **size)
+    write_embedded_capture(tmp_path, train_views=3, test_views=1, **size)
     assert len(list((tmp_path / "images").iterdir())) == 4
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_foreign_folder_is_refused_untouched(tmp_path):
+def test_folder_with_other_files_is_refused_and_unchanged(tmp_path):
     (tmp_path / "transforms.json").write_text("{}")
     before = _digest(tmp_path)
-    with pytest.raises(DataError, match="not a scene of ours"):
-        write_scene(tmp_path)
+    with pytest.raises(DataError, match="other files than an embedded capture"):
+        write_embedded_capture(tmp_path)
     assert _digest(tmp_path) == before
     with pytest.raises(DataError, match="is a file"):
-        write_scene(tmp_path / "transforms.json")
+        write_embedded_capture(tmp_path / "transforms.json")
 
 
 def test_marker_cannot_delete_outside(tmp_path):
-    victim = tmp_path / "victim"
-    victim.write_text("mine")
+    outside = tmp_path / "outside"
+    outside.write_text("mine")
     out = tmp_path / "out"
     out.mkdir()
-    (out / ".sundae_scene.json").write_text(json.dumps({"files": ["../victim", str(victim)]}))
-    write_scene(out, train_views=3, test_views=1, width=16, height=16, points=8)
-    assert victim.read_text() == "mine"
+    (out / ".sundae_scene.json").write_text(json.dumps({"files": ["../outside", str(outside)]}))
+    write_embedded_capture(out, train_views=3, test_views=1, width=16, height=16, points=8)
+    assert outside.read_text() == "mine"
 
 
 @pytest.mark.parametrize(
@@ -192,34 +192,34 @@ def test_marker_cannot_delete_outside(tmp_path):
 )
 def test_impossible_options(tmp_path, wrong):
     with pytest.raises(ConfigError):
-        write_scene(tmp_path / "scene", **wrong)
+        write_embedded_capture(tmp_path / "scene", **wrong)
     assert not (tmp_path / "scene").exists()
 
 
-def test_a_wall_fills_every_picture_and_is_smooth(tmp_path):
-    wall = write_scene(tmp_path / "wall", kind="wall", **SIZE)
-    still = write_scene(tmp_path / "still", **SIZE)
+def test_a_wall_fills_every_image_and_is_smooth(tmp_path):
+    wall = write_embedded_capture(tmp_path / "wall", kind="wall", **SIZE)
+    still = write_embedded_capture(tmp_path / "still", **SIZE)
 
     def detail(folder):
-        pictures = [_picture(path) for path in sorted((folder / "images").glob("*.png"))]
-        return np.mean([np.abs(np.diff(picture, axis=1)).mean() for picture in pictures])
+        images = [_image(path) for path in sorted((folder / "images").glob("*.png"))]
+        return np.mean([np.abs(np.diff(image, axis=1)).mean() for image in images])
 
     assert detail(wall) < detail(still) / 5
     xyz, _ = _points(wall)
     assert np.median(np.abs(xyz[:, 1])) < 0.02
     for path in (wall / "images").glob("*.png"):
-        assert 0.25 < _picture(path).min()
-        assert _picture(path).std(axis=(0, 1)).max() > 0.01, "no texture"
+        assert 0.25 < _image(path).min()
+        assert _image(path).std(axis=(0, 1)).max() > 0.01, "no texture"
     with pytest.raises(ConfigError, match="kind is 'attic'; use one of still-life, wall"):
-        write_scene(tmp_path / "attic", kind="attic", **SIZE)
+        write_embedded_capture(tmp_path / "attic", kind="attic", **SIZE)
 
 
-def test_sensor_noise_is_that_of_each_pixel(tmp_path):
+def test_sensor_noise_is_independent_in_each_pixel(tmp_path):
     clean, noisy = (
-        write_scene(tmp_path / str(noise), kind="wall", sensor_noise=noise, **SIZE) for noise in (0.0, 0.03)
+        write_embedded_capture(tmp_path / str(noise), kind="wall", sensor_noise=noise, **SIZE) for noise in (0.0, 0.03)
     )
     names = [f"images/frame_{i:05d}.png" for i in (1, 2)]
-    errors = np.stack([_picture(noisy / name) - _picture(clean / name) for name in names])
+    errors = np.stack([_image(noisy / name) - _image(clean / name) for name in names])
     assert 0.029 < errors.std() < 0.031
     assert np.abs(errors.mean()) < 0.001
     assert np.abs(np.corrcoef(errors[0].ravel(), errors[1].ravel())[0, 1]) < 0.03

@@ -1,4 +1,4 @@
-"""Shapes against geometry that needs no ray tracer: a hit lies on the surface, and the normal is its gradient."""
+"""Shapes against their signed distance: a hit lies on the surface, and the normal is the gradient."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def test_first_hit(shape, distance):
     assert 0.2 < hit.mean() < 0.99
     points = origins[hit] + t[hit, None] * directions[hit]
     assert np.abs(distance(shape, points)).max() < 2e-4
-    # Nothing of the solid lies before the hit, and nothing at all on a ray that missed.
+    # The solid does not lie before the hit, nor anywhere on a ray that misses.
     reach = np.where(hit, t - 1e-3, 6.0)
     for fraction in np.linspace(0, 1, 97):
         assert distance(shape, origins + (fraction * reach)[:, None] * directions).min() > -2e-4
@@ -55,7 +55,7 @@ def test_normal_is_gradient_of_distance(shape, distance):
     gradient = np.stack(
         [(distance(shape, points + e) - distance(shape, points - e)) / (2 * step) for e in step * np.eye(3)], axis=1
     )
-    # Edges have no normal: compare where the distance is smooth.
+    # Edges have no normal: compare only where the distance is smooth.
     smooth = np.abs(np.linalg.norm(gradient, axis=1) - 1) < 1e-3
     assert smooth.mean() > 0.9
     agreement = np.einsum("mi,mi->m", gradient, shape.normal(points))[smooth]

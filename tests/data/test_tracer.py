@@ -1,7 +1,7 @@
 import numpy as np
 
 from sundae_ns.data.shapes import Box, Sphere
-from sundae_ns.data.tracer import Body, Scene, first_hits, shade
+from sundae_ns.data.tracer import Body, TracedScene, first_hits, shade
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -11,10 +11,10 @@ def _plain(points):
 
 
 def _scene(*bodies):
-    return Scene(bodies, UP, ambient=0.2, diffuse=0.6)
+    return TracedScene(bodies, UP, ambient=0.2, diffuse=0.6)
 
 
-def test_nearest_body_wins_whatever_the_order():
+def test_nearest_body_is_hit_in_any_order():
     near, far = Body(Sphere(0.5), _plain, position=(0, 0, 2)), Body(Sphere(0.5), _plain)
     origin, direction = np.array([[0.0, 0.0, 5.0]]), -UP[None]
     for bodies, index in (((near, far), 0), ((far, near), 1)):
@@ -23,14 +23,14 @@ def test_nearest_body_wins_whatever_the_order():
         np.testing.assert_allclose(t, 2.5)
 
 
-def test_rotated_box_is_hit_where_it_stands():
+def test_rotated_box_is_hit_at_its_edge():
     c = np.sqrt(0.5)
     body = Body(Box((1.0, 1.0, 1.0)), _plain, rotation=np.array([[c, -c, 0], [c, c, 0], [0, 0, 1]]))
     t, _ = first_hits(_scene(body), np.array([[5.0, 0.01, 0.0]]), np.array([[-1.0, 0.0, 0.0]]))
     np.testing.assert_allclose(t, 5 - np.sqrt(2) + 0.01, atol=1e-6)
 
 
-def test_shadow_takes_the_direct_light_only():
+def test_shadow_removes_only_the_direct_light():
     floor = Body(Box((3.0, 3.0, 0.1)), _plain)
     scene = _scene(floor, Body(Sphere(0.3), _plain, position=(0, 0, 2)))
     points = np.array([[0.0, 0.0, 0.1], [2.0, 0.0, 0.1]], np.float32)

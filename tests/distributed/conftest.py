@@ -1,4 +1,4 @@
-"""Starts the ranks that go through a file's checks, and reads what they said."""
+"""Starts the ranks that run the checks of a file, and reads their results."""
 
 from __future__ import annotations
 
@@ -16,34 +16,25 @@ LIMIT = 600
 
 
 def _run_ranks(file: str, folder: Path) -> None:
-    rank = [sys.executable, str(Path(__file__).with_name("rank.py")), file]
-    programs = [subprocess.Popen([*rank, str(i), str(RANKS), str(folder)]) for i in range(RANKS)]
-    try:
-        for program in programs:
-            program.wait(LIMIT)
-    except subprocess.TimeoutExpired:
-        pass  # what is missing then fails by name
-    finally:
-        for program in programs:
-            program.kill()
-            program.wait()
+    program = [sys.executable, str(Path(__file__).with_name("rank.py")), file, str(RANKS), str(folder), str(LIMIT)]
+    subprocess.run(program, check=False)  # a missing result fails by name
 
 
 def _passed(folder: Path, name: str) -> None:
     for rank in range(RANKS):
         path = folder / f"rank{rank}.json"
         assert path.exists(), f"rank {rank} did not come to an end"
-        said = json.loads(path.read_text())
-        assert said.get(name, "not reached") == "", f"rank {rank}: {said.get(name)}"
+        results = json.loads(path.read_text())
+        assert results.get(name, "not reached") == "", f"rank {rank}: {results.get(name)}"
 
 
 @pytest.fixture(scope="session")
 def run_ranks() -> Callable[[str, Path], None]:
-    """Two ranks go through the checks of a file, and leave what they said in a folder."""
+    """Run the checks of a file on two ranks, which write their results into a folder."""
     return _run_ranks
 
 
 @pytest.fixture(scope="session")
 def passed() -> Callable[[Path, str], None]:
-    """Asserts that every rank has come through a check."""
+    """Assert that every rank has passed a check."""
     return _passed

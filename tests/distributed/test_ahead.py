@@ -1,34 +1,35 @@
-"""What a step can know of the next one: which views it draws, and how far Adam moves at most."""
+"""What a step knows of the next one: the views of all ranks, and a bound on the step of Adam."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 import torch.distributed as dist
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.cameras.cameras import Cameras
 from pytorch_msssim import SSIM
-from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.compensation import training_window
-from sundae_ns.distributed import Look, Shards, Timetable, longest_step, slack_of_step
-from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
+from sundae_ns.distributed import ShardedField, Shards
+from sundae_ns.distributed.ahead import Timetable, longest_step, slack_of_step
+from sundae_ns.distributed.source import statistics_of
+from sundae_ns.gaussians.field import Field
+from sundae_ns.rasterization import rasterize, select_backend
 from sundae_ns.rasterization.sharded import camera_row
-from sundae_ns.rendering.views import view_of
+from sundae_ns.rendering import ColorSettings, StepResolution, View, view_of
 from sundae_ns.training.densification import CappedStrategy
-from sundae_ns.training.losses import picture_loss
+from sundae_ns.training.losses import image_losses
 
 RATE = 0.01
 
 
-@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 10**6),
     ranks=st.sampled_from([1, 2, 4, 16]),
@@ -46,17 +47,17 @@ def test_no_step_of_adam_is_longer(seed: int, ranks: int, growth: float, sparsit
         before = value.detach().clone()
         optimizer.step()
         assert (value.detach() - before).abs().max() <= most
-        optimizer.state[value]["exp_avg"][step::50] = 0  # as where a primitive is merged or split
+        optimizer.state[value]["exp_avg"][step::50] = 0  # as after a merge or a split
         optimizer.state[value]["exp_avg_sq"][step::100] = 0 if step % 3 else 1.0
 
 
 @pytest.mark.parametrize("betas", [(0.9, 0.999), (0.81, 0.998001), (0.5, 0.5)])
-def test_gradients_that_grow_come_near(betas: tuple[float, float]) -> None:
-    """So nothing shorter would do; the rate by itself is far too short."""
+def test_growing_gradients_come_near_the_bound(betas: tuple[float, float]) -> None:
+    """So no shorter bound holds; the learning rate alone is far too short."""
     value = Parameter(torch.zeros((), dtype=torch.float64))
     optimizer = torch.optim.Adam([value], lr=RATE, betas=betas, eps=0.0)
     before = 0.0
-    for step in range(-6000, 1):  # until the corrections of the moments' bias are gone
+    for step in range(-6000, 1):  # until the bias correction of the moments has faded
         value.grad = torch.tensor((betas[1] / betas[0]) ** max(step, -200), dtype=torch.float64)
         before = value.item()
         optimizer.step()
@@ -78,45 +79,51 @@ def test_other_optimizers_are_not_planned_for() -> None:
     assert slack.scales == pytest.approx(2 * slack.means)
 
 
-def served(cameras: Cameras, index: int) -> Cameras:
-    camera = cameras[index : index + 1]
-    camera.metadata = {"cam_idx": index}
-    return camera
-
-
 def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dist, "get_rank", lambda: 1)
     monkeypatch.setattr(dist, "get_world_size", lambda: 3)
     poses = torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(0))
     sides = torch.tensor([[64], [48], [64], [32], [80]])
     cameras = Cameras(poses, 50.0, 40.0, 33.0, 20.0, width=sides, height=sides - 10)
-    timetable = Timetable(cameras, lambda picture: (2 * picture) % 5, "cpu", 0.02)
-    for look in (Look(0, 1, 0), Look(1, 1, 0), Look(1, 2, 0), Look(2, 1, 1024), Look(3, 1, 1024)):
-        pictures = [(2 * (3 * look.step + rank)) % 5 for rank in range(3)]
-        assert timetable.pictures(look.step) == pictures
-        views = [view_of(cameras[i : i + 1], "cpu", downscale=look.downscale) for i in pictures]
-        own, expected = timetable.view(look, served(cameras, pictures[1])), views[1]
+    timetable = Timetable(cameras, lambda image: (2 * image) % 5, "cpu", 0.02)
+    source = ShardedField(Shards("cpu"), Field({}), timetable)
+    for at in (
+        StepResolution(0, 1, 0),
+        StepResolution(1, 1, 0),
+        StepResolution(1, 2, 0),
+        StepResolution(2, 1, 1024),
+        StepResolution(3, 1, 1024),
+    ):
+        indices = [(2 * (3 * at.step + rank)) % 5 for rank in range(3)]
+        assert timetable.views(at.step) == indices
+        views = [view_of(cameras[i : i + 1], "cpu", downscale=at.downscale) for i in indices]
+        own, expected = source.training_view(at, not_called, indices[1]), views[1]
         assert (own.width, own.height, own.focal) == (expected.width, expected.height, expected.focal)
         assert torch.equal(own.viewmat, expected.viewmat)
         assert torch.equal(own.K, expected.K)
-        known = timetable.cameras(look)
+        known = timetable.cameras(at)
         for rank, view in enumerate(views):
-            window = training_window(view.width, view.height, look.window_pixels, seed=look.step)
+            window = training_window(view.width, view.height, at.window_pixels, seed=at.step)
             seen = view if window is None else view.cut(window)
             row = camera_row(seen.viewmat, seen.K, seen.width, seen.height, 0.02)
             assert torch.equal(torch.cat([known.centers[rank], known.bounds[rank].flatten()]), row)
-    with pytest.raises(AssertionError, match="timetable"):
-        timetable.view(Look(0, 1, 0), served(cameras, timetable.pictures(0)[0]))
+    for other in (timetable.views(0)[0], None):
+        with pytest.raises(AssertionError, match="timetable"):
+            source.training_view(StepResolution(0, 1, 0), not_called, other)
+
+
+def not_called() -> View:
+    raise AssertionError("a view built from the served camera waits for the GPU")
 
 
 @pytest.mark.gpu
-def test_a_step_waits_for_the_gpu_only_where_it_splats(tmp_path: Path) -> None:
-    """torch raises where it would wait; one GPU alone, so that any machine with one can tell."""
+def test_a_step_waits_for_the_gpu_only_while_it_splats(tmp_path: Path) -> None:
+    """torch raises where it would wait. One rank suffices, so this runs on any machine with a GPU."""
     learn(tmp_path, "cuda", "nccl", partial(torch.cuda.set_sync_debug_mode, "error"))
 
 
 def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None]) -> None:
-    """Three steps of a rank by itself; from the second on, its exchange has been planned ahead."""
+    """Three steps of a single rank; from the second on, its exchange is planned ahead."""
     generator = torch.Generator().manual_seed(0)
     shapes = {
         "means": (3,),
@@ -141,28 +148,22 @@ def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None
     dist.init_process_group(group, init_method=f"file://{folder / 'meeting'}", rank=0, world_size=1)
     try:
         shards = Shards(device)
-        shards.timetable = Timetable(cameras, lambda picture: 0, device, 0.01)
+        source = ShardedField(shards, Field(params), Timetable(cameras, lambda image: 0, device, 0.01))
         shards.recount(params)
-
-        def colors_of(field: Mapping[str, Tensor], centers: Tensor) -> Tensor:
-            coeffs = torch.cat([field["features_dc"][:, None], field["features_rest"]], dim=1)
-            return spherical_harmonics(1, field["means"] - centers, coeffs, backend=backend) + 0.5
-
         for step in range(3):
-            look = Look(step, 1, 0)
-            assert (shards.ahead is not None) == (step > 0)
-            view = shards.timetable.view(look, served(cameras, 0))
-            if step > 0:  # in the first one kernels load, constants are made, and the ranks meet
+            at = StepResolution(step, 1, 0)
+            assert (source._planned is not None) == (step > 0)
+            view = source.training_view(at, not_called, 0)
+            if step > 0:  # in the first step kernels load, constants are made, and the ranks meet
                 forbid_waits()
-            course = shards.course(params, look)
-            arrived = shards.arrivals(params, view, colors_of, near_plane=0.01, features=False, course=course)
+            received = source.primitives(view, ColorSettings(backend), features=False, at=at)
             allow_waits()
             splat = rasterize(
-                arrived["means"],
-                arrived["quats"],
-                arrived["scales"].exp(),
-                arrived["opacities"].sigmoid()[:, 0],
-                arrived["colors"],
+                received["means"],
+                received["quats"],
+                received["scales"].exp(),
+                received["opacities"].sigmoid()[:, 0],
+                received["colors"],
                 *view[:4],
                 absgrad=True,
                 backend=backend,
@@ -170,10 +171,10 @@ def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None
             if step > 0:
                 forbid_waits()
             splat.info["means2d"].retain_grad()
-            shards.follow(splat.info, arrived.route, absgrad=True)
-            shards.plan_ahead(params, Look(step + 1, 1, 0), slack_of_step(optimizers))
-            picture_loss(splat.colors, target, ssim, 0.2).backward()  # type: ignore[no-untyped-call]
-            strategy._update_state(params, state, {"statistics": shards.statistics(splat.info)})
+            source.follow(received, splat.info, absgrad=True)
+            source.plan_next(StepResolution(step + 1, 1, 0), optimizers)
+            image_losses(splat.colors, None, target, ssim, 0.2)[0].backward()  # type: ignore[no-untyped-call]
+            strategy._update_state(params, state, {"statistics": statistics_of(splat.info)})
             for optimizer in optimizers.values():
                 optimizer.step()
                 optimizer.zero_grad()

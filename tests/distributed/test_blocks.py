@@ -1,6 +1,6 @@
-"""The arithmetic of several ranks, in one process: who holds which rows, and what a checkpoint is for each rank.
+"""The arithmetic of several ranks in one process: the rows of each rank, and its part of a checkpoint.
 
-``test_collectives.py`` has the ranks talk to each other.
+``test_collectives.py`` runs the collectives.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.distributed import bounds, checkpoints, moves, pruning
-from sundae_ns.distributed.shards import per_primitive
 from sundae_ns.errors import CheckpointError, ConfigError
+from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.surgery import per_primitive
 from sundae_ns.pruning import PruningConfig
-from sundae_ns.training.schedules import make_policy
+from sundae_ns.storage.runs.checkpoint import FORMAT
+from sundae_ns.training.schedules import make_schedule
 
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "features")
 RANKS = 3
@@ -44,7 +46,7 @@ def test_moved_rows_lie_in_even_blocks_in_the_same_order(counts: list[int]) -> N
     for rank, (sent, _) in enumerate(plans):
         assert sum(sent) == counts[rank]
         for other, count in enumerate(sent):
-            assert plans[other][1][rank] == count, "one sends what the other does not wait for"
+            assert plans[other][1][rank] == count, "one sends rows that the other does not wait for"
             arrived[other] += [held[rank].pop(0) for _ in range(count)]
     assert [row for block in arrived for row in block] == list(range(sum(counts)))
     ends = bounds(sum(counts), ranks)
@@ -52,7 +54,7 @@ def test_moved_rows_lie_in_even_blocks_in_the_same_order(counts: list[int]) -> N
 
 
 def a_checkpoint(n: int = 10, step: int = 29) -> dict[str, Any]:
-    """What a trainer on one GPU saves, with numbers that say which row they belong to."""
+    """A checkpoint of a trainer on one GPU, whose numbers say to which row they belong."""
 
     def rows(*shape: int) -> Tensor:
         return torch.arange(float(n)).reshape(-1, *[1] * len(shape)).expand(n, *shape).clone()
@@ -66,13 +68,21 @@ def a_checkpoint(n: int = 10, step: int = 29) -> dict[str, Any]:
         "step": step,
         "pipeline": {
             **{f"_model.gauss_params.{name}": value for name, value in field.items()},
-            # As long as the field, and none of its rows.
-            "_model.head.bias": torch.arange(float(n)),
+            # As many numbers as the field has rows, but not rows of it.
+            "_model.networks.head.bias": torch.arange(float(n)),
             "_model._extra_state": {
                 "step": step,
-                "format": 1,
-                "strategy": {"grad2d": rows(), "scale": torch.tensor(2.0), "peak": 12, "other": torch.zeros(n + 1)},
-                "pruning": {"pruned_at": -1, "num_prunes": 0},
+                "format": FORMAT,
+                "running": {
+                    "densification": {
+                        "grad2d": rows(),
+                        "scale": torch.tensor(2.0),
+                        "peak": 12,
+                        "other": torch.zeros(n + 1),
+                    },
+                    "pruning": {"pruned_at": -1, "num_prunes": 0},
+                },
+                "extensions": {"densification": {}, "pruning": {}},
             },
         },
         "optimizers": {
@@ -105,13 +115,17 @@ def test_parts_of_a_checkpoint_are_rows_of_it_and_steps_of_larger_batches() -> N
                 part["pipeline"][f"_model.gauss_params.{name}"],
                 whole["pipeline"][f"_model.gauss_params.{name}"][start:end],
             ), name
-        assert torch.equal(part["pipeline"]["_model.head.bias"], whole["pipeline"]["_model.head.bias"])
+        assert torch.equal(
+            part["pipeline"]["_model.networks.head.bias"], whole["pipeline"]["_model.networks.head.bias"]
+        )
         extra = part["pipeline"]["_model._extra_state"]
-        assert extra["strategy"]["grad2d"].tolist() == list(range(start, end))
-        assert len(extra["strategy"]["other"]) == 11
-        assert (extra["strategy"]["scale"], extra["strategy"]["peak"]) == (2, 12)
-        assert extra["pruning"] == {"pruned_at": -1, "num_prunes": 0}
-        assert (part["step"], extra["step"], extra["format"]) == (9, 9, 1)
+        densification = extra["running"]["densification"]
+        assert densification["grad2d"].tolist() == list(range(start, end))
+        assert len(densification["other"]) == 11
+        assert (densification["scale"], densification["peak"]) == (2, 12)
+        assert extra["running"]["pruning"] == {"pruned_at": -1, "num_prunes": 0}
+        assert (part["step"], extra["step"], extra["format"]) == (9, 9, FORMAT)
+        assert extra["extensions"] == whole["pipeline"]["_model._extra_state"]["extensions"]
         moments = part["optimizers"]["means"]["state"][0]
         assert moments["step"] == 10
         assert moments["exp_avg"][:, 0].tolist() == list(range(start, end))
@@ -129,11 +143,11 @@ def test_parts_of_a_checkpoint_are_rows_of_it_and_steps_of_larger_batches() -> N
             {"max_steps": 1000, "warmup_steps": 20, "pruned_at": 8, "lr_final": 1e-6},
         ]
         assert len(part["random"]["torch"]) == 10
-        # Not a view of the whole, which would be kept in memory.
+        # Not a view, which would keep the whole in memory.
         assert part["pipeline"]["_model.gauss_params.means"].untyped_storage().nbytes() == 4 * 3 * (end - start)
 
 
-def test_the_whole_of_all_parts_is_the_checkpoint_that_they_came_from() -> None:
+def test_the_parts_together_are_the_checkpoint() -> None:
     whole = a_checkpoint()
     whole["schedulers"]["means"]["lr_lambdas"].pop()  # a step within a batch becomes the last of it
     parts = [checkpoints.state_of_rank(whole, rank, RANKS, NAMES) for rank in range(RANKS)]
@@ -147,7 +161,7 @@ def test_the_whole_of_all_parts_is_the_checkpoint_that_they_came_from() -> None:
 
 
 def test_a_step_within_a_batch_becomes_the_last_whole_batch() -> None:
-    """Pictures of a batch that was not whole are seen again rather than left out."""
+    """Images of an incomplete batch are seen again rather than left out."""
     for step, after in ((28, 8), (29, 9), (30, 9), (31, 9), (32, 10), (0, -1)):
         whole = a_checkpoint(step=step)
         part = checkpoints.state_of_rank(whole, 0, RANKS, NAMES)
@@ -157,18 +171,19 @@ def test_a_step_within_a_batch_becomes_the_last_whole_batch() -> None:
 @pytest.mark.parametrize(
     ("ranks", "pruned_at"), [(2, 0), (4, 0), (4, 1), (8, 0), (8, 1), (8, 5), (2, 7), (3, -1), (1, 0)]
 )
-def test_a_prune_in_the_midst_of_the_first_batch_is_not_done_again(ranks: int, pruned_at: int) -> None:
+def test_a_prune_within_the_first_batch_is_not_repeated(ranks: int, pruned_at: int) -> None:
     whole = a_checkpoint()
-    whole["pipeline"]["_model._extra_state"]["pruning"] = {"pruned_at": pruned_at, "num_prunes": int(pruned_at >= 0)}
+    running = whole["pipeline"]["_model._extra_state"]["running"]
+    running["pruning"] = {"pruned_at": pruned_at, "num_prunes": int(pruned_at >= 0)}
     whole["schedulers"]["means"]["lr_lambdas"][1]["pruned_at"] = max(pruned_at, 0)
     part = checkpoints.state_of_rank(whole, 0, ranks, NAMES)
-    state = part["pipeline"]["_model._extra_state"]["pruning"]
-    assert make_policy(PruningConfig(prune_at=0)).due(state, 30, 10) == (pruned_at < 0)
+    state = part["pipeline"]["_model._extra_state"]["running"]["pruning"]
+    assert make_schedule(PruningConfig(prune_at=0)).due(state, 30, 10) == (pruned_at < 0)
     assert part["schedulers"]["means"]["lr_lambdas"][1]["pruned_at"] >= 0
     assert state["pruned_at"] <= pruned_at
 
 
-def test_a_rank_may_have_no_primitive_of_a_checkpoint_that_has_some() -> None:
+def test_a_rank_may_get_no_primitive_of_a_checkpoint() -> None:
     parts = [checkpoints.state_of_rank(a_checkpoint(n=1), rank, 2, NAMES) for rank in range(2)]
     assert [len(part["pipeline"]["_model.gauss_params.means"]) for part in parts] == [0, 1]
     with pytest.raises(CheckpointError, match="the checkpoint holds no primitives; give another"):
@@ -181,32 +196,34 @@ def test_only_values_of_every_primitive_are_rows() -> None:
         assert not per_primitive(other, 3)
 
 
-def a_field(n: int = 60) -> dict[str, Tensor]:
+def a_field(n: int = 60) -> Field:
     generator = torch.Generator().manual_seed(0)
 
     def normal(*shape: int) -> Tensor:
         return torch.randn(n, *shape, generator=generator)
 
-    return {
-        "means": normal(3),
-        "quats": normal(4),
-        "scales": normal(3) - 2,
-        "opacities": normal(1),
-        "features_dc": normal(3),
-        "features_rest": normal(3, 3),
-    }
+    return Field(
+        {
+            "means": normal(3),
+            "quats": normal(4),
+            "scales": normal(3) - 2,
+            "opacities": normal(1),
+            "features_dc": normal(3),
+            "features_rest": normal(3, 3),
+        }
+    )
 
 
 @pytest.mark.parametrize("redistribution", ["none", "merge"])
 def test_the_deciding_rank_says_which_rows_stay_and_which_values_change(redistribution: Any) -> None:
     field, weights = a_field(), torch.rand(60, generator=torch.Generator().manual_seed(1))
     config = PruningConfig(prune_at=1, keep_ratio=0.3, num_neighbors=6, redistribution=redistribution)
-    policy = make_policy(config)
-    state = policy.initialize_state()
-    (report, counted, changed), params, rows = pruning._decide(policy, field, state, 2, weights)
-    alone: dict[str, Any] = {name: Parameter(value.clone()) for name, value in field.items()}
-    own = policy.initialize_state()
-    expected = policy.step_post_backward(alone, {}, own, 2, contribution=lambda: weights)
+    schedule = make_schedule(config)
+    state = schedule.initialize_state()
+    (report, counted, changed), params, rows = pruning._decide(schedule, field, state, 2, weights, field.encoding)
+    alone = Field({name: Parameter(value.clone()) for name, value in field.items()})
+    own = schedule.initialize_state()
+    expected = schedule.step_post_backward(alone, {}, own, 2, contribution=lambda: weights)
     assert expected is not None
     assert (report.before, report.after) == (60, expected.after)
     assert counted == own
@@ -222,9 +239,9 @@ def test_the_deciding_rank_says_which_rows_stay_and_which_values_change(redistri
 
 
 def test_the_deciding_rank_hands_on_an_error_instead_of_raising_it() -> None:
-    policy = make_policy(PruningConfig(prune_at=1, keep_ratio=0.3))
+    schedule = make_schedule(PruningConfig(prune_at=1, keep_ratio=0.3))
     field = a_field()
-    error, params, rows = pruning._decide(policy, field, policy.initialize_state(), 2, None)
+    error, params, rows = pruning._decide(schedule, field, schedule.initialize_state(), 2, None, field.encoding)
     assert isinstance(error, ConfigError)
     assert len(rows) == len(params["means"]) == 60
 

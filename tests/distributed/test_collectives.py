@@ -1,6 +1,6 @@
-"""Two processes over gloo hold one field: they draw, plan, level and prune as one process does.
+"""Two processes over gloo share one field: they render, plan, balance and prune as one process does.
 
-This file has the checks, which ``rank.py`` goes through on each rank, and the tests that see what came of them.
+``rank.py`` runs the checks of this file on each rank; the tests read their results.
 """
 
 from __future__ import annotations
@@ -19,20 +19,28 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.nn import Parameter
 
-from sundae_ns import distributed
-from sundae_ns.distributed import Course, GlobalPruning, Look, Shards, slack_of_step
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.distributed import ShardedField, Shards, bounds, take_shard
+from sundae_ns.distributed.batches import average_gradients
+from sundae_ns.distributed.densification import ShardedDensification
+from sundae_ns.distributed.pruning import GlobalPruning
+from sundae_ns.distributed.source import ReceivedPrimitives, statistics_of
 from sundae_ns.errors import ConfigError
+from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning import PruningConfig
-from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
-from sundae_ns.rasterization.sharded import Cameras, Slack, camera_row, cameras_of, may_be_seen
-from sundae_ns.rendering.views import View
+from sundae_ns.rasterization import rasterize, select_backend
+from sundae_ns.rasterization.sharded import Cameras, camera_row, cameras_of, may_be_seen
+from sundae_ns.rendering import ColorSettings, StepResolution, TrainingView, View
+from sundae_ns.rendering.source import colors_from
 from sundae_ns.training.densification import CappedStrategy
-from sundae_ns.training.schedules import make_policy
+from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.schedules import make_schedule
 
 RunRanks = Callable[[str, Path], None]
 Passed = Callable[[Path, str], None]
 RANKS = 2
 REFERENCE = select_backend("reference", "cpu")
+COLORS = ColorSettings(REFERENCE)
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "features")
 
 
@@ -62,12 +70,9 @@ def a_view(rank: int) -> View:
     return View(pose, K, width, height, focal)
 
 
-def colors_of(params: Any, center: Tensor) -> Tensor:
-    coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
-    return (spherical_harmonics(2, params["means"] - center, coeffs, backend=REFERENCE) + 0.5).clamp_min(0)
-
-
-def draw(params: Any, colors: Tensor, view: View) -> Any:
+def draw(params: Any, view: View) -> Any:
+    """Splat primitives: received ones by their colours, a whole field by those that it has from the view."""
+    colors = params["colors"] if "colors" in params else colors_from(params, params, view.center, COLORS)
     return rasterize(
         params["means"],
         params["quats"],
@@ -89,43 +94,63 @@ def loss_of(splat: Any, rank: int) -> Tensor:
     return (splat.colors * weights).mean() + splat.depth.mean() + splat.alpha.square().mean()
 
 
-def shard_of(params: dict[str, Tensor], start: int, end: int) -> dict[str, Parameter]:
-    return {name: Parameter(value[start:end].clone()) for name, value in params.items()}
+def shard_of(params: dict[str, Tensor], start: int, end: int) -> Field:
+    return Field({name: Parameter(value[start:end].clone()) for name, value in params.items()})
+
+
+def own_half(shards: Shards) -> Field:
+    """The block of 45 primitives that this rank holds of a field of 90."""
+    return shard_of(a_field(), *bounds(90, RANKS)[shards.rank : shards.rank + 2])
+
+
+def source_of(shards: Shards, field: Field) -> ShardedField:
+    """A sharded field whose plans are dropped when it changes, as :meth:`sundae_ns.distributed.Ranks.share` makes it."""
+    views: Any = Views(shards.rank)
+    source = ShardedField(shards, field, views)
+    shards.on_change(source.forget_plan)
+    return source
+
+
+def render(source: ShardedField, view: View, *, at: StepResolution | None = None) -> tuple[ReceivedPrimitives, Any]:
+    """The primitives that a view receives, and their image; densification finds its statistics after the backward pass."""
+    received = source.primitives(view, COLORS, features=True, at=at)
+    splat = draw(received, view)
+    splat.info["means2d"].retain_grad()
+    source.follow(received, splat.info, absgrad=True)
+    return received, splat
 
 
 def check_drawing(shards: Shards) -> None:
-    """Pictures, gradients and statistics of two ranks are those of one process for both pictures."""
+    """Images, gradients and statistics of two ranks are those of one process for both images."""
     start, end = ((0, 60), (60, 90))[shards.rank]
     params = shard_of(a_field(), start, end)
+    source = source_of(shards, params)
     shards.recount(params)
     assert shards.counts == [60, 30]
-    view = a_view(shards.rank)
-    arrived = shards.arrivals(params, view, colors_of, near_plane=0.01, features=True)
-    assert 0 < len(arrived["means"]) <= 90
-    splat = draw(arrived, arrived["colors"], view)
-    splat.info["means2d"].retain_grad()
-    shards.follow(splat.info, arrived.route, absgrad=True)
+    assert source.total == 90
+    received, splat = render(source, a_view(shards.rank))
+    assert 0 < len(received["means"]) <= 90
     loss_of(splat, shards.rank).backward()
     state = {"grad2d": None, "count": None, "radii": None}
-    CappedStrategy(absgrad=True)._update_state(params, state, {"statistics": shards.statistics(splat.info)})
+    CappedStrategy(absgrad=True)._update_state(params, state, {"statistics": statistics_of(splat.info)})
 
     whole = shard_of(a_field(), 0, 90)
-    one = [draw(whole, colors_of(whole, a_view(rank).center), a_view(rank)) for rank in range(RANKS)]
+    one = [draw(whole, a_view(rank)) for rank in range(RANKS)]
     for splats in one:
         splats.info["means2d"].retain_grad()
     losses = [loss_of(splats, rank) for rank, splats in enumerate(one)]
     (sum(losses) / RANKS).backward()  # type: ignore[union-attr]
 
-    for picture in ("colors", "depth", "alpha"):
-        worst = float((getattr(splat, picture) - getattr(one[shards.rank], picture)).abs().max())
-        assert worst < 1e-14, f"{picture} differs by {worst:.2g}"
+    for image in ("colors", "depth", "alpha"):
+        worst = float((getattr(splat, image) - getattr(one[shards.rank], image)).abs().max())
+        assert worst < 1e-14, f"{image} differs by {worst:.2g}"
     for name in NAMES:
         expected = whole[name].grad[start:end]
         assert expected.abs().max() > 0, name
         worst = float((params[name].grad - expected).abs().max() / expected.abs().max())
         assert worst < 1e-12, f"{name} differs by {worst:.2g} of the largest gradient"
 
-    # What gsplat's strategy would sum up per primitive over the two pictures, one at a time.
+    # The sums of gsplat's strategy over the two images, one at a time.
     norms, counts, radii = torch.zeros(90).double(), torch.zeros(90).double(), torch.zeros(90).double()
     for splats, seen_from in zip(one, (a_view(0), a_view(1))):
         halves = torch.tensor([seen_from.width / 2, seen_from.height / 2]).double()
@@ -139,97 +164,93 @@ def check_drawing(shards: Shards) -> None:
 
 
 def check_that_nothing_stays(shards: Shards) -> None:
-    """What a step holds goes by itself: Python's collector does not see the cycles that lead through autograd's graph."""
-    params = shard_of(a_field(), *distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2])
+    """Nothing keeps the tensors of a step: Python's collector does not see cycles through autograd's graph."""
+    params = own_half(shards)
+    source = source_of(shards, params)
     shards.recount(params)
-    view = a_view(shards.rank)
-    arrived = shards.arrivals(params, view, colors_of, near_plane=0.01, features=True)
-    splat = draw(arrived, arrived["colors"], view)
-    splat.info["means2d"].retain_grad()
-    shards.follow(splat.info, arrived.route, absgrad=True)
-    views: Any = Views(shards.rank)
-    shards.timetable = views
-    shards.plan_ahead(params, Look(1, 1, 0), Slack(0.1, 0.1))  # and it stays until then
+    received, splat = render(source, a_view(shards.rank))
+    source.plan_next(StepResolution(1, 1, 0), still(params))  # the plan stays until that step
     loss_of(splat, shards.rank).backward()
-    shards.statistics(splat.info)
-    route = weakref.ref(arrived.route)
-    del arrived, splat
+    statistics_of(splat.info)
+    route = weakref.ref(received.route)
+    del received, splat
     gc.collect()
     assert route() is None
-    assert shards.ahead is not None
-    shards.forget_plan()
+    assert source._planned is not None
+    source.forget_plan()
+
+
+def still(params: Field) -> dict[str, torch.optim.Optimizer]:
+    """Optimizers that move nothing."""
+    return {name: torch.optim.Adam([value], lr=0.0) for name, value in params.items()}
 
 
 class Views:
-    """A timetable in float64: two views, which the ranks take in turns, at half of the size where a look says so."""
+    """A timetable in float64: two views, which the ranks take in turns, at the resolution of the step."""
 
     def __init__(self, rank: int) -> None:
         self.rank = rank
 
-    def of(self, look: Look, rank: int) -> View:
-        view = a_view((look.step + rank) % RANKS).zoomed(1 / look.downscale)
+    def of(self, at: StepResolution, rank: int) -> View:
+        view = a_view((at.step + rank) % RANKS).zoomed(1 / at.downscale)
         aside = torch.zeros(4, 4, dtype=torch.float64)
-        aside[0, 3] = 1.2 * ((look.step + rank) % RANKS)  # so that each sees what the other does not
+        aside[0, 3] = 1.2 * ((at.step + rank) % RANKS)  # so that each sees primitives that the other does not
         return view._replace(viewmat=view.viewmat + aside)
 
-    def view(self, look: Look) -> View:
-        return self.of(look, self.rank)
+    def view(self, at: StepResolution) -> View:
+        return self.of(at, self.rank)
 
-    def cameras(self, look: Look) -> Cameras:
-        views = [self.of(look, rank) for rank in range(RANKS)]
+    def cameras(self, at: StepResolution) -> Cameras:
+        views = [self.of(at, rank) for rank in range(RANKS)]
         return cameras_of(torch.stack([camera_row(v.viewmat, v.K, v.width, v.height, 0.01) for v in views]))
 
 
 def check_planning_ahead(shards: Shards) -> None:
-    """Steps that were planned ahead do what steps that plan at their start do, and what one process does."""
-    start, end = distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2]
-    views: Any = Views(shards.rank)
-    shards.timetable = views
+    """Steps whose exchange was planned ahead do what steps that plan at their start do, and what one process does."""
+    start, end = bounds(90, RANKS)[shards.rank : shards.rank + 2]
+    views = Views(shards.rank)
     small = {**a_field(), "scales": a_field()["scales"] - 2}
-    looks = [Look(step, 1, 0) for step in range(4)]
+    steps = [StepResolution(step, 1, 0) for step in range(4)]
 
-    def optimizers_of(params: dict[str, Parameter]) -> dict[str, torch.optim.Optimizer]:
-        # Rates at which the field leaves its place within three steps.
+    def optimizers_of(params: Field) -> dict[str, torch.optim.Optimizer]:
+        # At these rates the field moves far within three steps.
         return {name: torch.optim.Adam([value], lr=0.1, betas=(0.8, 0.9), eps=1e-8) for name, value in params.items()}
 
     found = {}
     for ahead in (True, False):
         params = shard_of(small, start, end)
+        source = source_of(shards, params)
         shards.recount(params)
-        optimizers, pictures, missed = optimizers_of(params), [], 0
-        for look in looks[:-1]:
-            assert (shards.ahead is not None) == (ahead and look.step > 0)
-            cameras, route = shards.course(params, look)
-            assert shards.ahead is None
-            view = views.view(look)
-            arrived = shards.arrivals(
-                params, view, colors_of, near_plane=0.01, features=True, course=Course(cameras, route)
-            )
-            splat = draw(arrived, arrived["colors"], view)
-            pictures.append(splat.colors.detach())
+        optimizers, images, missed = optimizers_of(params), [], 0
+        for at in steps[:-1]:
+            assert (source._planned is not None) == (ahead and at.step > 0)
+            view = views.view(at)
+            received = source.primitives(view, COLORS, features=True, at=at)
+            assert source._planned is None
+            splat = draw(received, view)
+            images.append(splat.colors.detach())
             if ahead:
-                shards.plan_ahead(params, looks[look.step + 1], slack_of_step(optimizers))
-                bounds = views.cameras(looks[look.step + 1]).bounds
-                before = may_be_seen(params["means"], params["scales"], bounds)
+                source.plan_next(steps[at.step + 1], optimizers)
+                frusta = views.cameras(steps[at.step + 1]).bounds
+                before = may_be_seen(params["means"], params["scales"], frusta)
             loss_of(splat, view.width).backward()
             for optimizer in optimizers.values():
                 optimizer.step()
                 optimizer.zero_grad()
             if ahead:
-                missed += int((may_be_seen(params["means"], params["scales"], bounds) & ~before).sum())
-        # Without allowing for the steps, something would have been left out.
+                missed += int((may_be_seen(params["means"], params["scales"], frusta) & ~before).sum())
+        # Without slack for the steps, the plan would leave primitives out.
         every = [count for (count,) in shards.numbers(missed)]
         assert not ahead or sum(every) > 0, every
-        found[ahead] = pictures, {name: value.detach() for name, value in params.items()}
-        shards.forget_plan()
+        found[ahead] = images, {name: value.detach() for name, value in params.items()}
 
     whole = shard_of(small, 0, 90)
     optimizers = optimizers_of(whole)
     alone = []
-    for look in looks[:-1]:
-        drawn = [draw(whole, colors_of(whole, v.center), v) for v in (views.of(look, r) for r in range(RANKS))]
+    for at in steps[:-1]:
+        drawn = [draw(whole, views.of(at, rank)) for rank in range(RANKS)]
         alone.append(drawn[shards.rank].colors.detach())
-        losses = [loss_of(splat, views.of(look, rank).width) for rank, splat in enumerate(drawn)]
+        losses = [loss_of(splat, views.of(at, rank).width) for rank, splat in enumerate(drawn)]
         (sum(losses) / RANKS).backward()  # type: ignore[union-attr]
         for optimizer in optimizers.values():
             optimizer.step()
@@ -243,27 +264,26 @@ def check_planning_ahead(shards: Shards) -> None:
 
 
 def check_that_plans_are_forgotten(shards: Shards) -> None:
-    """A field that has changed, or pictures of another size, are planned for anew, on all ranks; silence is an error."""
-    params = shard_of(a_field(), *distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2])
-    views: Any = Views(shards.rank)
-    shards.timetable = views
+    """A changed field, or images of another size, get a new plan on all ranks; a silent change is an error."""
+    params, views = own_half(shards), Views(shards.rank)
+    source = source_of(shards, params)
     optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
 
     def planned() -> bool:
-        return shards.ahead is not None
+        return source._planned is not None
 
     def plan() -> None:
-        shards.plan_ahead(params, Look(1, 1, 0), Slack(0.0, 0.0))
+        source.plan_next(StepResolution(1, 1, 0), still(params))
         assert planned()
 
     shards.recount(params)
     plan()
-    # Pictures of another size, and another step.
-    for look in (Look(1, 2, 0), Look(2, 1, 0)):
+    # Images of another size, and another step.
+    for at in (StepResolution(1, 2, 0), StepResolution(2, 1, 0)):
         plan()
-        cameras, route = shards.course(params, look)
+        cameras, route = source._exchange(views.view(at), at)
         assert not planned()
-        expected = views.cameras(look)
+        expected = views.cameras(at)
         assert torch.equal(cameras.centers, expected.centers)
         assert torch.equal(cameras.bounds, expected.bounds)
         seen = may_be_seen(params["means"], params["scales"], expected.bounds)
@@ -284,51 +304,54 @@ def check_that_plans_are_forgotten(shards: Shards) -> None:
         plan()
         change()
         with pytest.raises(AssertionError, match="has changed since"):
-            shards.course(params, Look(1, 1, 0))
+            source._exchange(views.view(StepResolution(1, 1, 0)), StepResolution(1, 1, 0))
+    # Without a bound on the step nothing is planned.
+    shards.recount(params)
+    source.plan_next(StepResolution(1, 1, 0), {name: torch.optim.SGD([value]) for name, value in params.items()})
+    assert not planned()
 
 
 def check_looking_away(shards: Shards) -> None:
-    """A rank that sees nothing takes its part in the backward pass, and the other learns all the same."""
-    params = shard_of(a_field(), *distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2])
+    """A rank that sees nothing takes part in the backward pass, and the other rank learns."""
+    params = own_half(shards)
+    source = source_of(shards, params)
     view = a_view(0)
     if shards.rank == 1:
         view = view._replace(viewmat=torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]).double()) @ view.viewmat)
-    arrived = shards.arrivals(params, view, colors_of, near_plane=0.01, features=True)
-    assert (len(arrived["means"]) == 0) == (shards.rank == 1)
-    splat = draw(arrived, arrived["colors"], view)
-    loss_of(splat, 0).backward()
+    received = source.primitives(view, COLORS, features=True)
+    assert (len(received["means"]) == 0) == (shards.rank == 1)
+    loss_of(draw(received, view), 0).backward()
     whole = shard_of(a_field(), 0, 90)
-    (loss_of(draw(whole, colors_of(whole, a_view(0).center), a_view(0)), 0) / RANKS).backward()
-    start, end = distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2]
+    (loss_of(draw(whole, a_view(0)), 0) / RANKS).backward()
+    start, end = bounds(90, RANKS)[shards.rank : shards.rank + 2]
     for name in NAMES:
         torch.testing.assert_close(params[name].grad, whole[name].grad[start:end], rtol=1e-10, atol=1e-14)
 
 
 def check_an_empty_shard(shards: Shards) -> None:
-    """Fewer primitives than ranks: who holds none still draws what the other holds, and takes a step."""
-    params = shard_of(a_field(), *distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2])
+    """Fewer primitives than ranks: a rank without any renders those of the other, and takes a step."""
+    params = own_half(shards)
     optimizers = adams(params, 0)
     every = torch.zeros(90, dtype=torch.bool)
-    seen = int(draw(a_field(), colors_of(a_field(), a_view(0).center), a_view(0)).radii.argmax())
+    seen = int(draw(Field(a_field()), a_view(0)).radii.argmax())
     every[seen] = True
     shards.level(params, optimizers, [], every[45 * shards.rank : 45 * shards.rank + 45])
     assert shards.counts == [0, 1]
-    arrived = shards.arrivals(params, a_view(0), colors_of, near_plane=0.01, features=True)
-    splat = draw(arrived, arrived["colors"], a_view(0))
+    splat = draw(source_of(shards, params).primitives(a_view(0), COLORS, features=True), a_view(0))
     alone = shard_of(a_field(), seen, seen + 1)
-    expected = draw(alone, colors_of(alone, a_view(0).center), a_view(0))
+    expected = draw(alone, a_view(0))
     torch.testing.assert_close(splat.colors, expected.colors)
     loss_of(splat, 0).backward()
     loss_of(expected, 0).backward()
     for name, value in params.items():
-        if shards.rank == 1:  # both ranks have the same picture, so the mean is that of one
+        if shards.rank == 1:  # both ranks have the same image, so the mean is that of one
             torch.testing.assert_close(value.grad, alone[name].grad, rtol=1e-10, atol=1e-14)
         optimizers[name].step()
         assert len(value) == shards.counts[shards.rank]
 
 
 class Tripling:
-    """A strategy that grows the shard of rank 1 alone, and puts a mark on what it has counted."""
+    """A strategy that grows the shard of rank 1 only, and raises its peak."""
 
     refine_every, grows = 10, True
 
@@ -344,44 +367,42 @@ class Tripling:
 
 
 def check_drift(shards: Shards) -> None:
-    """Shards that have drifted apart are levelled after a round of densification, in order; the peak is that of all."""
+    """Shards that have drifted apart are balanced after densification, in order; the peak is that of all ranks."""
     start, end = ((0, 60), (60, 90))[shards.rank]
     params = shard_of(a_field(), start, end)
+    source = source_of(shards, params)
     shards.recount(params)
     optimizers = {name: torch.optim.Adam([value]) for name, value in params.items()}
-    arrived = shards.arrivals(params, a_view(shards.rank), colors_of, near_plane=0.01, features=True)
-    splat = draw(arrived, arrived["colors"], a_view(shards.rank))
-    splat.info["means2d"].retain_grad()
-    shards.follow(splat.info, arrived.route, absgrad=True)
+    _, splat = render(source, a_view(shards.rank))
     loss_of(splat, shards.rank).backward()
-    model: Any = SimpleNamespace(
-        strategy=Tripling(),
-        strategy_state={"count": torch.arange(start, end), "peak": 100},
-        config=SimpleNamespace(use_absgrad=True),
-        info=splat.info,
-        gaussians=params,
-        gauss_params=params,
+    state = FieldState(
+        field=params,
+        networks=torch.nn.ModuleDict(),
         optimizers=optimizers,
-        schedule_step=20,
+        densification={"count": torch.arange(start, end), "peak": 100},
+        info=splat.info,
+        step=19,
+        densify_until=100,
     )
+    strategy: Any = Tripling()
+    densification, run = ShardedDensification(strategy, shards), SimpleNamespace(state=state)
     planned: Any = object()
-    shards.ahead, model.schedule_step = planned, 19
-    model.strategy.grows = False
-    shards.densify(model)
-    assert shards.ahead is planned
-    model.schedule_step, model.strategy.grows = 20, True
-    shards.densify(model)
-    assert shards.ahead is None
+    source._planned, strategy.grows = planned, False
+    densification.after_step(run)  # type: ignore[arg-type]
+    assert source._planned is planned
+    state.step, strategy.grows = 20, True
+    densification.after_step(run)  # type: ignore[arg-type]
+    assert source._planned is None
     assert shards.counts == [75, 75]
-    assert model.strategy_state["peak"] == 60 + 90 + 5
+    assert state.densification["peak"] == 60 + 90 + 5
     every = torch.cat([torch.arange(60), torch.arange(60, 90).repeat_interleave(3)])
     own = every[75 * shards.rank : 75 * shards.rank + 75]
-    assert torch.equal(model.strategy_state["count"], own)
+    assert torch.equal(state.densification["count"], own)
     assert torch.equal(params["means"], a_field()["means"][own])
 
 
-def adams(params: dict[str, Parameter], start: int) -> dict[str, torch.optim.Optimizer]:
-    """Optimizers whose moments say which row they belong to."""
+def adams(params: Field, start: int) -> dict[str, torch.optim.Optimizer]:
+    """Optimizers whose moments say to which row they belong."""
     made: dict[str, torch.optim.Optimizer] = {}
     for name, value in params.items():
         optimizer = torch.optim.Adam([value], lr=0.1)
@@ -393,7 +414,7 @@ def adams(params: dict[str, Parameter], start: int) -> dict[str, torch.optim.Opt
 
 
 def check_levelling(shards: Shards) -> None:
-    """Rows move with their moments and counts, in order, though one rank keeps nothing of its own."""
+    """Rows move with their moments and counts, in order, also if one rank keeps none of its own."""
     whole, start = a_field(), (0, 60)[shards.rank]
     params = shard_of(whole, *((0, 60), (60, 90))[shards.rank])
     optimizers = adams(params, start)
@@ -426,17 +447,20 @@ def check_pruning(shards: Shards, **options: Any) -> None:
     params = shard_of(whole, start, end)
     optimizers, counts = adams(params, start), {"grad2d": torch.arange(start, end)}
     shards.recount(params)
-    policy = GlobalPruning(make_policy(config), shards)
-    state = policy.policy.initialize_state()
+    schedule = GlobalPruning(make_schedule(config), shards)
+    state = schedule.initialize_state()
+    assert schedule.config is config
+    assert schedule.due(state, 2, 200)
+    assert schedule.target(199) == round(0.3 * 199)
 
-    def contribution() -> Tensor:  # of the finite ones, which have been levelled by then
+    def contribution() -> Tensor:  # of the finite primitives, which are balanced by then
         return weights[counts["grad2d"]]
 
-    report = policy.step_post_backward(params, optimizers, state, 2, contribution=contribution, strategy_state=counts)
+    report = schedule.step_post_backward(params, optimizers, state, 2, contribution=contribution, strategy_state=counts)
 
     alone = shard_of(whole, 0, 200)
     own_optimizers, own_counts = adams(alone, 0), {"grad2d": torch.arange(200)}
-    own = make_policy(config)
+    own = make_schedule(config)
     own_state = own.initialize_state()
     expected = own.step_post_backward(
         alone,
@@ -463,19 +487,19 @@ def check_pruning(shards: Shards, **options: Any) -> None:
 
 
 def check_refusal(shards: Shards) -> None:
-    """What rank 0 finds wrong, all ranks say."""
-    params = shard_of(a_field(), *distributed.bounds(90, RANKS)[shards.rank : shards.rank + 2])
+    """All ranks raise the error that rank 0 finds."""
+    params = own_half(shards)
     shards.recount(params)
-    policy = GlobalPruning(make_policy(PruningConfig(prune_at=1, keep_ratio=0.3)), shards)
+    schedule = GlobalPruning(make_schedule(PruningConfig(prune_at=1, keep_ratio=0.3)), shards)
     with pytest.raises(ConfigError, match="pass over the training views"):
-        policy.step_post_backward(params, {}, policy.policy.initialize_state(), 2)
+        schedule.step_post_backward(params, {}, schedule.initialize_state(), 2)
 
 
 def check_averages(shards: Shards) -> None:
     values = [torch.zeros(3, requires_grad=True), torch.zeros(2, 2, requires_grad=True), torch.zeros(1)]
     for value in values[:2]:
         value.grad = torch.full_like(value, float(shards.rank + 1))
-    distributed.average_gradients(values)
+    average_gradients(values)
     assert all((value.grad == 1.5).all() for value in values[:2])  # type: ignore[union-attr]
     assert shards.announce({"rank": shards.rank}) == {"rank": 0}
     assert shards.apart(values) == 0
@@ -483,10 +507,51 @@ def check_averages(shards: Shards) -> None:
         values[1][1, 0] -= 0.25 * shards.rank
     assert shards.apart(values) == 0.25
     assert shards.apart([]) == 0
+    assert shards.widest(None) is None
+    assert shards.widest(None if shards.rank == 0 else (3.0, 4.0)) == (3.0, 4.0)
+    assert shards.widest((2.0 + shards.rank, 5.0 + shards.rank)) == (2.0, 6.0)
+
+
+def check_batches(shards: Shards) -> None:
+    """Values of a batch are added where the primitives are held; a view that is repeated is not counted."""
+    params = own_half(shards)
+    source = source_of(shards, params)
+    shards.recount(params)
+    views = [TrainingView(partial(a_view, index % 2), None) for index in range(3)]
+    batches = list(source.batches(views))
+    assert source.num_batches(views) == len(batches) == 2
+    assert [batch.num_views for batch in batches] == [2, 1]
+    assert [batch.own for batch in batches] == [views[shards.rank], views[2]]
+    seen = [may_be_seen(params["means"], params["scales"], _frustum(a_view(rank))) for rank in range(RANKS)]
+    total = torch.zeros(45)
+    received = source.primitives(a_view(shards.rank), COLORS, features=False)
+    source.accumulate(total, torch.full((len(received["means"]),), 10.0**shards.rank), received, batches[0])
+    assert torch.equal(total, seen[0][0] * 1.0 + seen[1][0] * 10.0)
+    total.zero_()
+    source.accumulate(total, torch.full((len(received["means"]),), 10.0**shards.rank), received, batches[1])
+    assert torch.equal(total, seen[0][0] * 1.0)
+
+
+def _frustum(view: View) -> Tensor:
+    return cameras_of(camera_row(view.viewmat, view.K, view.width, view.height, 0.01)[None]).bounds
+
+
+def check_taking_a_shard(shards: Shards) -> None:
+    """All ranks get the field and the head of rank 0, and keep their block."""
+    torch.manual_seed(shards.rank)
+    field = Field({name: Parameter(value + shards.rank) for name, value in a_field().items()})
+    networks = torch.nn.ModuleDict({"head": CompensationHead(HeadConfig(size="tiny", num_features=5))})
+    state = FieldState(field=field, networks=networks)
+    take_shard(state, shards)
+    assert shards.counts == [45, 45]
+    for name, value in own_half(shards).items():
+        assert torch.equal(state.field[name], value), name
+        assert state.field[name].untyped_storage().nbytes() == value.untyped_storage().nbytes()
+    assert shards.apart(networks.parameters()) == 0
 
 
 def checks(_: Path) -> dict[str, Callable[[Shards], None]]:
-    """What each rank goes through, in this order."""
+    """The checks of each rank, in this order."""
     plain = (
         check_drawing,
         check_that_nothing_stays,
@@ -502,13 +567,13 @@ def checks(_: Path) -> dict[str, Callable[[Shards], None]]:
     return {
         **{check.__name__: check for check in plain},
         "check_pruningresponse-contribution": by_response,
-        **{check.__name__: check for check in (check_refusal, check_averages)},
+        **{check.__name__: check for check in (check_refusal, check_averages, check_batches, check_taking_a_shard)},
     }
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: RunRanks) -> Path:
-    """Where two ranks have gone through all checks, once for all tests."""
+    """Results of two ranks that ran all checks, once for all tests."""
     folder = tmp_path_factory.mktemp("ranks")
     run_ranks(__file__, folder)
     return folder

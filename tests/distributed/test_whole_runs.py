@@ -1,7 +1,7 @@
-"""Whole runs of two ranks over gloo: they train, prune, save, resume and die as the documentation says.
+"""Whole runs of two ranks over gloo: they train, prune, save, resume and fail as the documentation says.
 
-This file has the checks, which ``rank.py`` goes through on each rank, and the tests of what they leave. Started as a
-program it is a run whose rank is killed. Every program has a limit of time, so that nothing hangs.
+``rank.py`` runs the checks of this file on each rank; the tests read their results. Started as a program, the file trains a
+run whose rank is killed. Every program has a time limit.
 """
 
 from __future__ import annotations
@@ -25,10 +25,15 @@ import torch.distributed as dist
 from PIL import Image
 
 from sundae_ns import distributed
-from sundae_ns.data import write_scene
-from sundae_ns.distributed import Course, Look, Shards
+from sundae_ns.data import write_embedded_capture
+from sundae_ns.distributed import ShardedField, Shards
+from sundae_ns.distributed.batches import shorten
+from sundae_ns.distributed.checkpoints import state_of_rank
+from sundae_ns.distributed.source import Exchange
+from sundae_ns.distributed.start import without_viewer
 from sundae_ns.errors import ConfigError, RankError, rank_ended
 from sundae_ns.method_configs import sundae_tiny
+from sundae_ns.rendering import StepResolution, View
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 
@@ -42,11 +47,11 @@ NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest"
 
 STEPS, KEEP, PRUNE_AT, SAVE_EVERY = 40, 0.4, 32, 26
 SAVED_AT = SAVE_EVERY + RANKS - 1
-"""Two ranks save after batch 13, which is the last that sees picture 27."""
+"""Two ranks save after batch 13, which ends with image 27."""
 
 
 def configured(folder: Path, name: str) -> SundaeTrainerConfig:
-    """A short run on a small scene: it densifies at picture 24, prunes at 32, and then the head takes part."""
+    """A short run on a small scene: it densifies at image 24, prunes at 32, and then enables the head."""
     import copy
 
     config = copy.deepcopy(sundae_tiny.config)
@@ -69,9 +74,9 @@ def configured(folder: Path, name: str) -> SundaeTrainerConfig:
 
 
 def frozen(folder: Path, name: str) -> SundaeTrainerConfig:
-    """One step at rates of 0 from the saved warm-up, and a prune: the field that is pruned is the same for any ranks.
+    """One step at rates of 0 from the saved warm-up, and a prune: any number of ranks prunes the same field.
 
-    Half of each picture is masked: what does not look there keeps other primitives.
+    Half of each image is masked; a prune that ignores the masks keeps other primitives.
     """
     config = configured(folder, name)
     config.max_num_iterations = 1
@@ -102,25 +107,27 @@ def train(config: SundaeTrainerConfig, rank: int, ranks: int) -> SundaeTrainer:
 def check_training(shards: Shards, folder: Path) -> None:
     """A run of two ranks; afterwards both have the same head, and no shard is far from the mean."""
     anew = []
-    course = Shards.course
+    exchange = ShardedField._exchange
 
-    def noted(self: Shards, params: Any, look: Look) -> Course:
-        if self.ahead is None or self.ahead.look != look:
-            anew.append(look.step)
-        return course(self, params, look)
+    def noted(self: ShardedField, view: View, at: StepResolution | None) -> Exchange:
+        if at is not None and (self._planned is None or self._planned.at != at):
+            anew.append(at.step)
+        return exchange(self, view, at)
 
-    Shards.course = noted  # type: ignore[method-assign]
+    ShardedField._exchange = noted  # type: ignore[method-assign]
     trainer = train(configured(folder, "train"), shards.rank, RANKS)
-    Shards.course = course  # type: ignore[method-assign]
-    # The first step, those after a round of growing, and the one after the prune; resolution rises at step 2.
+    ShardedField._exchange = exchange  # type: ignore[method-assign]
+    # The first step, those after densification, and the one after the prune; the resolution rises at step 2.
     assert anew == [0, *range(1, PRUNE_AT // RANKS + 1, 3), PRUNE_AT // RANKS + 1]
     model: Any = trainer.pipeline.model
     weights = torch.cat([value.detach().flatten() for value in model.head.parameters()])
     every = [torch.empty_like(weights) for _ in range(RANKS)]
     dist.all_gather(every, weights)
     assert torch.equal(every[0], every[1])
-    assert model.shards.numbers(model.num_points) == [[count] for count in model.shards.counts]
-    assert max(model.shards.counts) <= distributed.DRIFT * model.total_points / RANKS
+    team: Any = trainer.team
+    assert team.shards.numbers(model.num_points) == [[count] for count in team.shards.counts]
+    assert model.source.total == sum(team.shards.counts)
+    assert max(team.shards.counts) <= distributed.DRIFT * model.source.total / RANKS
     group = trainer.optimizers.optimizers["opacities"].param_groups[0]
     assert group["lr"] == pytest.approx(0.05 * RANKS**0.5)
     assert group["betas"] == pytest.approx((0.9**RANKS, 0.999**RANKS))
@@ -134,7 +141,7 @@ def check_frozen(shards: Shards, folder: Path) -> None:
 
 
 def check_few(shards: Shards, folder: Path) -> None:
-    """A field of one primitive trains, is saved and resumed, though one rank has nothing."""
+    """A field of one primitive trains, is saved and resumed, with nothing on one rank."""
     config = frozen(folder, "few")
     model: Any = config.pipeline.model
     model.pruning.keep_ratio = 1e-6
@@ -144,7 +151,8 @@ def check_few(shards: Shards, folder: Path) -> None:
     config.max_num_iterations = 2 * RANKS
     trainer = train(config, shards.rank, RANKS)
     assert trainer.step == 2
-    assert trainer.pipeline.model.shards.counts == [0, 1]
+    team: Any = trainer.team
+    assert team.shards.counts == [0, 1]
 
 
 def models(folder: Path, name: str) -> Path:
@@ -152,7 +160,7 @@ def models(folder: Path, name: str) -> Path:
 
 
 def checks(folder: Path) -> dict[str, Callable[[Shards], None]]:
-    """What each rank goes through, in this order."""
+    """The checks of each rank, in this order."""
     return {check.__name__: partial(check, folder=folder) for check in (check_training, check_frozen, check_few)}
 
 
@@ -164,7 +172,7 @@ class DyingTrainerConfig(SundaeTrainerConfig):
 
 
 class DyingTrainer(SundaeTrainer):
-    """Killed at a step, as by the system where memory is short."""
+    """Killed at a step, as the system does when memory is short."""
 
     def train_iteration(self, step: int) -> Any:
         if step == (SAVED_AT + 1) // RANKS + 2 and dist.get_rank() == 1:
@@ -173,7 +181,7 @@ class DyingTrainer(SundaeTrainer):
 
 
 def main(folder: Path) -> None:
-    """Two ranks that go on from a checkpoint, of which one is killed."""
+    """Two ranks resume from a checkpoint, and one is killed."""
     torch.set_num_threads(1)
     plain = configured(folder, "dies")
     config = DyingTrainerConfig(**{k: v for k, v in vars(plain).items() if k != "_target"})
@@ -193,9 +201,9 @@ if __name__ == "__main__":
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: RunRanks) -> Path:
-    """Where two ranks have trained, once for all tests."""
+    """Runs of two ranks, trained once for all tests."""
     folder = tmp_path_factory.mktemp("ranks")
-    write_scene(folder / "scene", train_views=7, test_views=2, width=40, height=32, points=150)
+    write_embedded_capture(folder / "scene", train_views=7, test_views=2, width=40, height=32, points=150)
     shutil.copytree(folder / "scene", folder / "masked")
     meta = json.loads((folder / "masked" / "transforms.json").read_text())
     mask = Image.new("L", (40, 32))
@@ -222,7 +230,7 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
     )
     assert len(after["pipeline"]["_model.gauss_params.means"]) == report["after"]
     n = len(before["pipeline"]["_model.gauss_params.means"])
-    assert len(before["pipeline"]["_model._extra_state"]["strategy"]["grad2d"]) == n
+    assert len(before["pipeline"]["_model._extra_state"]["running"]["densification"]["grad2d"]) == n
     for name in NAMES[:-1]:
         (moments,) = before["optimizers"][name]["state"].values()
         assert len(moments["exp_avg"]) == n
@@ -231,7 +239,8 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
     assert tuple(group["betas"]) == (0.9, 0.999)
     extra = after["pipeline"]["_model._extra_state"]
     assert extra["trained_focal"] is not None
-    assert (after["step"], extra["step"], extra["pruning"]["pruned_at"]) == (STEPS - 1, STEPS - 1, report["step"])
+    assert (after["step"], extra["step"]) == (STEPS - 1, STEPS - 1)
+    assert extra["running"]["pruning"]["pruned_at"] == report["step"]
     schedule = after["schedulers"]["means"]
     assert schedule["last_epoch"] == STEPS
     assert schedule["base_lrs"] == pytest.approx([1.6e-4])
@@ -240,24 +249,27 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
 
 
 def test_the_prune_is_that_of_one_process(folder: Path) -> None:
-    """From the same field, views and all: the same primitives stay, with the same values."""
+    """The same primitives of the same field stay, with the same values."""
     one = train(frozen(folder, "one"), 0, 1)
     two = checkpoint.load(models(folder, "two") / "step-000000001.ckpt")["pipeline"]
     for name, value in one.pipeline.model.gauss_params.items():
-        # Weights of a view are sums over fewer rows here, so that what a merge makes of them differs by rounding.
+        # Weights of a view are sums over fewer rows here, so merged values differ by rounding.
         torch.testing.assert_close(value.detach(), two[f"_model.gauss_params.{name}"], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
 def test_a_checkpoint_loads_on_another_number_of_ranks(folder: Path, ranks: int) -> None:
     loaded = checkpoint.load(models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt")
-    parts = [distributed.state_of_rank(loaded, rank, ranks, NAMES) for rank in range(ranks)]
+    parts = [state_of_rank(loaded, rank, ranks, NAMES) for rank in range(ranks)]
     for key, value in loaded["pipeline"].items():
         if key.startswith("_model.gauss_params."):
             assert torch.equal(torch.cat([part["pipeline"][key] for part in parts]), value)
-    counts = loaded["pipeline"]["_model._extra_state"]["strategy"]["count"]
-    theirs = [part["pipeline"]["_model._extra_state"]["strategy"]["count"] for part in parts]
-    assert torch.equal(torch.cat(theirs), counts)
+
+    def counts(state: dict[str, Any]) -> torch.Tensor:
+        found: torch.Tensor = state["pipeline"]["_model._extra_state"]["running"]["densification"]["count"]
+        return found
+
+    assert torch.equal(torch.cat([counts(part) for part in parts]), counts(loaded))
     group, whole = (x["optimizers"]["means"]["param_groups"][0] for x in (parts[0], loaded))
     assert group["lr"] == pytest.approx(whole["lr"] * ranks**0.5)
     assert group["betas"] == pytest.approx([beta**ranks for beta in whole["betas"]])
@@ -267,13 +279,15 @@ def test_a_checkpoint_loads_on_another_number_of_ranks(folder: Path, ranks: int)
     assert parts[0]["schedulers"]["means"]["last_epoch"] == round((SAVED_AT + 1) / ranks)
 
 
-def test_a_checkpoint_of_another_method_is_left_to_the_loader() -> None:
-    """Which names the method and the option; the ranks' own part of it would fail on the first missing key."""
-    loaded = {"step": 3, "pipeline": {"_model.gauss_params.means": torch.zeros(4, 3)}, "optimizers": {}}
-    assert distributed.state_of_rank(loaded, 1, 2, NAMES) == loaded
+def test_a_checkpoint_of_another_method_or_format_is_left_to_the_loader() -> None:
+    """The loader names the method and the option; cutting the checkpoint would fail on the first missing key."""
+    pipeline: dict[str, Any] = {"_model.gauss_params.means": torch.zeros(4, 3)}
+    for extra in ({}, {"_model._extra_state": {"method": "sundae", "format": 1, "strategy": {}}}):
+        loaded = {"step": 3, "pipeline": {**pipeline, **extra}, "optimizers": {}}
+        assert state_of_rank(loaded, 1, 2, NAMES) == loaded
 
 
-def test_one_process_goes_on_where_two_have_stopped(folder: Path) -> None:
+def test_one_process_resumes_a_run_of_two(folder: Path) -> None:
     config = configured(folder, "alone")
     config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
     config.max_num_iterations = PRUNE_AT - SAVED_AT + 1
@@ -285,20 +299,20 @@ def test_one_process_goes_on_where_two_have_stopped(folder: Path) -> None:
 
 
 def test_a_killed_rank_ends_all_with_one_line(folder: Path) -> None:
-    """It resumes on two ranks first, from what two have saved."""
+    """It resumes on two ranks first, from a checkpoint of two."""
     subprocess.run([sys.executable, __file__, str(folder)], timeout=LIMIT, check=True)
     line = (folder / "died.txt").read_text()
-    assert re.fullmatch(r"rank 1 has ended \(killed by SIGKILL\).*--load-dir.*--machine\.num-devices", line)
+    assert re.fullmatch(r"rank 1 ended \(killed by SIGKILL\).*--load-dir.*--machine\.num-devices", line)
     assert not (models(folder, "dies") / f"step-{SAVED_AT + STEPS:09d}.ckpt").exists()
 
 
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 def test_ns_train_on_two_gpus(tmp_path: Path) -> None:
-    """The command of users; the run opens on one GPU as any other."""
+    """The command of users; the run opens on one GPU like any other."""
     from nerfstudio.utils.eval_utils import eval_setup
 
-    write_scene(tmp_path / "scene", train_views=12, test_views=3, width=64, height=48, points=300)
+    write_embedded_capture(tmp_path / "scene", train_views=12, test_views=3, width=64, height=48, points=300)
     options = {
         "machine.num-devices": 2,
         "data": tmp_path / "scene",
@@ -325,13 +339,13 @@ def test_ns_train_on_two_gpus(tmp_path: Path) -> None:
     assert pipeline.get_average_eval_image_metrics()["psnr"] > 16
 
 
-def test_an_error_of_ours_in_a_rank_is_said_as_it_is() -> None:
+def test_an_error_of_sundae_in_a_rank_keeps_its_message() -> None:
     class Raised(Exception):
         error_index = 1
 
     text = "\n\n-- Process 1 terminated with the following error:\nTraceback ...\nsundae_ns.errors.DataError: cause; mend\n"
     assert str(rank_ended(Raised(text))) == "rank 1: cause; mend"
-    assert "rank 1 has ended (ValueError: odd)" in str(rank_ended(Raised("Traceback ...\nValueError: odd")))
+    assert "rank 1 ended (ValueError: odd)" in str(rank_ended(Raised("Traceback ...\nValueError: odd")))
 
 
 def test_nerfstudios_command_ends_with_one_line() -> None:
@@ -346,13 +360,13 @@ raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT, check=False)
     assert result.returncode == 1
     (line,) = result.stderr.splitlines()
-    assert line.startswith("sundae: rank 1 has ended (killed by SIGKILL)")
+    assert line.startswith("sundae: rank 1 ended (killed by SIGKILL)")
 
 
 @pytest.mark.parametrize(
     ("option", "value"), [("warmup", "mcmc"), ("pruning.mode", "auto"), ("camera_optimizer.mode", "SO3xR3")]
 )
-def test_what_several_ranks_cannot_do_is_refused(tmp_path: Path, option: str, value: str) -> None:
+def test_options_that_several_ranks_cannot_use_are_refused(tmp_path: Path, option: str, value: str) -> None:
     config = configured(tmp_path, "refused")
     *owners, name = option.split(".")
     owner: Any = config.pipeline.model
@@ -379,9 +393,9 @@ def test_more_ranks_than_gpus_are_refused_before_anything_is_written(
     assert (config.get_base_dir() / "config.yml").exists()
 
 
-def test_shorter_runs_see_as_many_pictures(tmp_path: Path) -> None:
+def test_shortened_runs_see_as_many_images(tmp_path: Path) -> None:
     config = configured(tmp_path, "short")
-    short = distributed.shorten(config, 2)
+    short = shorten(config, 2)
     assert (short.max_num_iterations, config.max_num_iterations) == (STEPS // 2, STEPS)
     assert short.pipeline.model.pruning.prune_at == PRUNE_AT // 2
     assert short.pipeline.model.refine_every == 3
@@ -390,8 +404,5 @@ def test_shorter_runs_see_as_many_pictures(tmp_path: Path) -> None:
 
 
 def test_loggers_stay_when_the_viewer_goes() -> None:
-    assert [distributed.without_viewer(vis) for vis in ("viewer", "viewer+wandb", "comet")] == [
-        "tensorboard",
-        "wandb",
-        "comet",
-    ]
+    found = [without_viewer(vis) for vis in ("viewer", "viewer+wandb", "comet")]
+    assert found == ["tensorboard", "wandb", "comet"]

@@ -1,4 +1,4 @@
-"""Measured fields made by hand, for tables and plots."""
+"""Hand-made measurements for the tests of tables and plots."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the viewer shows of features, depth and response: colours in range, whatever comes in."""
+"""Viewer colours of features, depth and response stay in range for any input."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from sundae_ns.evaluation import display
 
 
-def test_depth_behind_everything_is_the_farthest() -> None:
+def test_empty_pixels_get_the_largest_depth() -> None:
     depth = torch.tensor([[[2.0], [0.0]], [[5.0], [1.0]]])
     alpha = torch.tensor([[[0.5], [0.0]], [[1.0], [0.1]]])
     assert display.fill_depth(depth, alpha)[..., 0].tolist() == [[2.0, 5.0], [5.0, 1.0]]
@@ -21,7 +21,7 @@ def features(n: int = 2000) -> torch.Tensor:
     return torch.randn(n, 5, generator=generator) * spread + torch.arange(5.0)
 
 
-def test_principal_components_by_falling_variance() -> None:
+def test_principal_components_are_sorted_by_variance() -> None:
     mean, basis, deviations = display.principal_components(features())
     torch.testing.assert_close(mean, torch.arange(5.0), atol=0.2, rtol=0)
     assert basis.abs().argmax(dim=0).tolist() == [1, 3, 4]
@@ -44,18 +44,18 @@ def test_fewer_channels_than_colours(width: int) -> None:
     colors = display.feature_colors(torch.randn(4, 6, width), mean, basis, deviations, torch.ones(4, 6, 1))
     assert colors.shape == (4, 6, 3)
     assert torch.isfinite(colors).all()
-    # A direction that is missing shows mid-grey, not noise.
+    # A missing direction shows mid-grey, not noise.
     torch.testing.assert_close(colors[..., width:], torch.full((4, 6, 3 - width), 0.5))
 
 
-def test_colours_are_in_range_grey_at_the_mean_and_black_where_nothing_is() -> None:
+def test_colours_are_in_range_grey_at_the_mean_and_black_in_empty_pixels() -> None:
     values = features()
     parts = display.principal_components(values)
     alpha = torch.ones(40, 50, 1)
     colors = display.feature_colors(values.reshape(40, 50, 5), *parts, alpha)
     assert 0 <= colors.min()
     assert colors.max() <= 1
-    # Three deviations fill the range, so that hardly anything is clipped and the channels vary alike.
+    # Three deviations fill the range: almost nothing is clipped, and all channels vary equally.
     assert ((colors > 0) & (colors < 1)).float().mean() > 0.99
     torch.testing.assert_close(colors.reshape(-1, 3).std(dim=0), torch.full((3,), 1 / 6), atol=0.01, rtol=0)
     grey = display.feature_colors(parts[0].expand(2, 2, 5), *parts, torch.ones(2, 2, 1))
@@ -71,10 +71,10 @@ def test_equal_features_have_finite_colours() -> None:
     assert ((colors >= 0) & (colors <= 1)).all()
 
 
-def test_response_is_shown_by_rank() -> None:
+def test_response_values_are_ranks() -> None:
     response = torch.tensor([10.0, torch.nan, 0.1, 1e6, 0.0])
     values = display.response_values(response)
     assert values.tolist() == [0.75, 0.0, 0.5, 1.0, 0.25]
     assert torch.equal(values, display.response_values(response * 1e-7))
-    assert torch.equal(values, display.response_values(response.double()))  # float32 whatever comes in, for the viewer
+    assert torch.equal(values, display.response_values(response.double()))  # the viewer needs float32
     assert display.response_values(torch.full((3,), torch.nan)).tolist() == [0.0] * 3

@@ -14,7 +14,7 @@ def lines_of(text: str, start: str) -> list[list[str]]:
     ]
 
 
-def test_each_way_of_rendering_has_a_line(measured: Callable[..., Measured]) -> None:
+def test_each_configuration_has_a_row(measured: Callable[..., Measured]) -> None:
     own = [measured("ours"), measured("theirs", head=False)]
     text = document({"bicycle": own}, {}, {"bicycle": [("A plot", "a.png")]}, ["this and that"], "sundae report x")
     assert lines_of(text, "| ours")[0] == ["ours", "head on", "4,000", "3.00", "3.50", "25.50", "0.8500", "0.2000", "-"]
@@ -36,7 +36,7 @@ def test_each_way_of_rendering_has_a_line(measured: Callable[..., Measured]) -> 
     assert NOTE not in text
 
 
-def test_what_the_paper_prints_is_named_so(measured: Callable[..., Measured]) -> None:
+def test_printed_rows_are_marked(measured: Callable[..., Measured]) -> None:
     printed = {"bicycle": printed_of("bicycle", "1237x822")}
     text = document({"bicycle": [measured()]}, printed, {}, [], "")
     assert NOTE in text

@@ -1,4 +1,4 @@
-"""Change between frames: nothing where only the camera moves, something where the picture does."""
+"""Change between frames: near zero if only the camera moves, larger if the image flickers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def slanted_plane(shift: float, turn: float = 0.0, noise: float = 0.0, front: bo
     depth = (4 + 0.3 * origin[0]) / (world[..., 2] - 0.3 * world[..., 0])
     point = origin + depth[..., None] * world
     rgb = 0.5 + 0.3 * torch.stack([point[..., 0], point[..., 1], point[..., 0] + point[..., 1]], dim=-1).sin()
-    if front:  # a grey card that stands in the way
+    if front:  # a grey card in front of the plane
         depth[10:30, 20:40] = 2.0
         rgb[10:30, 20:40] = 0.5
     generator = torch.Generator().manual_seed(round(1e6 * shift))
@@ -35,9 +35,9 @@ def slanted_plane(shift: float, turn: float = 0.0, noise: float = 0.0, front: bo
     return Frame(rgb, depth[..., None], torch.ones(H, W, 1, dtype=torch.float64), viewmat, K)
 
 
-def test_motion_alone_is_no_change() -> None:
+def test_camera_motion_alone_is_no_change() -> None:
     still = change(slanted_plane(0.0), slanted_plane(0.1, turn=-0.02))
-    assert still.mean < 1e-3  # what bilinear sampling leaves
+    assert still.mean < 1e-3  # error of bilinear sampling
     assert still.share > 0.8
     # Without the warp the same two frames differ a lot.
     assert (slanted_plane(0.0).rgb - slanted_plane(0.1, turn=-0.02).rgb).abs().mean() > 1e-2
@@ -49,15 +49,15 @@ def test_flicker_is_measured() -> None:
     assert amounts[2] == pytest.approx(2 * amounts[1], rel=0.1)
 
 
-def test_what_is_newly_seen_does_not_count() -> None:
-    """Behind the card the surface has another depth in the earlier frame."""
+def test_disoccluded_surfaces_do_not_count() -> None:
+    """Behind the card, the earlier frame has another depth."""
     covered = change(slanted_plane(0.0, front=True), slanted_plane(0.02))
     plain = change(slanted_plane(0.0), slanted_plane(0.02))
     assert covered.share < plain.share - 0.9 * 400 / (H * W)
     assert covered.mean < 5e-3
 
 
-def test_nothing_in_common() -> None:
+def test_frames_without_common_pixels() -> None:
     frame: Tensor = slanted_plane(0.0).viewmat
     away = slanted_plane(0.0)._replace(accumulation=torch.zeros(H, W, 1, dtype=frame.dtype))
     nothing = change(slanted_plane(0.0), away)

@@ -11,7 +11,7 @@ from sundae_ns.evaluation import Lpips, lpips_weights_available, lpips_weights_p
 
 @pytest.fixture
 def hub(tmp_path, monkeypatch):
-    """A torch.hub folder of our own: empty, and nobody's download."""
+    """An empty torch.hub folder."""
     before = torch.hub._hub_dir
     torch.hub.set_dir(str(tmp_path))
     yield tmp_path
@@ -40,10 +40,10 @@ def _put_random_weights(net="alex"):
 
 
 def test_without_weights_there_is_one_warning_and_no_error(hub, offline, caplog):
-    metric, picture = Lpips(), torch.rand(40, 40, 3)
+    metric, image = Lpips(), torch.rand(40, 40, 3)
     assert not lpips_weights_available()
     with caplog.at_level(logging.WARNING):
-        assert [metric(picture, picture) for _ in range(3)] == [None] * 3
+        assert [metric(image, image) for _ in range(3)] == [None] * 3
     assert len(offline) == 1
     assert 0 < offline[0] <= 10
     (record,) = caplog.records
@@ -69,7 +69,7 @@ def test_damaged_weights_do_not_end_the_run(hub, offline, caplog):
     assert offline == []
 
 
-def test_small_pictures_have_no_lpips_and_need_no_weights(hub, offline, caplog):
+def test_small_images_have_no_lpips_and_need_no_weights(hub, offline, caplog):
     assert Lpips()(torch.rand(31, 60, 3), torch.rand(31, 60, 3)) is None
     assert offline == []
     assert caplog.records == []
@@ -93,4 +93,4 @@ def test_weights_on_disk_are_used_without_the_network(hub, offline, monkeypatch)
     assert same == 0
     assert 0 < near < far
     assert not far.requires_grad
-    assert metric(target, target) == 0  # nothing is left over from the calls before
+    assert metric(target, target) == 0  # earlier calls leave no state

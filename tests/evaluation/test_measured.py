@@ -10,7 +10,7 @@ import pytest
 from sundae_ns.evaluation import Configuration, Measured, ViewQuality
 
 
-def test_each_time_stands_beside_the_error_of_its_configuration(measured: Callable[..., Measured]) -> None:
+def test_a_row_pairs_each_time_with_the_quality_of_its_configuration(measured: Callable[..., Measured]) -> None:
     row = measured().row()
     assert (row.ms_frame, row.psnr) == (3.5, pytest.approx(25.5))
     assert (row.ms_splat, row.psnr_base) == (2.0, pytest.approx(25.0))
@@ -18,7 +18,7 @@ def test_each_time_stands_beside_the_error_of_its_configuration(measured: Callab
     assert (row.bytes_primitives, row.bytes_head, row.bytes_total) == (2_000_000, 1_000_000, 3_000_000)
 
 
-def test_without_a_head_both_are_the_same(measured: Callable[..., Measured]) -> None:
+def test_without_a_head_full_and_base_are_the_same(measured: Callable[..., Measured]) -> None:
     run = measured(head=False)
     assert not run.has_head
     row = run.row()
@@ -34,7 +34,7 @@ def test_a_mean_needs_all_views() -> None:
     assert Configuration("x", 1.0, 1, ()).mean("psnr") is None
 
 
-def test_the_net_is_named_only_where_lpips_was_taken(measured: Callable[..., Measured]) -> None:
+def test_the_net_is_named_only_if_lpips_was_measured(measured: Callable[..., Measured]) -> None:
     run = replace(measured(head=False), lpips_net="alex")
     assert run.row().lpips_net == ""
     views = tuple(replace(view, lpips=0.3) for view in run.full.views)
@@ -42,7 +42,7 @@ def test_the_net_is_named_only_where_lpips_was_taken(measured: Callable[..., Mea
     assert (run.row().lpips, run.row().lpips_net) == (pytest.approx(0.3), "alex")
 
 
-def test_json_knows_no_nan(measured: Callable[..., Measured]) -> None:
+def test_json_has_no_nan(measured: Callable[..., Measured]) -> None:
     run = measured(head=False)
     run = replace(run, configurations=(replace(run.full, views=(ViewQuality(math.inf, math.nan),)),))
     read = json.loads(json.dumps(run.as_json(), allow_nan=False))

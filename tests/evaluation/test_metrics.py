@@ -15,7 +15,7 @@ def _pair(height=40, width=30, noise=0.1):
 
 
 def _ssim_by_definition(x, y):
-    """Wang et al. 2004: Gaussian window of 11 pixels and sigma 1.5, kept where it lies whole inside the picture."""
+    """Wang et al. 2004: Gaussian window of 11 pixels and sigma 1.5, kept where it fits inside the image."""
     window = [math.exp(-(i**2) / (2 * 1.5**2)) for i in range(-5, 6)]
     window = [w / sum(window) for w in window]
 
@@ -42,7 +42,7 @@ def test_ssim_follows_the_definition():
     assert ssim(target, target).item() == pytest.approx(1.0)
 
 
-def test_smallest_picture_with_an_ssim():
+def test_smallest_image_with_an_ssim():
     assert ssim(*_pair(11, 11)).isfinite()
     for size in ((10, 40), (40, 10), (1, 1)):
         assert ssim(*_pair(*size)).isnan()

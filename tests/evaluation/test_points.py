@@ -1,4 +1,4 @@
-"""Pictures of points: where they land, which one is in front, and that whatever is given can be drawn."""
+"""Images of points: projection, visibility, and degenerate input."""
 
 from __future__ import annotations
 
@@ -11,57 +11,64 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.evaluation import Look, draw_points, look_along_axes, look_through, points_sheet, response_histogram
-from sundae_ns.evaluation.points import PAPER
+from sundae_ns.evaluation import (
+    Projection,
+    draw_points,
+    points_sheet,
+    project_along_axes,
+    project_through_camera,
+    response_histogram,
+)
+from sundae_ns.evaluation.points import BACKGROUND
 
 RED, BLUE = torch.tensor([[255, 0, 0], [0, 0, 255]], dtype=torch.uint8)
 K = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]])
 
 
-def look(*pixels_and_depths: tuple[float, float, float], width: int = 30, height: int = 20) -> Look:
+def projection(*pixels_and_depths: tuple[float, float, float], width: int = 30, height: int = 20) -> Projection:
     rows = torch.tensor(pixels_and_depths, dtype=torch.float64).reshape(-1, 3)
-    return Look("", rows[:, :2], rows[:, 2], width, height)
+    return Projection("", rows[:, :2], rows[:, 2], width, height)
 
 
-def drawn(picture: Any) -> Any:
-    return (picture != PAPER).any(axis=2)
+def drawn(image: Any) -> Any:
+    return (image != BACKGROUND).any(axis=2)
 
 
-def test_a_camera_sees_what_its_matrices_say() -> None:
+def test_projection_follows_the_camera_matrices() -> None:
     points = torch.tensor([[0.0, 0.0, 0.0], [1.0, -0.5, 2.0], [0.0, 0.0, -9.0]])
     turned = torch.tensor([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
     for viewmat in (turned, turned[:3]):
-        seen = look_through(points, viewmat, K, 100, 80)
+        seen = project_through_camera(points, viewmat, K, 100, 80)
         expected = torch.tensor([[50.0, 40.0], [50 + 100 * 0.5 / 7, 40 + 100 * 1 / 7]], dtype=torch.float64)
         torch.testing.assert_close(seen.pixels[:2], expected, atol=1e-5, rtol=0)
         assert seen.depth.tolist() == [5.0, 7.0, -4.0]
     assert seen.pixels.isfinite().all()
 
 
-def test_the_nearest_point_covers_the_others_whatever_their_order() -> None:
+def test_the_nearest_point_covers_the_others_in_any_order() -> None:
     far_and_near = ((10.5, 10.5, 5.0), (10.5, 10.5, 2.0))
     for places, colors in ((far_and_near, (BLUE, RED)), (far_and_near[::-1], (RED, BLUE))):
-        picture = draw_points(look(*places), torch.stack(colors))
-        assert picture.shape == (20, 30, 3)
-        assert picture[10, 10].tolist() == [255, 0, 0]
+        image = draw_points(projection(*places), torch.stack(colors))
+        assert image.shape == (20, 30, 3)
+        assert image[10, 10].tolist() == [255, 0, 0]
 
 
-def test_outside_and_behind_is_not_drawn() -> None:
+def test_points_outside_and_behind_are_not_drawn() -> None:
     outside = [(-1.0, 5.0, 1.0), (30.0, 5.0, 1.0), (5.0, 20.0, 1.0), (5.0, 5.0, 0.0), (5.0, 5.0, -1.0)]
     outside += [(float("nan"), 5.0, 1.0), (float("inf"), 5.0, 1.0)]
-    assert not drawn(draw_points(look(*outside), RED.repeat(len(outside), 1))).any()
+    assert not drawn(draw_points(projection(*outside), RED.repeat(len(outside), 1))).any()
     corners = [(0.0, 0.0, 1.0), (29.9, 0.0, 1.0), (0.0, 19.9, 1.0), (29.9, 19.9, 1.0)]
-    picture = drawn(draw_points(look(*corners), RED.repeat(4, 1)))
-    assert picture[0, 0]
-    assert picture[0, -1]
-    assert picture[-1, 0]
-    assert picture[-1, -1]
+    image = drawn(draw_points(projection(*corners), RED.repeat(4, 1)))
+    assert image[0, 0]
+    assert image[0, -1]
+    assert image[-1, 0]
+    assert image[-1, -1]
 
 
 def test_a_mask_leaves_points_out_and_fewer_points_are_larger() -> None:
     generator = torch.Generator().manual_seed(0)
     places = torch.rand(20_000, 2, generator=generator, dtype=torch.float64) * 400
-    seen = Look("", places, torch.ones(len(places)), 400, 400)
+    seen = Projection("", places, torch.ones(len(places)), 400, 400)
     colors = RED.repeat(len(places), 1)
     only = torch.zeros(len(places), dtype=torch.bool)
     only[7] = True
@@ -71,21 +78,21 @@ def test_a_mask_leaves_points_out_and_fewer_points_are_larger() -> None:
     assert abs(columns.mean() - places[7, 0]) < 3
     assert abs(rows.mean() - places[7, 1]) < 3
     assert only.sum() == 1
-    # Many points: so small that most of them show.
+    # Many points are drawn so small that most of them are visible.
     assert 0.3 < drawn(draw_points(seen, colors)).mean() < 0.6
 
 
-def test_views_along_the_axes_show_the_middle_and_keep_its_shape() -> None:
+def test_projections_along_the_axes_show_the_middle_at_one_scale() -> None:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(2000, 3, generator=generator) * torch.tensor([4.0, 2.0, 1.0]) + 100.0
     points[:40] *= 1e6  # floaters
-    above, front, side = look_along_axes(points, side=300)
+    above, front, side = project_along_axes(points, side=300)
     kept = points[40:].double()
     assert above.width == 300
     assert above.height == pytest.approx(220, abs=6)
     across = above.pixels[40:, 0]
     assert torch.equal(across.argsort(), kept[:, 0].argsort())
-    # Up in the picture is along the second axis named, and what is higher in it has the smaller row.
+    # The second axis points up in the image, so a higher point has a smaller row.
     assert torch.equal(above.pixels[40:, 1].argsort(descending=True), kept[:, 1].argsort())
     assert torch.equal(above.depth[40:].argsort(), kept[:, 2].argsort(descending=True))
     assert torch.equal(front.pixels[40:, 1].argsort(descending=True), kept[:, 2].argsort())
@@ -99,38 +106,38 @@ def test_views_along_the_axes_show_the_middle_and_keep_its_shape() -> None:
 
 @pytest.mark.parametrize("points", [torch.zeros(1, 3), torch.ones(5, 3), torch.tensor([[0.0, 0, 0], [0, 0, 1e-30]])])
 def test_degenerate_clouds_are_drawn(points: Tensor) -> None:
-    for seen in look_along_axes(points, side=100):
+    for seen in project_along_axes(points, side=100):
         assert drawn(draw_points(seen, RED.repeat(len(points), 1))).any()
 
 
-def test_a_sheet_has_a_panel_for_each_look_and_set() -> None:
+def test_a_sheet_has_a_panel_for_each_projection_and_set() -> None:
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
     everything, nothing = torch.ones(50, dtype=torch.bool), torch.zeros(50, dtype=torch.bool)
-    looks, colors = look_along_axes(points, side=100), RED.repeat(50, 1)
-    sheet = points_sheet(looks, colors, {"all": everything, "none": nothing}, title="what")
+    projections, colors = project_along_axes(points, side=100), RED.repeat(50, 1)
+    sheet = points_sheet(projections, colors, {"all": everything, "none": nothing}, title="a title")
     red = (np.asarray(sheet) == [255, 0, 0]).all(axis=2)
     half = sheet.width // 2
     assert red[:, :half].any()
     assert not red[:, half:].any()
-    single = points_sheet(looks[:1], colors, {"all": everything})
+    single = points_sheet(projections[:1], colors, {"all": everything})
     assert single.height < sheet.height
-    for given in (([], {"all": everything}), (looks, {})):
+    for given in (([], {"all": everything}), (projections, {})):
         with pytest.raises(DataError, match="nothing to draw"):
             points_sheet(given[0], colors, given[1])
 
 
 @pytest.fixture
 def drawings(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
-    """The figure that was drawn last."""
+    """The last figure that was drawn."""
     import sundae_ns.evaluation.points as module
 
     kept: list[Any] = []
-    original = module._picture
-    monkeypatch.setattr(module, "_picture", lambda figure: kept.append(figure) or original(figure))
+    original = module._rendered
+    monkeypatch.setattr(module, "_rendered", lambda figure: kept.append(figure) or original(figure))
     return lambda: kept[-1]
 
 
-def test_a_histogram_counts_what_has_a_place_on_its_axis(drawings: Callable[[], Any]) -> None:
+def test_a_histogram_counts_the_finite_positive_responses(drawings: Callable[[], Any]) -> None:
     generator = torch.Generator().manual_seed(0)
     magnitude = torch.cat([10 ** torch.randn(500, generator=generator, dtype=torch.float64), torch.zeros(3)])
     magnitude[:7] = torch.nan
@@ -139,7 +146,7 @@ def test_a_histogram_counts_what_has_a_place_on_its_axis(drawings: Callable[[], 
     assert sum(bar.get_height() for bar in panel.patches) == 493
     assert panel.get_xscale() == "log"
     assert "503" in panel.get_title()
-    assert "7 without neighbours, 3 of no response" in panel.get_title()
+    assert "7 without neighbours, 3 with response 0" in panel.get_title()
     assert sorted(float(line.get_xdata()[0]) for line in panel.lines) == [0.5, 2.0]
 
 

@@ -4,7 +4,7 @@ from multiprocessing.pool import ThreadPool
 import pytest
 
 from sundae_ns.errors import DataError
-from sundae_ns.evaluation import COLUMNS, RunRow, append_row, read_rows
+from sundae_ns.evaluation import COLUMNS, RunRow, append_row, csv_text, read_rows
 
 HEADER = (
     "scene,method,variant,keep_ratio,seed,steps,primitives,psnr,ssim,psnr_base,ssim_base,lpips,lpips_net,"
@@ -58,14 +58,22 @@ def test_round_trip(tmp_path):
     assert back == [rows[0], replace(rows[1], ssim=None), rows[2]]
 
 
-def test_a_row_is_a_line(tmp_path):
+def test_csv_text_is_the_content_of_the_file(tmp_path):
+    rows = [ROW, replace(ROW, ssim=float("nan"), command="a \n b")]
+    for row in rows:
+        append_row(tmp_path / "runs.csv", row)
+    assert (tmp_path / "runs.csv").read_text() == csv_text(rows)
+    assert csv_text([]).splitlines() == [HEADER]
+
+
+def test_a_row_is_one_line(tmp_path):
     path = tmp_path / "runs.csv"
     append_row(path, replace(ROW, command="ns-train \\\n  sundae\r\n --data x"))
     assert len(path.read_text().splitlines()) == 2
     assert read_rows(path)[0].command == "ns-train \\ sundae --data x"
 
 
-def test_missing_end_of_line_is_mended(tmp_path):
+def test_a_missing_final_newline_is_added(tmp_path):
     path = tmp_path / "runs.csv"
     append_row(path, ROW)
     path.write_text(path.read_text().rstrip("\n"))
@@ -80,7 +88,7 @@ def test_empty_file_gets_its_header(tmp_path):
     assert read_rows(path) == [ROW]
 
 
-def test_appends_at_once_lose_nothing(tmp_path):
+def test_concurrent_appends_lose_nothing(tmp_path):
     path = tmp_path / "runs.csv"
     append_row(path, ROW)
     with ThreadPool(8) as pool:

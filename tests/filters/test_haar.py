@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.errors import DataError
 from sundae_ns.filters import haar, high_pass, low_pass, response_magnitude
-from sundae_ns.graphs import NeighborGraph, build_graph, graph_from_neighbors, radius_neighbors
+from sundae_ns.graphs import NeighborGraph, build_graph
 
 
 def cloud(n: int = 60, seed: int = 0) -> torch.Tensor:
@@ -53,7 +53,7 @@ def test_shapes_dtypes_and_chunks_agree(monkeypatch: pytest.MonkeyPatch) -> None
     assert torch.equal(high_pass(graph, x), whole)
 
 
-def test_isolated_nodes_are_undefined_unless_asked_for() -> None:
+def test_isolated_nodes_are_nan() -> None:
     points = torch.cat([cloud(), torch.full((1, 3), 1e3, dtype=torch.float64)])
     graph = build_graph(points, num_neighbors=6)
     alone = graph.isolated
@@ -61,22 +61,20 @@ def test_isolated_nodes_are_undefined_unless_asked_for() -> None:
     assert torch.equal(high_pass(graph, points).isnan().all(dim=1), alone)
     assert torch.equal(response_magnitude(high_pass(graph, points)).isnan(), alone)
     A = random_walk(graph)
-    torch.testing.assert_close(high_pass(graph, points, isolated="zero"), points - A @ points)
-    torch.testing.assert_close(low_pass(graph, points, isolated="zero"), points + A @ points)
-    with pytest.raises(ConfigError, match="isolated"):
-        high_pass(graph, points, isolated="other")
+    torch.testing.assert_close(high_pass(graph, points)[~alone], (points - A @ points)[~alone])
+    torch.testing.assert_close(low_pass(graph, points)[~alone], (points + A @ points)[~alone])
 
 
 def test_one_node_and_no_node() -> None:
     for n in (0, 1):
-        graph = graph_from_neighbors(radius_neighbors(torch.zeros(n, 3), 1.0, 4))
+        graph = NeighborGraph(torch.zeros(n, 1, dtype=torch.int64), torch.zeros(n, 1), torch.zeros(n), 1.0, 1.0)
         assert high_pass(graph, torch.ones(n, 2)).shape == (n, 2)
-        assert high_pass(graph, torch.ones(n), isolated="zero").tolist() == [0.0] * n
+        assert high_pass(graph, torch.ones(n)).isnan().all()
     bare = NeighborGraph(torch.zeros(1, 0, dtype=torch.int64), torch.zeros(1, 0), torch.zeros(1), 1.0, 1.0)
     assert high_pass(bare, torch.ones(1, 2)).isnan().all()
 
 
-def test_two_nodes_see_their_difference() -> None:
+def test_two_nodes_respond_with_their_difference() -> None:
     points = torch.tensor([[0.0, 0, 0], [2.0, 0, 0]])
     graph = build_graph(points, num_neighbors=1)
     assert high_pass(graph, points).tolist() == [[-2.0, 0, 0], [2.0, 0, 0]]
@@ -99,17 +97,19 @@ def test_invariances_of_the_position_response() -> None:
 
 
 def test_float32_far_from_the_origin_keeps_its_digits() -> None:
-    # Coordinates are exact in float32 at this offset, so that float64 sees the very same field.
+    # Coordinates are exact in float32 at this offset, so float64 has the same field.
     points = (cloud(300) * 64).round() / 64 + 1e5
     exact_graph = build_graph(points, num_neighbors=8, tau=4.0, sigma=0.5)
-    exact = high_pass(exact_graph, points, isolated="zero")
+    exact = high_pass(exact_graph, points)
+    known = ~exact_graph.isolated
     single = points.float()
     assert torch.equal(single.double(), points)
     graph = build_graph(single, num_neighbors=8, tau=4.0, sigma=0.5)
-    worst = (high_pass(graph, single, isolated="zero") - exact).abs().max().item()
+    assert torch.equal(graph.isolated, exact_graph.isolated)
+    worst = (high_pass(graph, single) - exact)[known].abs().max().item()
     assert worst < 2e-6  # measured 1.5e-7
     naive = single - random_walk(graph) @ single
-    assert (naive - exact).abs().max().item() > 1e-3  # measured 2.2e-2: why the difference form is used
+    assert (naive - exact)[known].abs().max().item() > 1e-3  # measured 2.2e-2, the reason for the difference form
 
 
 def test_wrong_signal_is_refused() -> None:

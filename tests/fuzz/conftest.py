@@ -1,11 +1,13 @@
-"""Bad input: a reader either succeeds or says in one line what is wrong, soon and in little memory.
+"""Bad input: a reader either succeeds or fails with a one-line error, quickly and in little memory.
 
-A reader gets its corpus in a file of its own, ``test_<kind>.py``: a good input made by the package, harmed by ``harmed`` or
-by hand, one test a case, judged by ``verdict``. A new format (packed scenes) takes one more such file.
+Each kind of input has one file ``test_<kind>.py``. It takes a valid input made by the package, corrupts it with
+``corrupted`` or by hand, and judges each case with ``verdict``. A generator is marked ``seeds(n)``: it runs ten of its
+n seeds, or all of them if the environment variable ``SUNDAE_ALL_SEEDS`` is 1. Cases written by hand always run.
 """
 
 from __future__ import annotations
 
+import os
 import resource
 import signal
 import tracemalloc
@@ -18,28 +20,44 @@ import pytest
 
 from sundae_ns.errors import SundaeError
 
+FEW_SEEDS = 10
+"""Seeds of each generator in a normal run."""
 SECONDS = 30
-"""Longest time for one case: a hang, for cases that take milliseconds."""
+"""Time limit of one case; cases take milliseconds, so only a hang reaches it."""
 BASE, FACTOR = 24 << 20, 40
-"""Memory for one case: this many bytes, and this many a byte of input."""
+"""Memory limit of one case: BASE bytes plus FACTOR bytes per byte of input."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "seeds(n): parametrize `seed`; ten seeds, or n if SUNDAE_ALL_SEEDS is 1")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Parametrize ``seed`` of tests marked ``seeds(n)``."""
+    marker = metafunc.definition.get_closest_marker("seeds")
+    if marker is not None:
+        (count,) = marker.args
+        metafunc.parametrize("seed", seeds(count))
+
+
+def seeds(count: int) -> range:
+    """The seeds of a generator that has ``count`` of them."""
+    return range(count if os.environ.get("SUNDAE_ALL_SEEDS") == "1" else min(count, FEW_SEEDS))
 
 
 class Hang(BaseException):
-    """Raised by the clock; no reader can mistake it for an error of its input."""
+    """Raised by the alarm; a ``BaseException``, so that no reader catches it as an error of its input."""
 
 
 @pytest.fixture
-def verdict(record_property: Callable[[str, object], None]) -> Callable[..., SundaeError | None]:
-    """Call a reader under limits of time and memory: None if it succeeded, or the error of ours in which it ended.
-
-    ``benchmarks/corpus.py`` counts what is recorded.
-    """
+def verdict() -> Callable[..., SundaeError | None]:
+    """Call a reader under limits of time and memory; return None on success, or the ``SundaeError`` that it raised."""
 
     def stop(*_: Any) -> None:
         raise Hang
 
     def judge(reader: Callable[[], Any], size: int) -> SundaeError | None:
-        room = BASE + FACTOR * size
+        capacity = BASE + FACTOR * size
         before = signal.signal(signal.SIGALRM, stop)
         limits = resource.getrlimit(resource.RLIMIT_AS)
         pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -47,8 +65,8 @@ def verdict(record_property: Callable[[str, object], None]) -> Callable[..., Sun
         signal.alarm(SECONDS)
         tracemalloc.start()
         try:
-            # Python and numpy are counted; the limit on addresses holds for all others, torch among them.
-            resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (256 << 20) + room, limits[1]))
+            # tracemalloc counts Python and numpy; the limit on addresses covers all others, such as torch.
+            resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + (256 << 20) + capacity, limits[1]))
             reader()
         except SundaeError as raised:
             error = raised
@@ -58,8 +76,7 @@ def verdict(record_property: Callable[[str, object], None]) -> Callable[..., Sun
             tracemalloc.stop()
             resource.setrlimit(resource.RLIMIT_AS, limits)
             signal.signal(signal.SIGALRM, before)
-        assert peak <= room, f"took {peak:,} bytes of memory for {size:,} bytes of input"
-        record_property("verdict", "success" if error is None else type(error).__name__)
+        assert peak <= capacity, f"took {peak:,} bytes of memory for {size:,} bytes of input"
         if error is not None:
             assert "\n" not in str(error)
             assert 10 < len(str(error)) < 600
@@ -71,10 +88,10 @@ def verdict(record_property: Callable[[str, object], None]) -> Callable[..., Sun
 
 
 @pytest.fixture(scope="session")
-def harmed() -> Callable[[bytes, int], bytes]:
-    """One of several harms to a file, chosen by a seed: cut, bits flipped, bytes replaced, parts doubled or dropped."""
+def corrupted() -> Callable[[bytes, int], bytes]:
+    """Corrupt the bytes of a file; the seed chooses: truncate, flip bits, replace bytes, delete or repeat a part."""
 
-    def harm(content: bytes, seed: int) -> bytes:
+    def corrupt(content: bytes, seed: int) -> bytes:
         rng = Random(seed)
         data = bytearray(content)
         kind = seed % 6
@@ -83,10 +100,10 @@ def harmed() -> Callable[[bytes, int], bytes]:
         if kind == 1:
             for _ in range(rng.choice((1, 3, 30))):
                 data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
-        elif kind == 2:  # in the first bytes, where counts and kinds stand
+        elif kind == 2:  # in the first bytes, which hold counts and types
             for _ in range(rng.choice((1, 4))):
                 data[rng.randrange(min(len(data), 80))] = rng.choice((0, 1, 0x7F, 0x80, 0xFF, rng.randrange(256)))
-        elif kind == 3:  # a count, a length or a number of the largest kind
+        elif kind == 3:  # the largest values of counts, lengths and numbers
             start = rng.randrange(len(data))
             data[start : start + 8] = rng.choice((b"\xff" * 8, b"\xff" * 7 + b"\x7f", b"\x00" * 8, b"99999999"))
         elif kind == 4:
@@ -97,4 +114,4 @@ def harmed() -> Callable[[bytes, int], bytes]:
             data[start:start] = data[start : start + length]
         return bytes(data)
 
-    return harm
+    return corrupt

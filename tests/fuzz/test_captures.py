@@ -1,4 +1,4 @@
-"""Bad captures: transforms.json, COLMAP models and pictures, through the datamanager that training uses."""
+"""Bad captures: transforms.json, COLMAP models and images, loaded by the datamanager of training."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image
 
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.data import write_scene
+from sundae_ns.data import write_embedded_capture
 from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import DataError
 from sundae_ns.model import SundaeModelConfig
@@ -32,11 +32,13 @@ VIEWS, WIDTH, HEIGHT = 4, 20, 16
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("capture") / "scene"
-    return write_scene(out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40, samples=1)
+    return write_embedded_capture(
+        out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40, samples=1
+    )
 
 
 def write_model(folder: Path, names: list[str], *, observations: int = 2) -> None:
-    """A COLMAP model of binary files: cameras on a line, as many points as views."""
+    """Write a binary COLMAP model: cameras on a line, one point per view."""
     folder.mkdir(parents=True, exist_ok=True)
     focal = 18.0
     cameras = struct.pack("<QiiQQ4d", 1, 1, 1, WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2)
@@ -52,6 +54,7 @@ def write_model(folder: Path, names: list[str], *, observations: int = 2) -> Non
 
 
 def write_text_model(folder: Path, names: list[str]) -> None:
+    """Write the model of :func:`write_model` as text."""
     folder.mkdir(parents=True, exist_ok=True)
     cameras = f"# cameras\n1 PINHOLE {WIDTH} {HEIGHT} 18 18 {WIDTH / 2} {HEIGHT / 2}\n"
     images, points = "# images\n", "# points\n"
@@ -64,7 +67,7 @@ def write_text_model(folder: Path, names: list[str]) -> None:
 
 @pytest.fixture
 def capture(scene: Path, tmp_path: Path) -> Path:
-    """An own copy, in both layouts."""
+    """A copy of the capture for one test, with a transforms.json and a COLMAP model."""
     copy = Path(shutil.copytree(scene, tmp_path / "scene"))
     write_model(copy / "sparse" / "0", sorted(path.name for path in (copy / "images").iterdir()))
     return copy
@@ -80,12 +83,12 @@ def manager(data: Path, *, colmap: bool = False) -> SundaeDatamanager:
 
 
 def load(data: Path, *, colmap: bool = False) -> SundaeDatamanager:
-    """All that training does to a capture before its first step."""
-    made = manager(data, colmap=colmap)
-    for step in range(len(made.train_indices)):
-        made.next_train(step)
-    assert torch.isfinite(made.train_dataset.cameras.camera_to_worlds).all()
-    return made
+    """Load a capture and every training view, as training does."""
+    datamanager = manager(data, colmap=colmap)
+    for step in range(len(datamanager.train_indices)):
+        datamanager.next_train(step)
+    assert torch.isfinite(datamanager.train_dataset.cameras.camera_to_worlds).all()
+    return datamanager
 
 
 def bytes_of(data: Path) -> int:
@@ -99,10 +102,10 @@ def meta_of(data: Path) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------- transforms.json
 
 
-@pytest.mark.parametrize("seed", range(60))
-def test_harmed_transforms(capture: Path, harmed: Any, verdict: Any, seed: int) -> None:
+@pytest.mark.seeds(60)
+def test_corrupted_transforms(capture: Path, corrupted: Any, verdict: Any, seed: int) -> None:
     path = capture / "transforms.json"
-    path.write_bytes(harmed(path.read_bytes(), seed))
+    path.write_bytes(corrupted(path.read_bytes(), seed))
     verdict(lambda: load(capture), bytes_of(capture))
 
 
@@ -113,7 +116,7 @@ VALUES: tuple[Any, ...] = (
 
 
 def places(value: Any) -> list[tuple[Any, Any]]:
-    """Every container in a parsed file with each of its keys."""
+    """Every container of a parsed file, paired with each of its keys."""
     keys: Any = value.keys() if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
     found = [(value, key) for key in keys]
     for key in keys:
@@ -121,7 +124,7 @@ def places(value: Any) -> list[tuple[Any, Any]]:
     return found
 
 
-@pytest.mark.parametrize("seed", range(90))
+@pytest.mark.seeds(90)
 def test_strange_values_in_transforms(capture: Path, verdict: Any, seed: int) -> None:
     rng = Random(seed)
     meta = meta_of(capture)
@@ -160,7 +163,7 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
     "a huge width": (_top(w=10**9), "w is 1000000000"),
     "half a pixel": (_top(h=16.5), "h is 16.5"),
     "no frames": (_top(frames=[]), "no frames"),
-    "frames that are none": (_top(frames=[1, 2]), "frame 0"),
+    "frames that are numbers": (_top(frames=[1, 2]), "frame 0"),
     "an unknown camera": (_top(camera_model="BRAIN"), "camera_model is 'BRAIN'; use one of SIMPLE_PINHOLE"),
     "a round lens without a radius": (
         _top(camera_model="FISHEYE624"),
@@ -172,19 +175,19 @@ REFUSED: dict[str, tuple[Callable[[dict[str, Any]], None], str]] = {
             meta.update(camera_model="FISHEYE624", fisheye_crop_radius=7.0),
             [frame.update(mask_path="images/frame_00001.png") for frame in meta["frames"]],
         ),
-        "leave mask_path out",
+        "remove mask_path",
     ),
     "distortion NaN": (_top(k1=float("nan")), "k1 is nan"),
     "distortion of 3 numbers": (_top(distortion_params=[0, 0, 0]), "4, 6 or 12"),
-    "a split of other pictures": (_frame(file_path="images/none.png"), "which is the file_path of no frame"),
+    "a split of other images": (_frame(file_path="images/none.png"), "which no frame has as its file_path"),
     "a missing split": (_top(train_filenames=["images/a.png"], val_filenames=None), "train_filenames|val_filenames"),
-    "no list of test pictures": (lambda meta: [meta.pop(f"{s}_filenames", 0) for s in ("val", "test")], "none for val"),
+    "no list of test images": (lambda meta: [meta.pop(f"{s}_filenames", 0) for s in ("val", "test")], "none for val"),
     "a mask for one": (_frame(mask_path="images/frame_00001.png"), "1 of .* frames have a mask_path"),
     "a scale of zero": (_top(applied_scale=0), "applied_scale"),
     "a frame of NaN": (_top(applied_transform=[[float("nan")] * 4] * 3), "applied_transform"),
     "an unknown orientation": (_top(orientation_override="sideways"), "orientation_override"),
     "a cloud that is a number": (_top(ply_file_path=3), "ply_file_path"),
-    "a cloud that is not there": (_top(ply_file_path="none.ply"), r"none\.ply does not exist"),
+    "a missing cloud": (_top(ply_file_path="none.ply"), r"none\.ply does not exist"),
 }
 
 
@@ -203,20 +206,20 @@ def test_transforms_are_refused_by_name(capture: Path, verdict: Any, kind: str) 
 TEXTS = {
     "empty": "",
     "a list": "[1, 2]",
-    "nested without end": "[" * 200_000,
-    "digits without end": '{"frames": ' + "9" * 5000 + "}",
+    "endless nesting": "[" * 200_000,
+    "endless digits": '{"frames": ' + "9" * 5000 + "}",
     "half": '{"frames": [',
-    "no text": "\udcff",
+    "invalid UTF-8": "\udcff",
 }
 
 
 @pytest.mark.parametrize("kind", TEXTS)
-def test_what_is_no_transforms(capture: Path, verdict: Any, kind: str) -> None:
+def test_other_contents_of_transforms_are_refused(capture: Path, verdict: Any, kind: str) -> None:
     (capture / "transforms.json").write_text(TEXTS[kind], errors="surrogateescape")
     assert verdict(lambda: load(capture), bytes_of(capture)) is not None
 
 
-def test_no_capture(verdict: Any, tmp_path: Path) -> None:
+def test_a_folder_without_a_capture_is_refused(verdict: Any, tmp_path: Path) -> None:
     assert verdict(lambda: load(tmp_path / "none"), 0) is not None
     assert verdict(lambda: load(tmp_path), 0) is not None
     assert verdict(lambda: load(tmp_path, colmap=True), 0) is not None
@@ -225,7 +228,7 @@ def test_no_capture(verdict: Any, tmp_path: Path) -> None:
 # -------------------------------------------------------------------------------------------------------- COLMAP
 
 
-def test_good_models_are_read(capture: Path, verdict: Any) -> None:
+def test_valid_models_are_read(capture: Path, verdict: Any) -> None:
     assert verdict(lambda: load(capture, colmap=True), bytes_of(capture)) is None
     binary = load(capture, colmap=True)
     names = sorted(path.name for path in (capture / "images").iterdir())
@@ -236,21 +239,21 @@ def test_good_models_are_read(capture: Path, verdict: Any) -> None:
 
 
 @pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
-@pytest.mark.parametrize("seed", range(40))
-def test_harmed_model(capture: Path, harmed: Any, verdict: Any, file: str, seed: int) -> None:
+@pytest.mark.seeds(40)
+def test_corrupted_model(capture: Path, corrupted: Any, verdict: Any, file: str, seed: int) -> None:
     path = capture / "sparse" / "0" / file
-    path.write_bytes(harmed(path.read_bytes(), seed))
+    path.write_bytes(corrupted(path.read_bytes(), seed))
     verdict(lambda: load(capture, colmap=True), bytes_of(capture))
 
 
 @pytest.mark.parametrize("file", ["cameras.txt", "images.txt", "points3D.txt"])
-@pytest.mark.parametrize("seed", range(20))
-def test_harmed_text_model(capture: Path, harmed: Any, verdict: Any, file: str, seed: int) -> None:
+@pytest.mark.seeds(20)
+def test_corrupted_text_model(capture: Path, corrupted: Any, verdict: Any, file: str, seed: int) -> None:
     names = sorted(path.name for path in (capture / "images").iterdir())
     shutil.rmtree(capture / "sparse")
     write_text_model(capture / "sparse" / "0", names)
     path = capture / "sparse" / "0" / file
-    path.write_bytes(harmed(path.read_bytes(), seed))
+    path.write_bytes(corrupted(path.read_bytes(), seed))
     verdict(lambda: load(capture, colmap=True), bytes_of(capture))
 
 
@@ -277,7 +280,7 @@ def _folder(file: str) -> Callable[[Path], None]:
 
 
 def _spaced(model: Path) -> None:
-    write_text_model(model, ["a picture.png"])
+    write_text_model(model, ["an image.png"])
 
 
 _NAME = 8 + 64 + len("frame_00001.png") + 1  # offset of the first image's number of observations
@@ -293,23 +296,23 @@ MODELS: dict[str, tuple[Callable[[Path], None], str]] = {
     "zero focal length": (_patch("cameras.bin", 8 + 24, struct.pack("<d", 0.0)), "camera 1: parameter 0 is 0.0"),
     "NaN focal length": (_patch("cameras.bin", 8 + 24, struct.pack("<d", float("nan"))), "parameter 0 is nan"),
     "zero width": (_patch("cameras.bin", 8 + 8, struct.pack("<Q", 0)), "width is 0"),
-    "an unknown camera model": (_patch("cameras.bin", 8 + 4, struct.pack("<i", 10)), "no camera of model 10"),
+    "an unknown camera model": (_patch("cameras.bin", 8 + 4, struct.pack("<i", 10)), "not support camera model 10"),
     "a zero quaternion": (_patch("images.bin", 8 + 4, struct.pack("<4d", 0, 0, 0, 0)), "image 1: its quaternion"),
     "a NaN position": (_patch("images.bin", 8 + 36, struct.pack("<d", float("nan"))), "image 1: the pose is nan"),
-    "a camera that is not there": (_patch("images.bin", 8 + 60, struct.pack("<i", 9)), "camera 9 is not in the model"),
+    "a missing camera": (_patch("images.bin", 8 + 60, struct.pack("<i", 9)), "camera 9 is not in the model"),
     "a name for a shell": (_patch("images.bin", 8 + 64, b"$(reboot).png!!"), "rename it without quotes"),
-    "a name without end": (_patch("images.bin", 8 + 64, b"a" * 10**4), "without an end"),
+    "an endless name": (_patch("images.bin", 8 + 64, b"a" * 10**4), "without an end"),
     "no images": (lambda model: (model / "images.bin").write_bytes(struct.pack("<Q", 0)), "has no images"),
     "no points": (lambda model: (model / "points3D.bin").write_bytes(struct.pack("<Q", 0)), "has no points"),
     "no file of images": (lambda model: (model / "images.bin").unlink(), "images.bin does not exist"),
-    "no files": (shutil.rmtree, "is no folder"),
+    "no files": (shutil.rmtree, "is not a folder"),
     "no file of cameras": (lambda model: (model / "cameras.bin").unlink(), "holds neither cameras.bin nor cameras.txt"),
-    "a camera twice": (_twice, "camera 1: it stands there twice"),
+    "a camera twice": (_twice, "camera 1: it is listed twice"),
     "a folder in the place of a file": (_folder("cameras.bin"), "cannot be read"),
     "a folder in the place of a text": (_folder("cameras.txt"), "cannot be read"),
-    "a text that is none": (lambda model: (model / "cameras.txt").write_bytes(b"1 PIN\xff\xfe"), "is no text"),
+    "invalid UTF-8": (lambda model: (model / "cameras.txt").write_bytes(b"1 PIN\xff\xfe"), "is not UTF-8 text"),
     "a text with a space in a name": (_spaced, "does not read names with spaces"),
-    "no picture": (lambda model: next((model.parents[1] / "images").iterdir()).unlink(), "does not exist"),
+    "a missing image": (lambda model: next((model.parents[1] / "images").iterdir()).unlink(), "does not exist"),
 }
 
 
@@ -329,25 +332,25 @@ def test_a_model_without_points_starts_without_them(capture: Path, verdict: Any)
     assert "points3D_xyz" not in load(capture, colmap=True).train_dataset.metadata
 
 
-# ------------------------------------------------------------------------------------------------------- pictures
+# --------------------------------------------------------------------------------------------------------- images
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
-@pytest.mark.parametrize("seed", range(24))
-def test_harmed_picture(capture: Path, harmed: Any, verdict: Any, suffix: str, seed: int) -> None:
+@pytest.mark.seeds(24)
+def test_corrupted_image(capture: Path, corrupted: Any, verdict: Any, suffix: str, seed: int) -> None:
     meta = meta_of(capture)
     source = capture / meta["frames"][0]["file_path"]
     target = source.with_suffix(f".{suffix}")
     with Image.open(source) as image:
         image.convert("RGB").save(target)
-    target.write_bytes(harmed(target.read_bytes(), seed))
+    target.write_bytes(corrupted(target.read_bytes(), seed))
     old, new = meta["frames"][0]["file_path"], str(target.relative_to(capture))
     (capture / "transforms.json").write_text((capture / "transforms.json").read_text().replace(old, new))
     verdict(lambda: load(capture), bytes_of(capture))
 
 
 def bomb(width: int, height: int) -> bytes:
-    """A PNG whose header claims far more pixels than follow."""
+    """A PNG whose header claims more pixels than follow."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -362,12 +365,12 @@ def _saved(kind: str, size: tuple[int, int] = (WIDTH, HEIGHT)) -> Callable[[Path
     return lambda path: Image.new(kind, size).save(path)
 
 
-PICTURES: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "16 bits": (_saved("I;16"), "pixels of kind I;16"),
-    "a palette": (_saved("P"), "pixels of kind P"),
-    "grey with alpha": (_saved("LA"), "pixels of kind LA"),
+IMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "16 bits": (_saved("I;16"), "pixels of type I;16"),
+    "a palette": (_saved("P"), "pixels of type P"),
+    "grey with alpha": (_saved("LA"), "pixels of type LA"),
     "one pixel": (_saved("RGB", (1, 1)), "1 x 1 px but its camera says"),
-    "empty": (lambda path: path.write_bytes(b""), "no picture"),
+    "empty": (lambda path: path.write_bytes(b""), "not an image"),
     "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
     "missing": (lambda path: path.unlink(), "cannot be read|none"),
     "a bomb": (lambda path: path.write_bytes(bomb(30000, 30000)), "claims|exceeds limit|30000"),
@@ -377,14 +380,14 @@ PICTURES: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("which", ["train", "test"])
-@pytest.mark.parametrize("kind", PICTURES)
-def test_pictures_are_refused_by_name(capture: Path, verdict: Any, kind: str, which: str) -> None:
-    make, cause = PICTURES[kind]
+@pytest.mark.parametrize("kind", IMAGES)
+def test_images_are_refused_by_name(capture: Path, verdict: Any, kind: str, which: str) -> None:
+    make, cause = IMAGES[kind]
     meta = meta_of(capture)
     name = meta["train_filenames"][-1] if which == "train" else meta["test_filenames"][0]
     make(capture / name)
     if (kind, which) == ("right header, no pixels", "test"):
-        return  # found when the test views are decoded
+        return  # detected when the test views are decoded
     error = verdict(lambda: load(capture), bytes_of(capture))
     assert error is not None
     assert Path(name).name in str(error)
@@ -392,10 +395,10 @@ def test_pictures_are_refused_by_name(capture: Path, verdict: Any, kind: str, wh
     assert re.search(cause, str(error)), error
 
 
-# --------------------------------------------------------------------------------- odd, and yet to be trained on
+# ---------------------------------------------------------------------------------------- unusual captures that train
 
 
-def _each_picture(change: Callable[[Image.Image], Image.Image]) -> Callable[[Path], None]:
+def _each_image(change: Callable[[Image.Image], Image.Image]) -> Callable[[Path], None]:
     def make(data: Path) -> None:
         for path in (data / "images").iterdir():
             with Image.open(path) as image:
@@ -406,7 +409,7 @@ def _each_picture(change: Callable[[Image.Image], Image.Image]) -> Callable[[Pat
 
 
 def _one_pixel(data: Path) -> None:
-    _each_picture(lambda image: image.resize((1, 1)))(data)
+    _each_image(lambda image: image.resize((1, 1)))(data)
     meta = meta_of(data)
     meta.update(w=1, h=1, cx=0.5, cy=0.5)
     (data / "transforms.json").write_text(json.dumps(meta))
@@ -448,9 +451,9 @@ def _one_view(data: Path) -> None:
 
 
 FINE: dict[str, Callable[[Path], None]] = {
-    "as it is": lambda data: None,
-    "grey": _each_picture(lambda image: image.convert("L")),
-    "with alpha": _each_picture(lambda image: image.convert("RGBA")),
+    "unchanged": lambda data: None,
+    "grey": _each_image(lambda image: image.convert("L")),
+    "with alpha": _each_image(lambda image: image.convert("RGBA")),
     "one pixel": _one_pixel,
     "masks": _masks,
     "unicode and spaces in names": _renamed,
@@ -459,9 +462,9 @@ FINE: dict[str, Callable[[Path], None]] = {
 
 
 def train_a_step(data: Path) -> None:
-    """A step of training with the head, and an evaluation."""
-    made = load(data)
-    metadata = made.train_dataset.metadata
+    """Train one step with the head, and evaluate the test views."""
+    datamanager = load(data)
+    metadata = datamanager.train_dataset.metadata
     points = metadata.get("points3D_xyz")
     config = SundaeModelConfig(
         head=HeadConfig(size="tiny"),
@@ -471,39 +474,39 @@ def train_a_step(data: Path) -> None:
         num_downscales=0,
     )
     model = config.setup(
-        scene_box=made.train_dataset.scene_box,
+        scene_box=datamanager.train_dataset.scene_box,
         num_train_data=VIEWS,
         metadata=metadata,
         seed_points=None if points is None else (points, metadata["points3D_rgb"]),
     )
     model.train()
     model.step = config.pruning.prune_at + 1
-    camera, batch = made.next_train(0)
+    camera, batch = datamanager.next_train(0)
     outputs = model(camera)
     losses = model.get_loss_dict(outputs, batch, model.get_metrics_dict(outputs, batch))
     loss = torch.stack(list(losses.values())).sum()
     loss.backward()
     assert torch.isfinite(loss)
     model.eval()
-    for camera, batch in made.fixed_indices_eval_dataloader:
+    for camera, batch in datamanager.fixed_indices_eval_dataloader:
         metrics, _ = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
         assert np.isfinite(metrics["psnr"])
 
 
 @pytest.fixture(scope="module")
 def compiled(scene: Path) -> None:
-    """The CPU's rasteriser, which numba compiles where it never ran before: that takes time and memory of its own."""
+    """Compile the CPU rasteriser before its first use under limits of time and memory."""
     train_a_step(scene)
 
 
 @pytest.mark.parametrize("folder", ["scene", "a folder, with spaces", "ünï cöde 像"])
 @pytest.mark.parametrize("kind", FINE)
-def test_odd_captures_train(compiled: None, capture: Path, verdict: Any, kind: str, folder: str) -> None:
+def test_unusual_captures_train(compiled: None, capture: Path, verdict: Any, kind: str, folder: str) -> None:
     data = capture.rename(capture.with_name(folder))
     FINE[kind](data)
     assert verdict(lambda: train_a_step(data), bytes_of(data)) is None
 
 
-def test_one_view_is_success_or_one_line(capture: Path, verdict: Any) -> None:
+def test_one_view_succeeds_or_fails_with_one_line(capture: Path, verdict: Any) -> None:
     _one_view(capture)
     verdict(lambda: load(capture), bytes_of(capture))

@@ -1,4 +1,4 @@
-"""Bad checkpoints: damaged, of odd contents, and such that ask for code to be run."""
+"""Bad checkpoints: damaged files, odd contents, and pickles that would run code."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch.amp import GradScaler
 
 from sundae_ns.compensation import HeadConfig
+from sundae_ns.distributed import OneProcess
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.trainer import SundaeTrainer
@@ -35,11 +36,15 @@ def small_model() -> SundaeModel:
 
 
 class Pipeline(torch.nn.Module):
-    """What nerfstudio's pipeline is to a checkpoint."""
+    """The part of nerfstudio's pipeline that a checkpoint uses."""
 
     def __init__(self) -> None:
         super().__init__()
         self._model = small_model()
+
+    @property
+    def model(self) -> SundaeModel:
+        return self._model
 
     def load_pipeline(self, state: dict[str, Any], step: int) -> None:
         self._model.load_state_dict({name.removeprefix("_model."): value for name, value in state.items()})
@@ -47,14 +52,20 @@ class Pipeline(torch.nn.Module):
 
 @cache
 def trainer() -> SundaeTrainer:
-    """A trainer with nothing but what saving and resuming touch; one for all cases, since each is loaded anew."""
+    """A trainer with only the attributes that saving and resuming use; shared, because every case loads its state."""
     made = SundaeTrainer.__new__(SundaeTrainer)
+    made.team = OneProcess()
     made.pipeline = Pipeline()  # type: ignore[assignment]
     groups = made.pipeline._model.get_param_groups()
     made.optimizers = Optimizers({n: {"optimizer": FusedAdamConfig(), "scheduler": None} for n in groups}, groups)
     made.grad_scaler = GradScaler(enabled=False)
     made.config = SimpleNamespace(  # type: ignore[assignment]
-        load_dir=None, load_step=None, load_checkpoint=None, load_scheduler=True, save_only_latest_checkpoint=True
+        load_dir=None,
+        load_step=None,
+        load_checkpoint=None,
+        load_scheduler=True,
+        save_only_latest_checkpoint=True,
+        machine=SimpleNamespace(seed=0),
     )
     return made
 
@@ -81,7 +92,7 @@ def start_warm(path: Path) -> None:
     checkpoint.read_field(path)
 
 
-def test_the_good_one_is_good(good: bytes, verdict: Any, tmp_path: Path) -> None:
+def test_a_valid_checkpoint_is_read(good: bytes, verdict: Any, tmp_path: Path) -> None:
     path = tmp_path / "a.ckpt"
     path.write_bytes(good)
     assert verdict(lambda: resume(path), len(good)) is None
@@ -89,16 +100,16 @@ def test_the_good_one_is_good(good: bytes, verdict: Any, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("read", [resume, start_warm])
-@pytest.mark.parametrize("seed", range(30))
-def test_harmed_file(good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int, read: Any) -> None:
+@pytest.mark.seeds(30)
+def test_corrupted_file(good: bytes, corrupted: Any, verdict: Any, tmp_path: Path, seed: int, read: Any) -> None:
     path = tmp_path / "a.ckpt"
-    path.write_bytes(harmed(good, seed))
+    path.write_bytes(corrupted(good, seed))
     verdict(lambda: read(path), path.stat().st_size)
 
 
 @pytest.fixture
 def folder(good: bytes, tmp_path: Path) -> Iterator[Path]:
-    """Two checkpoints, the newer one damaged; the trainer looks there."""
+    """The trainer's folder with two checkpoints; the newer one is truncated."""
     (tmp_path / "step-000000007.ckpt").write_bytes(good)
     (tmp_path / "step-000000008.ckpt").write_bytes(good[:-1000])
     made = trainer()
@@ -107,17 +118,17 @@ def folder(good: bytes, tmp_path: Path) -> Iterator[Path]:
     made.config.load_dir = made.config.load_step = None
 
 
-def test_training_goes_on_from_the_newest_whole_one(
+def test_training_resumes_from_the_newest_complete_checkpoint(
     folder: Path, verdict: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made = trainer()
     assert verdict(made._load_checkpoint, 10**6) is None
     assert made._start_step == 8
-    assert "passed over a checkpoint: step-000000008.ckpt is not whole" in " ".join(capsys.readouterr().out.split())
+    assert "skipped a damaged checkpoint: step-000000008.ckpt is not whole" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("step", [8, 9])
-def test_a_step_that_was_asked_for_is_not_replaced(folder: Path, verdict: Any, step: int) -> None:
+def test_a_requested_step_is_not_replaced(folder: Path, verdict: Any, step: int) -> None:
     made = trainer()
     made.config.load_step = step
     error = verdict(made._load_checkpoint, 10**6)
@@ -125,7 +136,7 @@ def test_a_step_that_was_asked_for_is_not_replaced(folder: Path, verdict: Any, s
 
 
 def rezipped(good: bytes, change: Callable[[str, bytes], bytes]) -> bytes:
-    """The archive with entries changed and all checksums right again."""
+    """The archive with changed entries and valid checksums."""
     out = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(good)) as source, zipfile.ZipFile(out, "w", zipfile.ZIP_STORED) as target:
         for entry in source.namelist():
@@ -133,10 +144,12 @@ def rezipped(good: bytes, change: Callable[[str, bytes], bytes]) -> bytes:
     return out.getvalue()
 
 
-@pytest.mark.parametrize("seed", range(24))
-def test_harmed_pickle_with_right_checksums(good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
+@pytest.mark.seeds(24)
+def test_corrupted_pickle_with_valid_checksums(
+    good: bytes, corrupted: Any, verdict: Any, tmp_path: Path, seed: int
+) -> None:
     path = tmp_path / "a.ckpt"
-    path.write_bytes(rezipped(good, lambda name, data: harmed(data, seed) if name.endswith("data.pkl") else data))
+    path.write_bytes(rezipped(good, lambda name, data: corrupted(data, seed) if name.endswith("data.pkl") else data))
     verdict(lambda: resume(path), path.stat().st_size)
     verdict(lambda: start_warm(path), path.stat().st_size)
 
@@ -161,6 +174,10 @@ def _extra(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
     return lambda state: _at(key, value)(state["pipeline"]["_model._extra_state"])
 
 
+def _running(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda state: _at(key, value)(state["pipeline"]["_model._extra_state"]["running"])
+
+
 def _param(name: str, change: Callable[[torch.Tensor], Any]) -> Callable[[dict[str, Any]], None]:
     key = f"_model.gauss_params.{name}"
     return lambda state: _at(key, change(state["pipeline"][key]))(state["pipeline"])
@@ -172,19 +189,29 @@ def _moments(state: dict[str, Any]) -> None:
 
 ODD: dict[str, Callable[[dict[str, Any]], None]] = {
     "no step": _at("step", None),
-    "a step that is no number": _at("step", "many"),
+    "a step that is a word": _at("step", "many"),
     "no model": _at("pipeline", None),
     "a model that is a list": _at("pipeline", [1, 2]),
     "a number for a name": lambda state: state["pipeline"].update({3: torch.zeros(2)}),
     "no optimizers": _at("optimizers", None),
     "optimizers of another field": _moments,
-    "a generator that is none": _at("random", {"python": 1, "numpy": 2, "torch": 3, "cuda": 4}),
+    "generators that are numbers": _at("random", {"python": 1, "numpy": 2, "torch": 3, "cuda": 4}),
     "no format": _extra("format", None),
     "no features": _extra("num_features", None),
-    "no pruning state": _extra("pruning", None),
-    "a pruning state of words": _extra("pruning", {"pruned_at": "yesterday"}),
-    "no strategy state": _extra("strategy", None),
-    "a strategy of other rows": _extra("strategy", {"grad2d": torch.zeros(7), "count": torch.zeros(7)}),
+    "an older format": _extra("format", 1),
+    "no step of the model": _extra("step", None),
+    "no focal lengths": _extra("trained_focal", None),
+    "focal lengths of words": _extra("trained_focal", ["near", "far"]),
+    "one focal length": _extra("trained_focal", [1.0]),
+    "no running states": _extra("running", None),
+    "running states that are a list": _extra("running", [1, 2]),
+    "no extensions": _extra("extensions", None),
+    "extensions that are a list": _extra("extensions", [1, 2]),
+    "no pruning state": _running("pruning", None),
+    "a pruning state of words": _running("pruning", {"pruned_at": "yesterday"}),
+    "no densification state": _running("densification", None),
+    "a densification state that is a list": _running("densification", [1, 2]),
+    "statistics of other rows": _running("densification", {"grad2d": torch.zeros(7), "count": torch.zeros(7)}),
     "no extra state": lambda state: _at("_model._extra_state", None)(state["pipeline"]),
     "no primitives": lambda state: [_param(n, lambda v: v[:0])(state) for n in ("means", "scales")] and None,
     "fewer centres than sizes": _param("means", lambda value: value[:5]),
@@ -210,8 +237,8 @@ def test_odd_contents_are_refused(good: bytes, verdict: Any, tmp_path: Path, kin
     verdict(lambda: start_warm(path), path.stat().st_size)
 
 
-class Burglar:
-    """Runs a command when it is unpickled."""
+class MakesFolder:
+    """Make a folder when unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -222,13 +249,13 @@ class Burglar:
 
 @pytest.mark.parametrize("place", ["pipeline", "optimizers", "random", "schedulers", "scalers"])
 def test_nothing_in_a_checkpoint_is_run(good: bytes, verdict: Any, tmp_path: Path, place: str) -> None:
-    stolen, path = tmp_path / "stolen", tmp_path / "a.ckpt"
+    folder, path = tmp_path / "folder", tmp_path / "a.ckpt"
     state = contents(good)
-    state[place] = {**state[place], "extra": Burglar(stolen)}
+    state[place] = {**state[place], "extra": MakesFolder(folder)}
     torch.save(state, path)
     torch.load(path, weights_only=False)
-    assert stolen.exists(), "the trap does not work"
-    stolen.rmdir()
+    assert folder.exists(), "unpickling does not make the folder, so this test could not fail"
+    folder.rmdir()
     for read in (resume, start_warm):
         assert verdict(lambda read=read: read(path), path.stat().st_size) is not None
-    assert not stolen.exists()
+    assert not folder.exists()

@@ -1,4 +1,4 @@
-"""Bad packed scenes: harmed, harmed behind right checksums, bombs, and headers that lie."""
+"""Bad packed scenes: corrupted, corrupted with valid checksums, decompression bombs, and contradictory headers."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def parts(content: bytes) -> tuple[Json, bytes]:
 
 
 def sealed(meta: bytes, body: bytes) -> bytes:
-    """A file of any header and body, with the header's checksum right."""
+    """A file with this header and body, and a valid checksum of the header."""
     return b"\x89SUNDAE\n" + struct.pack("<II", 1, len(meta)) + hashlib.sha256(meta).digest() + meta + body
 
 
 def resealed(meta: Json, body: bytes) -> bytes:
-    """The file with all checksums right again."""
+    """The file with valid checksums of header and sections."""
     offset = 0
     for section in meta["sections"]:
         length = sum(section["parts"])
@@ -67,39 +67,39 @@ def resealed(meta: Json, body: bytes) -> bytes:
 
 def judged(verdict: Any, path: Path, content: bytes) -> Any:
     path.write_bytes(content)
-    return verdict(lambda: finite(read_scene(path)), len(content))
+    return verdict(lambda: check_field(read_scene(path)), len(content))
 
 
-def finite(found: Scene) -> None:
-    assert all(torch.isfinite(value).all() for value in found.field.values())
-    assert len({len(value) for value in found.field.values()}) == 1
+def check_field(unpacked: Scene) -> None:
+    assert all(torch.isfinite(value).all() for value in unpacked.field.values())
+    assert len({len(value) for value in unpacked.field.values()}) == 1
 
 
-def test_the_good_one_is_good(good: bytes, verdict: Any, tmp_path: Path) -> None:
+def test_a_valid_file_is_read(good: bytes, verdict: Any, tmp_path: Path) -> None:
     assert judged(verdict, tmp_path / "a.sundae", good) is None
     assert judged(verdict, tmp_path / "a.sundae", resealed(*parts(good))) is None
 
 
-@pytest.mark.parametrize("seed", range(60))
-def test_harmed(good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
-    content = harmed(good, seed)
+@pytest.mark.seeds(60)
+def test_corrupted(good: bytes, corrupted: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
+    content = corrupted(good, seed)
     error = judged(verdict, tmp_path / "a.sundae", content)
     assert isinstance(error, PackError) or content == good
 
 
-@pytest.mark.parametrize("seed", range(60))
-def test_harmed_behind_right_checksums(good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
+@pytest.mark.seeds(60)
+def test_corrupted_with_valid_checksums(good: bytes, corrupted: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
     meta, body = parts(good)
-    changed = harmed(body, seed)[: len(body)]
+    changed = corrupted(body, seed)[: len(body)]
     judged(verdict, tmp_path / "a.sundae", resealed(meta, changed + bytes(len(body) - len(changed))))
 
 
-@pytest.mark.parametrize("seed", range(60))
-def test_harmed_header_behind_right_checksums(
-    good: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int
+@pytest.mark.seeds(60)
+def test_corrupted_header_with_valid_checksums(
+    good: bytes, corrupted: Any, verdict: Any, tmp_path: Path, seed: int
 ) -> None:
     meta, body = parts(good)
-    judged(verdict, tmp_path / "a.sundae", sealed(harmed(json.dumps(meta).encode(), seed), body))
+    judged(verdict, tmp_path / "a.sundae", sealed(corrupted(json.dumps(meta).encode(), seed), body))
 
 
 def section(meta: Json, name: str) -> Json:
@@ -107,7 +107,7 @@ def section(meta: Json, name: str) -> Json:
 
 
 def change(path: str, value: Any) -> Callable[[Json], None]:
-    """Set one value of the header; ``path`` names keys, and after a colon a section."""
+    """Set one value of the header. ``path`` is dotted keys; after a leading colon the first names a section."""
 
     def apply(meta: Json) -> None:
         *keys, last = path.split(".")
@@ -125,21 +125,21 @@ LIES: dict[str, Callable[[Json], None]] = {
     "half a primitive": change("primitives", 0.5),
     "true primitives": change("primitives", True),
     "no attributes": change("attributes", 3),
-    "an attribute of another kind": change("attributes.scales.codec", "pickle"),
-    "more bits than numbers have": change("attributes.scales.bits", 200),
+    "an attribute of another codec": change("attributes.scales.codec", "pickle"),
+    "too many bits": change("attributes.scales.bits", 200),
     "an infinite step": change("attributes.opacities.step", [1e308]),
     "a huge whole number": change("attributes.opacities.low", [10**4000]),
     "a word for a number": change("attributes.opacities.low", ["nan"]),
-    "a blocks of nothing": change("attributes.means.block", 0),
+    "empty blocks": change("attributes.means.block", 0),
     "a huge shape": change(":opacities/codes.shape", [1, 2**27]),
-    "a shape beyond numbers": change(":opacities/codes.shape", [2**27, 2**27, 2**27]),
+    "a shape that overflows": change(":opacities/codes.shape", [2**27, 2**27, 2**27]),
     "a negative length": change(":opacities/codes.parts.0", -5),
     "a huge length": change(":opacities/codes.parts.0", 2**50),
     "no parts": change(":opacities/codes.parts", []),
     "a dtype of objects": change(":opacities/codes.dtype", "|O"),
     "a dtype of another width": change(":opacities/codes.dtype", "<f8"),
     "a name twice": change(":opacities/codes.name", "scales/codes"),
-    "sections that are none": change("sections", [1, None, []]),
+    "sections that are numbers": change("sections", [1, None, []]),
     "no sections": change("sections", {}),
     "a head of another shape": change("attributes.head.tensors", [["a", [3, 5, 1, 1]], ["b", [3]]]),
     "a head without shape": change("attributes.head.tensors", "all"),
@@ -148,7 +148,7 @@ LIES: dict[str, Callable[[Json], None]] = {
 
 
 @pytest.mark.parametrize("lie", LIES)
-def test_headers_that_lie_are_refused(lie: str, verdict: Any, tmp_path: Path) -> None:
+def test_contradictory_headers_are_refused(lie: str, verdict: Any, tmp_path: Path) -> None:
     meta, body = parts(packed(tmp_path, PackConfig()))
     LIES[lie](meta)
     text = json.dumps(meta).encode()
@@ -163,21 +163,21 @@ ODD: dict[str, bytes] = {
     "deep JSON": sealed(b"[" * 100_000, b""),
     "a list": sealed(b"[]", b""),
     "not a number": sealed(b'{"sections": [], "primitives": NaN}', b""),
-    "no text": sealed(b"\xff\xfe", b""),
+    "invalid UTF-8": sealed(b"\xff\xfe", b""),
     "a long header": b"\x89SUNDAE\n" + struct.pack("<II", 1, 2**32 - 1) + bytes(132),
 }
 
 
 @pytest.mark.parametrize("kind", ODD)
-def test_what_is_no_scene_is_refused(kind: str, verdict: Any, tmp_path: Path) -> None:
+def test_other_contents_are_refused(kind: str, verdict: Any, tmp_path: Path) -> None:
     assert isinstance(judged(verdict, tmp_path / "ünï cöde.sundae", ODD[kind]), PackError)
 
 
-@pytest.mark.parametrize("stated", ["as it is", "small"])
+@pytest.mark.parametrize("stated", ["true size", "small"])
 def test_bombs_are_refused_before_they_unpack(stated: str, verdict: Any, tmp_path: Path) -> None:
     size = 1 << 27
     frame = zstandard.ZstdCompressor(level=1).compress(bytes(size))
-    shape = [size if stated == "as it is" else 1 << 20]
+    shape = [size if stated == "true size" else 1 << 20]
     meta = {"primitives": 1, "attributes": {}, "sections": [{"name": "a", "dtype": "|u1", "shape": shape}]}
     meta["sections"][0] |= {"parts": [len(frame)], "sha256": hashlib.sha256(frame).hexdigest()}  # type: ignore[index]
     content = sealed(json.dumps(meta).encode(), frame)
@@ -186,7 +186,7 @@ def test_bombs_are_refused_before_they_unpack(stated: str, verdict: Any, tmp_pat
 
 
 def test_a_few_constant_planes_cannot_fill_the_memory(verdict: Any, tmp_path: Path) -> None:
-    """Every section within its limit, and the field that they describe beyond it."""
+    """Every section is within its limit, but the field that they describe is not."""
     n = 200_000
     field = {k: v[:1].expand(n, *v.shape[1:]) for k, v in scene().field.items()}
     write_scene(tmp_path / "a.sundae", Scene(field))

@@ -1,4 +1,4 @@
-"""Bad .ply files, for both readers: of fields, and of sparse clouds."""
+"""Bad .ply files, for the readers of fields and of point clouds."""
 
 from __future__ import annotations
 
@@ -38,18 +38,18 @@ def cloud(text: bool) -> Callable[[Path], bytes]:
     return make
 
 
-@pytest.mark.parametrize("seed", range(60))
-def test_harmed_field(field: bytes, harmed: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
+@pytest.mark.seeds(60)
+def test_corrupted_field(field: bytes, corrupted: Any, verdict: Any, tmp_path: Path, seed: int) -> None:
     path = tmp_path / "a.ply"
-    path.write_bytes(harmed(field, seed))
+    path.write_bytes(corrupted(field, seed))
     verdict(lambda: checkpoint.read_field(path), path.stat().st_size)
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "ascii"])
-@pytest.mark.parametrize("seed", range(30))
-def test_harmed_cloud(harmed: Any, verdict: Any, tmp_path: Path, seed: int, text: bool) -> None:
+@pytest.mark.seeds(30)
+def test_corrupted_cloud(corrupted: Any, verdict: Any, tmp_path: Path, seed: int, text: bool) -> None:
     path = tmp_path / "a.ply"
-    path.write_bytes(harmed(cloud(text)(path), seed))
+    path.write_bytes(corrupted(cloud(text)(path), seed))
 
     def read() -> None:
         points, rgb = read_point_cloud(path)
@@ -62,7 +62,7 @@ def test_harmed_cloud(harmed: Any, verdict: Any, tmp_path: Path, seed: int, text
 ODD: dict[str, bytes] = {
     "empty": b"",
     "no header": b"\x00" * 100,
-    "nothing before the end of its header": b"end_header\n" + b"\x00" * 100,
+    "end_header alone": b"end_header\n" + b"\x00" * 100,
     "only a header": HEADER % (b"binary_little_endian", b"100", XYZ),
     "a huge count": HEADER % (b"binary_little_endian", b"99999999999999", XYZ) + b"\x00" * 120,
     "a huge count of lists": HEADER % (b"binary_little_endian", b"9999999999", b"property list int float x\n")
@@ -70,28 +70,28 @@ ODD: dict[str, bytes] = {
     "a huge list": HEADER % (b"binary_little_endian", b"1", b"property list uint double x\n") + b"\xff" * 4,
     "a huge list in text": HEADER % (b"ascii", b"1", b"property list uint double x\n") + b"4000000000 1\n",
     "a huge count in text": HEADER % (b"ascii", b"99999999999", XYZ) + b"0 0 0\n",
-    "nothing in a row": HEADER % (b"binary_little_endian", b"99999999999", b""),
+    "no properties": HEADER % (b"binary_little_endian", b"99999999999", b""),
     "a negative count": HEADER % (b"binary_little_endian", b"-5", XYZ),
-    "a count that is none": HEADER % (b"binary_little_endian", b"many", XYZ),
+    "a count that is a word": HEADER % (b"binary_little_endian", b"many", XYZ),
     "x is a list": HEADER % (b"binary_little_endian", b"1", b"property list uchar float x\n" + XYZ[17:]) + b"\x00" * 9,
     "x twice": HEADER % (b"binary_little_endian", b"1", XYZ + XYZ) + b"\x00" * 24,
-    "a kind that is none": HEADER % (b"binary_little_endian", b"1", b"property quad x\n") + b"\x00" * 24,
-    "a format that is none": HEADER % (b"binary_middle_endian", b"1", XYZ) + b"\x00" * 24,
-    "words where numbers should be": HEADER % (b"ascii", b"1", XYZ) + b"one two three\n",
-    "two numbers for three": HEADER % (b"ascii", b"1", XYZ) + b"1 2\n",
-    "a header without end": b"ply\nformat ascii 1.0\n" + b"comment la\n" * 30000,
+    "an unknown type": HEADER % (b"binary_little_endian", b"1", b"property quad x\n") + b"\x00" * 24,
+    "an unknown format": HEADER % (b"binary_middle_endian", b"1", XYZ) + b"\x00" * 24,
+    "words instead of numbers": HEADER % (b"ascii", b"1", XYZ) + b"one two three\n",
+    "two numbers instead of three": HEADER % (b"ascii", b"1", XYZ) + b"1 2\n",
+    "an endless header": b"ply\nformat ascii 1.0\n" + b"comment la\n" * 30000,
 }
 
 
 @pytest.mark.parametrize("kind", ODD)
 @pytest.mark.parametrize("reader", [read_point_cloud, checkpoint.read_field])
-def test_what_is_no_field_is_refused(reader: Any, verdict: Any, tmp_path: Path, kind: str) -> None:
+def test_other_contents_are_refused(reader: Any, verdict: Any, tmp_path: Path, kind: str) -> None:
     path = tmp_path / "ünï cöde.ply"
     path.write_bytes(ODD[kind])
     assert verdict(lambda: reader(path), len(ODD[kind])) is not None
 
 
-def test_numbers_that_are_not_finite_are_left_out(verdict: Any, tmp_path: Path) -> None:
+def test_points_that_are_not_finite_are_dropped(verdict: Any, tmp_path: Path) -> None:
     rows = b"nan 0 0\n0 inf 0\n1e300 0 0\n1 2 3\n"
     path = tmp_path / "a.ply"
     path.write_bytes(HEADER % (b"ascii", b"4", XYZ.replace(b"float", b"double")) + rows)

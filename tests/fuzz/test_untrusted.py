@@ -1,6 +1,6 @@
-"""Files from strangers whose insides name places outside: reading one writes nothing, starts nothing and asks no network.
+"""Untrusted files that name paths outside their folder: reading them writes nothing, runs nothing and opens no socket.
 
-The interpreter itself tells what a reader does (PEP 578).
+An audit hook of the interpreter records what a reader does (PEP 578).
 """
 
 from __future__ import annotations
@@ -38,36 +38,37 @@ PLACES = (
 )
 ACTS = ("os.mkdir", "os.rename", "os.remove", "os.link", "os.symlink", "os.chmod", "os.system", "os.exec", "os.fork")
 ACTS += ("os.posix_spawn", "subprocess.Popen", "socket.connect", "socket.bind", "shutil.unpack_archive")
-done: list[str] | None = None
-"""What has been done while somebody looks; None while nobody does. Hooks of the interpreter stay for good."""
+recorded: list[str] | None = None
+"""Acts recorded in :func:`watched`; None outside of it, because an audit hook cannot be removed."""
 
 
-def note(event: str, arguments: tuple[Any, ...]) -> None:
-    if done is None:
+def record(event: str, arguments: tuple[Any, ...]) -> None:
+    if recorded is None:
         return
     if event == "open":
         path, mode, flags = arguments
         writes = isinstance(mode, str) and any(letter in mode for letter in "wax+")
         if writes or (isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)):
-            done.append(f"open {path!r} to write")
+            recorded.append(f"open {path!r} to write")
     elif event in ACTS:
-        done.append(f"{event} {arguments!r}")
+        recorded.append(f"{event} {arguments!r}")
 
 
-sys.addaudithook(note)
+sys.addaudithook(record)
 
 
 @contextmanager
 def watched() -> Iterator[list[str]]:
-    global done  # noqa: PLW0603
-    done = []
+    """Yield a list to which the acts of the block are added."""
+    global recorded  # noqa: PLW0603
+    recorded = []
     try:
-        yield done
+        yield recorded
     finally:
-        done = None
+        recorded = None
 
 
-def test_the_watch_sees_what_it_should(tmp_path: Path) -> None:
+def test_the_hook_records_writes_and_no_reads(tmp_path: Path) -> None:
     with watched() as found:
         (tmp_path / "a").mkdir()
         (tmp_path / "a" / "b").write_text("x")
@@ -81,7 +82,7 @@ def field() -> dict[str, torch.Tensor]:
 
 
 def a_checkpoint(path: Path, place: str) -> None:
-    """One whose archive also has members outside, a link among them, and whose tensors are named so."""
+    """Write a checkpoint that names ``place`` as a member of its archive, as the target of a link and as a tensor."""
     buffer = io.BytesIO()
     state = {f"_model.gauss_params.{name}": value for name, value in field().items()}
     torch.save({"step": 3, "pipeline": state | {place: torch.zeros(2)}}, buffer)
@@ -94,7 +95,7 @@ def a_checkpoint(path: Path, place: str) -> None:
 
 
 def a_pack(path: Path, place: str) -> None:
-    """One with a section of that name, and the name in whatever its header says."""
+    """Write a packed scene that names ``place`` as a section and throughout its header."""
     write_scene(path, Scene(field(), meta={"source": {"method": place}, "name": place, "model": {"sh_degree": 1}}))
     header = container.read_header(path)
     meta = {name: value for name, value in header.meta.items() if name != "sections"}
@@ -103,6 +104,7 @@ def a_pack(path: Path, place: str) -> None:
 
 
 def a_ply(path: Path, place: str) -> None:
+    """Write a .ply that names ``place`` in its comments."""
     write_ply(path, field(), comments=[place, f"TextureFile {place}"])
 
 
@@ -128,7 +130,7 @@ def test_nothing_leaves_the_file(tmp_path: Path, name: str, place: str, verdict:
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_an_unpacked_run_stays_in_the_folder_that_was_asked_for(tmp_path: Path, place: str) -> None:
+def test_an_unpacked_run_stays_in_the_given_folder(tmp_path: Path, place: str) -> None:
     a_pack(tmp_path / "a.sundae", place)
     scene = read_scene(tmp_path / "a.sundae")
     out = tmp_path / "deep" / "er" / "runs"
@@ -144,7 +146,7 @@ def test_an_unpacked_run_stays_in_the_folder_that_was_asked_for(tmp_path: Path, 
 
 
 def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:
-    """A .sog is a zip that others unpack."""
+    """A .sog is a zip that other programs unpack."""
     write_for_viewers(tmp_path / "a.sog", field())
     with zipfile.ZipFile(tmp_path / "a.sog") as archive:
         names = archive.namelist()
@@ -152,13 +154,15 @@ def test_members_of_an_exported_archive_are_plain_names(tmp_path: Path) -> None:
     assert all(Path(name).name == name for name in names)
 
 
-def test_a_capture_may_not_make_its_reader_write(tmp_path: Path, verdict: Any) -> None:
+def test_reading_a_capture_writes_nothing(tmp_path: Path, verdict: Any) -> None:
     from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-    from sundae_ns.data import write_scene as write_capture
+    from sundae_ns.data import write_embedded_capture
     from sundae_ns.datamanager import LightNerfstudioParser, check_capture
 
-    data = write_capture(tmp_path / "scene", train_views=3, test_views=1, width=16, height=16, points=30, samples=1)
+    data = write_embedded_capture(
+        tmp_path / "scene", train_views=3, test_views=1, width=16, height=16, points=30, samples=1
+    )
     for place in PLACES:
         copy = Path(shutil.copytree(data, tmp_path / "copy"))
         meta = json.loads((copy / "transforms.json").read_text())

@@ -1,4 +1,4 @@
-"""First values of a field: sizes from neighbours, colours from points, and nothing that is not finite."""
+"""Initial parameters of a field: scales from neighbours, colours from points, all finite."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def cloud(n: int = 50) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.randn(n, 3, generator=generator), torch.rand(n, 3, generator=generator)
 
 
-def test_one_primitive_a_point() -> None:
+def test_one_primitive_per_point() -> None:
     points, rgb = cloud()
     params = from_points(points, rgb, sh_degree=3, num_features=5)
     assert tuple(params) == (*SPLAT_NAMES[:3], "features_dc", "features_rest", "opacities", "features")
@@ -61,7 +61,7 @@ def test_coincident_points_get_a_finite_width() -> None:
     assert torch.isfinite(same).all()
 
 
-def test_points_that_are_not_finite_are_left_out() -> None:
+def test_points_that_are_not_finite_are_dropped() -> None:
     points, rgb = cloud()
     points[3, 1], points[7, 0], rgb[9, 2] = torch.nan, torch.inf, torch.nan
     params = from_points(points, rgb, sh_degree=1, num_features=1)
@@ -77,7 +77,7 @@ def test_no_finite_point(points: torch.Tensor) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_no_features_unless_asked_for() -> None:
+def test_no_features_for_zero_channels() -> None:
     assert "features" not in from_points(*cloud(), sh_degree=0, num_features=0)
 
 
@@ -92,7 +92,7 @@ def test_features_begin_with_the_colour_and_differ(width: int) -> None:
     assert (noise.std(dim=0) > 0.02).all()
 
 
-def test_generator_makes_it_repeatable() -> None:
+def test_equal_generators_give_equal_fields() -> None:
     first, second, other = (
         from_points(*cloud(), sh_degree=0, num_features=4, generator=torch.Generator().manual_seed(seed))
         for seed in (1, 1, 2)

@@ -1,4 +1,4 @@
-"""Covariances, overlap, merging, and rewriting a field in training."""
+"""Covariances, overlap, merging, and overwriting a field during training."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.covariance import covariances, mean_shadow, overlap, quaternions, rotations
+from sundae_ns.gaussians.covariance import covariances, mean_projected_area, overlap, quaternions
 from sundae_ns.gaussians.merging import merge
 from sundae_ns.gaussians.rewriting import rewrite
+from sundae_ns.gaussians.rotations import rotation_matrices
 
 
 def field(n: int = 12, seed: int = 0) -> dict[str, Tensor]:
@@ -33,20 +34,21 @@ def test_a_group_becomes_one_with_the_moments_of_the_mixture() -> None:
     assert {name: value.shape for name, value in found.items()} == {k: (4, *v.shape[1:]) for k, v in params.items()}
     for place, owner in enumerate([0, 4, 6, 7]):
         group = heir == owner
-        share = w[group] / w[group].sum()
-        mean = share @ params["means"][group]
+        weight = w[group] / w[group].sum()
+        mean = weight @ params["means"][group]
         offset = params["means"][group] - mean
-        S = (share[:, None, None] * (covariance_of(params)[group] + offset[:, :, None] * offset[:, None, :])).sum(dim=0)
+        spread = offset[:, :, None] * offset[:, None, :]
+        S = (weight[:, None, None] * (covariance_of(params)[group] + spread)).sum(dim=0)
         torch.testing.assert_close(found["means"][place], mean)
         torch.testing.assert_close(covariance_of(found)[place], S)
         for name in ("features_dc", "features_rest", "features"):
-            expected = torch.einsum("n,n...->...", share, params[name][group])
+            expected = torch.einsum("n,n...->...", weight, params[name][group])
             torch.testing.assert_close(found[name][place], expected)
     # 6 is alone.
     assert all(torch.equal(found[name][2], params[name][6]) for name in params)
 
 
-def test_clones_behind_each_other_multiply_what_they_let_through() -> None:
+def test_transmittances_of_clones_multiply() -> None:
     params = {name: value.expand(3, *value.shape[1:]).clone() for name, value in field(1).items()}
     params["opacities"][:] = math.log(0.3 / 0.7)
     found = merge(params, torch.zeros(3, dtype=torch.long), torch.ones(3))
@@ -54,8 +56,8 @@ def test_clones_behind_each_other_multiply_what_they_let_through() -> None:
     torch.testing.assert_close(covariance_of(found), covariance_of(params)[:1])
 
 
-def test_a_wall_of_small_ones_stays_as_dark() -> None:
-    # Optical depth times shadow is what leaves a picture darker, seen from afar.
+def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging() -> None:
+    # From afar, a primitive absorbs its optical depth times its projected area.
     params = field(100)
     params["means"] = torch.cartesian_prod(*[torch.arange(10.0).double()] * 2, torch.zeros(1).double())
     params["scales"][:] = torch.tensor([0.4, 0.4, 1e-3]).double().log()
@@ -63,26 +65,28 @@ def test_a_wall_of_small_ones_stays_as_dark() -> None:
     params["opacities"][:] = -2.0
     found = merge(params, torch.zeros(100, dtype=torch.long), torch.ones(100))
 
-    def darkness(p: dict[str, Tensor]) -> float:
-        return float((-torch.log1p(-p["opacities"].sigmoid().squeeze(1)) * mean_shadow(p["scales"].exp())).sum())
+    def absorption(p: dict[str, Tensor]) -> float:
+        return float(
+            (-torch.log1p(-p["opacities"].sigmoid().squeeze(1)) * mean_projected_area(p["scales"].exp())).sum()
+        )
 
-    assert darkness(found) == pytest.approx(darkness(params))
+    assert absorption(found) == pytest.approx(absorption(params))
     assert float(found["scales"].exp().min()) == pytest.approx(1e-3)
 
 
 def test_merging_commutes_with_rotation_scale_and_shift() -> None:
     params, heir, w = field(), torch.tensor([0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, -1]), torch.rand(12)
     turn = torch.randn(1, 4, dtype=torch.float64)
-    R = rotations(turn)[0]
+    R = rotation_matrices(turn)[0]
     moved = {**params, "means": 8 * params["means"] @ R.T + 100, "scales": params["scales"] + math.log(8)}
-    moved["quats"] = quaternions(R @ rotations(params["quats"]))
+    moved["quats"] = quaternions(R @ rotation_matrices(params["quats"]))
     before, after = merge(params, heir, w), merge(moved, heir, w)
     torch.testing.assert_close(after["means"], 8 * before["means"] @ R.T + 100)
     torch.testing.assert_close(covariance_of(after), 64 * R @ covariance_of(before) @ R.T)
     torch.testing.assert_close(after["opacities"], before["opacities"])
 
 
-def test_without_weight_nothing_changes_and_weights_have_no_unit() -> None:
+def test_groups_without_weight_are_unchanged_and_the_scale_of_weights_is_irrelevant() -> None:
     params, heir = field(), torch.tensor([0] * 6 + [6] * 6)
     for w in (torch.zeros(12), torch.full((12,), torch.nan)):
         found = merge(params, heir, w)
@@ -92,7 +96,7 @@ def test_without_weight_nothing_changes_and_weights_have_no_unit() -> None:
     assert all(torch.allclose(small[name], plain[name]) for name in params)
 
 
-def test_a_weight_that_is_not_a_number_counts_as_none() -> None:
+def test_weights_that_are_nan_infinite_or_negative_count_as_zero() -> None:
     params, heir, w = field(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
     w[[1, 7]] = 0
     expected = merge(params, heir, w)
@@ -102,7 +106,7 @@ def test_a_weight_that_is_not_a_number_counts_as_none() -> None:
         assert all(torch.equal(found[name], expected[name]) for name in params), odd
 
 
-def test_one_axis_that_overflows_leaves_its_group_as_it_is_and_others_are_merged() -> None:
+def test_a_group_with_an_axis_that_overflows_is_unchanged_and_others_are_merged() -> None:
     params = field()
     params["scales"][2, 1] = 400.0
     params["quats"][2] = torch.tensor([1.0, 0, 0, 0]).double()
@@ -124,7 +128,7 @@ def test_extremes_stay_finite() -> None:
     assert float(found["opacities"].sigmoid().max()) <= 0.99 + 1e-6
 
 
-def test_what_overflows_or_vanishes_stays_as_it_is() -> None:
+def test_groups_that_overflow_or_vanish_are_unchanged() -> None:
     params = field()
     params["scales"][0], params["scales"][6] = 500.0, -500.0
     params["scales"][7:] = -500.0
@@ -135,7 +139,7 @@ def test_what_overflows_or_vanishes_stays_as_it_is() -> None:
     assert not torch.equal(found["means"][1], params["means"][3])
 
 
-def test_overlap_is_one_with_oneself_falls_with_distance_and_has_no_unit() -> None:
+def test_overlap_with_itself_is_one_falls_with_distance_and_is_scale_invariant() -> None:
     params = field(200)
     S, means = covariance_of(params), params["means"]
     indices = torch.stack([torch.arange(200), torch.arange(200).roll(1)], dim=1)
@@ -148,7 +152,7 @@ def test_overlap_is_one_with_oneself_falls_with_distance_and_has_no_unit() -> No
     apart = overlap(torch.tensor([[0.0, 0, 0], [2.0, 0, 0]]).double(), unit, torch.tensor([[1], [0]]), least_width=0.0)
     assert apart.squeeze(1).tolist() == pytest.approx([math.exp(-0.5)] * 2)
     flat = torch.diag(torch.tensor([1.0, 1.0, 0.0])).double().expand(2, 3, 3)
-    # Against the formula, with LAPACK's determinants and inverses.
+    # Compare with the formula, with determinants and inverses of LAPACK.
     S = S + 0.3**2 * torch.eye(3)
     middle = (S + S.roll(1, dims=0)) / 2
     offset = means - means.roll(1, dims=0)
@@ -159,9 +163,9 @@ def test_overlap_is_one_with_oneself_falls_with_distance_and_has_no_unit() -> No
     assert overlap(torch.zeros(2, 3).double(), flat, torch.tensor([[1], [0]]), least_width=0.0).isfinite().all()
 
 
-def test_overlap_of_needles_is_known_where_rounding_leaves_no_pivot() -> None:
-    # Two crossed needles of 1e6 by 1e-6 at one spot, turned so that no axis is an axis of the matrices.
-    turn = rotations(torch.tensor([[0.3, -0.5, 0.7, 0.2]]).double())
+def test_overlap_of_needles_survives_pivots_lost_to_rounding() -> None:
+    # Two crossed needles of 1e6 by 1e-6 with one centre, rotated away from the coordinate axes.
+    turn = rotation_matrices(torch.tensor([[0.3, -0.5, 0.7, 0.2]]).double())
     crossed = torch.diag_embed(torch.tensor([[1e6, 1e-6, 1e-6], [1e-6, 1e6, 1e-6]]).double().square())
     found = overlap(
         torch.zeros(2, 3).double(), turn @ crossed @ turn.mT, torch.tensor([[0, 1], [1, 0]]), least_width=1e-6
@@ -171,7 +175,7 @@ def test_overlap_of_needles_is_known_where_rounding_leaves_no_pivot() -> None:
     assert float(found[:, 1].max()) < 1e-3
 
 
-def test_pieces_of_rows_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_of_rows_give_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
     params = field(50)
     indices = torch.randint(50, (50, 4))
     whole = overlap(params["means"], covariance_of(params), indices, least_width=0.1)
@@ -184,16 +188,16 @@ def test_pieces_of_rows_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     assert all(torch.equal(again[name], merged[name]) for name in merged)
 
 
-def test_quaternions_and_rotations_are_inverse_at_every_half_turn() -> None:
+def test_quaternions_inverts_rotations_also_at_half_turns() -> None:
     turns = torch.cat([torch.eye(4), torch.randn(200, 4), torch.randn(200, 4) * torch.tensor([1e-4, 1, 1, 1])]).double()
-    torch.testing.assert_close(rotations(quaternions(rotations(turns))), rotations(turns))
-    assert torch.equal(rotations(torch.zeros(1, 4)), torch.eye(3)[None])
+    torch.testing.assert_close(rotation_matrices(quaternions(rotation_matrices(turns))), rotation_matrices(turns))
+    assert torch.equal(rotation_matrices(torch.zeros(1, 4)), torch.eye(3)[None])
 
 
-def test_the_mean_shadow_is_that_of_spheres_and_discs() -> None:
-    found = mean_shadow(torch.tensor([[2.0, 2, 2], [1, 1, 0], [3, 2, 1]]).double())
+def test_mean_projected_area_of_spheres_and_discs() -> None:
+    found = mean_projected_area(torch.tensor([[2.0, 2, 2], [1, 1, 0], [3, 2, 1]]).double())
     assert float(found[0]) == pytest.approx(4)
-    # A disc's is half its area; a = 3, b = 2, c = 1 has a surface of 48.882.
+    # For a disc it is half the area; the surface of a = 3, b = 2, c = 1 is 48.882.
     assert float(found[1]) == pytest.approx(0.5, rel=0.012)
     assert float(found[2]) == pytest.approx(48.882 / (4 * math.pi), rel=0.012)
 
@@ -207,7 +211,7 @@ def trained(n: int = 6) -> tuple[dict[str, Parameter], dict[str, torch.optim.Opt
     return params, optimizers
 
 
-def test_rewriting_forgets_directions_where_values_changed_and_keeps_the_rest() -> None:
+def test_rewriting_resets_first_moments_of_changed_values_only() -> None:
     params, optimizers = trained()
     before = {name: value.detach().clone() for name, value in params.items()}
     values = {name: value.clone() for name, value in before.items()}
@@ -235,10 +239,10 @@ def test_rewriting_before_the_first_step_and_without_an_optimizer() -> None:
     assert not any(optimizer.state for optimizer in optimizers.values())
 
 
-def test_rewriting_refuses_what_does_not_fit_and_changes_nothing() -> None:
+def test_rewriting_refuses_wrong_names_and_shapes_and_changes_nothing() -> None:
     params, optimizers = trained()
     before = params["means"].detach().clone()
     for values in ({"means": before + 1, "colour": before}, {"means": before + 1, "scales": before[:2]}):
-        with pytest.raises(DataError, match="one row a primitive"):
+        with pytest.raises(DataError, match="one row per primitive"):
             rewrite(params, optimizers, values)
     assert torch.equal(params["means"].detach(), before)

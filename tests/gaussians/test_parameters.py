@@ -1,4 +1,4 @@
-"""Shapes of a field, and degrees of its harmonics."""
+"""Shapes of a field, and SH degrees."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_an_odd_shape_is_named(name: str, shape: tuple[int, ...]) -> None:
     assert found.startswith(f"{name} has shape {list(shape)}; it must be [7, ")
 
 
-def test_means_say_how_many_primitives_there_are() -> None:
+def test_means_set_the_number_of_primitives() -> None:
     assert odd_shapes(field(1) | {"means": torch.zeros(7, 4)}) == ["means has shape [7, 4]; it must be [7, 3]"]
     assert [line.partition(" ")[0] for line in odd_shapes(field(1) | {"means": torch.zeros(6, 3)})] == [
         *("scales", "quats", "features_dc", "opacities", "features_rest")

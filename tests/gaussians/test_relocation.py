@@ -1,4 +1,4 @@
-"""Moves of 3DGS-MCMC: copies that look like the one they came from, and an exact count."""
+"""Updates of 3DGS-MCMC: copies render like their original, and counts are exact."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import Parameter
@@ -27,15 +27,14 @@ def field(n: int = 30) -> tuple[dict[str, Parameter], dict[str, Adam]]:
 
 
 def integral(opacity: float, scale: float, copies: int) -> float:
-    """Of what ``copies`` primitives at one place hide along a line, by the midpoint rule."""
-    x = (torch.arange(200_000, dtype=torch.float64) + 0.5) / 200_000 * 24 - 12
+    """Integral along a line of the opacity of ``copies`` primitives at one place, by the midpoint rule."""
+    x = (torch.arange(20_000, dtype=torch.float64) + 0.5) / 20_000 * 24 - 12
     alpha = opacity * torch.exp(-0.5 * (x / scale) ** 2)
-    return float((1 - (1 - alpha) ** copies).sum() * 24 / 200_000)
+    return float((1 - (1 - alpha) ** copies).sum() * 24 / 20_000)
 
 
 @given(st.floats(0.006, 0.995), st.integers(1, MAX_COPIES))
-@settings(max_examples=40, deadline=None)
-def test_copies_hide_as_much_as_the_one(opacity: float, copies: int) -> None:
+def test_copies_are_as_opaque_as_the_original(opacity: float, copies: int) -> None:
     new, scales = split_evenly(
         torch.tensor([opacity], dtype=torch.float64), torch.ones(1, 3, dtype=torch.float64), torch.tensor([copies])
     )
@@ -43,7 +42,7 @@ def test_copies_hide_as_much_as_the_one(opacity: float, copies: int) -> None:
     assert integral(float(new), float(scales[0, 0]), copies) == pytest.approx(integral(opacity, 1.0, 1), rel=1e-6)
 
 
-def test_one_copy_is_itself_and_float32_will_do() -> None:
+def test_one_copy_is_the_original_and_float32_stays_finite() -> None:
     opacities, scales = torch.rand(50).clamp(0.01, 0.99), torch.rand(50, 3) + 0.1
     same, size = split_evenly(opacities, scales, torch.ones(50, dtype=torch.long))
     torch.testing.assert_close(same, opacities)
@@ -54,7 +53,7 @@ def test_one_copy_is_itself_and_float32_will_do() -> None:
 
 
 @pytest.mark.gpu
-def test_as_gsplats_kernel() -> None:
+def test_split_evenly_agrees_with_gsplat() -> None:
     from gsplat.relocation import compute_relocation
 
     opacities, scales = torch.rand(500).clamp(0.01, 0.99).cuda(), torch.rand(500, 3).cuda() + 0.1
@@ -91,7 +90,7 @@ def test_dead_primitives_move_onto_living_ones() -> None:
     assert relocate(params, optimizers, torch.zeros(30, dtype=torch.bool), 0.005) == 0
 
 
-def test_growing_adds_exactly_as_many() -> None:
+def test_growing_adds_the_exact_number() -> None:
     params, optimizers = field()
     old = {name: value.detach().clone() for name, value in params.items()}
     kept = moments(optimizers, params, "quats").clone()
@@ -107,7 +106,7 @@ def test_growing_adds_exactly_as_many() -> None:
     assert len(params["means"]) == 37
 
 
-def test_noise_moves_the_transparent_along_their_own_shape() -> None:
+def test_noise_moves_transparent_primitives_by_their_covariance() -> None:
     params, _ = field(2000)
     with torch.no_grad():
         params["opacities"].fill_(-9.0)
@@ -118,6 +117,6 @@ def test_noise_moves_the_transparent_along_their_own_shape() -> None:
     jitter(params, 1.0)
     moved = (params["means"].detach() - before).std(dim=0)
     assert (params["means"].detach() - before)[::2].abs().max() < 1e-6
-    # Half of them stand still; covariance, so squares of the scales: 1, e^-4, e^-8.
+    # Half of the primitives do not move; the others move by squared scales: 1, e^-4, e^-8.
     scaled = moved * torch.tensor([math.exp(4), 1.0, math.exp(8)]) * 2**0.5
     assert ((scaled > 0.55) & (scaled < 0.75)).all(), scaled  # the gate at sigmoid(-9) is 0.62

@@ -1,4 +1,4 @@
-"""Going back to a field: values and moments, and training on from there as if nothing had happened."""
+"""Snapshots of a field: values and moments come back, and training continues bit for bit."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def train(params: dict[str, Parameter], optimizers: dict[str, Adam], steps: int)
             optimizer.step()
 
 
-def test_training_goes_on_from_a_snapshot_bit_for_bit() -> None:
+def test_training_continues_from_a_snapshot_bit_for_bit() -> None:
     params, optimizers = field()
     train(params, optimizers, 3)
     saved = snapshot(params, optimizers)
@@ -36,7 +36,7 @@ def test_training_goes_on_from_a_snapshot_bit_for_bit() -> None:
     keep(params, optimizers, {}, torch.arange(20) < 7)
     narrow(params, optimizers, "features_rest", 3)
     train(params, optimizers, 5)
-    for _ in range(2):  # a snapshot can be gone back to more than once
+    for _ in range(2):  # a snapshot can be restored more than once
         restore(params, optimizers, saved)
         for name, value in params.items():
             assert optimizers[name].param_groups[0]["params"] == [value]
@@ -46,7 +46,7 @@ def test_training_goes_on_from_a_snapshot_bit_for_bit() -> None:
             assert torch.equal(value, expected[name]), name
 
 
-def test_without_moments() -> None:
+def test_snapshot_before_the_first_step_has_no_moments() -> None:
     params, optimizers = field()
     saved = snapshot(params, optimizers)
     train(params, optimizers, 1)
@@ -73,7 +73,7 @@ def test_narrow_keeps_the_first_columns_and_their_moments() -> None:
         moments = optimizers["features_rest"].state[params["features_rest"]]
 
 
-def test_a_network_goes_back_in_place() -> None:
+def test_a_network_is_restored_in_place() -> None:
     net = nn.Sequential(nn.Linear(3, 4), nn.Linear(4, 1))
     optimizer = Adam(net.parameters())
 

@@ -1,4 +1,4 @@
-"""Removal of primitives from a field in training: nothing forgotten, nothing lost on error."""
+"""Removal of primitives from a field during training: complete, and without effect on error."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def some(n: int = 20) -> Tensor:
     return torch.arange(n) % 3 == 0
 
 
-def test_training_goes_on_as_if_only_the_kept_had_ever_been() -> None:
+def test_training_continues_as_if_only_the_kept_primitives_had_existed() -> None:
     params, optimizers = field()
     expected, expected_optimizers = field()
     keep(expected, expected_optimizers, {}, some())
@@ -81,7 +81,7 @@ def test_optimizers_hold_the_new_parameters_and_sliced_moments() -> None:
         assert state[value]["exp_avg_sq"].shape == value.shape
 
 
-def test_a_live_graph_of_the_step_before_does_no_harm() -> None:
+def test_a_live_graph_of_the_previous_step_does_not_break_training() -> None:
     params, optimizers = field()
     still_alive = params["means"].exp().sum()
     train(params, optimizers)
@@ -91,7 +91,7 @@ def test_a_live_graph_of_the_step_before_does_no_harm() -> None:
     assert still_alive.grad_fn is not None
 
 
-def test_per_primitive_state_is_sliced_and_the_rest_is_left_alone() -> None:
+def test_per_primitive_state_is_sliced_and_other_state_is_unchanged() -> None:
     params, optimizers = field()
     other = torch.rand(5)
     state: dict[str, Any] = {
@@ -117,7 +117,7 @@ def test_per_primitive_state_is_sliced_and_the_rest_is_left_alone() -> None:
     assert alone["other"] is other
 
 
-def test_one_primitive_and_a_one_element_step_are_told_apart() -> None:
+def test_a_one_element_step_of_one_primitive_is_not_sliced() -> None:
     params, optimizers = field(1)
     train(params, optimizers)
     step = optimizers["means"].state[params["means"]]["step"] = torch.ones(1)

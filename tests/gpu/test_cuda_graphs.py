@@ -1,4 +1,4 @@
-"""Which recordings are kept; what a GPU records is tested where it is used."""
+"""The cache of CUDA graphs, and the recording of one; users of recorded graphs have tests of their own."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import torch
 
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu import cuda_graphs
-from sundae_ns.gpu.cuda_graphs import MAX_SIZES, RECORD_AT, Kept, aside, record, recording
+from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, RECORD_AT, GraphCache, is_recording, record, warm_up
 
 
 @pytest.fixture
 def eager_collector() -> Iterator[None]:
-    """Python looks for garbage at almost every allocation."""
+    """Run the garbage collector at almost every allocation."""
     before = gc.get_threshold()
     gc.set_threshold(1, 1, 1)
     yield
     gc.set_threshold(*before)
 
 
-def test_what_comes_often_enough_in_a_row_is_recorded_once() -> None:
-    kept: Kept[str] = Kept()
+def test_a_key_repeated_in_a_row_is_recorded_once() -> None:
+    cache: GraphCache[str] = GraphCache()
     made: list[str] = []
 
     def get(key: str) -> str | None:
@@ -33,7 +33,7 @@ def test_what_comes_often_enough_in_a_row_is_recorded_once() -> None:
             made.append(key)
             return f"graph of {key}"
 
-        return kept.get(key, make)
+        return cache.get(key, make)
 
     for key in "abababab":
         assert get(key) is None
@@ -44,43 +44,43 @@ def test_what_comes_often_enough_in_a_row_is_recorded_once() -> None:
     assert made == ["a"]
 
 
-def test_the_one_that_was_used_longest_ago_is_forgotten() -> None:
-    kept: Kept[int] = Kept()
-    for key in range(MAX_SIZES):
+def test_the_least_recently_used_graph_is_dropped() -> None:
+    cache: GraphCache[int] = GraphCache()
+    for key in range(MAX_GRAPHS):
         for _ in range(RECORD_AT):
-            kept.get(key, lambda key=key: key)
-    kept.get(0, lambda: -1)
+            cache.get(key, lambda key=key: key)
+    cache.get(0, lambda: -1)
     for _ in range(RECORD_AT):
-        kept.get(MAX_SIZES, lambda: MAX_SIZES)
-    assert len(kept) == MAX_SIZES
-    assert kept.get(0, lambda: -1) == 0
-    assert kept.get(1, lambda: -1) is None
-    kept.put(0, 7)
-    assert kept.get(0, lambda: -1) == 7
-    kept.clear()
-    assert len(kept) == 0
-    assert kept.get(0, lambda: -1) is None  # what came last is forgotten too: it is the first time again
+        cache.get(MAX_GRAPHS, lambda: MAX_GRAPHS)
+    assert len(cache) == MAX_GRAPHS
+    assert cache.get(0, lambda: -1) == 0
+    assert cache.get(1, lambda: -1) is None
+    cache.put(0, 7)
+    assert cache.get(0, lambda: -1) == 7
+    cache.clear()
+    assert len(cache) == 0
+    assert cache.get(0, lambda: -1) is None  # the count of repeats starts anew
 
 
-def test_a_recording_keeps_what_it_calls_from_recording() -> None:
-    assert not recording()
-    with cuda_graphs._recording():
-        with cuda_graphs._recording():
-            assert recording()
-        assert recording()
+def test_code_called_in_a_recording_knows_it() -> None:
+    assert not is_recording()
+    with cuda_graphs._mark_recording():
+        with cuda_graphs._mark_recording():
+            assert is_recording()
+        assert is_recording()
         with ThreadPoolExecutor(1) as pool:
-            assert not pool.submit(recording).result()
-    assert not recording()
+            assert not pool.submit(is_recording).result()
+    assert not is_recording()
 
 
 @pytest.mark.parametrize("fails", [False, True])
 @pytest.mark.parametrize("enabled", [True, False])
-def test_no_garbage_is_collected_during_a_recording(enabled: bool, fails: bool) -> None:
+def test_no_garbage_collection_during_a_recording(enabled: bool, fails: bool) -> None:
     try:
         if not enabled:
             gc.disable()
         try:
-            with cuda_graphs._uncollected():
+            with cuda_graphs._no_garbage_collection():
                 assert not gc.isenabled()
                 if fails:
                     raise ValueError
@@ -91,7 +91,7 @@ def test_no_garbage_is_collected_during_a_recording(enabled: bool, fails: bool) 
         gc.enable()
 
 
-def test_a_failed_recording_leaves_the_stream_that_torch_stays_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_recording_restores_stream_and_generator(monkeypatch: pytest.MonkeyPatch) -> None:
     current = "main"
 
     @contextmanager
@@ -104,7 +104,7 @@ def test_a_failed_recording_leaves_the_stream_that_torch_stays_on(monkeypatch: p
             current = before
 
     class Capture:
-        """As torch's: what fails at its end leaves the stream as it is."""
+        """Like torch's: a failure at its end leaves its stream current."""
 
         def __init__(self, graph: object, *, stream: str, **_: object) -> None:
             self.stream = stream
@@ -118,7 +118,7 @@ def test_a_failed_recording_leaves_the_stream_that_torch_stays_on(monkeypatch: p
             raise RuntimeError("operation failed due to a previous error during capture\nand more lines")
 
     class Generator:
-        """As torch's: a recording that fails leaves it refusing to draw, and its copies from before do not."""
+        """Like torch's: a failed recording leaves it refusing to draw, but copies from before still draw."""
 
         def __init__(self) -> None:
             self.drawn_from = "now"
@@ -135,7 +135,7 @@ def test_a_failed_recording_leaves_the_stream_that_torch_stays_on(monkeypatch: p
     for name, stand_in in stand_ins.items():
         monkeypatch.setattr(torch.cuda, name, stand_in)
     monkeypatch.setattr(cuda_graphs, "_side_stream", lambda device: "side")
-    monkeypatch.setattr(cuda_graphs, "_failed", failed := [])
+    monkeypatch.setattr(cuda_graphs, "_abandoned", failed := [])
     ended: list[object] = []
     monkeypatch.setattr(torch._C, "_cuda_endAllocateToPool", lambda *of: ended.append(of), raising=False)
     with pytest.raises(
@@ -147,24 +147,24 @@ def test_a_failed_recording_leaves_the_stream_that_torch_stays_on(monkeypatch: p
     assert ended == [(0, "pool")]
     assert len(failed) == 1
     assert gc.isenabled()
-    assert not recording()
+    assert not is_recording()
 
     def too_much() -> None:
         raise torch.cuda.OutOfMemoryError("no room")
 
-    with pytest.raises(torch.cuda.OutOfMemoryError, match="no room"):  # not what came of it
+    with pytest.raises(torch.cuda.OutOfMemoryError, match="no room"):  # not the error that follows from it
         record(too_much, torch.device("cuda"))
     assert len(ended) == len(failed) == 2
 
 
 @pytest.mark.gpu
-def test_a_graph_among_the_garbage_does_no_harm_to_a_recording(eager_collector: None) -> None:
+def test_a_graph_in_the_garbage_does_not_break_a_recording(eager_collector: None) -> None:
     device, values = torch.device("cuda"), torch.arange(8.0, device="cuda")
 
     def plus(summand: float) -> torch.Tensor:
         return values + summand
 
-    with aside(device):
+    with warm_up(device):
         plus(1.0)
     others = [record(lambda: plus(1.0), device)]
 
@@ -172,7 +172,7 @@ def test_a_graph_among_the_garbage_does_no_harm_to_a_recording(eager_collector: 
         ring: list[object] = [others.pop()]
         ring.append(ring)
         del ring
-        assert len([[] for _ in range(1000)]) == 1000  # what the collector counts
+        assert len([[] for _ in range(1000)]) == 1000  # allocations that trigger the collector
         return plus(2.0)
 
     graph, made = record(run, device)
@@ -181,27 +181,27 @@ def test_a_graph_among_the_garbage_does_no_harm_to_a_recording(eager_collector: 
 
 
 @pytest.mark.gpu
-def test_after_a_recording_that_failed_all_is_as_before() -> None:
+def test_later_work_is_not_affected_by_a_failed_recording() -> None:
     device, values = torch.device("cuda"), torch.arange(8.0, device="cuda")
     before = torch.cuda.current_stream()
 
     def total() -> torch.Tensor:
         return (values + 1).sum()
 
-    with aside(device):
+    with warm_up(device):
         total()
     for _ in range(3):
         with pytest.raises(BackendError, match="cannot record this as a CUDA graph"):
             record(lambda: float(total()), device)  # waits for the device
         assert torch.cuda.current_stream() == before
-        assert not recording()
+        assert not is_recording()
         torch.manual_seed(1)
         drawn = torch.rand(3, device="cuda")
         large = torch.empty(2**28, device="cuda")
         held = torch.cuda.memory_reserved()
         del large
         torch.cuda.empty_cache()
-        assert torch.cuda.memory_reserved() <= held - 2**30, "the allocator gives back what is free"
+        assert torch.cuda.memory_reserved() <= held - 2**30, "the allocator releases free memory"
         torch.manual_seed(1)
         assert torch.equal(drawn, torch.rand(3, device="cuda"))
     graph, made = record(total, device)

@@ -1,4 +1,4 @@
-"""Point sets that break neighbour searches, and the truth about them."""
+"""Hard point sets for neighbour searches, and their neighbours by brute force."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _lattice(n: int) -> Tensor:
 
 
 def _sphere(n: int) -> Tensor:
-    """Points as far from the first one as rounding allows, and four times as many clones of them as places."""
+    """Points at the corners of a cube, with many clones, all equally far from the first point."""
     points = torch.zeros(n, 3, dtype=torch.float64)
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3)
     points[1:] = corners.repeat(n // 8 + 1, 1)[: n - 1]
@@ -78,7 +78,7 @@ CLOUDS: dict[str, Cloud] = {
 
 @pytest.fixture(params=CLOUDS, ids=[name.replace(" ", "-") for name in CLOUDS])
 def cloud(request: pytest.FixtureRequest) -> Cloud:
-    """One distribution: gives its first so many points, float64 ``[N, 3]``."""
+    """One distribution: maps a number N to its first N points, float64 ``[N, 3]``."""
     return CLOUDS[request.param]
 
 
@@ -90,7 +90,7 @@ def truth() -> Callable[[Tensor, int], tuple[Tensor, Tensor]]:
         x, y, z = (points.double()[:, None] - points.double()[None]).unbind(2)
         squared = (x * x + y * y + z * z).fill_diagonal_(torch.inf)
         ordered = squared.sort(dim=1, stable=True)
-        # numpy's root is rounded correctly; torch's need not be.
+        # numpy's root is correctly rounded; torch's need not be.
         return ordered.indices[:, :k], torch.from_numpy(np.sqrt(ordered.values[:, :k].numpy())).to(points.dtype)
 
     return nearest

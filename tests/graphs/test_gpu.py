@@ -1,4 +1,4 @@
-"""The search on a GPU against the one on the CPU, and what follows from it."""
+"""Neighbour search on a GPU against the CPU, and the graph and response built on it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sundae_ns.filters import high_pass, response_magnitude
-from sundae_ns.graphs import build_graph, knn, neighbors, radius_neighbors
+from sundae_ns.graphs import build_graph, knn, neighbors
 from sundae_ns.graphs.tree import build_tree
 
 pytestmark = pytest.mark.gpu
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.gpu
 
 @pytest.fixture(autouse=True)
 def kernel_runs() -> None:
-    """Without it, the search on the CPU would be compared with itself."""
+    """Without the kernel, the search on the CPU would be compared with itself."""
     assert neighbors._kernel(torch.device("cuda", torch.cuda.current_device()), torch.float32, 16) is not None
 
 
@@ -38,15 +38,6 @@ def test_same_tree_as_on_the_cpu(cloud: Callable) -> None:
     assert on_gpu.depth == on_cpu.depth
     for name in ("points", "order", "boxes", "lowest"):
         assert torch.equal(getattr(on_gpu, name).cpu(), getattr(on_cpu, name))
-
-
-@pytest.mark.parametrize("n", [1, 5000])
-def test_same_neighbours_within_a_radius(cloud: Callable, n: int) -> None:
-    points = cloud(max(n, 2)).float()[:n]
-    radius = 1.0 if n == 1 else float(knn(points, 6).distances.median().clamp_min(1e-6))
-    on_gpu, on_cpu = radius_neighbors(points.cuda(), radius, 16), radius_neighbors(points, radius, 16)
-    assert torch.equal(on_gpu.indices.cpu(), on_cpu.indices)
-    assert torch.equal(on_gpu.distances.cpu(), on_cpu.distances)
 
 
 def test_a_million_clones_of_one_point() -> None:
@@ -91,7 +82,7 @@ def test_extra_memory_grows_with_the_number_of_points_only() -> None:
         before = torch.cuda.memory_allocated()
         high_pass(build_graph(points), points)
         peaks.append((torch.cuda.max_memory_allocated() - before) / n)
-    # 2 GiB at 5,000,000 points are 429 bytes a point; 8 MiB chunks weigh more here than there.
+    # 2 GiB at 5,000,000 points are 429 bytes per point; the 8 MiB chunks add more at this size.
     assert max(peaks) < 600
     assert peaks[1] < 1.1 * peaks[0]
 
@@ -117,7 +108,7 @@ def test_without_the_kernel_the_cpu_gives_the_same(monkeypatch: pytest.MonkeyPat
     assert torch.equal(without.distances, with_kernel.distances)
 
 
-def test_a_thread_that_has_done_nothing_yet_can_search() -> None:
+def test_the_first_call_in_a_new_thread_can_search() -> None:
     points = torch.rand(5000, 3, device="cuda")
     expected = knn(points, 8).indices
     neighbors._kernel.cache_clear()

@@ -1,4 +1,4 @@
-"""The search on the CPU where a field is one tie: points so far away that float64 cannot tell the rest apart."""
+"""Search on the CPU with ties: points so far away that float64 cannot separate the others."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FAR = (1e18, 1e20, 1e25, 1e30, 1e38)
 
 
 def with_floaters(cluster: Tensor) -> Tensor:
-    """A cluster, and a point about as far away as each of :data:`FAR`, mixed; float64 ``[N, 3]``."""
+    """A cluster and one point at about each distance of :data:`FAR`, shuffled, float64 ``[N, 3]``."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.randn(len(FAR), 3, generator=generator, dtype=torch.float64)
     points = torch.cat([cluster, directions * torch.tensor(FAR, dtype=torch.float64)[:, None]])
@@ -24,13 +24,13 @@ def with_floaters(cluster: Tensor) -> Tensor:
 
 
 def with_clones(n: int) -> Tensor:
-    """Normal points, one in four of them four times at one position, float64 ``[N, 3]``."""
+    """Normal points, every fourth of them four times, float64 ``[N, 3]``."""
     points = torch.randn(n, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     return torch.cat([points, points[: n // 4].repeat(3, 1)])
 
 
 def lattice(n: int) -> Tensor:
-    """Points on a cube of cells, each as far from its neighbours as from others, float64 ``[N, 3]``."""
+    """Points on a cubic lattice, so that many distances are equal, float64 ``[N, 3]``."""
     side = round(n ** (1 / 3)) + 1
     return torch.cartesian_prod(*[torch.arange(side, dtype=torch.float64)] * 3)[:n]
 
@@ -59,37 +59,37 @@ def test_nearest_of_all_is_ordered_by_squared_distance_and_index(cluster: Callab
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_floaters_find_what_all_pairs_give_and_the_tree_is_not_asked_for_more(
+def test_floaters_match_all_pairs_and_compare_with_all_points_at_once(
     monkeypatch: pytest.MonkeyPatch, truth: Callable, dtype: torch.dtype
 ) -> None:
     points, k = with_floaters(with_clones(400)).to(dtype), 6
     asked: list[int] = []
-    all_looked_at: list[int] = []
+    compared_with_all: list[int] = []
     query, nearest_of_all = host_search._query, host_search._nearest_of_all
     monkeypatch.setattr(host_search, "_query", lambda *args: (asked.append(args[2]), query(*args))[1])
     monkeypatch.setattr(
-        host_search, "_nearest_of_all", lambda *args: (all_looked_at.append(len(args[1])), nearest_of_all(*args))[1]
+        host_search, "_nearest_of_all", lambda *args: (compared_with_all.append(len(args[1])), nearest_of_all(*args))[1]
     )
     found = knn(points, k)
     expected, distances = truth(points, k)
     assert torch.equal(found.indices, expected)
     assert torch.equal(found.distances, distances)
     assert set(asked) == {k + 2, host_search.ASKED_AGAIN * (k + 2)}
-    assert sum(all_looked_at) == len(FAR)
+    assert sum(compared_with_all) == len(FAR)
 
 
 @pytest.mark.parametrize("cluster", CLUSTERS.values(), ids=CLUSTERS)
 def test_memory_grows_with_points_and_not_with_their_square(
     monkeypatch: pytest.MonkeyPatch, cluster: Callable[[int], Tensor]
 ) -> None:
-    # Numpy tells tracemalloc of its arrays; the tree is scipy's own. One part at a time, or threads would add up by chance.
+    # tracemalloc sees numpy's arrays, not scipy's tree. One thread, so that the sum does not depend on timing.
     monkeypatch.setattr(threads, "cores", lambda: 1)
 
     def peak(n: int) -> int:
         coordinates = with_floaters(cluster(n)).numpy()
         tracemalloc.start()
         try:
-            host_search.nearest(coordinates, 16, np.inf, np.float32)
+            host_search.nearest(coordinates, 16, np.float32)
             return tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()

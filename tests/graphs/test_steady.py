@@ -1,4 +1,4 @@
-"""Graph and filters on hard point sets: each test names the property that must hold."""
+"""Graph and filters on hard point sets."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sundae_ns.filters import cheby_filter, estimate_lmax, high_pass, high_pass_kernel, response_magnitude
-from sundae_ns.graphs import NeighborGraph, adjacency, build_graph, graph_from_neighbors, laplacian, radius_neighbors
+from sundae_ns.filters import high_pass, response_magnitude
+from sundae_ns.graphs import NeighborGraph, build_graph
 
 
 def magnitude(points: Tensor, k: int = 8, **options: float) -> Tensor:
@@ -19,12 +19,12 @@ def magnitude(points: Tensor, k: int = 8, **options: float) -> Tensor:
 
 
 def check(graph: NeighborGraph, signal: Tensor) -> None:
-    """What holds on every graph: weights in [0, 1], and a response that is finite exactly where there is an edge."""
+    """Properties of every graph: weights in [0, 1], and a response that is finite exactly for nodes with an edge."""
     assert ((graph.weights >= 0) & (graph.weights <= 1)).all()
     assert (graph.indices != torch.arange(graph.N)[:, None])[graph.weights > 0].all()
     response = high_pass(graph, signal)
     assert torch.equal(response.isfinite().all(dim=1), ~graph.isolated)
-    # A mean of differences is no longer than the longest of them.
+    # A mean of differences is at most as long as the longest difference.
     reach = (signal[graph.indices] - signal[:, None]).norm(dim=2).amax(dim=1)
     assert (response.norm(dim=1) <= reach * (1 + 1e-5))[~graph.isolated].all()
 
@@ -36,17 +36,6 @@ def test_every_hard_cloud(cloud: Callable, dtype: torch.dtype, rule: str) -> Non
     check(build_graph(points, rule=rule), points)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("lap_type", ["combinatorial", "normalized"])
-def test_chebyshev_filters_stay_bounded_on_every_hard_cloud(cloud: Callable, lap_type: str) -> None:
-    L = laplacian(build_graph(cloud(300), num_neighbors=8), lap_type)  # type: ignore[arg-type]
-    x = torch.randn(300, 2, dtype=torch.float64)
-    lmax = estimate_lmax(L)
-    # The gain of a high pass is at most 1, and order 40 is within 1e-7 of it.
-    filtered = cheby_filter(L, x, high_pass_kernel(lmax or 1.0), order=40, lmax=lmax)
-    assert filtered.norm() <= (1 + 1e-6) * x.norm()
-
-
-@settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.integers(-2, 2), st.integers(-2, 2), st.integers(0, 1)), min_size=3, max_size=60),
     st.integers(-30, 15),
@@ -69,7 +58,7 @@ def test_collinear_and_coplanar_points_respond_within_their_line_and_plane(cloud
     assert (response[:, 1].nan_to_num() == 0).all()
 
 
-def test_two_clusters_1e6_apart_do_not_see_each_other() -> None:
+def test_two_clusters_1e6_apart_are_independent() -> None:
     cluster = (torch.randn(300, 3) * 16).round() / 16
     both = torch.cat([cluster, cluster + 1e6])
     assert torch.equal(both[300:] - 1e6, cluster)
@@ -90,7 +79,7 @@ def test_scale_changes_the_response_by_its_square(scale: float) -> None:
     points = torch.randn(2000, 3)
     found, scaled = magnitude(points), magnitude(points * scale)
     known = ~found.isnan()
-    # An edge as long as the cutoff may come or go by rounding: its weight is 0.011, and few are so long.
+    # Rounding may add or remove an edge at the cutoff; its weight is 0.011, and such edges are rare.
     off = ((scaled.double() / scale**2 - found).abs() > 1e-4 * found)[known]
     assert off.sum() <= 4  # measured 0
     assert (scaled.isnan() != found.isnan()).sum() == 0
@@ -107,17 +96,12 @@ def test_rotation_and_permutation_are_followed() -> None:
     assert torch.equal(magnitude(single[order]).nan_to_num(-1), magnitude(single)[order].nan_to_num(-1))
 
 
-def test_one_node_two_nodes_and_none() -> None:
-    for n in (0, 1):
-        graph = graph_from_neighbors(radius_neighbors(torch.zeros(n, 3), 1.0, 4))
-        check(graph, torch.zeros(n, 3))
-        assert laplacian(graph).shape == (n, n)
-        assert cheby_filter(laplacian(graph), torch.ones(n), high_pass_kernel(1.0)).shape == (n,)
+def test_two_nodes_at_any_distance() -> None:
     for distance in (0.0, 1e-30, 1.0, 1e18):
         points = torch.tensor([[0.0, 0, 0], [distance, 0, 0]])
         graph = build_graph(points, num_neighbors=1)
         check(graph, points)
-        assert adjacency(graph).nnz == 2
+        assert graph.Ne == 2
 
 
 def test_thousands_of_points_at_one_spot_do_not_respond() -> None:
@@ -127,6 +111,7 @@ def test_thousands_of_points_at_one_spot_do_not_respond() -> None:
     assert (found[5000:].nan_to_num(1) > 0).all()
 
 
-def test_a_missing_neighbour_and_an_infinite_width_give_no_nan() -> None:
-    graph = graph_from_neighbors(radius_neighbors(torch.randn(20, 3), 0.5, 6), sigma=float("inf"))
+def test_an_overflowing_distance_and_an_infinite_width_give_no_nan() -> None:
+    points = torch.cat([torch.randn(20, 3), torch.tensor([[3e38, 3e38, 3e38]])])
+    graph = build_graph(points, num_neighbors=6, sigma=float("inf"))
     assert set(graph.weights.unique().tolist()) == {0.0, 1.0}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import subprocess
 import sys
 import urllib.request
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +20,8 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import profiler, writer
 
 Call = Callable[..., "subprocess.CompletedProcess[str]"]
+CallHere = Callable[..., str]
+Once = Callable[[str, Callable[[Path], None]], Path]
 
 
 class TinyRun(NamedTuple):
@@ -46,8 +51,8 @@ class TinyRun(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def call(tmp_path_factory: pytest.TempPathFactory) -> Call:
-    """Run an installed command in a fresh process, out of reach of any network; its output is in the error, if any."""
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Variables for the installed commands: where they lie, a wide terminal, and no network."""
     folder = tmp_path_factory.mktemp("bin")
     ffmpeg = folder / "ffmpeg"
     ffmpeg.write_text("#!/bin/sh\nexit 1\n")
@@ -56,18 +61,23 @@ def call(tmp_path_factory: pytest.TempPathFactory) -> Call:
     # ns-render asks for ffmpeg even where it writes images only; one that is installed comes first.
     path = os.pathsep.join([str(commands), os.environ.get("PATH", ""), str(folder)])
     nowhere = "http://127.0.0.1:9"
-    environment = {**os.environ, "PATH": path, "COLUMNS": "250", "https_proxy": nowhere, "http_proxy": nowhere}
+    return {"PATH": path, "COLUMNS": "250", "https_proxy": nowhere, "http_proxy": nowhere}
 
-    def run(*arguments: object, **variables: str) -> subprocess.CompletedProcess[str]:
+
+@pytest.fixture(scope="session")
+def call(environment: dict[str, str]) -> Call:
+    """Run an installed command in a fresh process, out of reach of any network; its output is in the error, if any."""
+
+    def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         words = [str(word) for word in arguments]
         # Beside the interpreter, or where a package was put that the interpreter only knows of.
-        command = shutil.which(words[0], path=path)
+        command = shutil.which(words[0], path=environment["PATH"])
         assert command is not None, f"{words[0]} is not installed"
         result = subprocess.run(
             [command, *words[1:]],
             capture_output=True,
             text=True,
-            env={**environment, **variables},
+            env={**os.environ, **environment},
             stdin=subprocess.DEVNULL,
             check=False,
         )
@@ -78,58 +88,71 @@ def call(tmp_path_factory: pytest.TempPathFactory) -> Call:
     return run
 
 
+@pytest.fixture
+def call_here(environment: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> CallHere:
+    """Run an installed command in this process, which has imported nerfstudio; returns what it printed."""
+
+    def run(*arguments: object) -> str:
+        words = [str(word) for word in arguments]
+        (command,) = entry_points(group="console_scripts", name=words[0])
+        monkeypatch.setattr(sys, "argv", words)
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        with redirect_stdout(io.StringIO()) as out:
+            try:
+                command.load()()
+            except SystemExit as end:
+                if end.code:
+                    pytest.fail(f"{' '.join(words)}\nexit code {end.code}\n{out.getvalue()}")
+        return out.getvalue()
+
+    return run
+
+
 @pytest.fixture(scope="session")
-def tiny(call: Call, tmp_path_factory: pytest.TempPathFactory) -> TinyRun:
-    root = tmp_path_factory.mktemp("tiny")
-    scene = root / "scene"
+def tiny(call: Call, once: Once) -> TinyRun:
     points, prune_at, save_every, steps, keep_ratio = 300, 45, 30, 120, 0.5
-    call(
-        "sundae",
-        "scene",
-        scene,
-        "--train-views",
-        12,
-        "--test-views",
-        3,
-        "--width",
-        48,
-        "--height",
-        48,
-        "--points",
-        points,
-    )
-    options = {
-        "data": scene,
-        "output-dir": root / "outputs",
-        "experiment-name": "tiny",
-        "timestamp": "now",
-        "max-num-iterations": steps,
-        "steps-per-save": save_every,
-        "save-only-latest-checkpoint": False,
-        "steps-per-eval-image": 50,
-        "vis": "tensorboard",
-        "viewer.quit-on-train-completion": True,
-        "logging.steps-per-log": 5,
-        "pipeline.model.pruning.prune-at": prune_at,
-        "pipeline.model.pruning.keep-ratio": keep_ratio,
-        # One round of densification, at step 30.
-        "pipeline.model.warmup-length": 5,
-        "pipeline.model.refine-every": 15,
-        "pipeline.model.densify-grad-thresh": 0.0004,
-        "pipeline.model.sh-degree-interval": 20,
-    }
-    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
-    output = call("ns-train", "sundae-tiny", *arguments).stdout
+
+    def train(root: Path) -> None:
+        views = ("--train-views", 12, "--test-views", 3, "--width", 48, "--height", 48)
+        call("sundae", "scene", root / "scene", *views, "--points", points)
+        options = {
+            "data": root / "scene",
+            "output-dir": root / "outputs",
+            "experiment-name": "tiny",
+            "timestamp": "now",
+            "max-num-iterations": steps,
+            "steps-per-save": save_every,
+            "save-only-latest-checkpoint": False,
+            "steps-per-eval-image": 50,
+            "vis": "tensorboard",
+            "viewer.quit-on-train-completion": True,
+            "logging.steps-per-log": 5,
+            "pipeline.model.pruning.prune-at": prune_at,
+            "pipeline.model.pruning.keep-ratio": keep_ratio,
+            # One round of densification, at step 30.
+            "pipeline.model.warmup-length": 5,
+            "pipeline.model.refine-every": 15,
+            "pipeline.model.densify-grad-thresh": 0.0004,
+            "pipeline.model.sh-degree-interval": 20,
+        }
+        arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
+        (root / "output.txt").write_text(call("ns-train", "sundae-tiny", *arguments).stdout)
+
+    root = once("tiny", train)
     folder = root / "outputs" / "tiny" / "sundae-tiny" / "now"
-    return TinyRun(scene, folder, output, points, prune_at, save_every, steps, keep_ratio)
+    output = (root / "output.txt").read_text()
+    return TinyRun(root / "scene", folder, output, points, prune_at, save_every, steps, keep_ratio)
 
 
 @pytest.fixture(scope="session")
-def exported(tiny: TinyRun, call: Call, open3d: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported(tiny: TinyRun, call: Call, open3d: None, once: Once) -> Path:
     """The .ply that ns-export writes of the tiny run; skips where open3d does not import."""
-    folder = tmp_path_factory.mktemp("exported")
-    call("ns-export", "gaussian-splat", "--load-config", tiny.config, "--output-dir", folder)
-    return folder / "splat.ply"
+
+    def export(folder: Path) -> None:
+        call("ns-export", "gaussian-splat", "--load-config", tiny.config, "--output-dir", folder)
+
+    return once("exported", export) / "splat.ply"
 
 
 @pytest.fixture(autouse=True)

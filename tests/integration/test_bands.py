@@ -1,4 +1,4 @@
-"""``sundae bands`` on a finished run: through the cameras that nerfstudio itself gives to it."""
+"""``sundae bands`` on a finished run, from the cameras that nerfstudio gives to it."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from sundae_ns.cli import main
-from sundae_ns.storage.runs.folder import read_config, training_cameras
+from sundae_ns.scenes.cameras import training_cameras
 
 
 def test_cameras_are_those_of_the_run(tiny: Any) -> None:
     _, pipeline, _, _ = eval_setup(tiny.config, test_mode="test")
     expected = pipeline.datamanager.train_dataset.cameras
-    found = training_cameras(read_config(tiny.config))
+    found = training_cameras(tiny.config)
     assert len(found) == len(expected)
     torch.testing.assert_close(found.camera_to_worlds, expected.camera_to_worlds)
     torch.testing.assert_close(found.get_intrinsics_matrices(), expected.get_intrinsics_matrices())
@@ -32,7 +32,7 @@ def test_points_lie_where_the_run_renders_them(tiny: Any, tmp_path: Path, what: 
         main(["bands", str(getattr(tiny, what)), "-o", str(tmp_path), "--keep-ratio", "0.5", "--view", "2"])
     assert caught.value.code == 0
     result = json.loads((tmp_path / "bands.json").read_text())
-    assert result["looked_from"] == "training view 2"
+    assert result["seen_from"] == "training view 2"
     assert result["primitives"] == result["bands"][0]["kept"]["high"] + result["bands"][0]["kept"]["low"]
     assert set(os.listdir(tmp_path)) == {*result["files"], "bands.json"}
     with Image.open(tmp_path / "bands-0.5.png") as sheet:

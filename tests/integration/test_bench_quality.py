@@ -1,4 +1,4 @@
-"""``sundae bench quality`` and ``bench paper`` with real, tiny trainings: stopped and continued, and published layouts."""
+"""``sundae bench quality`` and ``bench paper`` with tiny trainings: stopped and resumed, and published layouts."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sundae_ns.cli import main
+from sundae_ns.cli.bench.arms import Lengths, choose_arms
 from sundae_ns.cli.bench.job import perform
 from sundae_ns.cli.bench.options import PaperOptions
-from sundae_ns.cli.bench.plan import Job, parser_of, plan_scene, schedule_of
+from sundae_ns.cli.bench.plan import Job, parser_of, plan_scene
 from sundae_ns.cli.bench.quality import run_paper
 from sundae_ns.evaluation import read_rows
 from sundae_ns.scenes.opening import open_scene
 
 WARMUP, FINETUNE = 12, 8
+WARM_UP = "sundae-tiny-warm-up"
 
 
 def in_process(job: Job, out: Path, on_percent: Callable[[float], object]) -> None:
@@ -32,13 +34,11 @@ def in_process(job: Job, out: Path, on_percent: Callable[[float], object]) -> No
 
 def test_stopped_and_continued(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arms, out = ["sundae", "random-no-head", "mcmc"], tmp_path / "out"
-    schedule = schedule_of("sundae-tiny", warmup=WARMUP, finetune=FINETUNE, scale=1)
     jobs = plan_scene(
         tiny.scene.name,
         tiny.scene.resolve(),
         parser_of(tiny.scene),
-        schedule,
-        arms=arms,
+        choose_arms(arms, "sundae-tiny", Lengths(WARMUP, FINETUNE)),
         keep_ratios=[0.5],
         seeds=[42],
         repeat_at=[0.5],
@@ -62,17 +62,17 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, capsys: pytest.Capture
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
     assert not leftover.exists()
     rows = {row.variant: row for row in read_rows(out / "results.csv")}
-    assert set(rows) == {"warm-up", *arms}
-    kept = round(0.5 * rows["warm-up"].primitives)
+    assert set(rows) == {WARM_UP, *arms}
+    kept = round(0.5 * rows[WARM_UP].primitives)
     assert {rows[arm].primitives for arm in arms} == {kept}
     for row in rows.values():
         assert None not in (row.ms_frame, row.psnr, row.train_s)
     peaks = {arm: row.peak_primitives for arm, row in rows.items()}
-    assert peaks["sundae"] == peaks["random-no-head"] == peaks["warm-up"] >= rows["warm-up"].primitives
+    assert peaks["sundae"] == peaks["random-no-head"] == peaks[WARM_UP] >= rows[WARM_UP].primitives
     assert peaks["mcmc"] == kept
     assert rows["sundae"].bytes_head > 0 == rows["random-no-head"].bytes_head
     # What was measured is what lies there: the run can be opened and looked at.
-    assert open_scene(out / "jobs" / warm_up.key / "warm-up" / "sundae-tiny" / "run").steps == WARMUP
+    assert open_scene(out / "jobs" / warm_up.key / WARM_UP / "sundae-tiny" / "run").steps == WARMUP
 
 
 def published(scene: Path, out: Path, *, factor: int) -> None:
@@ -89,8 +89,8 @@ def published(scene: Path, out: Path, *, factor: int) -> None:
     for number, frame in enumerate(meta["frames"], start=1):
         name = Path(frame["file_path"]).name
         shutil.copy(scene / frame["file_path"], out / f"images_{factor}" / name)
-        with Image.open(scene / frame["file_path"]) as picture:
-            picture.resize((width, height)).save(out / "images" / name)
+        with Image.open(scene / frame["file_path"]) as image:
+            image.resize((width, height)).save(out / "images" / name)
         pose = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1.0, -1.0, 1.0])
         turn, shift = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
         x, y, z, w = Rotation.from_matrix(turn).as_quat()
@@ -128,4 +128,4 @@ def test_a_scene_as_it_is_published(tiny: Any, tmp_path: Path) -> None:
     assert [float(camera.fx) for camera in opened.cameras] == pytest.approx([meta["fl_x"]] * len(opened.cameras))
     page = (tmp_path / "out" / "table.md").read_text()
     assert "*23.23*" in page
-    assert "Not there: bonsai, garden" in page
+    assert "Missing: bonsai, garden" in page

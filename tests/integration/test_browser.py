@@ -24,7 +24,8 @@ from PIL import Image
 from torch import Tensor
 from viser import transforms
 
-from sundae_ns.pruning import decide
+from sundae_ns.pruning import decide, kept_count
+from sundae_ns.rendering import render
 from sundae_ns.viewer import rule_config
 
 ROOT = Path(__file__).parents[2]
@@ -67,7 +68,7 @@ def camera_of(page: Any) -> Any:
     rotation = transforms.SO3(wxyz=np.array(seen.wxyz)) @ transforms.SO3.from_x_radians(np.pi)
     position = torch.tensor(seen.position, dtype=torch.float64) / 10
     pose = torch.cat([torch.tensor(rotation.as_matrix()), position[:, None]], dim=1)
-    width, height = page.pictures[-1]
+    width, height = page.images[-1]
     return get_camera(CameraState(seen.fov, seen.aspect, pose, CameraType.PERSPECTIVE), height, width)
 
 
@@ -95,7 +96,7 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
     model = pipeline.model
     browser.wait_for(server.listens, "ns-viewer", 120)
     page.open(server.address)
-    browser.wait_for(lambda: bool(page.pictures), "the first picture", 60)
+    browser.wait_for(lambda: bool(page.images), "the first picture", 60)
     page.press("Hide Train Cams")
     page.settle(lambda: page.press("Fast"), SIDE)
     page.settle(lambda: page.drag(200, 250, 140, 230), SIDE)
@@ -146,11 +147,14 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
     keep_ratio = page.settle(lambda: page.slide("Keep ratio", 0.1), SIDE)
     assert 0.05 < keep_ratio < 0.15
     config = rule_config(model.config.pruning, "as configured", keep_ratio)
-    decision = decide(model.gaussians, config, lambda: model.contribution(pipeline.datamanager, config))
+    count = kept_count(keep_ratio, model.num_points)
+    share = keep_ratio if config.uses_detail else None
+    decision = decide(model.state.field, config, lambda: model.contribution(pipeline.datamanager, share), count=count)
     assert decision.values is not None
-    part = {name: value[decision.mask] for name, value in model.gaussians.items()} | dict(decision.values)
+    settings = model.render_settings(training=False).without_head()
     with torch.no_grad():
-        preview, _ = model.render(part, model.view_of(camera_of(page)), expected["background"][0, 0], compensate=False)
+        part = model.source.part(decision.mask, decision.values)
+        preview, _ = render(part, model.view_of(camera_of(page)), expected["background"][0, 0], settings)
     previewed = scene(page)
     found["preview"] = differences(previewed, preview["rgb"])
     assert differences(previewed, expected["base_rgb"])[0] > 2 * found["preview"][0]

@@ -1,4 +1,4 @@
-"""nerfstudio's own commands on a finished run, each in a fresh process."""
+"""nerfstudio's own commands on a finished run."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from sundae_ns.gaussians import SPLAT_NAMES
 from sundae_ns.storage import is_nerfstudio_ply, read_ply
 
 
-def test_ns_eval(tiny: Any, call: Any, tmp_path: Path) -> None:
-    call("ns-eval", "--load-config", tiny.config, "--output-path", tmp_path / "eval.json")
+def test_ns_eval(tiny: Any, call_here: Any, tmp_path: Path) -> None:
+    call_here("ns-eval", "--load-config", tiny.config, "--output-path", tmp_path / "eval.json")
     result = json.loads((tmp_path / "eval.json").read_text())
     assert result["method_name"] == "sundae-tiny"
     assert result["checkpoint"].endswith(f"step-{tiny.steps - 1:09d}.ckpt")
@@ -35,9 +35,9 @@ def pictures(folder: Path) -> list[np.ndarray]:
     return [np.asarray(Image.open(path)) for path in sorted(folder.glob("*.png"))]
 
 
-def test_ns_render_interpolate(tiny: Any, call: Any, tmp_path: Path) -> None:
+def test_ns_render_interpolate(tiny: Any, call_here: Any, tmp_path: Path) -> None:
     names = ("rgb", "base_rgb", "depth", "accumulation", "features", "response", "background")
-    call(
+    call_here(
         *("ns-render", "interpolate", "--load-config", tiny.config, "--output-path", tmp_path / "out"),
         *("--output-format", "images", "--image-format", "png", "--interpolation-steps", 2),
         *("--rendered-output-names", *names),
@@ -52,7 +52,7 @@ def test_ns_render_interpolate(tiny: Any, call: Any, tmp_path: Path) -> None:
     assert 0 < np.abs(rgb - frames[0][:, 48:96]).mean() < 30
 
 
-def test_ns_render_camera_path(tiny: Any, call: Any, tmp_path: Path) -> None:
+def test_ns_render_camera_path(tiny: Any, call_here: Any, tmp_path: Path) -> None:
     pose = torch.eye(4)
     pose[2, 3] = 1.0
     turned = pose.clone()
@@ -65,7 +65,7 @@ def test_ns_render_camera_path(tiny: Any, call: Any, tmp_path: Path) -> None:
         "camera_path": [{"camera_to_world": m.flatten().tolist(), "fov": 70, "aspect": 1} for m in (pose, turned)],
     }
     (tmp_path / "path.json").write_text(json.dumps(path))
-    call(
+    call_here(
         *("ns-render", "camera-path", "--load-config", tiny.config, "--output-path", tmp_path / "out"),
         *("--output-format", "images", "--image-format", "png", "--camera-path-filename", tmp_path / "path.json"),
     )

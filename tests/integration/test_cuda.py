@@ -56,10 +56,10 @@ def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkp
         trainer.train()
     line = str(raised.value)
     found = re.fullmatch(
-        r"the GPU's memory is full: [\d.]+ [KMG]iB more were asked for, with ([\d,]+) primitives; try "
+        r"the GPU's memory is full: cannot allocate [\d.]+ [KMG]iB more with ([\d,]+) primitives; try "
         r"--pipeline\.datamanager\.cache-images cpu \(.*\), --pipeline\.datamanager\.camera-res-scale-factor 0\.5 \(.*\), "
         r"or --pipeline\.model\.pruning\.mode continuous .*--pipeline\.model\.pruning\.max-primitives (\d+) \(.*\); "
-        r"--load-dir goes on from the last checkpoint",
+        r"--load-dir resumes from the last checkpoint",
         line,
     )
     assert found, line

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,8 @@ import torch
 from torch import Tensor
 
 from sundae_ns.evaluation import psnr
+from sundae_ns.gaussians.field import Field
+from sundae_ns.rendering import LocalField, render
 from sundae_ns.scenes.opening import load_run
 from sundae_ns.storage import read_ply
 
@@ -26,18 +27,20 @@ def test_exported_files_show_the_base_colours(tiny: Any, call: Any, tmp_path: Pa
     run = load_run(tiny.config)
     background = run.model._get_background_color()
 
-    def pictures(field: Mapping[str, Tensor]) -> list[Tensor]:
+    settings = run.model.render_settings(training=False).without_head()
+
+    def images(field: dict[str, Tensor]) -> list[Tensor]:
         views = [run.model.view_of(camera) for camera in run.cameras]
         with torch.no_grad():
-            return [run.model.render(field, view, background, compensate=False)[0]["base_rgb"] for view in views]
+            return [render(LocalField(Field(field)), view, background, settings)[0]["base_rgb"] for view in views]
 
-    own = pictures(dict(run.model.gauss_params))
-    # The worst that was seen: 50.2 and 63.0 dB.
+    own = images(dict(run.model.gauss_params))
+    # The worst seen: 50.2 and 63.0 dB.
     for kind, least in (("ply", None), ("spz", 46.0), ("sog", 55.0)):
         file, back = tmp_path / f"tiny.{kind}", tmp_path / f"{kind}.ply"
         call("sundae", "export", tiny.folder, "-o", file)
         subprocess.run([str(PROGRAM), "--quiet", str(file), str(back)], check=True, capture_output=True, timeout=120)
-        for found, expected in zip(pictures(read_ply(back)), own, strict=True):
+        for found, expected in zip(images(read_ply(back)), own, strict=True):
             if least is None:
                 assert torch.equal(found, expected)
             else:

@@ -1,8 +1,9 @@
-"""Figures of a finished run, taken from the run."""
+"""Measurements of a finished run."""
 
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -18,7 +19,7 @@ from sundae_ns.cli import main
 from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import psnr
-from sundae_ns.rendering.views import zoomed
+from sundae_ns.rendering import render, zoomed
 from sundae_ns.scenes.measure import compensation, frame_figures, frame_times, sizes
 from sundae_ns.scenes.opening import load_run
 
@@ -33,12 +34,12 @@ def test_figures_of_a_run(tiny: Any) -> None:
     floats = sum(value.numel() for value in model.gauss_params.values())
     assert sizes(model).primitives == 4 * floats
     assert sizes(model).head == sum(p.numel() * p.element_size() for p in model.head.parameters())
-    # Before the head's start there is no head to time.
-    model.config.head.start_at = 10**9
+    # Before the head is enabled there is none to time.
+    model.state.head_starts_at = 10**9
     assert frame_times(model, cameras[:1], warmup=0, repeats=1).head == 0
 
 
-def test_frames_are_judged_as_they_are_timed(tiny: Any) -> None:
+def test_the_timed_frames_are_those_compared_with_the_truth(tiny: Any) -> None:
     run = load_run(tiny.config)
     run = replace(run, cameras=run.cameras[:2], truths=run.truths[:2])
     whole = frame_figures(run, warmup=0, repeats=1)
@@ -48,11 +49,11 @@ def test_frames_are_judged_as_they_are_timed(tiny: Any) -> None:
     with torch.no_grad():
         shown = [run.model.get_outputs_for_camera(camera) for camera in run.cameras]
     for name, found in (("rgb", whole.psnr), ("base_rgb", whole.psnr_base)):
-        expected = [float(psnr(picture[name], truth)) for picture, truth in zip(shown, run.truths, strict=True)]
+        expected = [float(psnr(image[name], truth)) for image, truth in zip(shown, run.truths, strict=True)]
         assert found == pytest.approx(sum(expected) / 2, abs=1e-4)
     half = frame_figures(run, factor=0.5, warmup=0, repeats=1)
     assert (half.width, half.height) == (whole.width // 2, whole.height // 2)
-    # The cameras of the run are as they were.
+    # The cameras of the run do not change.
     assert int(run.cameras[0].width) == whole.width
 
 
@@ -64,20 +65,21 @@ def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> N
     found = frame_figures(run, factor=factor, warmup=0, repeats=1)
     height, width = (round(factor * side) for side in run.truths[0].shape[:2])
     assert (found.width, found.height) == (width, height)
-    assert width != pytest.approx(factor * run.truths[0].shape[1], abs=0.1)  # or nothing would be rounded
+    assert width != pytest.approx(factor * run.truths[0].shape[1], abs=0.1)  # else nothing is rounded
     background, expected = model._get_background_color(), []
+    settings = model.render_settings(training=False).without_head()
     for camera, truth in zip(run.cameras, run.truths, strict=True):
         view = model.view_of(camera)
-        # Edges on edges: pixels are those that the whole picture is cut into.
+        # The edges of both images agree.
         K = view.K * torch.tensor([[width / view.width], [height / view.height], [1.0]])
         view = view._replace(K=K, width=width, height=height)
-        shown, _ = model.render(model.gaussians, view, background, depth=False, compensate=False)
+        shown, _ = render(model.source, view, background, settings, depth=False)
         expected.append(float(psnr(shown["base_rgb"], resize(truth, height, width))))
     assert found.psnr_base == pytest.approx(sum(expected) / len(expected), abs=1e-3)
 
 
 @torch.no_grad()
-def test_the_head_is_timed_on_what_it_sees_of_the_frame(tiny: Any) -> None:
+def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny: Any) -> None:
     run = load_run(tiny.config)
     model, whole = run.model, tuple(run.truths[0].shape[:2])
     seen: list[tuple[int, ...]] = []
@@ -88,7 +90,7 @@ def test_the_head_is_timed_on_what_it_sees_of_the_frame(tiny: Any) -> None:
         fn()
         return set(seen)
 
-    # Of its own scale, others, which are corrected at that scale, and thumbnails, which are not.
+    # Frames of other scales are corrected at the trained one, thumbnails not at all.
     for factor, expected in ((1.0, {whole}), (0.875, {whole}), (0.5, {whole}), (2.0, {whole}), (0.25, set())):
         camera = zoomed(run.cameras[0], factor)
         assert sizes_seen(partial(model.get_outputs_for_camera, camera)) == expected
@@ -96,7 +98,7 @@ def test_the_head_is_timed_on_what_it_sees_of_the_frame(tiny: Any) -> None:
     assert frame_times(model, [camera], warmup=0, repeats=1).head == 0
 
 
-def test_switching_the_head_off_for_a_while(tiny: Any) -> None:
+def test_the_head_is_disabled_inside_a_block(tiny: Any) -> None:
     run = load_run(tiny.config)
 
     def corrected() -> bool:
@@ -112,13 +114,25 @@ def test_switching_the_head_off_for_a_while(tiny: Any) -> None:
     assert corrected()
 
 
+def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path) -> None:
+    assert load_run(tiny.config).kept == tiny.keep_ratio
+    run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
+    prunes = [{"before": 200, "after": 50, "seconds": 1.0}, {"before": 80, "after": 40, "seconds": 0.5}]
+    (run / "prune.json").write_text(json.dumps(prunes))
+    found = load_run(run)
+    assert (found.kept, found.prune_s) == (0.125, 1.5)
+    (run / "prune.json").unlink()
+    found = load_run(run)
+    assert (found.kept, found.prune_s) == (None, None)
+
+
 @pytest.mark.parametrize(
     ("options", "error", "match"),
     [
         ({"precision": "fp16"}, BackendError, "a CPU runs the head in fp32"),
-        ({"factor": 0.0}, ConfigError, "no picture is 0.0 times"),
-        ({"factor": float("nan")}, ConfigError, "no picture is nan times"),
-        ({"factor": float("inf")}, ConfigError, "no picture is inf times"),
+        ({"factor": 0.0}, ConfigError, "images cannot be 0.0 times"),
+        ({"factor": float("nan")}, ConfigError, "images cannot be nan times"),
+        ({"factor": float("inf")}, ConfigError, "images cannot be inf times"),
     ],
 )
 def test_frames_that_cannot_be_measured(tiny: Any, options: dict[str, Any], error: type, match: str) -> None:
@@ -134,7 +148,7 @@ def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixt
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["factor"] for line in lines] == [1, 0.25]
     assert {line["device"] for line in lines} == {"cpu"}
-    # A quarter is where the head has faded out.
+    # At a quarter of the size the correction has faded out.
     assert lines[0]["psnr"] != lines[0]["psnr_base"]
     assert lines[1]["psnr"] == lines[1]["psnr_base"]
     with pytest.raises(SystemExit):
@@ -142,7 +156,7 @@ def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixt
     assert "PSNR off" in capsys.readouterr().out
 
 
-def test_bench_frame_prints_null_for_what_is_not_defined(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_frame_prints_null_for_undefined_figures(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["--load-config", str(tiny.config), "--views", "1", "--repeats", "1", "--factors", "0.2", "0.25"]
     with pytest.raises(SystemExit) as caught:
         main(["bench", "frame", *arguments, "--json"])
@@ -152,7 +166,7 @@ def test_bench_frame_prints_null_for_what_is_not_defined(tiny: Any, capsys: pyte
         raise AssertionError(f"JSON has no {constant}")
 
     small, larger = (json.loads(line, parse_constant=refuse) for line in capsys.readouterr().out.splitlines())
-    # 10 pixels are less than the window of SSIM.
+    # The window of SSIM is larger than 10 pixels.
     assert (small["width"], small["ssim"], small["ssim_base"]) == (10, None, None)
     assert larger["width"] == 12
     assert 0 < min(small["psnr"], larger["psnr"], larger["ssim"])

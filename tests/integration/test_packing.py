@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,15 +34,17 @@ class Packed(NamedTuple):
 def packed(tiny: Any, call: Any, tmp_path_factory: pytest.TempPathFactory) -> Packed:
     folder = tmp_path_factory.mktemp("packed")
     file = folder / "tiny.sundae"
-    output = call("sundae", "pack", tiny.folder, "-o", file).stdout
+    with redirect_stdout(io.StringIO()) as output, pytest.raises(SystemExit, match="0"):
+        main(["pack", str(tiny.folder), "-o", str(file)])
+    with pytest.raises(SystemExit, match="0"):
+        main(["unpack", str(file), "-o", str(folder / "runs"), "--name", "blind"])
     assert call("sundae", "unpack", file, "-o", folder / "runs", "--data", tiny.scene).stderr == ""
-    call("sundae", "unpack", file, "-o", folder / "runs", "--name", "blind")
     config, blind = (folder / "runs" / name / "sundae" / "unpacked" / "config.yml" for name in ("tiny", "blind"))
-    return Packed(file, output, config, blind)
+    return Packed(file, output.getvalue(), config, blind)
 
 
 def test_the_report_counts_every_byte(packed: Packed) -> None:
-    table = packed.output.partition("bits a primitive")[2]
+    table = packed.output.partition("bits per primitive")[2]
     rows = {words[0]: int(words[1].replace(",", "")) for words in map(str.split, table.strip().splitlines())}
     size = packed.file.stat().st_size
     assert rows.pop("all") == size
@@ -62,8 +66,8 @@ def test_ns_eval_finds_the_same_quality(tiny: Any, packed: Packed, call: Any, tm
         assert 0 < abs(after[key] - sum(values) / len(values)) < 0.15
 
 
-def test_ns_render_needs_no_capture(packed: Packed, call: Any, tmp_path: Path) -> None:
-    call(
+def test_ns_render_needs_no_capture(packed: Packed, call_here: Any, tmp_path: Path) -> None:
+    call_here(
         *("ns-render", "interpolate", "--load-config", packed.blind, "--output-path", tmp_path),
         *("--output-format", "images", "--image-format", "png", "--interpolation-steps", 1, "--pose-source", "train"),
     )

@@ -1,4 +1,4 @@
-"""``sundae pack --finetune`` on a finished run: what is gained, what is stored, and what stays as it was."""
+"""``sundae pack --finetune`` on a finished run: the gain, what is stored, and what does not change."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def quality(run: Any, scene: Scene, folder: Path) -> float:
-    """Mean PSNR of what is shown of a scene on the test views."""
+    """Mean PSNR of a scene on the test views, dB."""
     pipeline = load_run(write_run(scene, folder, "a", data=run.scene))
     with torch.no_grad():
         values = [
@@ -54,7 +54,7 @@ def quality(run: Any, scene: Scene, folder: Path) -> float:
     return sum(values) / len(values)
 
 
-def test_a_scene_learns_to_live_with_its_rounding(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Ten times the rates for a twentieth of the steps.
     monkeypatch.setattr(packing_finetune, "RATES", {name: 10 * rate for name, rate in packing_finetune.RATES.items()})
     seen: list[dict[str, Tensor]] = []
@@ -72,13 +72,14 @@ def test_a_scene_learns_to_live_with_its_rounding(tiny: Any, tmp_path: Path, mon
     monkeypatch.setattr(SundaeModel, "get_outputs", render)
     assert digests(tiny.folder) == before
     assert len(losses) == len(seen) == 60
-    # Pictures are made of rounded values: rounding them once more changes nothing.
+    # Images are made of rounded values: rounding them again changes nothing.
     assert codecs.head is not None
     for state in (seen[0], seen[1], seen[-1]):
         shown = codecs.rounded({name: state[f"gauss_params.{name}"] for name in codecs.field})
         assert all(torch.equal(shown[name], state[f"gauss_params.{name}"]) for name in ("scales", "features_dc"))
         for name in trained.head:
-            assert torch.equal(codecs.head.rounded(name, state[f"head.{name}"]), state[f"head.{name}"])
+            value = state[f"networks.head.{name}"]
+            assert torch.equal(codecs.head.rounded(name, value), value)
     assert not torch.equal(seen[0]["gauss_params.scales"], seen[-1]["gauss_params.scales"])
     assert trained.meta["source"] == {**scene.meta["source"], "finetuned": 60}
     # The positions are those of a pack without it, and everything else has moved.
@@ -95,7 +96,7 @@ def test_a_scene_learns_to_live_with_its_rounding(tiny: Any, tmp_path: Path, mon
     assert all(torch.equal(found.field[name], shown[name]) for name in codecs.field)
     write_fitted(tmp_path / "b.sundae", *fit_scene(scene, COARSE))
     plain = quality(tiny, read_scene(tmp_path / "b.sundae"), tmp_path / "plain")
-    # As much training without the rounding, which comes as a surprise then; most that of the positions, on so small a scene.
+    # As many steps without rounding in the loop; on so small a scene the rounding of the positions costs most.
     blind, _ = finetune(tiny.folder, scene, PackConfig(), 60)
     write_fitted(tmp_path / "c.sundae", *fit_scene(blind, COARSE))
     surprised = quality(tiny, read_scene(tmp_path / "c.sundae"), tmp_path / "blind")
@@ -148,7 +149,7 @@ def test_a_run_of_splatfacto(tiny: Any, tmp_path: Path) -> None:
     config.pipeline.model.sh_degree = 2
     field = scene_of_run(tiny.folder, max_cameras=0).field
     rest = 0.1 * torch.randn(len(field["means"]), 8, 3)
-    rest[::2] = 0  # these look the same from everywhere, and stay so
+    rest[::2] = 0  # these colours stay view-independent
     state = {f"_model.gauss_params.{name}": value for name, value in field.items() if name != "features"}
     state |= {"_model.gauss_params.features_rest": rest, "_model.device_indicator_param": torch.zeros(0)}
     checkpoint.save({"step": 29999, "pipeline": state}, tmp_path / "nerfstudio_models" / "step-000029999.ckpt")
@@ -164,13 +165,13 @@ def test_a_run_of_splatfacto(tiny: Any, tmp_path: Path) -> None:
     assert not torch.equal(trained.field["features_rest"], fitted.field["features_rest"])
 
 
-def test_runs_that_cannot_be_tuned(tiny: Any, tmp_path: Path) -> None:
+def test_runs_that_cannot_be_fine_tuned(tiny: Any, tmp_path: Path) -> None:
     run = tmp_path / "run"
     (run / "nerfstudio_models").mkdir(parents=True)
     shutil.copy(tiny.config, run)
     shutil.copy(tiny.checkpoint(30), run / "nerfstudio_models")
     scene = scene_of_run(run)
-    with pytest.raises(CheckpointError, match="was still growing"):
+    with pytest.raises(CheckpointError, match="was saved during densification"):
         finetune(run, scene, PackConfig(), 3)
     with pytest.raises(ConfigError, match="changes nothing"):
         finetune(run, scene, PackConfig(), 0)

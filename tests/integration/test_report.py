@@ -15,6 +15,7 @@ from nerfstudio.configs.method_configs import method_configs
 
 from sundae_ns.cli import main
 from sundae_ns.evaluation import COLUMNS, flip_available, read_rows
+from sundae_ns.rendering import render
 from sundae_ns.scenes.measure import quality
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import scene_of_run
@@ -52,13 +53,14 @@ def report(tiny: Any, stock: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     return out
 
 
-def test_files(report: Path) -> None:
+def test_files(report: Path, stock: Path) -> None:
     names = {path.name for path in report.iterdir()}
-    pictures = {"cost.png", "gain.png", "views.png", "curves.png", "errors-1.png", "errors-2.png"}
-    assert names == {"report.json", "report.csv", "report.md"} | pictures
+    images = {"gain.png", "views.png", "curves.png", "errors-1.png", "errors-2.png"}
+    images |= {f"quality-{cost}.png" for cost in ("size", "time", "primitives")}
+    assert names == {"report.json", "report.csv", "report.md"} | images
     text = (report / "report.md").read_text()
-    assert all(f"({name})" in text for name in pictures)
-    assert "Curves of stock/splatfacto: there are no event files" in text
+    assert all(f"({name})" in text for name in images)
+    assert f"Curves of stock/splatfacto: {stock} holds no tensorboard event files" in text
     with open(report / "report.csv", newline="") as file:
         assert tuple(next(csv.reader(file))) == COLUMNS
 
@@ -68,7 +70,7 @@ def test_rows_are_of_the_runs(report: Path, tiny: Any) -> None:
     assert (ours.scene, ours.method, ours.steps, ours.keep_ratio) == ("scene", "sundae-tiny", tiny.steps, 0.5)
     assert (theirs.scene, theirs.method, theirs.steps, theirs.keep_ratio) == ("scene", "splatfacto", 7000, 1.0)
     assert ours.primitives == theirs.primitives
-    # The same primitives, rendered without a head, are the same pictures, whoever's configuration says so.
+    # The same primitives without a head give the same images, whichever method the configuration names.
     assert ours.psnr_base == theirs.psnr == theirs.psnr_base
     assert ours.psnr != ours.psnr_base
     assert min(ours.ms_frame, ours.ms_splat, ours.ms_head, theirs.ms_frame) > 0
@@ -82,16 +84,12 @@ def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any
     assert [way["name"] for way in theirs["configurations"]] == ["head off"]
     opened = open_scene(tiny.folder)
     model = opened.model
-    for way, compensate in zip(ours["configurations"], (True, False), strict=True):
+    with_head = model.render_settings(training=False)
+    for way, settings in zip(ours["configurations"], (with_head, with_head.without_head()), strict=True):
         assert way["ms"] > 0
         with torch.no_grad():
-            pictures, _ = model.render(
-                model.gaussians,
-                model.view_of(opened.cameras[1]),
-                model._get_background_color(),
-                compensate=compensate,
-            )
-        expected = quality(pictures["rgb"], opened.truths[1])
+            images, _ = render(model.source, model.view_of(opened.cameras[1]), model._get_background_color(), settings)
+        expected = quality(images["rgb"], opened.truths[1])
         found = way["views"][1]
         assert (found["psnr"], found["ssim"]) == (pytest.approx(expected.psnr), pytest.approx(expected.ssim))
         assert (found["flip"] is not None) == flip_available()
@@ -158,7 +156,7 @@ def test_a_capture_that_moved(tiny: Any, stock: Path, tmp_path: Path, capsys: py
     config.data = config.pipeline.datamanager.data = tmp_path / "gone"
     (run / "config.yml").write_text(yaml.dump(config))
     assert sundae("report", run, "-o", tmp_path / "out") == 2
-    assert "is gone; say with --data" in one_line(capsys)
+    assert "is missing; give its folder with --data" in one_line(capsys)
     options = ("--data", tiny.scene, "--repeats", 0)
     assert sundae("report", run, "-o", tmp_path / "out", *options) == 0
     (row,) = read_rows(tmp_path / "out" / "report.csv")
@@ -173,7 +171,7 @@ def test_a_packed_scene_counts_the_bytes_of_its_file(
     with torch.no_grad():
         write_scene(packed, scene_of_run(tiny.folder))
     assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0) == 2
-    assert "say it with --data" in one_line(capsys)
+    assert "give the capture with --data" in one_line(capsys)
     assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0, "--data", tiny.scene) == 0
     (row,) = read_rows(tmp_path / "out" / "report.csv")
     before = read_rows(report / "report.csv")[0]

@@ -1,4 +1,4 @@
-"""Train, prune, save, resume: the tiny run, and what goes on from it."""
+"""Train, prune, save, resume: the tiny run, and runs that resume it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
-from sundae_ns.errors import MemoryExhaustedError
+from sundae_ns.errors import CheckpointError, MemoryExhaustedError
 from sundae_ns.gaussians import SPLAT_NAMES
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage import MODEL_FRAME, write_ply
@@ -68,7 +68,7 @@ def test_loss_falls(scalars: dict[str, dict[int, float]], tiny: Any) -> None:
     loss = scalars["Train Loss Dict/main_loss"]
     early = [value for step, value in loss.items() if step < 15]
     late = [value for step, value in loss.items() if step >= tiny.steps - 15]
-    # Backgrounds are random, so what a picture's empty part costs is too.
+    # Backgrounds are random, and so is the loss of an image's empty part.
     assert sum(late) / len(late) < 0.85 * sum(early) / len(early)
 
 
@@ -93,10 +93,11 @@ def test_checkpoints_are_plain_and_hold_no_lpips(tiny: Any) -> None:
         assert state["pipeline"]["_model._extra_state"]["step"] == step
         for name, value in field(state).items():
             (moments,) = state["optimizers"][name]["state"].values()
-            # Features have no gradient, and so no moments, before the head takes part.
+            # Features have no gradient, and so no moments, before the head is enabled.
             assert (moments == {}) if (name, step) == ("features", 30) else moments["exp_avg"].shape == value.shape
-    assert load(tiny.checkpoint(30))["pipeline"]["_model._extra_state"]["pruning"]["pruned_at"] == -1
-    assert load(tiny.checkpoint(119))["pipeline"]["_model._extra_state"]["pruning"]["pruned_at"] == tiny.prune_at
+    for step, pruned_at in ((30, -1), (119, tiny.prune_at)):
+        extra = load(tiny.checkpoint(step))["pipeline"]["_model._extra_state"]
+        assert (extra["format"], extra["running"]["pruning"]["pruned_at"]) == (2, pruned_at)
 
 
 def assert_live(trainer: Any) -> None:
@@ -110,7 +111,7 @@ def assert_live(trainer: Any) -> None:
 
 
 @pytest.mark.parametrize("start", [30, 60], ids=["before the prune", "after the prune"])
-def test_a_resumed_run_goes_on_as_if_never_stopped(tiny: Any, trainer_of: Any, start: int) -> None:
+def test_a_resumed_run_ends_like_one_that_never_stopped(tiny: Any, trainer_of: Any, start: int) -> None:
     def change(config: Any) -> None:
         config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, start, tiny.save_every
 
@@ -135,8 +136,8 @@ def test_a_resumed_run_goes_on_as_if_never_stopped(tiny: Any, trainer_of: Any, s
 
     model = trainer.pipeline.model
     assert model.num_points == report(tiny)["after"]
-    assert model.pruning_state["num_prunes"] == 1
-    assert model.pruning_state["pruned_at"] == tiny.prune_at
+    assert model.state.pruning["num_prunes"] == 1
+    assert model.state.pruning["pruned_at"] == tiny.prune_at
     assert (trainer.base_dir / "prune.json").exists() == (start < tiny.prune_at)
     assert_live(trainer)
     if start > tiny.prune_at:
@@ -145,23 +146,23 @@ def test_a_resumed_run_goes_on_as_if_never_stopped(tiny: Any, trainer_of: Any, s
     assert_same(load(tiny.checkpoint(end)), load(trainer.checkpoint_dir / f"step-{end:09d}.ckpt"))
 
 
-def test_a_run_stopped_right_at_the_prune_goes_on_as_if_never_stopped(tiny: Any, trainer_of: Any) -> None:
+def test_a_run_stopped_right_at_the_prune_ends_like_one_that_never_stopped(tiny: Any, trainer_of: Any) -> None:
     def to_the_prune(config: Any) -> None:
         config.load_dir, config.load_step = tiny.checkpoints, 30
         config.max_num_iterations = tiny.prune_at - 30
 
     trainer = trainer_of(to_the_prune)
     trainer.train()
-    torch.rand(100)  # whatever else a program draws
+    torch.rand(100)  # other random draws of the program
 
     def onwards(config: Any) -> None:
         config.load_dir, config.max_num_iterations = trainer.checkpoint_dir, 60 - tiny.prune_at
 
     again = trainer_of(onwards)
     assert again.pipeline.model.num_points == report(tiny)["after"]
-    assert again.pipeline.model.pruning_state["pruned_at"] == tiny.prune_at
+    assert again.pipeline.model.state.pruning["pruned_at"] == tiny.prune_at
     again.train()
-    assert again.pipeline.model.pruning_state["num_prunes"] == 1
+    assert again.pipeline.model.state.pruning["num_prunes"] == 1
     assert_same(load(tiny.checkpoint(60)), load(again.checkpoint_dir / "step-000000060.ckpt"))
 
 
@@ -206,7 +207,7 @@ def test_memory_does_not_grow_past_the_prune(tiny: Any, trainer_of: Any) -> None
         tracemalloc.stop()
     (tensors, before), (tensors_later, after) = seen
     assert tensors_later <= tensors
-    # Bytes of Python and numpy; loggers keep a few hundred a step, one picture of the scene has 27,648.
+    # Bytes of Python and numpy; loggers keep a few hundred a step, one image of the scene has 27,648.
     assert (after - before) / (steps - settled) < 2000
 
 
@@ -220,7 +221,7 @@ def test_full_memory_in_the_backward_pass(tiny: Any, trainer_of: Any, monkeypatc
     trainer = trainer_of(change)
     monkeypatch.setattr(Tensor, "backward", full)
     count = trainer.pipeline.model.num_points
-    with pytest.raises(MemoryExhaustedError, match=rf"300\.00 MiB more were asked for, with {count:,} primitives"):
+    with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} primitives"):
         trainer.train()
 
 
@@ -243,8 +244,8 @@ def check_warm(tiny: Any, params: dict[str, Tensor], start: dict[str, Tensor], t
     kept = round(tiny.keep_ratio * len(params["means"]))
     assert (found["before"], found["after"]) == (len(params["means"]), kept)
     assert trainer.pipeline.model.num_points == kept
-    assert trainer.pipeline.model.pruning_state["num_prunes"] == 1
-    assert trainer.pipeline.model.head_active
+    assert trainer.pipeline.model.state.pruning["num_prunes"] == 1
+    assert trainer.pipeline.model.state.head_enabled
     assert_live(trainer)
     assert load(trainer.checkpoint_dir / "step-000000002.ckpt")["step"] == 2
 
@@ -280,7 +281,7 @@ def test_warm_start_from_the_exported_ply(tiny: Any, trainer_of: Any, exported: 
     check_warm(tiny, params, *warm(trainer_of, exported))
 
 
-def test_a_splatfacto_checkpoint_is_not_loaded_in_silence(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
+def test_a_splatfacto_checkpoint_is_refused(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
     state = load(tiny.checkpoint(30))
     stock = [name for name in state["pipeline"] if name.startswith("_model.gauss_params.") and "features" not in name]
     state["pipeline"] = {name: state["pipeline"][name] for name in stock}
@@ -291,6 +292,25 @@ def test_a_splatfacto_checkpoint_is_not_loaded_in_silence(tiny: Any, trainer_of:
 
     with pytest.raises(ValueError, match="warm-start"):
         trainer_of(change)
+
+
+def test_a_checkpoint_of_format_1_is_refused_in_one_line(tiny: Any, trainer_of: Any, tmp_path: Any) -> None:
+    state = load(tiny.checkpoint(30))
+    state["pipeline"]["_model._extra_state"] = {"method": "sundae", "format": 1, "step": 30, "num_features": 5}
+    torch.save(state, tmp_path / "step-000000030.ckpt")
+
+    def resume(config: Any) -> None:
+        config.load_dir = tmp_path
+
+    def start_warm(config: Any) -> None:
+        config.pipeline.model.warm_start = tmp_path
+
+    for change in (resume, start_warm):
+        with pytest.raises(
+            CheckpointError, match="format 1, this version reads 2; use the version that wrote"
+        ) as raised:
+            trainer_of(change)
+        assert "\n" not in str(raised.value)
 
 
 def test_saved_config_is_read_back_the_same(tiny: Any) -> None:

@@ -26,22 +26,6 @@ def test_killed_anywhere_it_goes_on_as_if_never_killed() -> None:
     assert found["same seed, same result"]
 
 
-def test_the_same_seed_gives_the_same_field_to_the_bit_on_a_cpu() -> None:
-    """The short version of ``benchmarks/spread.py``, which says how far runs on CUDA are apart."""
-    options = ["--runs", "2", "--steps", "24", "--size", "32", "--points", "100"]
-    result = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "spread.py"), *options], capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    (line,) = result.stdout.splitlines()
-    found = json.loads(line)
-    assert found["bit_for_bit"]
-    assert found["psnr"]["range"] == found["primitives"]["range"] == 0
-    assert found["psnr"]["mean"] > 5
-    assert found["primitives"]["mean"] == round(0.25 * found["primitives_before"]["mean"])
-    assert found["selection_overlap"] == {"mean": 1, "least": 1}
-
-
 def test_ns_train_shows_bad_input_in_one_line(tiny: Any, tmp_path: Path) -> None:
     data = Path(shutil.copytree(tiny.scene, tmp_path / "scene"))
     meta = json.loads((data / "transforms.json").read_text())
@@ -59,4 +43,4 @@ def test_ns_train_shows_bad_input_in_one_line(tiny: Any, tmp_path: Path) -> None
     assert "Traceback" not in result.stdout + result.stderr
     line = result.stderr.splitlines()[-1]
     assert line.startswith("sundae: transforms.json, frame 3 (")
-    assert line.endswith("transform_matrix is nan; it must be finite, and at most 1e+12")
+    assert line.endswith("transform_matrix is nan; it must be finite and at most 1e+12")

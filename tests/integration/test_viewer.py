@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerElement
 
 
@@ -29,13 +30,6 @@ def camera(pipeline: Any, height: int, aspect: float) -> Cameras:
     return Cameras(known.camera_to_worlds, fx=1.2 * height, fy=1.2 * height, cx=width / 2, cy=height / 2).to(
         pipeline.device
     )
-
-
-def elements(thing: object) -> Iterator[ViewerElement[Any]]:
-    """Elements that the viewer's control panel finds among a module's attributes."""
-    for value in vars(thing).values():
-        if isinstance(value, ViewerElement):
-            yield value
 
 
 def as_the_viewer(call: Callable[[], Any]) -> Any:
@@ -70,7 +64,9 @@ def test_every_output_becomes_a_picture(pipeline: Any, height: int, aspect: floa
 
 @torch.no_grad()
 def test_check_box_switches_the_head_off(pipeline: Any) -> None:
-    (box,) = [element for element in elements(pipeline.model) if isinstance(element, ViewerCheckbox)]
+    # As nerfstudio's control panel finds them.
+    controls = [control for _, control in parse_object(pipeline.model, ViewerElement, "Custom Elements")]
+    (box,) = [control for control in controls if isinstance(control, ViewerCheckbox) and "compensation" in control.name]
     view = camera(pipeline, 40, 1.0)
     on = pipeline.model.get_outputs_for_camera(view)
     box.value = False

@@ -38,8 +38,8 @@ def test_round_trip_into_another_count_keeps_optimizers_alive(
         assert value is held[name]
         assert torch.equal(value, source.model.gauss_params[name])
     assert target.model.step == 4
-    assert target.model.pruning_state == source.model.pruning_state
-    assert target.model.head_active
+    assert target.model.state.pruning == source.model.state.pruning
+    assert target.model.state.head_enabled
     for (_, ours), (_, theirs) in zip(
         target.model.head.named_parameters(),  # type: ignore[union-attr]
         source.model.head.named_parameters(),  # type: ignore[union-attr]
@@ -62,11 +62,11 @@ def test_round_trip_into_another_count_keeps_optimizers_alive(
 def test_state_of_densification_is_kept(build: Build, training_of: TrainingOf, tmp_path: Path) -> None:
     source = training_of(build())
     source.step(0)
-    assert source.model.strategy_state["grad2d"].any()
+    assert source.model.state.densification["grad2d"].any()
     target = build(n=25)
     target.load_state_dict(saved(source.model, tmp_path / "a.pt"))
-    assert torch.equal(target.strategy_state["grad2d"], source.model.strategy_state["grad2d"])
-    assert target.strategy_state["scene_scale"] == source.model.strategy_state["scene_scale"]
+    assert torch.equal(target.state.densification["grad2d"], source.model.state.densification["grad2d"])
+    assert target.state.densification["scene_scale"] == source.model.state.densification["scene_scale"]
 
 
 def _stock(state: dict[str, Any]) -> dict[str, Any]:

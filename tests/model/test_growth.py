@@ -38,8 +38,8 @@ def test_continuous_pruning_and_densification_share_a_field(
         densify_grad_thresh=1e-9,
         stop_split_at=14,
     )
-    model.strategy.pause_refine_after_reset = 0
     training = training_of(model)
+    training.extensions["densification"].strategy.pause_refine_after_reset = 0
     counts = []
     for step in range(15):
         training.step(step)
@@ -48,15 +48,15 @@ def test_continuous_pruning_and_densification_share_a_field(
             assert training.live()
         assert all(
             len(value) == model.num_points
-            for value in model.strategy_state.values()
+            for value in model.state.densification.values()
             if isinstance(value, Tensor) and value.ndim
         )
     assert [counts[step] for step in (4, 8, 12)] == [40, 40, 40]
     assert max(counts) > 40
     # The cap holds at every step, and between growing and culling; densification ends with the last prune.
-    assert 40 < model.pruning_state["peak"] <= 70
+    assert 40 < model.state.pruning["peak"] <= 70
     assert counts[12:] == [40, 40, 40]
-    assert model.head_active
+    assert model.state.head_enabled
 
 
 def test_continuous_pruning_merges_and_leaves_adam_in_order(
@@ -68,13 +68,13 @@ def test_continuous_pruning_merges_and_leaves_adam_in_order(
         densify_grad_thresh=1e-9,
         **densified,
     )
-    model.strategy.pause_refine_after_reset = 0
     training = training_of(model)
+    training.extensions["densification"].strategy.pause_refine_after_reset = 0
     for step in range(13):
         training.step(step)
         assert training.live() or step < 4
         assert all(value.isfinite().all() for value in model.gauss_params.values())
-        if model.pruning_state["pruned_at"] == step:
+        if model.state.pruning["pruned_at"] == step:
             scales = model.gauss_params["scales"]
             direction = training.optimizers.optimizers["scales"].state[scales]["exp_avg"]
             # What was merged starts without one, and what stayed as it is keeps its own.
@@ -91,8 +91,8 @@ def test_nothing_grows_after_the_prune(build: Build, training_of: TrainingOf, pr
     """Not even where the prune is the first thing that happens, as it may be after a warm start."""
     grows = {"warmup_length": 0, "refine_every": 3, "reset_alpha_every": 100, "densify_grad_thresh": 1e-9}
     model = build(pruning={"prune_at": prune_at}, stop_split_at=14, warmup=warmup, **grows)
-    model.strategy.pause_refine_after_reset = 0
     training, counts = training_of(model), []
+    training.extensions["densification"].strategy.pause_refine_after_reset = 0
     for step in range(11):
         training.step(step)
         counts.append(model.num_points)

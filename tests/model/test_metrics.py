@@ -87,5 +87,5 @@ def test_lpips_is_not_built_and_not_saved(build: Build, monkeypatch: pytest.Monk
     assert not [name for name in model.state_dict() if "lpips" in name]
     assert not [name for name, _ in model.named_modules() if "lpips" in name]
     # The field, the head and nerfstudio's empty marker of the device; nothing else costs bytes.
-    known = ("gauss_params.", "head.", "device_indicator_param", "_extra_state", "ssim.", "camera_optimizer.")
+    known = ("gauss_params.", "networks.head.", "device_indicator_param", "_extra_state", "ssim.", "camera_optimizer.")
     assert not [name for name in model.state_dict() if not name.startswith(known)]

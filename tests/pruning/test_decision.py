@@ -1,4 +1,4 @@
-"""Signals, scores and the decision: what is kept, and that nothing is touched or computed in vain."""
+"""Signals, scores and the decision: exact counts, and no input changed or computed without need."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from prunes import decide_share
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError, SundaeError
@@ -15,7 +16,7 @@ from sundae_ns.pruning import PruningConfig, attribute_signal, decide, position_
 from sundae_ns.pruning.scores import Response
 
 PLAIN = PruningConfig(selection="sampled", score="response-contribution", edges="centres", redistribution="none")
-"""A score and independent draws, none of what the default rule adds."""
+"""Response times contribution and independent draws, without the additions of the default rule."""
 PAPER = replace(PLAIN, selection="band", score="response", signal="positions")
 
 
@@ -37,31 +38,25 @@ def ones(n: int = 60) -> Tensor:
 
 
 @pytest.mark.parametrize("selection", ["band", "sampled", "top"])
-@pytest.mark.parametrize(
-    "name",
-    ["response-contribution", "response", "contribution", "opacity", "random", "coherence", "coherence-contribution"],
-)
+@pytest.mark.parametrize("name", ["response-contribution", "response", "contribution", "opacity", "random"])
 @pytest.mark.parametrize("keep_ratio", [0.001, 0.1, 0.25, 1.0])
 def test_every_score_and_selection_keeps_the_exact_count(name: Any, selection: Any, keep_ratio: float) -> None:
     params = field()
     before = {key: value.clone() for key, value in params.items()}
     config = replace(PLAIN, score=name, selection=selection, keep_ratio=keep_ratio)
-    decision = decide(params, config, ones)
+    decision = decide_share(params, config, ones)
     assert int(decision.mask.sum()) == decision.kept == max(1, round(keep_ratio * 60))
-    assert torch.equal(decide(params, config, ones).mask, decision.mask)
+    assert torch.equal(decide_share(params, config, ones).mask, decision.mask)
     assert (decision.sigma is not None) == (config.uses_graph and keep_ratio < 1)
     assert all(torch.equal(params[key], before[key]) for key in params)
 
 
 def test_the_papers_rule_is_the_band_of_the_position_response() -> None:
     params = field()
-    decision = decide(params, replace(PAPER, keep_ratio=0.2))
-    assert decision.magnitude is not None
-    magnitude = decision.magnitude[~decision.magnitude.isnan()]
-    ranked = magnitude.sort().values
-    assert sorted(decision.magnitude[decision.mask].tolist()) == torch.cat([ranked[:6], ranked[-6:]]).tolist()
+    decision = decide_share(params, replace(PAPER, keep_ratio=0.2))
     found = response(params, PAPER)
-    torch.testing.assert_close(found.magnitude, decision.magnitude, equal_nan=True)
+    ranked = found.magnitude[~found.magnitude.isnan()].sort().values
+    assert sorted(found.magnitude[decision.mask].tolist()) == torch.cat([ranked[:6], ranked[-6:]]).tolist()
     assert found.isolated == decision.isolated == int(found.magnitude.isnan().sum())
 
 
@@ -69,10 +64,10 @@ def test_isolated_floaters_are_judged_by_contribution_or_not_kept() -> None:
     params = field()
     params["means"][[3, 40]] = torch.tensor([[500.0, 0, 0], [0, 500.0, 0]])
     for gamma in (0.0, 0.5, 1.0):
-        assert not decide(params, replace(PAPER, keep_ratio=0.5, gamma=gamma)).mask[[3, 40]].any()
+        assert not decide_share(params, replace(PAPER, keep_ratio=0.5, gamma=gamma)).mask[[3, 40]].any()
     contribution = torch.ones(60)
     contribution[3], contribution[40] = 1e6, 0.0
-    mask = decide(params, replace(PLAIN, keep_ratio=0.5), lambda: contribution).mask
+    mask = decide_share(params, replace(PLAIN, keep_ratio=0.5), lambda: contribution).mask
     assert mask[3]
     assert not mask[40]
 
@@ -80,7 +75,7 @@ def test_isolated_floaters_are_judged_by_contribution_or_not_kept() -> None:
 def test_contribution_alone_decides_on_a_graph_without_edges() -> None:
     contribution = torch.arange(60).float()
     config = replace(PLAIN, selection="top", keep_ratio=0.1, tau=1e-12)
-    decision = decide(field(), config, lambda: contribution)
+    decision = decide_share(field(), config, lambda: contribution)
     assert decision.isolated == 60
     assert decision.mask.nonzero().squeeze(1).tolist() == list(range(54, 60))
 
@@ -123,32 +118,30 @@ def test_constant_and_almost_constant_attributes_are_finite() -> None:
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])
-def test_broken_primitives_go_first_and_do_not_count(value: float) -> None:
+def test_primitives_that_are_not_finite_are_dropped_and_do_not_count(value: float) -> None:
     params = field()
     params["features_rest"][7, 1, 2] = value
     params["means"][8] = value
     contribution = torch.ones(60)
     contribution[7] = torch.nan
-    decision = decide(params, replace(PLAIN, keep_ratio=0.5), lambda: contribution)
+    decision = decide_share(params, replace(PLAIN, keep_ratio=0.5), lambda: contribution)
     assert decision.dropped_nonfinite == 2
     assert int(decision.mask.sum()) == decision.kept == 29
     assert not decision.mask[[7, 8]].any()
-    assert decision.magnitude is not None
-    assert decision.magnitude[[7, 8]].isnan().all()
-    everything = decide(params, PruningConfig(keep_ratio=1.0), lambda: contribution)
+    everything = decide_share(params, PruningConfig(keep_ratio=1.0), lambda: contribution)
     assert everything.mask.nonzero().squeeze(1).tolist() == [i for i in range(60) if i not in (7, 8)]
 
 
-def test_contribution_is_only_asked_for_when_it_matters() -> None:
+def test_contribution_is_computed_only_if_needed() -> None:
     def never() -> Tensor:
         raise AssertionError
 
     for name in ("response", "opacity", "random"):
-        decide(field(), replace(PLAIN, score=name), never)
-    decide(field(), PruningConfig(keep_ratio=1.0), never)
+        decide_share(field(), replace(PLAIN, score=name), never)
+    decide_share(field(), PruningConfig(keep_ratio=1.0), never)
 
 
-def test_count_replaces_the_share() -> None:
+def test_exactly_count_primitives_are_kept_and_all_if_they_are_fewer() -> None:
     config = replace(PLAIN, score="opacity", selection="top")
     decision = decide(field(), config, count=17)
     opacities = field()["opacities"].squeeze(1)
@@ -156,19 +149,19 @@ def test_count_replaces_the_share() -> None:
     assert decide(field(), config, count=1000).kept == 60
 
 
-def test_what_cannot_work_says_why_in_one_line() -> None:
+def test_invalid_input_raises_one_line() -> None:
     cases: list[tuple[type[Exception], str, Any]] = [
         (DataError, "1 primitives cannot have 1 neighbours", lambda: response(field(1), PAPER)),
-        (DataError, "none of 60", lambda: decide({k: v * torch.nan for k, v in field().items()}, PAPER)),
-        (ConfigError, "training views", lambda: decide(field(), PruningConfig())),
-        (DataError, r"shape \[59\] for 60", lambda: decide(field(), PruningConfig(), lambda: ones(59))),
+        (DataError, "none of 60", lambda: decide_share({k: v * torch.nan for k, v in field().items()}, PAPER)),
+        (ConfigError, "training views", lambda: decide_share(field(), PruningConfig())),
+        (DataError, r"shape \[59\] for 60", lambda: decide_share(field(), PruningConfig(), lambda: ones(59))),
         (
             DataError,
             r"shape \[9\] for 60",
             lambda: score(field(), PruningConfig(score="contribution"), None, lambda: ones(9)),
         ),
         (ConfigError, "graph response", lambda: score(field(), PAPER, None, None)),
-        (ConfigError, "keep_ratio", lambda: decide(field(), PruningConfig(keep_ratio=0.0))),
+        (ConfigError, "keep_ratio", lambda: decide_share(field(), PruningConfig(keep_ratio=0.0))),
     ]
     for error, message, call in cases:
         with pytest.raises(error, match=message) as caught:
@@ -181,12 +174,12 @@ def test_what_cannot_work_says_why_in_one_line() -> None:
 def test_decision_on_the_gpu_keeps_the_same_primitives() -> None:
     params = field(500)
     config = replace(PAPER, keep_ratio=0.3)
-    on_gpu = decide({name: value.cuda() for name, value in params.items()}, config)
+    on_gpu = decide_share({name: value.cuda() for name, value in params.items()}, config)
     assert on_gpu.mask.is_cuda
-    assert torch.equal(on_gpu.mask.cpu(), decide(params, config).mask)
+    assert torch.equal(on_gpu.mask.cpu(), decide_share(params, config).mask)
 
 
-def test_a_contribution_of_nan_counts_as_none() -> None:
+def test_a_contribution_of_nan_counts_as_0() -> None:
     config = PruningConfig(score="contribution")
     values = score(field(), config, None, lambda: torch.arange(60.0).index_fill(0, torch.tensor([7]), torch.nan))
     assert values[7] == 0
@@ -196,24 +189,19 @@ def test_a_contribution_of_nan_counts_as_none() -> None:
 def test_scores_by_hand() -> None:
     params, weights = field(3), torch.tensor([2.0, 0.5, torch.nan])
     found = Response(torch.tensor([4.0, torch.nan, 9.0]), 1.0, 1.0, 1)
-    coherent = torch.tensor([0.1, 0.2, 0.4]).double()
     expected = {
         "contribution": [2.0, 0.5, 0.0],
         "detail-contribution": [2.0, 0.5, 0.0],
         "random": [1.0, 1.0, 1.0],
-        "coherence": [0.1, 0.2, 0.4],
-        "coherence-contribution": [0.2, 0.1, 0.0],
-        # Nothing is known of the second, which gets the lower median, 2.
+        # The second has no response and gets the lower median, 2.
         "response-contribution": [4.0, 1.0, 0.0],
     }
     for name, values in expected.items():
         config = replace(PLAIN, score=name)  # type: ignore[arg-type]
-        assert score(params, config, found, lambda: weights, coherent).tolist() == pytest.approx(values), name
+        assert score(params, config, found, lambda: weights).tolist() == pytest.approx(values), name
     assert score(params, replace(PLAIN, score="response"), found, None)[[0, 2]].tolist() == [2, 3]
     opacities = score(params, replace(PLAIN, score="opacity"), None, None)
     assert torch.equal(opacities, params["opacities"].double().sigmoid().flatten())
-    with pytest.raises(ConfigError, match="needs a coherence"):
-        score(params, replace(PLAIN, score="coherence"), found, None)
     with pytest.raises(ConfigError, match="needs a graph response"):
         score(params, replace(PLAIN, score="response"), None, None)
     nothing = Response(torch.full((3,), torch.nan), 1.0, 1.0, 3)

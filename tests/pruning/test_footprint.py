@@ -32,13 +32,13 @@ def test_the_mean_shadow_of_an_ellipsoid() -> None:
     assert footprint(field([axes.tolist()])).item() == pytest.approx(0.5 * shadows.mean().item(), rel=0.012)
 
 
-def test_order_of_axes_does_not_matter_and_sizes_do() -> None:
+def test_footprint_depends_on_size_and_not_on_the_order_of_axes() -> None:
     a, b, c = footprint(field([[1.0, 2.0, 3.0], [3.0, 1.0, 2.0], [10.0, 20.0, 30.0]]))
     assert a.item() == pytest.approx(b.item())
     assert c.item() == pytest.approx(100 * a.item())
 
 
-def test_sizes_beyond_all_bounds_stay_numbers() -> None:
+def test_extreme_sizes_stay_finite() -> None:
     huge = {
         "scales": torch.tensor([[1e30, 0.0, -1e30]]).repeat(3, 1),
         "opacities": torch.tensor([[-1e30], [0.0], [1e30]]),

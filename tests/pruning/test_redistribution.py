@@ -1,4 +1,4 @@
-"""Heirs, merges, growth and rounds: what the kept become, and that training goes on with them."""
+"""Heirs of dropped primitives, and values of kept primitives after a merge."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
+from prunes import decide_share
 from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import Adam, Optimizer
+from torch.optim import Adam
 
 from sundae_ns.errors import ConfigError
+from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.parameters import rgb_to_sh, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.pruning import PruningConfig, decide, field_graph, grown, heirs
+from sundae_ns.pruning import PruningConfig, field_graph, heirs
 from sundae_ns.training.schedulers import Decay, notify_pruned
-from sundae_ns.training.schedules import make_policy
 
 
 def field(n: int = 300, seed: int = 0) -> dict[str, Tensor]:
@@ -41,7 +42,7 @@ def test_heirs_are_the_nearest_along_the_edges() -> None:
     found = heirs(graph, mask)
     rows, lengths = np.repeat(np.arange(300), 3), -graph.weights.log().numpy().ravel()
     edge = graph.weights.numpy().ravel() > 0
-    # Edges are followed from the heirless to its neighbours: from the kept they are walked backwards.
+    # Heirs follow edges from dropped primitives; the search from kept ones follows them backwards.
     backwards = sp.csr_matrix((lengths[edge], (graph.indices.numpy().ravel()[edge], rows[edge])), shape=(300, 300))
     kept = mask.nonzero().squeeze(1).numpy()
     distance, _, source = dijkstra(backwards, indices=kept, min_only=True, return_predecessors=True)
@@ -50,7 +51,7 @@ def test_heirs_are_the_nearest_along_the_edges() -> None:
     assert not reached.all()
     assert len(expected[reached].unique()) > 5
     assert torch.equal(found[reached], expected[reached])
-    # Backwards too where there is no other way; then those are lost that share no component with a kept one.
+    # The others follow edges in both directions; primitives in a component without a kept one have no heir.
     _, component = connected_components(backwards, directed=False)
     joined = torch.from_numpy(np.isin(component, component[kept]))
     assert torch.equal(found >= 0, joined)
@@ -58,21 +59,21 @@ def test_heirs_are_the_nearest_along_the_edges() -> None:
     assert (component[found[joined]] == component[joined.numpy()]).all()
 
 
-def test_of_many_clones_whoever_stays_inherits() -> None:
+def test_the_one_clone_that_is_kept_is_the_heir_of_all() -> None:
     graph = build_graph(torch.zeros(100, 3), num_neighbors=4)
     for stays in (0, 3, 50, 99):
         assert (heirs(graph, torch.arange(100) == stays) == stays).all()
 
 
-def test_backwards_the_nearest_and_then_the_lowest_index_inherits() -> None:
-    # Node 0 knows only itself; 1, 2 and 3 know it, and 3 as well as 2.
+def test_against_edges_the_nearest_heir_wins_and_then_the_lowest_index() -> None:
+    # Node 0 has no neighbour; it is the neighbour of 1, 2 and 3, and as near to 2 as to 3.
     weights = torch.tensor([[0.0], [0.5], [0.9], [0.9]])
     graph = NeighborGraph(torch.tensor([[0], [0], [0], [0]]), weights, weights[:, 0], 1.0, 1.0)
     assert heirs(graph, torch.tensor([False, True, True, True])).tolist() == [2, 1, 2, 3]
     assert heirs(graph, torch.tensor([False, True, False, False])).tolist() == [1, 1, 1, 1]
 
 
-def test_a_chain_hands_on_over_many_hops_and_islands_lose() -> None:
+def test_a_chain_has_one_heir_over_many_hops_and_islands_have_none() -> None:
     line = torch.cartesian_prod(torch.arange(50.0), torch.zeros(1), torch.zeros(1))
     graph = build_graph(torch.cat([line, line[:4] + 1e6]), num_neighbors=2)
     mask = torch.zeros(54, dtype=torch.bool)
@@ -89,7 +90,7 @@ def test_appearance_keeps_heirs_on_their_side_of_an_edge() -> None:
     left = params["means"][:, 0] < 9.5
     params["features_dc"] = rgb_to_sh(torch.where(left, 0.1, 0.9)[:, None].expand(-1, 3)).clone()
     mask = torch.zeros(400, dtype=torch.bool)
-    # One next to the edge on the left, and one far from it on the right.
+    # One kept primitive next to the edge on the left, and one far from it on the right.
     mask[[8 * 20 + 10, 19 * 20 + 10]] = True
     wrong = []
     for edges in ("centres", "appearance"):
@@ -100,11 +101,11 @@ def test_appearance_keeps_heirs_on_their_side_of_an_edge() -> None:
 
 
 @pytest.mark.parametrize("edges", ["centres", "appearance"])
-def test_a_merge_keeps_what_is_seen_in_all(edges: Any) -> None:
+def test_a_merge_keeps_the_weighted_sum_of_colours(edges: Any) -> None:
     params = field()
     config = PruningConfig(keep_ratio=0.1, score="contribution", redistribution="merge", edges=edges)
     before = {name: value.clone() for name, value in params.items()}
-    decision = decide(params, config, weights)
+    decision = decide_share(params, config, weights)
     assert all(torch.equal(params[name], before[name]) for name in params)
     assert decision.values is not None
     assert {name: len(value) for name, value in decision.values.items()} == dict.fromkeys(params, 30)
@@ -113,8 +114,8 @@ def test_a_merge_keeps_what_is_seen_in_all(edges: Any) -> None:
     found = (total[:, None] * decision.values["features_dc"]).sum(dim=0)
     expected = (weights() * (heir >= 0)) @ params["features_dc"]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-    # Those that stay are the same as without a merge.
-    assert torch.equal(decide(params, replace(config, redistribution="none"), weights).mask, decision.mask)
+    # A merge does not change the selection.
+    assert torch.equal(decide_share(params, replace(config, redistribution="none"), weights).mask, decision.mask)
 
 
 @pytest.mark.parametrize("device", ["cpu", "field"])
@@ -123,16 +124,19 @@ def test_a_merge_keeps_what_is_seen_in_all(edges: Any) -> None:
     [
         {},
         {"score": "response-contribution", "selection": "sampled"},
-        {"score": "response-contribution", "signal": "colors", "edges": "centres"},
+        {"score": "response-contribution", "signal": "attributes", "edges": "centres"},
     ],
 )
-def test_logits_are_pruned_as_the_colours_that_they_are(rule: dict[str, Any], device: Any) -> None:
-    """The same primitives stay as of the field in harmonics, and their colours become the same, not their logits."""
+def test_logits_are_pruned_as_their_colours(rule: dict[str, Any], device: Any) -> None:
+    """The selection is that of the same field in harmonics, and colours are averaged instead of logits."""
     logits = field()
     logits["features_dc"] *= 4
     harmonics = {**logits, "features_dc": rgb_to_sh(logits["features_dc"].sigmoid())}
     config = PruningConfig(keep_ratio=0.3, graph_device=device, **rule)
-    found, expected = decide(logits, replace(config, logits=True), weights), decide(harmonics, config, weights)
+    found, expected = (
+        decide_share(Field(logits, "logits"), config, weights),
+        decide_share(harmonics, config, weights),
+    )
     assert torch.equal(found.mask, expected.mask)
     assert found.values is not None
     assert expected.values is not None
@@ -145,51 +149,26 @@ def test_logits_are_pruned_as_the_colours_that_they_are(rule: dict[str, Any], de
         assert torch.equal(found.values[name], expected.values[name])
 
 
-def test_growth_is_the_spacing_of_those_that_stay_over_that_of_all() -> None:
-    params = field(8**3)
-    params["means"] = torch.cartesian_prod(*[torch.arange(8.0)] * 3)
-    mask = (params["means"] % 2 == 0).all(dim=1)
-    found = grown(params, mask)
-    # Inner ones have three neighbours at twice the distance, and so has a corner.
-    torch.testing.assert_close(found["scales"], params["scales"][mask] + math.log(2))
-    assert all(torch.equal(found[name], params[name][mask]) for name in params if name != "scales")
-
-
-def test_growth_has_a_limit_and_copes_with_clones() -> None:
-    params = field(400)
-    params["means"][:200] = 0
-    for mask in (torch.arange(400) % 4 == 0, torch.arange(400) == 0, torch.arange(400) < 10):
-        found = grown(params, mask)
-        growth = (found["scales"] - params["scales"][mask]).exp()
-        assert found["scales"].isfinite().all()
-        assert float(growth.min()) >= 1 - 1e-5
-        assert float(growth.max()) <= (400 / int(mask.sum())) ** 0.5 * (1 + 1e-5)
-
-
-@pytest.mark.parametrize("redistribution", ["merge", "grow"])
-def test_what_becomes_of_the_kept_follows_a_permutation_scale_and_shift(redistribution: Any) -> None:
+def test_merged_values_follow_a_permutation_a_scale_and_a_shift() -> None:
     params = {name: value.double() for name, value in field().items()}
-    config = PruningConfig(
-        keep_ratio=0.1, score="contribution", selection="top", redistribution=redistribution, edges="appearance"
-    )
-    plain = decide(params, config, weights).values
+    config = PruningConfig(keep_ratio=0.1, score="contribution", selection="top")
+    plain = decide_share(params, config, weights).values
     assert plain is not None
     order = torch.randperm(300)
-    shuffled = decide({k: v[order] for k, v in params.items()}, config, lambda: weights()[order])
+    shuffled = decide_share({k: v[order] for k, v in params.items()}, config, lambda: weights()[order])
     assert shuffled.values is not None
     back = torch.argsort(order[shuffled.mask])
     for name, value in plain.items():
         torch.testing.assert_close(shuffled.values[name][back], value, rtol=1e-9, atol=1e-9)
     moved = {**params, "means": 1024 * params["means"] + 4096, "scales": params["scales"] + math.log(1024)}
-    found = decide(moved, config, weights).values
+    found = decide_share(moved, config, weights).values
     assert found is not None
     torch.testing.assert_close(found["means"], 1024 * plain["means"] + 4096)
     torch.testing.assert_close(found["scales"], plain["scales"] + math.log(1024))
     torch.testing.assert_close(found["opacities"], plain["opacities"])
 
 
-@pytest.mark.parametrize("redistribution", ["merge", "grow"])
-def test_hard_fields_stay_finite(redistribution: Any) -> None:
+def test_hard_fields_stay_finite() -> None:
     cloud = torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
     hard = {
         "one spot": torch.zeros(200, 3),
@@ -200,87 +179,18 @@ def test_hard_fields_stay_finite(redistribution: Any) -> None:
     }
     for means in hard.values():
         for edges in ("centres", "appearance"):
-            config = PruningConfig(
-                keep_ratio=0.05,
-                score="contribution",
-                redistribution=redistribution,
-                edges=edges,
-                selection="systematic",
-            )
-            values = decide({**field(200), "means": means}, config, lambda: weights(200)).values
+            config = PruningConfig(keep_ratio=0.05, score="contribution", edges=edges)
+            values = decide_share({**field(200), "means": means}, config, lambda: weights(200)).values
             assert values is not None
             assert all(value.isfinite().all() for value in values.values())
 
 
-def training(n: int = 300) -> tuple[dict[str, Parameter], dict[str, Optimizer]]:
-    params = {name: Parameter(value) for name, value in field(n).items()}
-    return params, {name: Adam([value], lr=0.01) for name, value in params.items()}
+def test_a_merge_without_training_views_is_refused() -> None:
+    with pytest.raises(ConfigError, match="training views.* set redistribution to none"):
+        decide_share(field(), PruningConfig(score="random", redistribution="merge"))
 
 
-def step(params: dict[str, Parameter], optimizers: dict[str, Optimizer]) -> float:
-    loss = torch.stack([(value - 1).square().mean() for value in params.values()]).sum()
-    for optimizer in optimizers.values():
-        optimizer.zero_grad()
-    loss.backward()
-    for optimizer in optimizers.values():
-        optimizer.step()
-    return loss.item()
-
-
-@pytest.mark.parametrize("redistribution", ["none", "merge", "grow"])
-def test_rounds_end_at_the_exact_count_also_when_resumed(redistribution: Any) -> None:
-    config = PruningConfig(
-        prune_at=2, keep_ratio=0.01, rounds=3, round_every=2, redistribution=redistribution, num_neighbors=4
-    )
-    policy = make_policy(config)
-    assert config.last_prune == 6
-    ends = []
-    for resumed_at in (None, 3, 4):
-        params, optimizers = training()
-        state = policy.initialize_state()
-        counts = []
-        for at in range(12):
-            step(params, optimizers)
-            if at == resumed_at:
-                state = dict(state)
-                policy = make_policy(config)
-            report = policy.step_post_backward(
-                params,
-                optimizers,
-                state,
-                at,
-                contribution=lambda p=params: p["opacities"].detach().sigmoid().squeeze(1),
-            )
-            if report is not None:
-                counts.append((at, report.after))
-        assert counts == [(2, round(300 * 0.01 ** (1 / 3))), (4, round(300 * 0.01 ** (2 / 3))), (6, 3)]
-        assert all(isinstance(value, int) for value in state.values())
-        before = step(params, optimizers)
-        assert step(params, optimizers) < before
-        ends.append(params["means"].detach().clone())
-    assert torch.equal(ends[0], ends[1])
-    assert torch.equal(ends[0], ends[2])
-
-
-def test_a_late_first_round_keeps_the_distance_of_the_next() -> None:
-    policy = make_policy(PruningConfig(prune_at=2, rounds=2, round_every=5, score="random", redistribution="none"))
-    params, optimizers = training()
-    state = policy.initialize_state()
-    done = [at for at in range(9, 20) if policy.step_post_backward(params, optimizers, state, at) is not None]
-    assert done == [9, 14]
-    assert len(params["means"]) == 30
-
-
-def test_a_merge_and_rounds_say_what_they_cannot_do() -> None:
-    with pytest.raises(ConfigError, match="training views"):
-        decide(field(), PruningConfig(score="random", redistribution="merge"))
-    with pytest.raises(ConfigError, match="rounds is 2 but mode is continuous"):
-        PruningConfig(mode="continuous", rounds=2).validate()
-    with pytest.raises(ConfigError, match="rounds is 0"):
-        PruningConfig(rounds=0).validate()
-
-
-def test_rates_that_wait_for_the_end_of_pruning_wait_for_the_last_round() -> None:
+def test_held_learning_rates_wait_for_the_last_prune() -> None:
     def rate(hold: bool) -> Any:
         decay = Decay(0.01, 100, 1.0, hold, 0)
         return decay, torch.optim.lr_scheduler.LambdaLR(Adam([Parameter(torch.zeros(1))]), decay)
@@ -293,11 +203,10 @@ def test_rates_that_wait_for_the_end_of_pruning_wait_for_the_last_round() -> Non
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("redistribution", ["merge", "grow"])
-def test_on_the_gpu_the_kept_become_the_same(redistribution: Any) -> None:
-    config = PruningConfig(keep_ratio=0.1, score="contribution", redistribution=redistribution, selection="systematic")
-    on_cpu = decide(field(), config, weights)
-    on_gpu = decide({name: value.cuda() for name, value in field().items()}, config, lambda: weights().cuda())
+def test_a_merge_on_the_gpu_gives_the_same_values() -> None:
+    config = PruningConfig(keep_ratio=0.1, score="contribution")
+    on_cpu = decide_share(field(), config, weights)
+    on_gpu = decide_share({name: value.cuda() for name, value in field().items()}, config, lambda: weights().cuda())
     assert torch.equal(on_gpu.mask.cpu(), on_cpu.mask)
     assert on_cpu.values is not None
     assert on_gpu.values is not None
@@ -306,6 +215,6 @@ def test_on_the_gpu_the_kept_become_the_same(redistribution: Any) -> None:
         torch.testing.assert_close(on_gpu.values[name].cpu(), value, rtol=1e-4, atol=1e-5)
 
 
-def test_isolated_primitives_are_lost_and_no_heir_is_dropped() -> None:
+def test_isolated_primitives_have_no_heir() -> None:
     graph = NeighborGraph(torch.tensor([[1], [0], [2]]), torch.tensor([[1.0], [1.0], [0.0]]), torch.ones(3), 1.0, 1.0)
     assert heirs(graph, torch.tensor([True, False, False])).tolist() == [0, 0, -1]

@@ -1,4 +1,4 @@
-"""Options of one prune made from those of a run, and decisions on a graph that is at hand."""
+"""Options of one prune derived from those of a run, and decisions on a given graph."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from typing import Any
 
 import pytest
 import torch
+from prunes import decide_share
 from torch import Tensor
 
 import sundae_ns.pruning.decision
-from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, single_prune
+from sundae_ns.pruning import PruningConfig, band_rule, field_graph, single_prune
+from sundae_ns.training.schedules import make_schedule
 
 N = 80
 
@@ -27,21 +29,20 @@ def field() -> dict[str, Tensor]:
         {"mode": "auto", "max_psnr_drop": 0.2, "stop": 15000, "start": 30000},
         {"mode": "auto", "max_bytes": 1000},
         {"mode": "continuous", "target_primitives": 10, "max_primitives": 20},
-        {"mode": "one-shot", "rounds": 3},
         {"mode": "off"},
     ],
 )
-def test_schedules_and_budgets_do_not_count(options: dict[str, Any]) -> None:
+def test_schedules_and_budgets_are_ignored(options: dict[str, Any]) -> None:
     config = PruningConfig(**options)
     config.validate()
     single = single_prune(config, 0.25)
     single.validate()
-    assert (single.share(N), single.last_prune) == (0.25, single.prune_at)
-    expected = decide(field(), PruningConfig(keep_ratio=0.25), lambda: torch.ones(N)).mask
-    assert torch.equal(decide(field(), single, lambda: torch.ones(N)).mask, expected)
+    assert (make_schedule(single).target(N), single.settled_at) == (N // 4, single.prune_at)
+    expected = decide_share(field(), PruningConfig(keep_ratio=0.25), lambda: torch.ones(N)).mask
+    assert torch.equal(decide_share(field(), single, lambda: torch.ones(N)).mask, expected)
 
 
-def test_the_bands_are_the_papers() -> None:
+def test_the_band_rule_is_the_papers() -> None:
     config = PruningConfig(signal="positions", num_neighbors=7, seed=3)
     paper = PruningConfig(
         signal="positions",
@@ -53,21 +54,21 @@ def test_the_bands_are_the_papers() -> None:
         edges="centres",
         redistribution="none",
     )
-    found = decide(field(), band_rule(config, 0.2, 0.7))
-    assert torch.equal(found.mask, decide(field(), paper).mask)
+    found = decide_share(field(), band_rule(config, 0.2, 0.7))
+    assert torch.equal(found.mask, decide_share(field(), paper).mask)
     assert found.values is None
 
 
 @pytest.mark.parametrize("options", [{}, {"score": "response", "selection": "band", "redistribution": "none"}])
-def test_a_graph_at_hand_is_taken_and_changes_nothing(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_given_graph_is_used_and_changes_nothing(options: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     params, config = field(), PruningConfig(keep_ratio=0.3, **options)
     params["opacities"][4] = torch.nan
     usable = {name: value[torch.arange(N) != 4] for name, value in params.items()}
-    expected, graph = decide(params, config, lambda: torch.ones(N)), field_graph(usable, config)
+    expected, graph = decide_share(params, config, lambda: torch.ones(N)), field_graph(usable, config)
     monkeypatch.delattr(sundae_ns.pruning.decision, "field_graph")
-    found = decide(params, config, lambda: torch.ones(N), graph=graph)
+    found = decide_share(params, config, lambda: torch.ones(N), graph=graph)
     assert torch.equal(found.mask, expected.mask)
     for name, value in (expected.values or {}).items():
         assert torch.equal((found.values or {})[name], value)
-    # A rule that needs none does not look at it.
-    assert decide(params, PruningConfig(score="opacity", redistribution="none"), graph=graph).tau is None
+    # A rule without a graph ignores it.
+    assert decide_share(params, PruningConfig(score="opacity", redistribution="none"), graph=graph).tau is None

@@ -1,4 +1,4 @@
-"""How loops are compiled: kept on disk, compiled anew when a constant changes, and announced when it takes long."""
+"""Compilation of loops: cached on disk, renewed when a constant changes, and announced when it takes long."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sundae_ns.rasterization.cpu import parallel
 LOOP = """
 import numpy as np
 from sizes_of_this_test import SIZE
-from sundae_ns.rasterization.cpu.parallel import compiled, share
+from sundae_ns.rasterization.cpu.parallel import compiled, parallel_for
 
 @compiled
 def loop(begin, end, out):
@@ -24,11 +24,11 @@ def loop(begin, end, out):
         out[i] = SIZE
 
 out = np.zeros(3)
-share(loop, 3, out)
+parallel_for(loop, 3, out)
 """
 
 
-def test_code_is_kept_and_a_constant_of_another_module_renews_it(
+def test_cached_code_is_renewed_when_a_constant_of_another_module_changes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = tmp_path / "loop.py"
@@ -48,16 +48,18 @@ def test_code_is_kept_and_a_constant_of_another_module_renews_it(
     assert run(2) == ([2.0, 2.0, 2.0], 0)
 
 
-def test_where_nothing_can_be_kept_it_compiles_all_the_same() -> None:
-    """numba finds no folder for a function without a file, as where neither package nor home can be written to."""
+def test_compiles_without_a_cache_folder() -> None:
+    """numba finds no folder for a function without a file, as if neither package nor home were writable."""
     made: dict[str, Any] = {}
     exec(compile("def double(x):\n    return 2 * x", "<nowhere>", "exec"), made)
     assert parallel.compiled(made["double"])(4) == 8
 
 
-def test_a_line_says_that_it_compiles(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    parallel._say_that_it_compiles.cache_clear()
-    monkeypatch.setattr(parallel, "_PATIENCE", 0.05)
+def test_a_notice_is_printed_for_long_compilation(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parallel._print_notice.cache_clear()
+    monkeypatch.setattr(parallel, "_NOTICE_AFTER", 0.05)
     monkeypatch.setattr(parallel, "_ready", set())
 
     def slow(begin: int, end: int) -> None:
@@ -66,12 +68,12 @@ def test_a_line_says_that_it_compiles(monkeypatch: pytest.MonkeyPatch, capsys: p
     def fast(begin: int, end: int) -> None:
         pass
 
-    parallel.share(fast, 3)
+    parallel.parallel_for(fast, 3)
     assert capsys.readouterr().err == ""
-    parallel.share(slow, 3)
+    parallel.parallel_for(slow, 3)
     (line,) = capsys.readouterr().err.splitlines()
     assert "compiling" in line
     parallel._ready.clear()
-    parallel.share(slow, 3)
-    parallel.share(slow, 3)
+    parallel.parallel_for(slow, 3)
+    parallel.parallel_for(slow, 3)
     assert capsys.readouterr().err == ""

@@ -1,6 +1,6 @@
 """gsplat's CUDA kernels in float32 against the reference on the CPU in float64.
 
-Every deviation is the norm of the difference over the norm of the reference. Run with ``-s`` to see the worst ones.
+Deviations are the norm of the difference over the norm of the reference. Run with ``-s`` to see the worst ones.
 Faint opacities keep every footprint inside three standard deviations, where gsplat 1.4 and 1.5 bin alike; with opaque
 ones, 1.5 also blends the rim from 3 to 3.33 standard deviations (alphas up to 0.011), which 1.4 and the reference cut.
 """
@@ -75,7 +75,7 @@ def _deviation(ours: Tensor, theirs: Tensor) -> float:
 
 @pytest.fixture
 def within(record_property: Callable[[str, object], None]) -> Callable[[str, Tensor, Tensor, float], None]:
-    """Compare, and leave the deviation in the report and on the screen."""
+    """Compare, and record the deviation in the report and on the screen."""
 
     def check(name: str, gsplat: Tensor, reference: Tensor, tolerance: float) -> None:
         deviation = _deviation(gsplat, reference)
@@ -131,7 +131,7 @@ def test_radii() -> None:
         assert (ours - theirs).abs().max() <= 1
         assert (ours != theirs).float().mean() < 1e-2
     else:
-        # 1.5 fits the radius to the opacity and to each axis, and culls what cannot be seen.
+        # 1.5 fits the radius to the opacity and to each axis, and culls invisible primitives.
         assert (ours <= (theirs * 1.12).ceil() + 1).all()
 
 

@@ -1,4 +1,4 @@
-"""The lists of primitives that gsplat is given for its tiles: the kernels' very lines, compiled for the CPU."""
+"""The tile lists given to gsplat: the CUDA source, compiled for the CPU."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu import nvrtc
 from sundae_ns.rasterization import GsplatBackend, gsplat_backend, gsplat_harmonics, gsplat_tiles
-from sundae_ns.rasterization.gsplat_tiles import TILE, Room, tile_lists
+from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, tile_lists
 from sundae_ns.rasterization.harmonics import evaluate_harmonics
 
 Field = dict[str, Tensor]
@@ -36,7 +36,7 @@ def on_cpu(compile_kernels: Callable[..., dict[str, Any]], monkeypatch: pytest.M
 
 
 def field(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Field:
-    """Footprints of all sizes and shapes, up to needles across the picture, in and around it."""
+    """Footprints of all sizes and shapes, up to needles across the image, in and around it."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> Tensor:
@@ -61,136 +61,138 @@ def field(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 
     }
 
 
-def in_square(of: Field, column: int, row: int, columns: int, rows: int) -> Tensor:
-    """Whether gsplat has a tile in the square of each primitive ``[N]``."""
-    radii = of["radii"].float().view(len(of["depths"]), -1).expand(-1, 2) / TILE
-    low = (of["means2d"] / TILE - radii).floor().clamp(min=0).minimum(torch.tensor([columns, rows]))
-    high = (of["means2d"] / TILE + radii).ceil().clamp(min=0).minimum(torch.tensor([columns, rows]))
+def in_square(primitives: Field, column: int, row: int, columns: int, rows: int) -> Tensor:
+    """Whether gsplat's square of each primitive contains a tile ``[N]``."""
+    radii = primitives["radii"].float().view(len(primitives["depths"]), -1).expand(-1, 2) / TILE
+    low = (primitives["means2d"] / TILE - radii).floor().clamp(min=0).minimum(torch.tensor([columns, rows]))
+    high = (primitives["means2d"] / TILE + radii).ceil().clamp(min=0).minimum(torch.tensor([columns, rows]))
     at = torch.tensor([column, row])
     return (radii > 0).all(dim=1) & (low <= at).all(dim=1) & (high > at).all(dim=1)
 
 
-def most_alpha(of: Field, column: int, row: int, width: int, height: int) -> Tensor:
+def most_alpha(primitives: Field, column: int, row: int, width: int, height: int) -> Tensor:
     """Largest alpha of each primitive over the pixels of a tile, float64 ``[N]``."""
     ys, xs = torch.meshgrid(
         torch.arange(row * TILE, min(row * TILE + TILE, height)) + 0.5,
         torch.arange(column * TILE, min(column * TILE + TILE, width)) + 0.5,
         indexing="ij",
     )
-    dx = xs.reshape(1, -1).double() - of["means2d"][:, :1].double()
-    dy = ys.reshape(1, -1).double() - of["means2d"][:, 1:].double()
-    a, b, c = of["conics"].double().T[..., None]
+    dx = xs.reshape(1, -1).double() - primitives["means2d"][:, :1].double()
+    dy = ys.reshape(1, -1).double() - primitives["means2d"][:, 1:].double()
+    a, b, c = primitives["conics"].double().T[..., None]
     exponents = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-    return (of["opacities"][:, None].double() * (-exponents).exp()).amax(dim=1)
+    return (primitives["opacities"][:, None].double() * (-exponents).exp()).amax(dim=1)
 
 
-def by_tile(of: Field, width: int, height: int, room: Room | None = None) -> list[Tensor]:
-    lists = tile_lists(**of, width=width, height=height, room=room or Room())
+def by_tile(primitives: Field, width: int, height: int, capacity: Capacity | None = None) -> list[Tensor]:
+    lists = tile_lists(**primitives, width=width, height=height, capacity=capacity or Capacity())
     ends = [*lists.starts.flatten()[1:].tolist(), len(lists.primitives)]
     starts = lists.starts.flatten().tolist()
     return [lists.primitives[start:end].long() for start, end in zip(starts, ends, strict=True)]
 
 
 @pytest.mark.parametrize(("width", "height"), [(150, 100), (1, 1), (400, 37), (20, 700)])
-def test_nothing_that_is_blended_is_missing_and_hardly_anything_else_is_there(width: int, height: int) -> None:
-    of = field(300, width, height, largest=5.5)
+def test_all_blended_primitives_are_listed_and_hardly_any_others(width: int, height: int) -> None:
+    primitives = field(300, width, height, largest=5.5)
     columns, rows = -(-width // TILE), -(-height // TILE)
     needed = listed = squares = 0
-    for tile, found in enumerate(by_tile(of, width, height)):
+    for tile, found in enumerate(by_tile(primitives, width, height)):
         row, column = divmod(tile, columns)
-        square = in_square(of, column, row, columns, rows)
-        blended = square & (most_alpha(of, column, row, width, height) >= 1 / 255)
+        square = in_square(primitives, column, row, columns, rows)
+        blended = square & (most_alpha(primitives, column, row, width, height) >= 1 / 255)
         there = torch.zeros_like(square).index_fill(0, found, True)
         assert not (blended & ~there).any()
         assert not (there & ~square).any()
-        order = of["depths"][found] * 1000 + found  # by depth, and ties by index
-        assert (of["depths"][found].diff() >= 0).all()
-        assert (order.diff()[of["depths"][found].diff() == 0] > 0).all()
+        order = primitives["depths"][found] * 1000 + found  # by depth, and ties by index
+        assert (primitives["depths"][found].diff() >= 0).all()
+        assert (order.diff()[primitives["depths"][found].diff() == 0] > 0).all()
         needed, listed, squares = (
             needed + int(blended.sum()),
             listed + len(found),
             squares + int(square.sum()),
         )
     assert listed <= 1.02 * needed + 2
-    if columns * rows > 1:  # this test can tell them from gsplat's own
+    if columns * rows > 1:  # gsplat's own lists would fail this test
         assert squares > 2 * listed
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10**6), largest=st.sampled_from([1.0, 4.0, 7.0]), shift=st.sampled_from([0.0, 3000.0]))
 def test_needles_far_away_are_not_dropped(seed: int, largest: float, shift: float) -> None:
     width, height = 70, 50
-    of = field(40, width, height, largest=largest, seed=seed)
-    of["means2d"] += shift * torch.randn(40, 2, generator=torch.Generator().manual_seed(seed))
-    of["radii"][:] = 10000
-    for tile, found in enumerate(by_tile(of, width, height)):
+    primitives = field(40, width, height, largest=largest, seed=seed)
+    primitives["means2d"] += shift * torch.randn(40, 2, generator=torch.Generator().manual_seed(seed))
+    primitives["radii"][:] = 10000
+    for tile, found in enumerate(by_tile(primitives, width, height)):
         row, column = divmod(tile, 5)
-        # As gsplat sums the exponent in float32: what rounding makes visible may be there, and what is visible must be.
-        blended = most_alpha(of, column, row, width, height) >= 1.01 / 255
+        # gsplat sums the exponent in float32: primitives that are visible by rounding may be listed, visible ones must
+        # be.
+        blended = most_alpha(primitives, column, row, width, height) >= 1.01 / 255
         assert not (blended & ~torch.zeros(40, dtype=torch.bool).index_fill(0, found, True)).any()
 
 
-def test_where_it_is_least_between_two_tiles_either_may_be_the_one() -> None:
-    """A faint needle that leans over the gap between two tiles: the one on the far side of the border is reached."""
-    of = field(1, 64, 64)
+def test_least_exponent_between_two_tiles() -> None:
+    """A faint needle across the gap between two tiles reaches the tile on the far side of the border."""
+    primitives = field(1, 64, 64)
     c, s = math.cos(1.7074472511921694), math.sin(1.7074472511921694)
     xx, xy, yy = 625.1582971 * c * c + 0.3, 625.1582971 * c * s, 625.1582971 * s * s + 0.3
-    of["conics"][0] = torch.tensor([yy, -xy, xx], dtype=torch.float64) / (xx * yy - xy * xy)
-    of["means2d"][0] = torch.tensor([32.12918686614097, 32.5 - 0.9142656220370688])
-    of["opacities"][0], of["radii"][0] = math.exp(0.1) / 255, 100
-    alphas = [float(most_alpha(of, column, 2, 64, 64)) for column in range(4)]
+    primitives["conics"][0] = torch.tensor([yy, -xy, xx], dtype=torch.float64) / (xx * yy - xy * xy)
+    primitives["means2d"][0] = torch.tensor([32.12918686614097, 32.5 - 0.9142656220370688])
+    primitives["opacities"][0], primitives["radii"][0] = math.exp(0.1) / 255, 100
+    alphas = [float(most_alpha(primitives, column, 2, 64, 64)) for column in range(4)]
     assert [alpha >= 1 / 255 for alpha in alphas] == [False, True, False, False]
-    assert len(by_tile(of, 64, 64)[2 * 4 + 1]) == 1
+    assert len(by_tile(primitives, 64, 64)[2 * 4 + 1]) == 1
 
 
-def test_what_is_not_a_number_is_left_to_gsplat() -> None:
-    of = field(20, 64, 64)
-    of["radii"][:] = 100
-    of["conics"][3], of["opacities"][5], of["conics"][7] = torch.nan, torch.nan, 0.0
-    for found in by_tile(of, 64, 64):
+def test_nan_is_left_to_gsplat() -> None:
+    primitives = field(20, 64, 64)
+    primitives["radii"][:] = 100
+    primitives["conics"][3], primitives["opacities"][5], primitives["conics"][7] = torch.nan, torch.nan, 0.0
+    for found in by_tile(primitives, 64, 64):
         assert {3, 5, 7} <= set(found.tolist())
 
 
-def test_a_radius_for_each_axis() -> None:
-    of = field(200, 150, 100)
-    both = {**of, "radii": of["radii"][:, None].repeat(1, 2)}
-    assert all(torch.equal(a, b) for a, b in zip(by_tile(both, 150, 100), by_tile(of, 150, 100), strict=True))
-    both["radii"][:, 1] = both["radii"][:, 1] // 3
-    for tile, found in enumerate(by_tile(both, 150, 100)):
-        assert in_square(both, tile % 10, tile // 10, 10, 7)[found].all()
+def test_radii_per_axis() -> None:
+    primitives = field(200, 150, 100)
+    per_axis = {**primitives, "radii": primitives["radii"][:, None].repeat(1, 2)}
+    assert all(
+        torch.equal(a, b) for a, b in zip(by_tile(per_axis, 150, 100), by_tile(primitives, 150, 100), strict=True)
+    )
+    per_axis["radii"][:, 1] = per_axis["radii"][:, 1] // 3
+    for tile, found in enumerate(by_tile(per_axis, 150, 100)):
+        assert in_square(per_axis, tile % 10, tile // 10, 10, 7)[found].all()
 
 
-def test_room_leaves_the_lists_as_they_are_and_tells_what_was_needed() -> None:
-    of, room = field(200, 150, 100), Room()
-    exact = by_tile(of, 150, 100, room)
-    (needed,) = room.needed
+def test_capacity_keeps_the_lists_and_reports_the_number_of_pairs() -> None:
+    primitives, capacity = field(200, 150, 100), Capacity()
+    exact = by_tile(primitives, 150, 100, capacity)
+    (needed,) = capacity.needed
     assert int(needed) == sum(map(len, exact))
     for spare in (0, 1000):
-        roomy = Room(int(needed) + spare)
-        *found, below = by_tile(of, 150, 100, roomy)[: len(exact) + 1]
+        spacious = Capacity(int(needed) + spare)
+        *found, below = by_tile(primitives, 150, 100, spacious)[: len(exact) + 1]
         assert all(torch.equal(a, b) for a, b in zip(found, exact, strict=True))
-        assert len(below) == spare  # a tile below the picture has what is left
-    short = Room(int(needed) - 5)
-    by_tile(of, 150, 100, short)
+        assert len(below) == spare  # a tile below the image takes the unused pairs
+    short = Capacity(int(needed) - 5)
+    by_tile(primitives, 150, 100, short)
     assert int(short.needed[0]) == int(needed)
 
 
 def test_more_tiles_than_16_bits_count() -> None:
-    of = field(5, 30, 30)
-    of["means2d"] = torch.tensor([[3275.0 * TILE, 5.0]] * 5)
-    found = by_tile(of, 3300 * TILE, 10 * TILE)
+    primitives = field(5, 30, 30)
+    primitives["means2d"] = torch.tensor([[3275.0 * TILE, 5.0]] * 5)
+    found = by_tile(primitives, 3300 * TILE, 10 * TILE)
     assert {tile % 3300 // 100 for tile, list_ in enumerate(found) if len(list_)} == {32}
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_harmonics_are_those_of_the_reference(degree: int) -> None:
+def test_harmonics_match_the_reference(degree: int) -> None:
     directions, coeffs = torch.randn(100, 3) * 3, torch.randn(100, 25, 3)
     found = gsplat_harmonics.harmonics(degree, directions, coeffs)
     exact = evaluate_harmonics(degree, directions.double(), coeffs.double())
     torch.testing.assert_close(found.double(), exact, rtol=0, atol=5e-6)
 
 
-def test_they_compile_for_gpus() -> None:
+def test_kernels_compile_for_gpus() -> None:
     try:
         for dtype in (torch.int16, torch.int32):
             nvrtc.compile_cubin(gsplat_tiles.SOURCE, "sm_75", gsplat_tiles.definitions(dtype))
@@ -201,8 +203,8 @@ def test_they_compile_for_gpus() -> None:
         pytest.skip(f"no NVRTC here: {error}")
 
 
-def test_outside_of_recordings_harmonics_are_gsplats_with_gradients_or_without(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A GPU on which no kernel of ours compiles can do without; and where gsplat's do not run, it is found out."""
+def test_without_capacity_harmonics_are_gsplats(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU on which our kernels do not compile can still use gsplat's, and an error of gsplat's is raised."""
 
     def refuse(*_: Any) -> Tensor:
         raise RuntimeError("no kernel image")
@@ -213,5 +215,5 @@ def test_outside_of_recordings_harmonics_are_gsplats_with_gradients_or_without(m
     for gradients in (True, False):
         with torch.set_grad_enabled(gradients), pytest.raises(RuntimeError, match="no kernel image"):
             GsplatBackend().spherical_harmonics(0, directions, coeffs)
-    found = GsplatBackend(Room()).spherical_harmonics(0, directions, coeffs)
+    found = GsplatBackend(Capacity()).spherical_harmonics(0, directions, coeffs)
     torch.testing.assert_close(found, evaluate_harmonics(0, directions, coeffs))

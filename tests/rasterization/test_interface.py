@@ -35,7 +35,7 @@ def test_auto_takes_the_compiled_loops_on_a_cpu(device: torch.device | str) -> N
 
 
 def test_without_numba_auto_takes_the_reference() -> None:
-    """In a fresh interpreter that cannot import numba; asked for by name, the backend says why not."""
+    """In a fresh interpreter that cannot import numba; selected by name, the backend raises the cause."""
     code = """
 import sys
 sys.modules["numba"] = None
@@ -58,7 +58,7 @@ def test_cpu_backend_off_the_cpu_is_refused() -> None:
         select_backend("cpu", "meta")
 
 
-def test_gsplat_without_a_gpu_is_one_line_with_cause_and_mend(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gsplat_without_a_gpu_is_one_line_with_cause_and_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(BackendError, match=r"CUDA is not available; use .* or use the backend 'reference'") as caught:
         select_backend("gsplat", "cuda")
@@ -73,7 +73,7 @@ def test_gsplat_on_cpu_tensors_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     assert select_backend("auto", "cpu").name == "cpu"
 
 
-def test_kernels_that_fail_are_reported_and_auto_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_that_fail_are_reported_and_auto_falls_back(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr("sundae_ns.rasterization.select._kernel_problem", lambda: "its kernels do not run (x); mend")
     with pytest.raises(BackendError, match="its kernels do not run"):
@@ -87,7 +87,7 @@ def test_unknown_backend() -> None:
 
 
 @pytest.mark.parametrize(("chosen", "missing"), [("'auto', 'cpu'", "gsplat"), ("'reference', 'cpu'", "numba")])
-def test_selecting_imports_nothing_of_what_is_not_taken(chosen: str, missing: str) -> None:
+def test_selecting_does_not_import_other_backends(chosen: str, missing: str) -> None:
     code = (
         f"import sys; from sundae_ns.rasterization import select_backend; select_backend({chosen}); "
         f"sys.exit(any(name.split('.')[0] == '{missing}' for name in sys.modules))"
@@ -132,7 +132,7 @@ def test_blending_weights_work_without_grad() -> None:
     assert not weights.requires_grad
 
 
-def test_blending_weights_count_pixels_by_their_weight() -> None:
+def test_blending_weights_with_pixel_weights() -> None:
     arguments = {**_arguments(), "scales": torch.full((3, 3), 0.3), "opacities": torch.full((3,), 0.5), "height": 5}
     arguments.pop("colors")
     left = torch.zeros(5, 4)

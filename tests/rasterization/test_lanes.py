@@ -1,4 +1,4 @@
-"""Lanes against numpy, and the rows of pixels that a primitive is blended in against all pixels."""
+"""Lanes against numpy, and the pixel rows in which a primitive is blended against all pixels."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import torch
 
 from sundae_ns.rasterization.cpu.lanes import (
     WIDTH,
-    anywhere,
-    both,
-    choose,
-    decay,
-    fused,
-    least,
+    absolute,
+    any_lane,
+    broadcast,
+    exp_negative,
+    fma,
     load,
-    magnitude,
-    spread,
+    logical_and,
+    minimum,
+    select,
     store,
-    store_totals,
+    store_sums,
 )
 from sundae_ns.rasterization.cpu.parallel import compiled
 from sundae_ns.rasterization.cpu.projection import project
@@ -37,18 +37,18 @@ def _try_all(a: Any, b: Any, whole: Any, out: Any, count: Any) -> Any:
     store(out, 1 * WIDTH, 1.5 - x)
     store(out, 2 * WIDTH, x * 0.1)
     store(out, 3 * WIDTH, x / y)
-    store(out, 4 * WIDTH, fused(x, y, -1.0))
-    store(out, 5 * WIDTH, choose(both(x < y, y >= 0.0), x, 7.0))
-    store(out, 6 * WIDTH, least(x, y) - magnitude(y))
-    store(out, 7 * WIDTH, spread(a, 3) * x)
+    store(out, 4 * WIDTH, fma(x, y, -1.0))
+    store(out, 5 * WIDTH, select(logical_and(x < y, y >= 0.0), x, 7.0))
+    store(out, 6 * WIDTH, minimum(x, y) - absolute(y))
+    store(out, 7 * WIDTH, broadcast(a, 3) * x)
     store(out, 8 * WIDTH, 2.5)
-    store(count, 0, choose(x > 0.0, 5, load(whole, 0)))
-    store_totals(out, 9 * WIDTH, x, y, x + 1.0, y + 1.0, x + 2.0, y + 2.0, x + 3.0, y + 3.0)
-    return anywhere(x > y), anywhere(x > 1e6), anywhere(load(whole, 0) <= 2)
+    store(count, 0, select(x > 0.0, 5, load(whole, 0)))
+    store_sums(out, 9 * WIDTH, x, y, x + 1.0, y + 1.0, x + 2.0, y + 2.0, x + 3.0, y + 3.0)
+    return any_lane(x > y), any_lane(x > 1e6), any_lane(load(whole, 0) <= 2)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_lanes_are_what_numpy_computes(dtype: Any) -> None:
+def test_lanes_match_numpy(dtype: Any) -> None:
     generator = np.random.default_rng(0)
     a, b = generator.normal(size=(2, WIDTH)).astype(dtype)
     whole, count, out = np.arange(WIDTH, dtype=np.int32), np.zeros(WIDTH, np.int32), np.zeros(10 * WIDTH, dtype)
@@ -57,7 +57,7 @@ def test_lanes_are_what_numpy_computes(dtype: Any) -> None:
     exact = [a + b, dtype(1.5) - a, a * dtype(0.1), a / b, None, np.where((a < b) & (b >= 0), a, dtype(7))]
     for row, expected in zip(rows, exact):
         assert expected is None or np.array_equal(row, expected)
-    # Rounded once: in float32 what float64 rounds to it.
+    # Rounded once: in float32 equal to the float64 result rounded to float32.
     once = (a.astype(np.float64) * b - 1).astype(dtype)
     assert np.array_equal(rows[4], once) if dtype == np.float32 else np.allclose(rows[4], once, rtol=1e-14)
     assert np.array_equal(rows[6], np.minimum(a, b) - np.abs(b))
@@ -69,16 +69,16 @@ def test_lanes_are_what_numpy_computes(dtype: Any) -> None:
 
 
 @compiled
-def _decays(x: Any, out: Any) -> None:
+def _apply_exp_negative(x: Any, out: Any) -> None:
     for place in range(0, len(x), WIDTH):
-        store(out, place, decay(load(x, place)))
+        store(out, place, exp_negative(load(x, place)))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_decay_is_within_one_and_a_half_units_in_the_last_place(dtype: Any) -> None:
+def test_exp_negative_is_within_one_and_a_half_units_in_the_last_place(dtype: Any) -> None:
     x = np.concatenate([np.linspace(0, 80, 2**16 - WIDTH), np.linspace(0, 1e-6, WIDTH)]).astype(dtype)
     out = np.empty_like(x)
-    _decays(x, out)
+    _apply_exp_negative(x, out)
     exact = np.exp(-x.astype(np.longdouble))
     error = float((np.abs(out - exact) / exact).max()) / np.finfo(dtype).eps
     assert error < 1.5  # measured: 1.37 and 1.32
@@ -86,8 +86,8 @@ def test_decay_is_within_one_and_a_half_units_in_the_last_place(dtype: Any) -> N
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_no_pixel_that_counts_is_left_out_and_few_others_are_in(dtype: torch.dtype) -> None:
-    """Round ones, needles that lie askew, and some that are cut off by the picture's edge."""
+def test_every_blended_pixel_is_listed_and_few_others(dtype: torch.dtype) -> None:
+    """Round primitives, oblique needles, and some that the image's edge cuts off."""
     generator = torch.Generator().manual_seed(0)
     n, width, height = 400, 70, 50
     means = torch.rand(n, 3, generator=generator) * torch.tensor([2.0, 1.6, 1.0]) + torch.tensor([-1.0, -0.8, 2.0])
@@ -95,7 +95,7 @@ def test_no_pixel_that_counts_is_left_out_and_few_others_are_in(dtype: torch.dty
     camera = torch.eye(4), torch.tensor([[80.0, 0, 35], [0, 80, 25], [0, 0, 1]])
     values = (means, torch.randn(n, 4, generator=generator), scales, *camera)
     projection = project(*(value.to(dtype) for value in values), width, height, 0.01, 1e10)
-    # What gsplat's bins of three sigmas cut off is no matter here: faint ones end before that.
+    # The faint opacity ends footprints inside gsplat's three-sigma bins, so the bins do not matter here.
     lists = build_lists(projection, torch.full((n,), 0.2, dtype=dtype), width, height)
     table = lists.table.astype(np.float64)
     y, x = np.mgrid[: lists.rows * TILE, : lists.columns * TILE] + 0.5
@@ -107,6 +107,6 @@ def test_no_pixel_that_counts_is_left_out_and_few_others_are_in(dtype: torch.dty
             listed[lists.ranks[entry], first:beyond, left : left + TILE] = True
     dx, dy = x - table[:, U, None, None], y - table[:, V, None, None]
     xx, xy, yy, limit = (table[:, column, None, None] for column in (HALF_XX, XY, HALF_YY, LIMIT))
-    counts = xx * dx * dx + xy * dx * dy + yy * dy * dy <= limit - 1e-3
-    assert not (counts & ~listed).any()
-    assert counts.sum() > 0.3 * listed.sum()  # measured: 0.42
+    visible = xx * dx * dx + xy * dx * dy + yy * dy * dy <= limit - 1e-3
+    assert not (visible & ~listed).any()
+    assert visible.sum() > 0.3 * listed.sum()  # measured: 0.42

@@ -6,8 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from sundae_ns.gaussians.rotations import rotation_matrices
 from sundae_ns.rasterization.harmonics import evaluate_harmonics
-from sundae_ns.rasterization.projection import project, rotation_matrices
+from sundae_ns.rasterization.projection import project
 
 gsplat_torch = pytest.importorskip("gsplat.cuda._torch_impl")
 
@@ -67,7 +68,7 @@ def test_projection_matches_gsplat(antialiased: bool) -> None:
         means, covars, viewmat[None], K[None], WIDTH, HEIGHT, calc_compensations=antialiased
     )
     if radii.dim() == 3:
-        # gsplat 1.5 has a radius for each axis, and culls what no pixel sees; the reference follows 1.4.
+        # gsplat 1.5 has one radius per axis and culls invisible primitives; the reference follows 1.4.
         seen = (radii[0] > 0).all(dim=-1) & (ours.radii > 0)
     else:
         seen = radii[0] > 0

@@ -1,4 +1,4 @@
-"""The reference rasteriser against a per-pixel loop, finite differences and invariants; and where it must not break."""
+"""The reference rasteriser against a per-pixel loop, finite differences and invariants; and extreme scenes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _scene(n: int, channels: int = 3, dtype: torch.dtype = torch.float64, seed: 
         "means": (uniform(n, 3) - 0.5) * 2 + torch.tensor([0.0, 0.0, 3.0]),
         "quats": torch.randn(n, 4, generator=generator, dtype=torch.float64),
         "scales": 0.02 + 0.15 * uniform(n, 3),
-        "opacities": uniform(n) ** 0.5,  # many near one, so that capping and stopping both happen
+        "opacities": uniform(n) ** 0.5,  # many near one, so that clamping and stopping both happen
         "colors": uniform(n, channels),
     }
     return {name: value.to(dtype) for name, value in scene.items()}
@@ -38,7 +38,7 @@ def _view(width: int, height: int, dtype: torch.dtype = torch.float64) -> dict:
 
 
 def _add_wall(scene: dict[str, Tensor]) -> None:
-    """Make the first primitive so wide and opaque that its alpha is capped in every pixel."""
+    """Make the first primitive so wide and opaque that its alpha is clamped in every pixel."""
     scene["scales"][0] = 50.0
     scene["opacities"][0] = 1.0
 
@@ -131,7 +131,7 @@ def test_stops_early_like_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     [(4, 3, 3, False, False), (60, 19, 18, False, True), (60, 19, 18, True, True)],
 )
 def test_gradcheck(count: int, width: int, height: int, antialiased: bool, fast: bool) -> None:
-    """Every input; fast mode compares random projections of the Jacobian, which affords a crowded scene."""
+    """All inputs; fast mode compares random projections of the Jacobian, which allows a crowded scene."""
     scene, view = _scene(count, channels=2, seed=3), _view(width, height)
     _add_wall(scene)
     viewmat = view.pop("viewmat").requires_grad_()
@@ -205,7 +205,7 @@ def test_ties_in_depth_are_broken_by_index() -> None:
 
 
 def test_footprints_end_with_the_bins_of_gsplat() -> None:
-    """A 16-pixel bin that the three-sigma square does not reach stays empty, though alphas there would still count."""
+    """A 16-pixel bin that the three-sigma square does not reach stays empty, though alphas there would be visible."""
     scene, view = _scene(1), _view(40, 20)
     scene["means"][:] = torch.tensor([0.0, 0.0, 1.0])
     scene["scales"][:] = math.sqrt(8.5) / view["K"][0, 0]  # 8.8 square pixels with the blur: 3 sigma = 8.9, 3.33 = 9.9

@@ -1,7 +1,7 @@
-"""Rasterisers on hard scenes: finite values and gradients, and the reference's in float32 close to float64.
+"""Rasterisers on hard scenes: values and gradients are finite, and the reference in float32 is close to float64.
 
-Scenes are given before activation, as they are trained, and rounded to float32 before they are rendered in float64: the
-differences are those of the arithmetic. They are norms of the difference over the norm in float64.
+Scenes are given before activation, as in training, and rounded to float32 before they are rendered in float64, so
+differences come from arithmetic alone. Errors are the norm of the difference over the norm in float64.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from sundae_ns.rasterization import Backend, Rasterization, rasterize, select_ba
 
 REFERENCE = select_backend("reference", "cpu")
 NEAR = 2.0**-6
-"""A number of float32, so that a primitive can lie on the plane in both precisions."""
+"""A float32 number, so that a primitive can lie on the plane in both precisions."""
 FLOOR = 1e-6
-"""Norms below this count as this: a gradient that vanishes in float64 has no relative error."""
+"""Lower bound of norms that divide errors: a gradient that vanishes in float64 has no relative error."""
 Scene = dict[str, Tensor]
 
 
@@ -37,7 +37,7 @@ def scene(n: int = 300, seed: int = 0) -> Scene:
 def render(
     made: Scene, dtype: torch.dtype, size: int, antialiased: bool, *, backend: Backend = REFERENCE, device: str = "cpu"
 ) -> tuple[Rasterization, Scene]:
-    """The rendering, and the gradients of a sum over it with fixed random weights."""
+    """The rendering, and the gradients of its sum with fixed random weights."""
     leaves = {name: value.to(device, dtype, copy=True).requires_grad_() for name, value in made.items()}
     K = torch.tensor([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]], dtype=dtype, device=device)
     rendered = rasterize(
@@ -57,9 +57,9 @@ def render(
         backend=backend,
     )
     assert rendered.depth is not None
-    picture = torch.cat([rendered.colors, rendered.alpha, rendered.depth], dim=2)
-    weights = torch.randn(picture.shape, generator=torch.Generator().manual_seed(9)).to(picture)
-    (picture * weights).sum().backward()
+    image = torch.cat([rendered.colors, rendered.alpha, rendered.depth], dim=2)
+    weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(9)).to(image)
+    (image * weights).sum().backward()
     gradients = {name: leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for name, leaf in leaves.items()}
     return rendered, gradients
 
@@ -119,8 +119,8 @@ def behind_the_camera() -> Scene:
     return made
 
 
-# Scene, size of the image, and the bounds on the errors of image and worst gradient. Measured worst cases: 9.9e-7 and
-# 9.3e-6 but for two, which say theirs.
+# Scene, image size, and the bounds on the errors of the image and of the worst gradient. Measured worst cases: 9.9e-7
+# and 9.3e-6, except where noted.
 CASES: dict[str, tuple[Callable[[], Scene], int, float, float]] = {
     "ordinary": (scene, 48, 5e-6, 2e-5),
     "scales of 1e-8": (lambda: with_scales(1e-8), 48, 5e-6, 2e-5),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -41,26 +42,26 @@ def test_what_masks_leave_out_of_training_asks_for_no_primitives(build: Build, d
     """All of a picture is what one half shows and what the other does; many primitives have nothing in one of the two."""
     model = build(pruning={"score": score})
     model.gauss_params["scales"].data[:] = -4.0
-    whole = model.contribution(datamanager)
+    share = 0.5 if score == "detail-contribution" else None
+    whole = model.contribution(datamanager, share)
     left = torch.zeros(32, 40, 1, dtype=torch.bool)
     left[:, :20] = True
     parts = []
     for datamanager.mask in (left, ~left):
-        parts.append(model.contribution(datamanager))
+        parts.append(model.contribution(datamanager, share))
     torch.testing.assert_close(parts[0] + parts[1], whole)
     for only, other in (parts, parts[::-1]):
         assert ((only == 0) & (other > 0)).any()
     datamanager.mask = torch.ones_like(left)
-    torch.testing.assert_close(model.contribution(datamanager), whole)
+    torch.testing.assert_close(model.contribution(datamanager, share), whole)
     for datamanager.mask in (left[:-1], left[..., 0], left[:1]):
-        with pytest.raises(DataError, match="where its view is 40 x 32 px"):
-            model.contribution(datamanager)
+        with pytest.raises(DataError, match="its view is 40 x 32 px"):
+            model.contribution(datamanager, share)
 
 
 def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(build: Build, datamanager: Any) -> None:
-    plain, weighted = (build(pruning={"score": f"{name}contribution"}) for name in ("", "detail-"))
-    weighted.gauss_params.load_state_dict(plain.gauss_params.state_dict())
-    found = [model.contribution(datamanager) for model in (plain, weighted, weighted)]
+    model = build()
+    found = [model.contribution(datamanager, share) for share in (None, 0.5, 0.5)]
     assert torch.equal(found[1], found[2])
     assert torch.equal(found[1] > 0, found[0] > 0)
     seen = found[0] > 0
@@ -69,21 +70,23 @@ def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(buil
     assert float(ratio.min()) < 0.9
 
 
-def test_a_round_weighs_detail_for_what_it_keeps(
+def test_a_prune_weighs_detail_for_the_share_that_it_keeps(
     build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not for what the last of the rounds will have left."""
-    training = training_of(build(pruning={"rounds": 2, "round_every": 2, "keep_ratio": 0.25}))
-    asked, weights_of = [], training.model.weights_of
+    training = training_of(build(pruning={"mode": "continuous", "start": 3, "stop": 3, "target_primitives": 15}))
+    asked: list[float | None] = []
+    rendering = sys.modules["sundae_ns.rendering.contribution"]  # its name is also that of a function
+    view_weights = rendering.view_weights
 
-    def spy(view: Any, keep_ratio: float | None = None, mask: Tensor | None = None) -> Tensor:
-        asked.append(keep_ratio)
-        return weights_of(view, keep_ratio, mask=mask)
+    def spy(*arguments: Any) -> Tensor:
+        asked.append(arguments[4])
+        weights: Tensor = view_weights(*arguments)
+        return weights
 
-    monkeypatch.setattr(training.model, "weights_of", spy)
+    monkeypatch.setattr(rendering, "view_weights", spy)
     counts = []
     for step in range(6):
         training.step(step)
         counts.append(training.model.num_points)
-    assert counts == [60, 60, 60, 30, 30, 15]
-    assert asked == [0.5] * 6
+    assert counts == [60, 60, 60, 15, 15, 15]
+    assert asked == [0.25] * 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 
 import pytest
@@ -9,7 +10,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering import render as rendering
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -21,6 +21,7 @@ def test_outputs_that_nobody_asks_for_cost_nothing(
 ) -> None:
     model = perturb(build()).eval()
     splatted: list[int] = []
+    rendering = sys.modules["sundae_ns.rendering.render"]  # its name is also that of a function
     rasterize = rendering.rasterize
     monkeypatch.setattr(rendering, "rasterize", lambda *a, **kwargs: splatted.append(1) or rasterize(*a, **kwargs))
     outputs = model.get_outputs_for_camera(camera())
@@ -37,7 +38,7 @@ def test_outputs_belong_to_the_field_that_was_rendered(build: Build, perturb: Pe
     with torch.no_grad():  # a prune, while another thread still shows the picture
         for name, value in model.gauss_params.items():
             model.gauss_params[name] = torch.nn.Parameter(value[::2].clone())
-        model.pruning_state["num_prunes"] += 1
+        model.state.pruning["num_prunes"] += 1
     assert {name for name, value in outputs.items() if not torch.equal(value, before[name])} == set()
     after = model.get_outputs_for_camera(camera())
     assert not torch.equal(after["response"], before["response"])

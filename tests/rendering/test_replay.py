@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from types import SimpleNamespace
@@ -17,12 +17,11 @@ from nerfstudio.data.scene_box import OrientedBox
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
+from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.cuda_graphs import RECORD_AT
 from sundae_ns.model import SundaeModel
-from sundae_ns.rasterization import GsplatBackend, Room
-from sundae_ns.rendering import replay as recordings
-from sundae_ns.rendering.render import Style, render
-from sundae_ns.rendering.views import View
+from sundae_ns.rasterization import Capacity, GsplatBackend
+from sundae_ns.rendering import FieldSource, FrameReplay, LocalField, RenderSettings, View, render, replay
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -40,23 +39,22 @@ class Recorder:
 
     def record(
         self,
-        field: Mapping[str, Tensor],
+        source: FieldSource,
         view: View,
         background: Tensor,
-        style: Style,
-        compensate: bool,
-        pairs: Any = None,
+        settings: RenderSettings,
+        capacity: int | None = None,
     ) -> Any:
         if self.fails is not None:
             raise self.fails
-        self.recorded.append(pairs)
+        self.recorded.append(capacity)
         shown = {}
 
         def show(view: View, background: Tensor) -> dict[str, Tensor]:
-            shown.update(render(field, view, background, style, depth=False, compensate=compensate)[0])
-            return {name: shown[name] for name in recordings.SHOWN}
+            shown.update(render(source, view, background, settings, depth=False)[0])
+            return {name: shown[name] for name in replay.REPLAYED}
 
-        return SimpleNamespace(show=show, pairs=pairs or 120)
+        return SimpleNamespace(show=show, capacity=capacity or 120)
 
     def play(self, recording: Any, view: View, background: Tensor) -> tuple[dict[str, Tensor], int]:
         self.played += 1
@@ -66,9 +64,9 @@ class Recorder:
 @pytest.fixture
 def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     found = Recorder()
-    monkeypatch.setattr(recordings, "_record", found.record)
-    monkeypatch.setattr(recordings, "_play", found.play)
-    monkeypatch.setattr(recordings, "_recordable", lambda field, style: True)
+    monkeypatch.setattr(replay, "_record", found.record)
+    monkeypatch.setattr(replay, "_replay", found.play)
+    monkeypatch.setattr(replay, "_recordable", lambda source, settings: source.replayable)
     return found
 
 
@@ -78,7 +76,7 @@ def test_a_size_that_stays_is_recorded_and_played_back(
     model = perturb(build(background_color="black")).eval()
     shown = [model.get_outputs_for_camera(camera(shift=0.1 * i))["rgb"] for i in range(RECORD_AT + 2)]
     assert (len(recorder.recorded), recorder.played) == (1, 3)
-    model._recordings = recordings.Recordings()
+    model._replay = FrameReplay()
     for i, picture in enumerate(shown):
         assert torch.equal(picture, model.get_outputs_for_camera(camera(shift=0.1 * i))["rgb"])
         model.get_outputs_for_camera(camera(width=20 + i))
@@ -103,12 +101,12 @@ def test_what_a_recording_has_fixed_makes_another_one(
     assert model.head is not None
     model.head.config = replace(model.head.config, phases=2)
     assert show() == 5
-    model.trained_focal = (10.0, 10.0)  # the camera's is 30: the head runs at another scale
+    model.state.trained_focal = (10.0, 10.0)  # the camera's is 30: the head runs at another scale
     assert show() == 6
     with torch.no_grad():
         model.gauss_params["means"] = torch.nn.Parameter(model.gauss_params["means"].clone())
     assert show() == 7
-    assert len(model._recordings._kept) == 1
+    assert len(model._replay._frames) == 1
     model.step = 0  # fewer bands of the harmonics take part
     assert show() == 8
     model.config.rasterize_mode = "antialiased"
@@ -125,7 +123,7 @@ def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(
         model.get_outputs_for_camera(camera())
     recorder.needed = 121
     outputs = model.get_outputs_for_camera(camera())
-    assert recorder.recorded == [None, int(recordings.SPARE * 121)]
+    assert recorder.recorded == [None, int(replay.SPARE * 121)]
     assert outputs["rgb"].shape == (32, 40, 3)
     recorder.needed = 150
     model.get_outputs_for_camera(camera())
@@ -146,7 +144,7 @@ def test_one_thread_plays_at_a_time(
         inside[0] -= 1
         return made
 
-    monkeypatch.setattr(recordings, "_play", slowly)
+    monkeypatch.setattr(replay, "_replay", slowly)
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(lambda _: model.get_outputs_for_camera(camera())["rgb"], range(12)))
     assert (most[0], recorder.played) == (1, 10)
@@ -178,7 +176,7 @@ def test_a_part_of_a_field_is_never_recorded(
     for _ in range(2 * RECORD_AT):
         cropped = model.get_outputs_for_camera(camera(), obb_box=box)["rgb"]
     half = SimpleNamespace(mask=torch.arange(60) % 2 == 0, values=None)
-    monkeypatch.setattr(model.preview, "decision", lambda _: half)
+    monkeypatch.setattr(model.viewer_controls, "preview", lambda: half)
     for _ in range(2 * RECORD_AT):
         previewed = model.get_outputs_for_camera(camera())["rgb"]
     assert recorder.recorded == []
@@ -194,28 +192,28 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(
     def refuse(*_: Any, **__: Any) -> None:
         raise AssertionError("recorded")
 
-    monkeypatch.setattr(recordings, "_record", refuse)
+    monkeypatch.setattr(replay, "_record", refuse)
     model = perturb(build()).eval()
     for _ in range(2 * RECORD_AT):
         model.get_outputs_for_camera(camera())
-    field = {"means": torch.zeros(1, 3)}
-    style = replace(model._style, backend=SimpleNamespace(name="gsplat"))  # type: ignore[arg-type]
+    source, empty = (LocalField(Field({"means": torch.zeros(n, 3)})) for n in (1, 0))
+    settings = replace(model.render_settings(training=False), backend=SimpleNamespace(name="gsplat"))  # type: ignore[arg-type]
     with torch.no_grad():
-        assert recordings._recordable(field, style)
-        assert not recordings._recordable({"means": torch.zeros(0, 3)}, style)
-        assert not recordings._recordable(field, replace(style, training=True))
-        assert not recordings._recordable(field, replace(style, arrivals=lambda *_: None))  # type: ignore[arg-type]
-    assert not recordings._recordable(field, style)  # with gradients
+        assert replay._recordable(source, settings)
+        assert not replay._recordable(empty, settings)
+        assert not replay._recordable(source, replace(settings, training=True))
+        assert not replay._recordable(source.part(torch.ones(1, dtype=torch.bool)), settings)
+    assert not replay._recordable(source, settings)  # with gradients
 
 
 # ------------------------------------------------------------------------------------------------------------- on a GPU
 
 
 def eager(model: SundaeModel, camera: Cameras) -> dict[str, Tensor]:
-    model._recordings = recordings.Recordings()
+    model._replay = FrameReplay()
     outputs = model.get_outputs_for_camera(camera)
-    assert len(model._recordings._kept) == 0
-    return {name: outputs[name] for name in recordings.SHOWN}
+    assert len(model._replay._frames) == 0
+    return {name: outputs[name] for name in replay.REPLAYED}
 
 
 @pytest.mark.gpu
@@ -227,17 +225,17 @@ def test_what_is_played_back_is_what_would_be_rendered(
     model = perturb(build(n=2000, sh_degree=3, head=head, background_color="white")).cuda().eval()
     model.step = 10_000
     if focal is not None:
-        model.trained_focal = (focal, focal)
+        model.state.trained_focal = (focal, focal)
     views = [camera(width=150, height=101, shift=shift) for shift in (0.0, 0.3, -0.6, 0.1)]
     expected = [eager(model, view) for view in views]
-    played = model._recordings = recordings.Recordings()
+    replayed = model._replay = FrameReplay()
     if model.head is not None:
         model.head._accelerate()  # forgets what the frames above have made it record
     for _ in range(RECORD_AT):
         model.get_outputs_for_camera(views[0])
     shown = [model.get_outputs_for_camera(view) for view in views]
-    assert len(played._kept) == 1
-    assert played._can_record
+    assert len(replayed._frames) == 1
+    assert replayed._can_record
     # The head is a part of the frame's recording, and has none of its own, unless a single frame has run it often enough.
     if model.head is not None and model.head.config.phases < RECORD_AT:
         assert len(model.head._inference._recorded) == 0
@@ -258,7 +256,7 @@ def test_what_is_trained_meanwhile_is_seen(build: Build, perturb: Perturb, camer
         for value in model.head.parameters():  # type: ignore[union-attr]
             value += 0.02
     after = model.get_outputs_for_camera(camera())["rgb"]
-    assert len(model._recordings._kept) == 1
+    assert len(model._replay._frames) == 1
     assert not torch.equal(after, before)
     torch.testing.assert_close(after, eager(model, camera())["rgb"], rtol=0, atol=2e-3)
     with torch.no_grad():  # a prune
@@ -274,15 +272,15 @@ def test_a_view_of_many_more_pairs(build: Build, perturb: Perturb, camera: MakeC
     model = perturb(build(n=3000)).cuda().eval()
     far, near = camera(width=640, height=480, shift=300.0), camera(width=640, height=480)
     expected = eager(model, near)["base_rgb"]
-    model._recordings = recordings.Recordings()
+    model._replay = FrameReplay()
     for _ in range(RECORD_AT):
         model.get_outputs_for_camera(far)
-    (small,) = model._recordings._kept._kept.values()
+    (small,) = model._replay._frames._graphs.values()
     found = model.get_outputs_for_camera(near)["base_rgb"]
-    (large,) = model._recordings._kept._kept.values()
-    assert large.pairs > small.pairs
+    (large,) = model._replay._frames._graphs.values()
+    assert large.capacity > small.capacity
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
-    assert model._recordings._can_record
+    assert model._replay._can_record
 
 
 @pytest.mark.gpu
@@ -292,10 +290,10 @@ def test_shorter_lists_make_the_same_picture(build: Build, camera: MakeCamera, s
     model = build(n=5000).cuda().eval()
     model.gauss_params["scales"] += 2 * torch.randn_like(model.gauss_params["scales"])
     view, background = model.view_of(camera(width=size[0], height=size[1])), torch.zeros(3, device="cuda")
-    theirs = render(model.gaussians, view, background, model._style)[0]
-    room = Room()
-    style = replace(model._style, backend=GsplatBackend(room))
-    ours = render(model.gaussians, view, background, style)[0]
-    assert int(room.needed[0]) > 0
+    settings = model.render_settings(training=False)
+    theirs = render(model.source, view, background, settings)[0]
+    capacity = Capacity()
+    ours = render(model.source, view, background, replace(settings, backend=GsplatBackend(capacity)))[0]
+    assert int(capacity.needed[0]) > 0
     for name in ("base_rgb", "depth", "accumulation"):
         assert torch.equal(ours[name], theirs[name])

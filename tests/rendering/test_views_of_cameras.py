@@ -94,13 +94,13 @@ def test_a_window_is_a_part_of_the_whole_picture(
 
 def test_windows_wait_for_the_head_and_for_densification(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
     model = build(head={"max_train_pixels": 600})
-    assert not model.head_active
-    assert model._look(0).window_pixels == 0
+    assert not model.state.head_enabled
+    assert model._resolution(0).window_pixels == 0
     perturb(model)
-    assert model._look(0).window_pixels == 600
+    assert model._resolution(0).window_pixels == 600
     assert model.eval().get_outputs(camera())["rgb"].shape == (32, 40, 3)  # what is shown is whole
     early = perturb(
         build(head={"max_train_pixels": 600, "start_at": 0}, pruning={"mode": "continuous", "start": 5, "stop": 50})
     )
-    assert early.head_active
-    assert early._look(0).window_pixels == 0  # densification takes its statistics from whole pictures
+    assert early.state.head_enabled
+    assert early._resolution(0).window_pixels == 0  # densification takes its statistics from whole pictures

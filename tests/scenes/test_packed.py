@@ -1,4 +1,4 @@
-"""Runs as packed scenes, and back: what travels, what does not, and headers that lie."""
+"""Runs as packed scenes, and back: what is stored, what is not, and headers with false claims."""
 
 from __future__ import annotations
 
@@ -92,8 +92,8 @@ def test_a_scene_becomes_a_run(tmp_path: Path) -> None:
         assert torch.equal(found[name], truth.field[name]), name
     for name, value in model.head.state_dict().items():
         assert torch.equal(value, truth.head[name]), name
-    assert model.head_active
-    assert model.trained_focal == (40.0, 41.0)
+    assert model.state.head_enabled
+    assert model.state.trained_focal == (40.0, 41.0)
     assert (model.config.rasterize_mode, model.config.background_color) == ("antialiased", "white")
     seen = pipeline.datamanager.train_dataset
     assert torch.equal(seen.cameras.camera_to_worlds, cameras()["poses"])
@@ -102,32 +102,32 @@ def test_a_scene_becomes_a_run(tmp_path: Path) -> None:
     outputs = model.get_outputs_for_camera(seen.cameras[0:1])
     assert outputs["rgb"].shape == (32, 40, 3)
     assert (outputs["rgb"] - outputs["base_rgb"]).abs().max() > 1e-3
-    # Grey is what stands for pictures, and no measure of anything.
+    # Grey images stand for those of the capture; nothing is measured on them.
     camera, batch = pipeline.datamanager.fixed_indices_eval_dataloader[0]
     with pytest.raises(DataError, match="unpacked without its capture"):
         model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
 
 
-def test_pictures_of_the_run_are_those_of_the_scene(tmp_path: Path) -> None:
+def test_images_of_the_run_are_those_of_the_scene(tmp_path: Path) -> None:
     """Through the file, and through another run made of that run."""
     first = opened(write_run(scene(), tmp_path / "a", "x"))
     write_scene(tmp_path / "x.sundae", scene_of_run(tmp_path / "a" / "x" / "sundae" / "unpacked"))
     second = opened(write_run(read_scene(tmp_path / "x.sundae"), tmp_path / "b", "x"))
     camera = first.datamanager.train_dataset.cameras[1:2]
-    pictures = [run.model.get_outputs_for_camera(camera)["rgb"] for run in (first, second)]
-    assert (pictures[0] - pictures[1]).square().mean().sqrt() < 0.004
-    assert (pictures[0] - 1).abs().max() > 0.2
+    images = [run.model.get_outputs_for_camera(camera)["rgb"] for run in (first, second)]
+    assert (images[0] - images[1]).square().mean().sqrt() < 0.004
+    assert (images[0] - 1).abs().max() > 0.2
 
 
 def test_a_run_without_its_capture_names_none(tmp_path: Path) -> None:
-    """It is read otherwise than the capture was: what it would state of it put every camera in a wrong place."""
+    """Its parser is another one; options of that would move every camera to a wrong place."""
     blind = write_run(scene(), tmp_path, "x").parent
     assert scene_of_run(blind).meta["capture"] is None
     with pytest.raises(DataError, match="unpacked without its capture"):
         scene_of_run(blind, data=tmp_path)
 
 
-def test_a_scene_without_cameras_is_looked_at_from_outside(tmp_path: Path) -> None:
+def test_a_scene_without_cameras_gets_one_outside_of_it(tmp_path: Path) -> None:
     pipeline = opened(write_run(Scene(field(), head(), None, meta()), tmp_path, "a"))
     (camera,) = [pipeline.datamanager.train_dataset.cameras[0:1]]
     accumulation = pipeline.model.get_outputs_for_camera(camera)["accumulation"]
@@ -152,12 +152,14 @@ def test_a_run_is_never_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("parser", ["colmap", "nerfstudio-data"])
-@pytest.mark.parametrize("kind", ["missing", "empty", "pictures"])
-def test_what_is_no_capture_is_refused_before_anything_is_written(tmp_path: Path, kind: str, parser: str) -> None:
+@pytest.mark.parametrize("kind", ["missing", "empty", "images"])
+def test_a_folder_without_a_capture_is_refused_before_anything_is_written(
+    tmp_path: Path, kind: str, parser: str
+) -> None:
     capture = tmp_path / "capture"
     if kind != "missing":
         capture.mkdir()
-    if kind == "pictures":
+    if kind == "images":
         (capture / "a.jpg").touch()
     found = scene()
     found.meta["capture"] = {"parser": parser, "options": {}, "scale": 1.0}
@@ -231,7 +233,7 @@ def test_headers_that_lie_are_refused(tmp_path: Path, lie: str) -> None:
         NerfstudioDataParserConfig(auto_scale_poses=False, scale_factor=0.5, center_method="focus"),
     ],
 )
-def test_a_capture_is_read_again_as_it_was(parser: Any) -> None:
+def test_the_options_of_a_capture_survive(parser: Any) -> None:
     parser.load_3D_points = False
     manager = SundaeDatamanagerConfig(dataparser=parser, camera_res_scale_factor=0.5)
     found, scale = packed_run._capture(packed_run._describe(manager))
@@ -247,7 +249,7 @@ def test_captures_that_are_not_described() -> None:
         with pytest.raises(PackError, match="without --data"):
             packed_run._capture(stated)
     for scale in (0, 2, "1", None, float("nan")):
-        with pytest.raises(PackError, match="a scale that cannot be"):
+        with pytest.raises(PackError, match="an impossible scale"):
             packed_run._capture({"parser": "colmap", "options": {}, "scale": scale})
 
 
@@ -273,8 +275,8 @@ def test_captures_that_are_not_described() -> None:
         ("masks_path", None),
     ],
 )
-def test_options_of_a_capture_that_cannot_be(name: str, value: Any) -> None:
-    with pytest.raises(PackError, match="cannot be"):
+def test_impossible_options_of_a_capture(name: str, value: Any) -> None:
+    with pytest.raises(PackError, match="an impossible option"):
         packed_run._capture({"parser": "colmap", "options": {name: value}, "scale": 1.0})
 
 
@@ -282,7 +284,7 @@ def test_options_of_a_capture_that_cannot_be(name: str, value: Any) -> None:
 
 
 def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path, dict[str, Tensor]]:
-    """A run as ns-train would leave it at a step, without the training."""
+    """The folder of a run at a step, as ns-train writes it, without the training."""
     config = copy.deepcopy(all_methods[method])
     for name, value in model.items():
         setattr(config.pipeline.model, name, value)
@@ -299,8 +301,8 @@ def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path
         made.step = step
         state = made.state_dict() | state
         state["_extra_state"] = made.get_extra_state()
-        state |= {name: value + 0.01 for name, value in state.items() if name.startswith("head.")}
-    # What stock nerfstudio leaves there beside the model.
+        state |= {name: value + 0.01 for name, value in state.items() if name.startswith("networks.head.")}
+    # Stock nerfstudio saves these beside the model.
     state["lpips.net.weight"] = torch.zeros(3)
     state["camera_optimizer.pose_adjustment"] = torch.zeros(7, 6)
     folder.mkdir()
@@ -311,7 +313,7 @@ def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path
     return folder, truth
 
 
-def test_what_a_run_needs_to_be_shown(tmp_path: Path) -> None:
+def test_a_packed_run_holds_what_its_images_need(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 1100)
     found = scene_of_run(run, max_cameras=0)
     assert set(found.field) == set(truth)
@@ -320,12 +322,12 @@ def test_what_a_run_needs_to_be_shown(tmp_path: Path) -> None:
     assert found.cameras is None
     assert found.meta["source"] == {"method": "sundae-tiny", "step": 1100}
     assert found.meta["model"]["head"]["size"] == "tiny"
-    # nothing of where it was trained
+    # No path of the machine that trained it.
     assert str(tmp_path) not in str(found.meta)
     assert scene_of_run(run / "config.yml", max_cameras=0).meta == found.meta
 
 
-def test_what_takes_no_part_yet_is_left_out(tmp_path: Path) -> None:
+def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 30, sh_degree_interval=20)
     found = scene_of_run(run, max_cameras=0)
     assert found.head == {}
@@ -355,7 +357,7 @@ def test_runs_that_cannot_be_packed(tmp_path: Path) -> None:
         scene_of_run(tmp_path)
     run, _ = run_folder(tmp_path / "run", "sundae-tiny", 30)
     with pytest.raises(DataError):
-        scene_of_run(run)  # its capture is not there
+        scene_of_run(run)  # its capture is missing
     (run / "nerfstudio_models" / "step-000000030.ckpt").write_bytes(b"PK")
     with pytest.raises(CheckpointError, match="no whole checkpoint"):
         scene_of_run(run, max_cameras=0)

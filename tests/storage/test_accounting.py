@@ -3,7 +3,7 @@ import torch
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
 
 
-def test_primitives_count_as_fp32_whatever_their_dtype():
+def test_primitives_count_as_fp32_for_any_dtype():
     params = {"means": torch.zeros(10, 3), "features_rest": torch.zeros(10, 15, 3), "features": torch.zeros(10, 13)}
     assert bytes_of(params) == 10 * (3 + 45 + 13) * 4
     assert bytes_of({name: value.half() for name, value in params.items()}) == bytes_of(params)

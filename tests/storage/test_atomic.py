@@ -1,4 +1,4 @@
-"""Files are whole or not there, whatever happens while they are written."""
+"""Atomic writes: after any error a file is complete or unchanged."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sundae_ns.storage.atomic import writing
 
 @contextmanager
 def small_disk(limit: int) -> Iterator[None]:
-    """Refuse to write past ``limit`` bytes of any file, as a full disk does."""
+    """Limit the size of any file to ``limit`` bytes, like a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
@@ -32,14 +32,14 @@ def small_disk(limit: int) -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, before)
 
 
-def test_the_new_text_takes_the_place_of_the_old(tmp_path: Path) -> None:
+def test_a_new_text_replaces_the_old(tmp_path: Path) -> None:
     write_text(tmp_path / "a.txt", "old")
     write_text(tmp_path / "a.txt", "new, ünïcode")
     assert (tmp_path / "a.txt").read_text(encoding="utf-8") == "new, ünïcode"
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
-def test_an_error_in_the_middle_leaves_the_old(tmp_path: Path) -> None:
+def test_an_error_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
     write_text(tmp_path / "a.txt", "old")
 
     def fail() -> None:
@@ -54,7 +54,7 @@ def test_an_error_in_the_middle_leaves_the_old(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
-def test_what_is_renamed_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_is_flushed_before_it_is_renamed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     order: list[str] = []
     sync, replace = os.fsync, Path.replace
     monkeypatch.setattr(os, "fsync", lambda handle: (order.append("sync"), sync(handle))[1])
@@ -75,31 +75,30 @@ def test_full_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "mend"),
+    ("number", "reason"),
     [(errno.ENOSPC, "disk is full; make room"), (errno.EROFS, "read-only"), (errno.EACCES, "permission denied")],
 )
-def test_what_the_system_says_becomes_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, mend: str
+def test_system_errors_become_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, reason: str
 ) -> None:
     def refuse(_: int) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "fsync", refuse)
-    with pytest.raises(StorageError, match=mend):
+    with pytest.raises(StorageError, match=reason):
         write_text(tmp_path / "a.txt", "new")
     assert os.listdir(tmp_path) == []
 
 
-def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
+def test_other_errors_are_not_converted(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         write_text(tmp_path / "nowhere" / "a.txt", "new")
 
 
-def test_only_what_a_user_can_mend_becomes_an_error_of_ours() -> None:
+def test_only_errors_that_a_user_can_correct_are_converted() -> None:
     with pytest.raises(StorageError, match="^cannot make a: the disk is full; make room$"), writing("cannot make a"):
         raise OSError(errno.ENOSPC, "no space")
-    ours, theirs = StorageError("cannot write b: denied"), OSError(errno.EMFILE, "too many open files")
-    for error in (ours, theirs):
+    for error in (StorageError("cannot write b: denied"), OSError(errno.EMFILE, "too many open files")):
         with pytest.raises(OSError, match=str(error.args[-1])) as caught, writing("cannot make a"):
             raise error
         assert caught.value is error

@@ -1,4 +1,4 @@
-"""Files are known by how they begin, not by what they are called."""
+"""The kind of a file follows from its first bytes, not from its name."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_kinds(files: Path, name: str, kind: str | None) -> None:
     assert kind_of(files / name) == kind
 
 
-def test_only_what_there_is_advice_for_is_refused(files: Path) -> None:
+def test_only_kinds_with_advice_are_refused(files: Path) -> None:
     with pytest.raises(CheckpointError, match=r"packed\.ply is a packed scene; unpack it$"):
         refuse(files / "packed.ply", packed="unpack it")
     with pytest.raises(CheckpointError, match=r"points\.sundae is a \.ply file; give a run$"):

@@ -58,14 +58,14 @@ def test_layout(tmp_path):
     expected = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 " + " ".join(f"f_rest_{i}" for i in range(9))
     expected += " opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     assert [prop.name for prop in vertex.properties] == expected.split()
-    # Three coefficients of red come first, then green's.
+    # Channel-major: three coefficients of red, then those of green.
     np.testing.assert_array_equal(vertex["f_rest_1"], params["features_rest"][:, 1, 0])
     np.testing.assert_array_equal(vertex["f_rest_3"], params["features_rest"][:, 0, 1])
     np.testing.assert_array_equal(vertex["rot_0"], params["quats"][:, 0])
 
 
 def test_same_vertices_as_nerfstudio_exports(tmp_path, monkeypatch):
-    # The exporter imports open3d for its meshes only; without a display it may not import.
+    # The exporter needs open3d for meshes only, and open3d cannot be imported on every machine.
     monkeypatch.setitem(sys.modules, "open3d", types.ModuleType("open3d"))
     monkeypatch.delitem(sys.modules, "nerfstudio.scripts.exporter", raising=False)
     from nerfstudio.models.splatfacto import SplatfactoModel
@@ -89,7 +89,7 @@ def test_same_vertices_as_nerfstudio_exports(tmp_path, monkeypatch):
     assert not is_nerfstudio_ply(tmp_path / "ours.ply")
 
 
-def test_foreign_properties_and_order_do_not_matter(tmp_path):
+def test_other_properties_types_and_orders_are_read(tmp_path):
     params = _field(n=4, degree=1)
     write_ply(tmp_path / "a.ply", params)
     vertices = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
@@ -137,9 +137,9 @@ WRONG = {
     "gone": (lambda path: path.unlink(), "cannot be read"),
     "a folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read"),
     "ascii": (_ascii, "ascii"),
-    "cut short": (lambda path: path.write_bytes(path.read_bytes()[:-5]), "not a whole"),
-    "empty": (lambda path: path.write_bytes(b""), "not a whole"),
-    "a picture": (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe" * 9), "not a whole"),
+    "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-5]), "not a complete"),
+    "empty": (lambda path: path.write_bytes(b""), "not a complete"),
+    "an image": (lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n\xff\xfe" * 9), "not a complete"),
     "no vertices": (
         lambda path: path.write_bytes(b"ply\nformat binary_little_endian 1.0\nend_header\n"),
         "no vertices",
@@ -149,10 +149,10 @@ WRONG = {
 
 @pytest.mark.parametrize("wrong", WRONG)
 def test_wrong_files(tmp_path, wrong):
-    spoil, cause = WRONG[wrong]
+    change, cause = WRONG[wrong]
     path = tmp_path / "a.ply"
     write_ply(path, _field())
-    spoil(path)
+    change(path)
     with pytest.raises(DataError, match=cause) as caught:
         read_ply(path)
     assert "\n" not in str(caught.value)

@@ -58,7 +58,7 @@ def test_frame_of_the_coordinates(tmp_path):
     assert not is_nerfstudio_ply(tmp_path / "gone.ply")
 
 
-def test_what_is_written_is_read(tmp_path):
+def test_round_trip(tmp_path):
     path, points, rgb = tmp_path / "a.ply", torch.from_numpy(XYZ), torch.from_numpy(RGB)
     write_point_cloud(path, points, rgb, scalars={"response": torch.tensor([0.25, -1.0], dtype=torch.float64)})
     found = read_point_cloud(path)

@@ -1,4 +1,4 @@
-"""Files of .spz, read back by the C++ reader beside the writer; by another program in test_viewers.py."""
+"""Files of .spz, read by gsply's C++ reader; test_viewers.py reads them with another program."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_values_come_back_within_the_steps_of_the_format(tmp_path: Path, degree:
     assert np.abs(found["sh0"] - truth["features_dc"].numpy()).max() <= 0.5 / (0.15 * 255) + 1e-6
     quats = torch.nn.functional.normalize(truth["quats"], dim=1).numpy()
     cosines = np.abs((found["quats"] / np.linalg.norm(found["quats"], axis=1, keepdims=True) * quats).sum(axis=1))
-    # Half a step of each of three components, and what the largest one takes up of it.
+    # Half a step of each of three components, and the resulting error of the largest one.
     assert cosines.min() >= 1 - 6 * (0.5 / 511) ** 2
     if degree:
         rest = found["shN"].reshape(truth["features_rest"].shape)
@@ -76,7 +76,7 @@ def test_positions_get_as_many_bits_as_fit(tmp_path: Path, farthest: float, bits
     assert error.max() <= 2.0 ** -(bits + 1) + 1e-7
 
 
-def test_rotations_that_are_none_become_no_rotation(tmp_path: Path) -> None:
+def test_zero_quaternions_become_the_identity(tmp_path: Path) -> None:
     given = field()
     given["quats"][0] = 0
     given["quats"][1] = torch.tensor([0.0, 1e-30, 0.0, 0.0])
@@ -86,17 +86,17 @@ def test_rotations_that_are_none_become_no_rotation(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "cause"),
     [
         ({"means": torch.zeros(0, 3)}, "has shape"),
-        ({"features_rest": torch.zeros(50, 24, 3)}, "degree 3"),
+        ({"features_rest": torch.zeros(50, 24, 3)}, "degrees up to 3"),
         ({"opacities": torch.full((50, 1), torch.nan)}, "NaN or infinite"),
         ({"means": torch.full((50, 3), 1e5)}, "1e.05 from the origin"),
     ],
 )
-def test_refusals_leave_the_older_file(tmp_path: Path, change: dict[str, Tensor], says: str) -> None:
+def test_refusals_leave_the_older_file(tmp_path: Path, change: dict[str, Tensor], cause: str) -> None:
     (tmp_path / "a.spz").write_bytes(b"older")
-    with pytest.raises(DataError, match=says):
+    with pytest.raises(DataError, match=cause):
         write_spz(tmp_path / "a.spz", {**field(), **change})
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"older"]
 

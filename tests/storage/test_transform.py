@@ -1,4 +1,4 @@
-"""A moved field seen by the moved camera is the same picture, to rounding."""
+"""A transformed field, rendered from the transformed camera, gives the same image up to rounding."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def field(degree: int = 3, n: int = 60) -> dict[str, Tensor]:
 
     return {
         "means": normal(3) * 0.6,
-        # Long in one direction, so that a wrong rotation shows.
+        # Elongated, so that a wrong rotation changes the image.
         "scales": (0.12 * torch.tensor([3.0, 1.0, 0.3], dtype=torch.float64)).log() + 0.1 * normal(3),
         "quats": normal(4),
         "features_dc": normal(3),
@@ -53,7 +53,7 @@ def camera() -> Tensor:
 
 
 def moved_camera() -> Tensor:
-    """World-to-camera of the camera that moves with the world; its coordinates are ``SCALE`` times as large."""
+    """World-to-camera of the transformed camera; its coordinates are ``SCALE`` times as large."""
     view, (turn, shift) = camera(), transform().split([3, 1], dim=1)
     moved = view.clone()
     moved[:3, :3] = view[:3, :3] @ turn.T
@@ -61,13 +61,13 @@ def moved_camera() -> Tensor:
     return moved
 
 
-def picture(params: dict[str, Tensor], view: Tensor) -> tuple[Tensor, Tensor]:
+def image(params: dict[str, Tensor], view: Tensor) -> tuple[Tensor, Tensor]:
     backend = select_backend("reference", "cpu")
     K = torch.tensor([[30.0, 0.0, SIZE / 2], [0.0, 30.0, SIZE / 2], [0.0, 0.0, 1.0]], dtype=torch.float64)
     center = -view[:3, :3].T @ view[:3, 3]
     coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
     colors = spherical_harmonics(3, params["means"] - center, coeffs, backend=backend) + 0.5
-    shown = rasterize(
+    rendered = rasterize(
         params["means"],
         params["quats"],
         params["scales"].exp(),
@@ -80,35 +80,35 @@ def picture(params: dict[str, Tensor], view: Tensor) -> tuple[Tensor, Tensor]:
         render_depth=True,
         backend=backend,
     )
-    assert shown.depth is not None
-    return shown.colors, shown.depth
+    assert rendered.depth is not None
+    return rendered.colors, rendered.depth
 
 
-def test_moved_field_and_camera_give_the_same_picture() -> None:
+def test_transformed_field_and_camera_give_the_same_image() -> None:
     params = field()
-    colors, depth = picture(params, camera())
-    moved_colors, moved_depth = picture(similarity(params, transform(), SCALE), moved_camera())
+    colors, depth = image(params, camera())
+    moved_colors, moved_depth = image(similarity(params, transform(), SCALE), moved_camera())
     assert colors.std() > 0.1
     torch.testing.assert_close(moved_colors, colors, atol=1e-10, rtol=0)
     torch.testing.assert_close(moved_depth, SCALE * depth, atol=1e-10, rtol=0)
 
 
 @pytest.mark.parametrize("name", ["means", "scales", "quats", "features_rest"])
-def test_each_parameter_matters_to_that_picture(name: str) -> None:
+def test_each_transformed_parameter_changes_the_image(name: str) -> None:
     params = field()
-    colors, _ = picture(params, camera())
+    colors, _ = image(params, camera())
     wrong = {**similarity(params, transform(), SCALE), name: params[name]}
-    assert (picture(wrong, moved_camera())[0] - colors).abs().max() > 0.02
+    assert (image(wrong, moved_camera())[0] - colors).abs().max() > 0.02
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_rotated_harmonics_are_the_rotated_function(degree: int) -> None:
     rest = field(degree, n=4)["features_rest"]
-    band_0 = torch.zeros(4, 1, 3, dtype=torch.float64)
+    degree_0 = torch.zeros(4, 1, 3, dtype=torch.float64)
     directions = torch.nn.functional.normalize(torch.randn(4, 3, dtype=torch.float64), dim=1)
-    before = evaluate_harmonics(degree, directions, torch.cat([band_0, rest], dim=1))
+    before = evaluate_harmonics(degree, directions, torch.cat([degree_0, rest], dim=1))
     rotated = rotate_spherical_harmonics(rest, rotation())
-    after = evaluate_harmonics(degree, directions @ rotation().T, torch.cat([band_0, rotated], dim=1))
+    after = evaluate_harmonics(degree, directions @ rotation().T, torch.cat([degree_0, rotated], dim=1))
     torch.testing.assert_close(after, before, atol=1e-12, rtol=0)
 
 
@@ -137,7 +137,7 @@ def test_quaternion_of_a_rotation(matrix: Tensor) -> None:
     torch.testing.assert_close(matrix_of(quat), matrix, atol=1e-12, rtol=0)
 
 
-def test_the_rest_is_shared_and_nothing_is_changed() -> None:
+def test_other_parameters_are_shared_and_the_input_is_unchanged() -> None:
     params = field()
     before = {name: value.clone() for name, value in params.items()}
     moved = similarity({**params, "features": torch.ones(60, 2)}, transform(), SCALE)

@@ -1,4 +1,4 @@
-"""Files for other viewers, read back by PlayCanvas's splat-transform where it is installed."""
+"""Files for other viewers, read by PlayCanvas's splat-transform if it is installed."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_another_program_reads_the_same_scene(tmp_path: Path, kind: str, degree:
     found = {name: value[rows] for name, value in found.items()}
     found["quats"] = found["quats"] * (found["quats"] * truth["quats"]).sum(dim=1, keepdim=True).sign()
     found["opacities"], opacities = found["opacities"].sigmoid(), truth["opacities"].sigmoid()
-    # The worst that was seen, of both formats: 5e-5, 0.0045, 0.0312, 0.0130, 0.0078, 0.0020.
+    # Measured worst cases of both formats: 5e-5, 0.0045, 0.0312, 0.0130, 0.0078, 0.0020.
     tolerances = {"means": 1e-4, "quats": 0.006, "scales": 0.033, "features_dc": 0.015, "features_rest": 0.009}
     for name, tolerance in {**tolerances, "opacities": 0.0021}.items():
         expected = opacities if name == "opacities" else truth[name]
@@ -72,7 +72,7 @@ def test_another_program_reads_the_same_scene(tmp_path: Path, kind: str, degree:
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_what_is_not_finite_is_left_out(tmp_path: Path, kind: str) -> None:
+def test_primitives_that_are_not_finite_are_dropped(tmp_path: Path, kind: str) -> None:
     given = field()
     given["means"][3, 0] = torch.nan
     given["scales"][7, 1] = -torch.inf
@@ -81,21 +81,21 @@ def test_what_is_not_finite_is_left_out(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize(("kind", "degree"), [(".ply", 4), (".spz", 3), (".sog", 3)])
-def test_the_fourth_degree(tmp_path: Path, kind: str, degree: int) -> None:
+def test_sh_degree_4_is_cut_to_the_format(tmp_path: Path, kind: str, degree: int) -> None:
     given = field(degree=3)
     given["features_rest"] = torch.cat([given["features_rest"], torch.ones(300, 9, 3)], dim=1)
     written = write_for_viewers(tmp_path / f"a{kind}", given)
     assert (written.degree, written.cut) == (degree, degree == 3)
 
 
-def test_colours_of_models_without_harmonics(tmp_path: Path) -> None:
+def test_colours_of_models_of_sh_degree_0(tmp_path: Path) -> None:
     given = field(degree=0)
     write_for_viewers(tmp_path / "a.ply", given, sigmoid_colors=True)
     colors = 0.5 + 0.28209479 * read_ply(tmp_path / "a.ply")["features_dc"]
     torch.testing.assert_close(colors, given["features_dc"].sigmoid(), rtol=0, atol=1e-6)
 
 
-def test_upright_turns_z_to_minus_y(tmp_path: Path) -> None:
+def test_upright_rotates_z_to_minus_y(tmp_path: Path) -> None:
     given = field(degree=1)
     given["means"][0] = torch.tensor([1.0, 2.0, 3.0])
     write_for_viewers(tmp_path / "a.ply", given)
@@ -104,19 +104,19 @@ def test_upright_turns_z_to_minus_y(tmp_path: Path) -> None:
     assert not is_nerfstudio_ply(tmp_path / "b.ply")
     turned = read_ply(tmp_path / "b.ply")
     torch.testing.assert_close(turned["means"][0], torch.tensor([1.0, -3.0, 2.0]))
-    # Harmonics turn too: seen from above, +z before and -y after, the colours are the same.
+    # SH rotate, too: from above, along +z before and -y after, the colours are the same.
     above, turned_above = (harmonic_basis(1, torch.tensor([d]))[0, 1:] for d in ([0.0, 0.0, 1.0], [0.0, -1.0, 0.0]))
     before = torch.einsum("k,nkc->nc", above, given["features_rest"])
     after = torch.einsum("k,nkc->nc", turned_above, turned["features_rest"])
     torch.testing.assert_close(after, before, rtol=0, atol=1e-5)
 
 
-def test_other_names_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"not named .ply or .spz or .sog"):
+def test_other_suffixes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"name it .ply or .spz or .sog"):
         write_for_viewers(tmp_path / "a.splat", field())
 
 
-def test_names_in_capitals(tmp_path: Path) -> None:
+def test_suffixes_in_capitals(tmp_path: Path) -> None:
     write_for_viewers(tmp_path / "a.PLY", field())
     write_ply(tmp_path / "b.ply", field())
     assert torch.equal(read_ply(tmp_path / "a.PLY")["means"], read_ply(tmp_path / "b.ply")["means"])

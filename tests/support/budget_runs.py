@@ -1,24 +1,29 @@
-"""Runs that search for a budget, on a scene of a few pixels: what the tests of ``tests/integration/budget`` share."""
+"""Budget searches on a scene of a few pixels, for the tests of ``tests/integration/budget``."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import torch
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import profiler, writer
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
+from sundae_ns.callbacks import NerfstudioRun
 from sundae_ns.evaluation import psnr
 from sundae_ns.method_configs import sundae_auto
 from sundae_ns.scenes.finetune import finetune
 from sundae_ns.scenes.packed import scene_of_run, write_run
 from sundae_ns.storage.packing import PackConfig, read_scene, write_fitted
+from sundae_ns.training.budget import BudgetSearch
+from sundae_ns.training.budget.searched_field import SearchedField
+from sundae_ns.training.extension import Extension
 
 STEPS, SAVE, PRUNE_AT, STOP = 90, 10, 20, 70
 Make = Callable[..., Trainer]
@@ -54,9 +59,22 @@ def set_up(scene: Path, out: Path, *, model_options: dict[str, Any] | None = Non
     config.save_config()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    # Test views are not to be looked at.
+    # A search must not use test views.
     trainer.pipeline.get_average_eval_image_metrics = None
     return trainer
+
+
+def search_of(extensions: Sequence[Extension]) -> BudgetSearch:
+    """The budget search among the extensions of a model."""
+    (found,) = (extension for extension in extensions if isinstance(extension, BudgetSearch))
+    return found
+
+
+def searched_field(trainer: Trainer) -> SearchedField:
+    """The field of a trainer under search."""
+    model: Any = trainer.pipeline.model
+    attributes = TrainingCallbackAttributes(trainer.optimizers, trainer.grad_scaler, trainer.pipeline, trainer)
+    return SearchedField(NerfstudioRun(model, attributes), model.config.pruning)
 
 
 class Run:
@@ -72,7 +90,7 @@ class Run:
 
 
 def same(a: Any, b: Any, where: str = "") -> None:
-    """All tensors and numbers of two states, but times."""
+    """Assert that two states have the same tensors and numbers, except for times."""
     if isinstance(a, dict):
         assert set(a) == set(b), where
         for key in a:
@@ -89,7 +107,7 @@ def same(a: Any, b: Any, where: str = "") -> None:
 
 
 def shown_alike_when_packed(run: Run, folder: Path) -> None:
-    """What a budget has chosen goes through a pack, fine-tune included."""
+    """Assert that a packed and fine-tuned run of a budget search shows the same images."""
     scene = scene_of_run(run.folder)
     trained, codecs = finetune(run.folder, scene, PackConfig(), 1)
     write_fitted(folder / "a.sundae", trained, codecs)
@@ -97,5 +115,5 @@ def shown_alike_when_packed(run: Run, folder: Path) -> None:
     assert (found.head is None) == (run.model.head is None)
     camera = run.trainer.pipeline.datamanager.train_dataset.cameras[0:1]
     with torch.no_grad():
-        pictures = [model.eval().get_outputs_for_camera(camera)["rgb"] for model in (run.model, found)]
-    assert psnr(*pictures) > 30
+        images = [model.eval().get_outputs_for_camera(camera)["rgb"] for model in (run.model, found)]
+    assert psnr(*images) > 30

@@ -16,6 +16,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils import writer
 from torch import Tensor
 
+from sundae_ns.callbacks import NerfstudioRun
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.pruning import PruningConfig
@@ -67,6 +68,8 @@ class FakeDatamanager:
     """Three training cameras; no test views."""
 
     eval_dataset = None
+    place = (0, 1)
+    holdout_indices: tuple[int, ...] = ()
 
     mask: Tensor | None = None
     """Of each view."""
@@ -93,6 +96,17 @@ class Training:
         self.callbacks = model.get_training_callbacks(
             TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)  # type: ignore[arg-type]
         )
+
+    @property
+    def extensions(self) -> dict[str, Any]:
+        """The extensions by name."""
+        return {extension.name: extension for extension in self.model.extensions}
+
+    def act(self, name: str, step: int) -> None:
+        """Let one extension act after a step, and no other."""
+        self.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step)
+        run: NerfstudioRun = self.callbacks[0].func.__self__  # type: ignore[attr-defined]
+        run.act([self.extensions[name]])
 
     def run_callbacks(self, location: TrainingCallbackLocation, step: int) -> None:
         for callback in self.callbacks:

@@ -12,6 +12,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from sundae_ns.model import SundaeModel
+from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.initial_field import Start
 from sundae_ns.training.schedulers import Decay
 
@@ -54,13 +55,12 @@ def test_primitives_that_are_not_finite_are_dropped_and_counted(
         training.model.gauss_params["scales"][7, 1] = torch.inf
         training.model.gauss_params["features"][9, 0] = torch.nan
     # A step on a broken field would spread the damage; the prune itself is what is tested.
-    training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 3)
-    training.callbacks[-1].run_callback_at_location(3, location=TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+    training.act("pruning", 3)
     assert training.model.num_points == round(0.5 * (N - 4))
     assert all(torch.isfinite(value).all() for value in training.model.gauss_params.values())
     assert training.live()
     out = " ".join(capsys.readouterr().out.split())
-    assert "dropped 4 primitives that were not finite" in out
+    assert "removed 4 primitives that were not finite" in out
     assert training.step(4)["main_loss"].isfinite()
 
 
@@ -72,23 +72,6 @@ def test_nothing_goes_unless_asked_for(build: Build, training_of: TrainingOf, op
     assert training.model.num_points == N
 
 
-@pytest.mark.parametrize("redistribution", ["merge", "grow"])
-def test_rounds_prune_to_the_count_and_the_head_waits_for_the_last(
-    build: Build, training_of: TrainingOf, redistribution: str
-) -> None:
-    options = {"rounds": 3, "round_every": 2, "keep_ratio": 0.4, "redistribution": redistribution, "num_neighbors": 5}
-    training = training_of(build(pruning={**options, "selection": "systematic", "edges": "appearance"}))
-    counts, active = [], []
-    for step in range(11):
-        training.step(step)
-        counts.append(training.model.num_points)
-        active.append(training.model.head_active)
-        assert training.live()
-    assert counts == [60] * 3 + [44] * 2 + [33] * 2 + [24] * 4
-    assert active == [False] * 8 + [True] * 3
-    assert all(torch.isfinite(value).all() for value in training.model.gauss_params.values())
-
-
 def test_the_rate_of_a_head_that_starts_later_begins_with_it(build: Build, training_of: TrainingOf) -> None:
     training = training_of(build(head={"start_at": 6}))
     decays = {name: Decay(0.01, 20, 1.0, name == "compensation", 0) for name in ("means", "compensation")}
@@ -97,7 +80,7 @@ def test_the_rate_of_a_head_that_starts_later_begins_with_it(build: Build, train
         training.optimizers.schedulers[name] = torch.optim.lr_scheduler.LambdaLR(optimizer, decay)
     for step in range(8):
         training.step(step)
-        assert training.model.head_active == (step > 6)
+        assert training.model.state.head_enabled == (step > 6)
     assert {name: decay.pruned_at for name, decay in decays.items()} == {"means": 3, "compensation": 6}
 
 
@@ -111,40 +94,35 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
         (
             {"prune_at": 3},
             {},
-            "3 (pruning.prune-at): nothing is pruned, and the head takes no part; train longer, or prune",
+            "3 (pruning.prune-at): nothing is pruned, and the head stays disabled; train longer, or prune",
         ),
         ({"prune_at": 3}, {"mode": "off"}, "3 (pruning.prune-at): nothing is pruned; train longer, or prune earlier"),
         ({"prune_at": 3}, {"start_at": 1}, "3 (pruning.prune-at): nothing is pruned; train longer, or prune earlier"),
-        ({"mode": "continuous", "start": 3}, {}, "3 (pruning.start): nothing is pruned, and the head takes no part"),
+        ({"mode": "continuous", "start": 3}, {}, "3 (pruning.start): nothing is pruned, and the head stays disabled"),
         (
             {"mode": "continuous", "start": 1, "every": 3, "stop": 5},
             {},
-            "4 (pruning.stop): more primitives are left than asked for, and the head takes no part; train longer",
+            "4 (pruning.stop): more primitives are left than asked for, and the head stays disabled; train longer",
         ),
         (
             {"mode": "continuous", "start": 1, "every": 5, "stop": 5},
             {},
-            "6 (pruning.stop): it takes no part; train longer, or prune earlier",
+            "6 (pruning.stop): it stays disabled; train longer, or prune earlier",
         ),
         (
             {"mode": "continuous", "start": 1, "every": 5, "stop": 5, "max_primitives": 40},
             {},
-            "5 (pruning.stop): more primitives are left than asked for, and the head takes no part; train longer",
+            "5 (pruning.stop): more primitives are left than asked for, and the head stays disabled; train longer",
         ),
-        (
-            {"prune_at": 1, "rounds": 3, "round_every": 2},
-            {"start_at": 0},
-            "5 (pruning.rounds): more primitives are left than asked for; train longer, or prune earlier",
-        ),
-        ({"prune_at": 1}, {"start_at": 4}, "5 (head.start-at): it takes no part; train longer, or start it earlier"),
-        ({"prune_at": 1}, {"start_at": 2}, "3 (head.start-at): it takes no part; train longer, or start it earlier"),
-        ({"mode": "off"}, {"start_at": 4}, "5 (head.start-at): it takes no part; train longer, or start it earlier"),
-        ({"mode": "off"}, {}, "4 (pruning.prune-at): it takes no part; train longer, or prune earlier"),
-        ({"prune_at": 2}, {}, "3 (pruning.prune-at): it takes no part; train longer, or prune earlier"),
+        ({"prune_at": 1}, {"start_at": 4}, "5 (head.start-at): it stays disabled; train longer, or enable it earlier"),
+        ({"prune_at": 1}, {"start_at": 2}, "3 (head.start-at): it stays disabled; train longer, or enable it earlier"),
+        ({"mode": "off"}, {"start_at": 4}, "5 (head.start-at): it stays disabled; train longer, or enable it earlier"),
+        ({"mode": "off"}, {}, "4 (pruning.prune-at): it stays disabled; train longer, or prune earlier"),
+        ({"prune_at": 2}, {}, "3 (pruning.prune-at): it stays disabled; train longer, or prune earlier"),
         (
             {"prune_at": 3},
             {"start_at": 9},
-            "3 (pruning.prune-at): nothing is pruned, and the head takes no part; train",
+            "3 (pruning.prune-at): nothing is pruned, and the head stays disabled; train",
         ),
     ],
 )
@@ -159,7 +137,7 @@ def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_aft
 ) -> None:
     training = training_of(build(pruning=pruning, head=head), SimpleNamespace(last_step=2, base_dir=tmp_path))
     (before,) = said(capsys)
-    which = "first prune" if "nothing" in ending else "head" if "it takes" in ending else "last prune"
+    which = "first prune" if "nothing" in ending else "head" if "it stays" in ending else "last prune"
     assert before.startswith(f"Warning: training ends after 3 steps, and the {which} needs more than " + ending)
     for step in range(3):
         training.step(step)
@@ -177,7 +155,6 @@ def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_aft
         {"pruning": {"mode": "off"}, "head": {"start_at": 1}},
         {"pruning": {"mode": "continuous", "start": 1, "stop": 1}},
         {"pruning": {"mode": "continuous", "start": 1, "every": 5, "stop": 5}, "head": {"mode": "off"}},
-        {"pruning": {"prune_at": 0, "rounds": 2, "round_every": 1}},
         {"pruning": {"prune_at": 100}, "warm_start": Path("anything")},
         {"pruning": {"prune_at": 100}, "head": {"start_at": 101}, "warm_start": Path("anything")},
     ],
@@ -200,14 +177,14 @@ def test_a_warm_start_counts_from_the_prune(
     model._start = Start()  # of a file that need not be there
     training_of(model, SimpleNamespace(last_step=2))
     (line,) = said(capsys)
-    assert "training ends after 3 steps, and the head needs more than 3 (head.start-at): it takes no part" in line
+    assert "training ends after 3 steps, and the head needs more than 3 (head.start-at): it stays disabled" in line
 
 
 def test_a_search_that_never_begins_says_so_once_at_each_end(
     build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = build(pruning={"mode": "auto", "prune_at": 3})
-    monkeypatch.setattr(model.budget, "check", lambda _: None)
+    monkeypatch.setattr(BudgetSearch, "before_training", lambda *_: None)
     training = training_of(model, SimpleNamespace(last_step=2))
     assert len(said(capsys)) == 1
     training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 2)

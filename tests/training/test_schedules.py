@@ -17,7 +17,13 @@ from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.graphs import build_graph
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.training.report import PruneReport
-from sundae_ns.training.schedules import ContinuousPruning, NoPruning, OneShotPruning, PruningPolicy, make_policy
+from sundae_ns.training.schedules import (
+    ContinuousPruning,
+    NoPruning,
+    OneShotPruning,
+    PruningSchedule,
+    make_schedule,
+)
 
 Field = tuple[dict[str, Parameter], dict[str, Optimizer]]
 
@@ -47,7 +53,7 @@ def train_step(params: dict[str, Parameter], optimizers: dict[str, Optimizer]) -
 
 
 def run(
-    policy: PruningPolicy, made: Field, steps: range, state: dict[str, Any] | None = None, **options: Any
+    policy: PruningSchedule, made: Field, steps: range, state: dict[str, Any] | None = None, **options: Any
 ) -> tuple[list[PruneReport], dict[str, Any]]:
     params, optimizers = made
     state = policy.initialize_state() if state is None else state
@@ -70,7 +76,7 @@ def saved_and_loaded(state: dict[str, Any]) -> dict[str, Any]:
 
 def test_one_shot_prunes_once_and_training_goes_on() -> None:
     made = field()
-    policy = make_policy(PruningConfig(prune_at=3, keep_ratio=0.25))
+    policy = make_schedule(PruningConfig(prune_at=3, keep_ratio=0.25))
     losses = []
     state = policy.initialize_state()
     for step in range(8):
@@ -87,7 +93,7 @@ def test_one_shot_prunes_once_and_training_goes_on() -> None:
 
 
 def test_a_resumed_run_does_not_prune_twice() -> None:
-    policy = make_policy(PruningConfig(prune_at=3, keep_ratio=0.5))
+    policy = make_schedule(PruningConfig(prune_at=3, keep_ratio=0.5))
     made = field()
     _, state = run(policy, made, range(5))
     reports, state = run(policy, made, range(2, 9), saved_and_loaded(state))
@@ -97,7 +103,7 @@ def test_a_resumed_run_does_not_prune_twice() -> None:
 
 
 def test_a_warm_start_behind_the_step_prunes_at_once() -> None:
-    reports, _ = run(make_policy(PruningConfig(prune_at=3)), field(), range(10, 14))
+    reports, _ = run(make_schedule(PruningConfig(prune_at=3)), field(), range(10, 14))
     assert [report.step for report in reports] == [10]
 
 
@@ -105,14 +111,14 @@ def test_the_same_seed_gives_the_same_field() -> None:
     kept = []
     for seed in (1, 1, 2):
         made = field()
-        run(make_policy(PruningConfig(prune_at=1, seed=seed)), made, range(3))
+        run(make_schedule(PruningConfig(prune_at=1, seed=seed)), made, range(3))
         kept.append(made[0]["means"].detach())
     assert torch.equal(kept[0], kept[1])
     assert not torch.equal(kept[0], kept[2])
 
 
 def test_continuous_keeps_a_share_on_schedule() -> None:
-    policy = make_policy(PruningConfig(mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, num_neighbors=4))
+    policy = make_schedule(PruningConfig(mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, num_neighbors=4))
     reports, state = run(policy, field(), range(13))
     assert [report.step for report in reports] == [2, 5, 8]
     assert [report.after for report in reports] == [70, 49, 34]
@@ -125,7 +131,7 @@ def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
     config = PruningConfig(
         mode="continuous", start=0, every=2, stop=100, max_primitives=110, keep_ratio=1.0, num_neighbors=4
     )
-    policy = make_policy(config)
+    policy = make_schedule(config)
     state = policy.initialize_state()
     counts, peaks = [], []
     params, optimizers = field(100)
@@ -145,7 +151,7 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
     config = PruningConfig(
         mode="continuous", start=0, every=2, stop=3, target_primitives=80, max_primitives=120, num_neighbors=4
     )
-    policy = make_policy(config)
+    policy = make_schedule(config)
     made = field()
     reports, state = run(policy, made, range(2))
     assert [report.after for report in reports] == [80]
@@ -165,9 +171,9 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
 def test_a_resumed_continuous_run_goes_on_as_if_never_stopped() -> None:
     config = PruningConfig(mode="continuous", start=1, every=2, stop=7, keep_ratio=0.8, num_neighbors=4)
     whole, halves = field(), field()
-    run(make_policy(config), whole, range(8))
-    _, state = run(make_policy(config), halves, range(4))
-    run(make_policy(config), halves, range(4, 8), saved_and_loaded(state))
+    run(make_schedule(config), whole, range(8))
+    _, state = run(make_schedule(config), halves, range(4))
+    run(make_schedule(config), halves, range(4, 8), saved_and_loaded(state))
     assert torch.equal(whole[0]["means"], halves[0]["means"])
 
 
@@ -175,7 +181,7 @@ def test_continuous_draws_anew_each_time() -> None:
     config = PruningConfig(
         mode="continuous", start=0, every=1, keep_ratio=0.5, score="random", selection="sampled", redistribution="none"
     )
-    policy = make_policy(config)
+    policy = make_schedule(config)
     kept = []
     for step in (3, 3, 4):
         made = field()
@@ -196,7 +202,7 @@ def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> 
         asked.append(len(params["means"]))
         return torch.ones(len(params["means"]))
 
-    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=0.5))
+    policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=0.5))
     report = policy.step_post_backward(
         params, optimizers, policy.initialize_state(), 0, contribution=contribution, strategy_state=None
     )
@@ -213,7 +219,7 @@ def test_the_state_of_densification_is_sliced_along() -> None:
     strategy_state = {"grad2d": torch.arange(100), "scene_scale": 2.0}
     config = PruningConfig(prune_at=0, score="opacity", selection="top", redistribution="none", keep_ratio=0.1)
     opacities = made[0]["opacities"].detach().squeeze(1).clone()
-    policy = make_policy(config)
+    policy = make_schedule(config)
     policy.step_post_backward(*made, policy.initialize_state(), 0, strategy_state=strategy_state)
     assert strategy_state["grad2d"].tolist() == sorted((opacities[1:].topk(10).indices + 1).tolist())
     assert strategy_state["scene_scale"] == 2.0
@@ -221,21 +227,21 @@ def test_the_state_of_densification_is_sliced_along() -> None:
 
 def test_full_keep_ratio_keeps_all_and_asks_for_nothing() -> None:
     made = field(10)
-    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=1.0))
+    policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=1.0))
     report = policy.step_post_backward(*made, policy.initialize_state(), 0)
     assert report is not None
     assert (report.before, report.after, report.sigma) == (10, 10, None)
 
 
 def test_off_never_prunes_but_counts() -> None:
-    reports, state = run(make_policy(PruningConfig(mode="off", prune_at=0, start=0, every=1)), field(), range(4))
+    reports, state = run(make_schedule(PruningConfig(mode="off", prune_at=0, start=0, every=1)), field(), range(4))
     assert reports == []
     assert state == {"pruned_at": -1, "num_prunes": 0, "peak": 100}
 
 
 def test_a_failed_prune_leaves_field_and_state() -> None:
     made = field(10)
-    policy = make_policy(PruningConfig(prune_at=0))
+    policy = make_schedule(PruningConfig(prune_at=0))
     state = policy.initialize_state()
     with pytest.raises(DataError, match=r"contribution has shape \[9\] for 10 primitives"):
         policy.step_post_backward(*made, state, 0, contribution=lambda: torch.ones(9))
@@ -244,7 +250,7 @@ def test_a_failed_prune_leaves_field_and_state() -> None:
 
 
 def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
-    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=0.5))
+    policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=0.5))
     params, optimizers = field()
     foreign = {**params, "means": Parameter(torch.zeros(100, 3))}
     with pytest.raises(DataError, match="optimizer of 'means'"):
@@ -255,7 +261,7 @@ def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
 
 
 def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
-    policy = make_policy(PruningConfig(prune_at=0, keep_ratio=0.5))
+    policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=0.5))
     params, optimizers = field(10)
     params["opacities"].data[:] = torch.nan
     with pytest.raises(DataError, match="none of 10 primitives is finite: the training has diverged"):
@@ -263,14 +269,14 @@ def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
 
 
 def test_report_is_one_line_of_plain_numbers() -> None:
-    (report,), _ = run(make_policy(PruningConfig(prune_at=0)), field(), range(1))
+    (report,), _ = run(make_schedule(PruningConfig(prune_at=0)), field(), range(1))
     assert all(type(getattr(report, f.name)) in (int, float) for f in fields(report))
     summary = report.summary()
     assert "\n" not in summary
     assert summary.startswith("step 0: kept 10 of 100 primitives in ")
     assert f"sigma {report.sigma:.3g}, tau {report.tau:.3g}, {report.isolated:,} isolated" in summary
     (unscored,), _ = run(
-        make_policy(PruningConfig(prune_at=0, score="opacity", redistribution="none")), field(), range(1)
+        make_schedule(PruningConfig(prune_at=0, score="opacity", redistribution="none")), field(), range(1)
     )
     assert "sigma" not in unscored.summary()
 
@@ -291,7 +297,7 @@ def test_the_last_options_that_work() -> None:
 
 
 def test_continuous_leaves_a_field_alone_that_holds_the_target() -> None:
-    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=1, target_primitives=100))
+    policy = make_schedule(PruningConfig(mode="continuous", start=0, stop=10, every=1, target_primitives=100))
     state = policy.initialize_state()
     assert [policy.due(state, 0, n) for n in (99, 100, 101)] == [False, False, True]
 
@@ -301,29 +307,29 @@ def test_continuous_under_a_cap_keeps_the_share_too(cap: int, expected: list[int
     config = PruningConfig(
         mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, max_primitives=cap, num_neighbors=4
     )
-    reports, _ = run(make_policy(config), field(), range(13))
+    reports, _ = run(make_schedule(config), field(), range(13))
     assert [report.step for report in reports] == [2, 5, 8]
     assert [report.after for report in reports] == expected
 
 
 def test_a_field_above_the_cap_is_pruned_when_continuous_pruning_has_ended() -> None:
     """As after a resume under a lower cap."""
-    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_primitives=100))
+    policy = make_schedule(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_primitives=100))
     state = policy.initialize_state()
     assert [policy.due(state, step, 101) for step in (9, 10, 30)] == [False, True, True]
     assert not policy.due(state, 30, 100)
 
 
 def test_continuous_prunes_a_step_once() -> None:
-    policy = make_policy(PruningConfig(mode="continuous", start=0, stop=10, every=1))
+    policy = make_schedule(PruningConfig(mode="continuous", start=0, stop=10, every=1))
     assert [policy.due({**policy.initialize_state(), "pruned_at": 5}, step, 100) for step in (5, 6)] == [False, True]
 
 
 @pytest.mark.parametrize(
     ("mode", "kind"), [("one-shot", OneShotPruning), ("continuous", ContinuousPruning), ("off", NoPruning)]
 )
-def test_mode_names_the_policy(mode: Any, kind: type[PruningPolicy]) -> None:
-    assert type(make_policy(PruningConfig(mode=mode))) is kind
+def test_mode_names_the_policy(mode: Any, kind: type[PruningSchedule]) -> None:
+    assert type(make_schedule(PruningConfig(mode=mode))) is kind
 
 
 @pytest.mark.parametrize(
@@ -355,7 +361,7 @@ def test_mode_names_the_policy(mode: Any, kind: type[PruningPolicy]) -> None:
 )
 def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))) as caught:
-        make_policy(replace(PruningConfig(), **wrong))
+        make_schedule(replace(PruningConfig(), **wrong))
     assert "\n" not in str(caught.value)
 
 
@@ -365,7 +371,6 @@ def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> No
         ({"mode": "auto", "stop": 20000, "max_bytes": 1, "max_primitives": 1}, "max_bytes and max_primitives are both"),
         ({"mode": "auto", "stop": 20000, "max_psnr_drop": 0.0}, "max_psnr_drop is 0.0"),
         ({"mode": "auto", "stop": 14999}, "auto has no time to search"),
-        ({"mode": "auto", "stop": 20000, "rounds": 2}, "rounds is 2 but mode is auto"),
         ({"mode": "auto", "stop": 20000, "target_primitives": 5}, "target_primitives is set but mode is auto"),
         ({"max_bytes": 5}, "max_bytes is set but mode is one-shot: set mode to auto"),
         ({"mode": "continuous", "max_psnr_drop": 0.1}, "max_psnr_drop is set but mode is continuous"),
@@ -388,12 +393,20 @@ def test_one_budget_is_enough(budget: dict[str, object]) -> None:
     PruningConfig(mode="auto", stop=20000, **budget).validate()  # type: ignore[arg-type]
 
 
-def test_the_share_is_that_of_what_a_prune_leaves() -> None:
-    target = PruningConfig(mode="continuous", target_primitives=30)
-    assert (target.share(60), target.share(10), PruningConfig(keep_ratio=0.2).share(60)) == (0.5, 1.0, 0.2)
-    cap = PruningConfig(mode="continuous", max_primitives=30, keep_ratio=0.6)
-    assert (cap.share(60), cap.share(10)) == (0.5, 0.6)
-    assert PruningConfig(keep_ratio=0.25, rounds=2).share(60) == 0.5
+@pytest.mark.parametrize(
+    ("options", "of_60", "of_10"),
+    [
+        ({"keep_ratio": 0.2}, 12, 2),
+        ({"keep_ratio": 0.01}, 1, 1),
+        ({"mode": "continuous", "target_primitives": 30}, 30, 10),
+        ({"mode": "continuous", "max_primitives": 30, "keep_ratio": 0.6}, 30, 6),
+        ({"mode": "continuous", "keep_ratio": 0.6}, 36, 6),
+        ({"mode": "off"}, 60, 10),
+    ],
+)
+def test_the_schedule_decides_how_many_stay(options: dict[str, Any], of_60: int, of_10: int) -> None:
+    schedule = make_schedule(PruningConfig(**options))
+    assert (schedule.target(60), schedule.target(10)) == (of_60, of_10)
 
 
 @pytest.mark.parametrize("mode", ["off", "one-shot"])

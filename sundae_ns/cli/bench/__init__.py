@@ -1,4 +1,4 @@
-"""``sundae bench``: one command and one module a measurement. Modules are imported when their command runs."""
+"""``sundae bench``: one command and one module for each measurement. A module is imported when its command runs."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def graph(
     seed: int = 0,
     json: bool = False,
 ) -> int:
-    """Time the neighbour graph and the high-pass response of positions, beside scipy's cKDTree in the same run.
+    """Time the neighbour graph and the high-pass response of positions; compare with scipy's cKDTree.
 
     Args:
-        points: how many points to draw.
+        points: number of points to draw.
         neighbors: neighbours of each point.
         device: where to measure; the reference always runs on all cores of the CPU.
-        distribution: what to draw; field is like a trained one, clusters and duplicates are hard for a search.
-        field: take the positions of this checkpoint or .ply instead of drawing any.
-        reference: false leaves cKDTree out, which takes long for many millions of points.
-        repeats: timed runs, of which the median counts.
-        seed: of what is drawn.
+        distribution: of the points; field is like a trained one, clusters and duplicates are hard for a search.
+        field: use the positions of this checkpoint or .ply instead of drawing points.
+        reference: false leaves cKDTree out, which is slow for many millions of points.
+        repeats: timed runs; their median counts.
+        seed: of the points.
         json: print one line of JSON.
     """
     from sundae_ns.cli.bench.graph import run_graph
@@ -56,10 +56,24 @@ def graph(
 
 @app.command
 def quality(options: Annotated[QualityOptions, INLINE]) -> int:
-    """Warm up once a seed, branch, fine-tune and evaluate; peers in the same run. Stopped, the same command goes on.
+    """Compare methods and options on one capture: train and evaluate each arm. Stopped, the same command resumes.
 
-    Every finished job is a file of one line in OUT/done. Parts of a plan (--shard) may run side by side, in one folder or
-    in several whose results.jsonl are concatenated into one.
+    --arms MINE.yaml compares arms of your own. The file is a list; each entry has a name, a method of ns-train (of this
+    package, splatfacto, or mcmc for 3DGS-MCMC), and options of ns-train:
+
+        - name: sundae-30
+          method: sundae
+          options:
+            pipeline.model.pruning.keep-ratio: 0.3
+            pipeline.model.head.mode: off
+        - name: splatfacto
+          method: splatfacto
+
+    Methods that prune once share a warm-up of each seed, and prune at every share of --keep-ratios. Other methods train
+    from scratch. Methods and options are checked before anything is trained.
+
+    Every finished job is a file of one line in OUT/done. Shards of a plan may run side by side, in one folder, or in
+    several whose results.jsonl are concatenated.
     """
     from sundae_ns.cli.bench.quality import run_quality
 
@@ -68,9 +82,9 @@ def quality(options: Annotated[QualityOptions, INLINE]) -> int:
 
 @app.command
 def paper(options: Annotated[PaperOptions, INLINE]) -> int:
-    """Measure the paper's eleven scenes at its keep ratios, into one table beside its own figures.
+    """Measure the paper's eleven scenes at its keep ratios, in one table with the paper's figures.
 
-    Pictures are those that papers measure on: images_4 outdoors and images_2 indoors of Mip-NeRF 360, every eighth for test.
+    Images as in papers: images_4 outdoors and images_2 indoors of Mip-NeRF 360, every eighth for test.
     """
     from sundae_ns.cli.bench.quality import run_paper
 
@@ -87,15 +101,15 @@ def frame(
     repeats: int = 5,
     json: bool = False,
 ) -> int:
-    """Time the frames of a finished run: splat, head and whole, each beside the error of the frames that were timed.
+    """Time the frames of a finished run: splat, head and whole frame, with the error of the timed frames.
 
     Args:
         load_config: the run's folder, or its config.yml.
-        factors: sizes to show, as factors on the pictures' sides; the truth is resized alike.
-        precisions: arithmetic of the head; by default all three on CUDA, and fp32 on a CPU, which knows no other.
-        phases: how often the head runs for a frame, over as many places of its grid; by default as the run says.
-        views: measure on the first so many test views; by default on all.
-        repeats: timed runs of each view, of which the median counts.
+        factors: on the sides of the images; the test images are resized alike.
+        precisions: arithmetic of the head; by default all three on CUDA, and fp32 on a CPU, the only one there.
+        phases: passes of the head for a frame, at as many offsets of its grid; by default those of the run.
+        views: number of test views to measure on, from the first; by default all.
+        repeats: timed runs of each view; their median counts.
         json: print one line of JSON for each size and precision, instead of a table.
     """
     from sundae_ns.cli.bench.frame import run_frame
@@ -119,20 +133,20 @@ def rasterizer(
     output: Path | None = None,
     json: bool = False,
 ) -> int:
-    """Time the rasterisers on random views, each row with its errors against the reference in float64.
+    """Time the rasterisers on random views, with their errors against the reference in float64.
 
     Args:
         counts: numbers of primitives.
-        rasterizers: what to measure; by default everything that runs here. gsplat runs on CUDA, cpu on a CPU.
-        dtypes: precisions; gsplat knows float32 only.
-        size: width and height of the picture.
-        channels: values that are blended beside alpha.
+        rasterizers: to measure; by default all that run here. gsplat runs on CUDA, cpu on a CPU.
+        dtypes: precisions; gsplat has float32 only.
+        size: width and height of the image.
+        channels: number of blended values, without alpha.
         pixels: standard deviation of a primitive on the screen.
-        repeats: timed runs, of which the median counts; fewer where they take longer than 20 s together.
+        repeats: timed runs; their median counts. Fewer if together they take longer than 20 s.
         seed: of the views.
-        shard: i/n measures the i-th of n parts; what they write is merged by concatenation.
-        output: append a line of JSON for every row to this file, and leave out what is in it already.
-        json: print one line of JSON for every row that was measured, instead of a table.
+        shard: i/n measures the i-th of n parts; their outputs are merged by concatenation.
+        output: append a line of JSON for every row to this file; rows in it are not measured again.
+        json: print one line of JSON for every row, instead of a table.
     """
     from sundae_ns.cli.bench.rasterizer import run_rasterizer
 

@@ -1,8 +1,8 @@
-"""Figures as benchmarks print them."""
+"""Numbers as benchmarks print them."""
 
 from __future__ import annotations
 
 
 def significant(value: float, digits: int = 4) -> float:
-    """A number rounded to so many significant digits."""
+    """The number rounded to this many significant digits."""
     return float(f"{value:.{digits}g}")

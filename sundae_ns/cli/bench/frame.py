@@ -1,4 +1,4 @@
-"""``sundae bench frame``: milliseconds of splat, head and whole frame, each beside the error of what was timed."""
+"""``sundae bench frame``: milliseconds of splat, head and whole frame, with the error of the timed frames."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ def run_frame(
     """Measure and print; options are those of the command.
 
     Raises:
-        BackendError: a CPU was asked for another precision than fp32.
+        BackendError: a precision other than fp32 on a CPU.
         CheckpointError: the run cannot be opened.
         ConfigError: an option cannot work.
-        DataError: the capture is gone or has no test views.
+        DataError: the capture is missing or has no test views.
     """
     if repeats < 1 or (views is not None and views < 1):
         raise ConfigError(f"{repeats} timed runs of {views} views measure nothing: use at least 1 of each")
-    with redirect_stdout(sys.stderr):  # what nerfstudio says while it loads is no figure
+    with redirect_stdout(sys.stderr):  # nerfstudio prints while it loads
         run = load_run(load_config)
     run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
     device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
@@ -55,7 +55,7 @@ def run_frame(
             line = {"config": str(load_config), "device": device, "primitives": run.model.num_points}
             rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(found[-1]).items()}
             line |= {"factor": factor, "repeats": repeats, **rounded}
-            # Pictures that are smaller than its window have no SSIM.
+            # Images smaller than its window have no SSIM.
             print(jsonlib.dumps(without_nan(line), allow_nan=False), flush=True)
     if not json:
         Console().print(_table(found, f"{run.model.num_points:,} primitives, {device}, {len(run.cameras)} test views"))

@@ -1,4 +1,4 @@
-"""``sundae bench graph``: the neighbour graph and the high-pass response, timed beside scipy's k-d tree."""
+"""``sundae bench graph``: time of the neighbour graph and the high-pass response, compared with scipy's k-d tree."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sundae_ns.graphs import NeighborGraph, build_graph
 from sundae_ns.graphs.threads import cores
 
 ROUNDING = 1e-12
-"""Relative difference of two float64 distances that counts as a tie."""
+"""Relative difference up to which two float64 distances are a tie."""
 
 
 def run_graph(
@@ -42,14 +42,14 @@ def run_graph(
     """Measure and print; options are those of the command.
 
     Raises:
-        BackendError: there is no CUDA device, or memory cannot be measured here.
+        BackendError: no CUDA device is found, or memory cannot be measured.
         CheckpointError: the field cannot be read.
-        ConfigError: an option cannot work.
+        ConfigError: an option is invalid.
     """
     if repeats < 1:
-        raise ConfigError(f"{repeats} timed runs measure nothing: use at least 1")
+        raise ConfigError(f"cannot measure {repeats} timed runs: use at least 1")
     if device == "cuda" and not torch.cuda.is_available():
-        raise BackendError("there is no CUDA device here: use --device cpu")
+        raise BackendError("no CUDA device is found: use --device cpu")
     if field is None:
         positions = draw(distribution, points, seed)
     else:
@@ -76,17 +76,17 @@ def run_graph(
 
 
 def measure(positions: Tensor, neighbors: int, device: str, repeats: int, reference: bool) -> dict[str, Any]:
-    """Times in seconds, memory in MiB, and the errors; what depends on the reference is None without it.
+    """Times in seconds, memory in MiB, and errors; figures of the reference are None without it.
 
     Args:
-        positions: float32 on the CPU ``[N, 3]``.
-        neighbors: neighbours of each point.
-        device: where to measure.
-        repeats: timed runs, after one that is not timed.
+        positions: positions, float32 on the CPU ``[N, 3]``.
+        neighbors: number of neighbours of each point.
+        device: device to measure on.
+        repeats: number of timed runs, after one untimed run.
         reference: whether to run cKDTree.
 
     Raises:
-        BackendError: memory cannot be measured here.
+        BackendError: memory cannot be measured.
     """
     placed = positions.to(device)
     stages: dict[str, float] = {}
@@ -128,14 +128,14 @@ def measure(positions: Tensor, neighbors: int, device: str, repeats: int, refere
 
 
 def count_mismatches(positions: Tensor, indices: Tensor, reference: np.ndarray) -> int:
-    """Rows of neighbours that are wrong beyond ties.
+    """Number of rows of neighbours that are wrong beyond ties.
 
-    A row is right if its points are different ones, none the point itself, and as far away as those of the reference:
-    then the two sets differ in points of equal distance only.
+    A row is correct if its points are distinct, do not include the point itself, and have the distances of the reference:
+    then the two sets differ only in points of equal distance.
 
     Args:
-        positions: ``[N, 3]``.
-        indices: neighbours that were found, int64 ``[N, K]``.
+        positions: positions ``[N, 3]``.
+        indices: found neighbours, int64 ``[N, K]``.
         reference: ascending distances to the true neighbours, float64 ``[N, K]``.
     """
     wrong = 0
@@ -163,16 +163,16 @@ def _reference(positions: Tensor, neighbors: int) -> tuple[float, np.ndarray]:
 
 
 def compare_with_float64(placed: Tensor, neighbors: int, response: Tensor) -> tuple[float, int]:
-    """How far the response is from that of the same positions in float64.
+    """Error of a response against the response of the same positions in float64.
 
     Args:
         placed: positions ``[N, 3]``.
-        neighbors: neighbours of each point.
-        response: high-pass response, NaN where a node is isolated ``[N, 3]``.
+        neighbors: number of neighbours of each point.
+        response: high-pass response ``[N, 3]``, NaN for isolated nodes.
 
     Returns:
-        Norm of the difference over the norm in float64, of nodes with neighbours in both; and how many nodes have
-        neighbours in one of the two only, which no norm would show.
+        Norm of the difference over the norm in float64, for nodes with neighbours in both; and the number of nodes with
+        neighbours in only one of the two.
     """
     double = placed.double()
     exact = high_pass(build_graph(double, num_neighbors=neighbors), double)
@@ -184,7 +184,7 @@ def compare_with_float64(placed: Tensor, neighbors: int, response: Tensor) -> tu
 
 
 def _with_peak(run: Callable[[], Any], device: str) -> tuple[Any, int]:
-    """What a run gives, and the most memory that it took beside what was there before, in bytes."""
+    """Result of a run, and the peak of its additional memory in bytes."""
     if device == "cuda":
         torch.cuda.synchronize()
         before = torch.cuda.memory_allocated()
@@ -194,29 +194,28 @@ def _with_peak(run: Callable[[], Any], device: str) -> tuple[Any, int]:
     status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
     _give_back()
     try:
-        # Linux: 5 makes the peak of the resident memory start anew.
+        # Linux: writing 5 resets the peak of the resident memory.
         reset.write_text("5")
         before = _resident(status, "VmRSS")
         result = run()
         return result, _resident(status, "VmHWM") - before
     except OSError as error:
-        raise BackendError(f"memory cannot be measured here ({error}): use Linux") from error
+        raise BackendError(f"memory cannot be measured ({error}): use Linux") from error
 
 
 def _give_back() -> None:
-    """Return freed memory to the system, where glibc would keep it.
+    """Return freed memory to the system.
 
-    What earlier runs have freed stays resident otherwise, the next run takes it from there, and it would seem to need
-    next to nothing beside what was there before.
+    Otherwise glibc keeps it resident, and the next run reuses it and seems to need almost no additional memory.
     """
     if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # no other C library has it
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc only
         if trim is not None:
             trim(0)
 
 
 def _threads() -> str:
-    """The processor's threads: those of the search, and torch's, which have the weights and the response."""
+    """Numbers of threads of the processor: for the search, and torch's for weights and response."""
     if cores() == torch.get_num_threads():
         return f"CPU, {cores()} threads"
     return f"CPU, {cores()} threads for neighbours, {torch.get_num_threads()} for torch"

@@ -1,6 +1,6 @@
 """One job of a comparison: trained by nerfstudio, saved, opened again from its files, and measured.
 
-``python -m sundae_ns.cli.bench.job OUT KEY`` does the job of that key, whose description lies in its folder.
+``python -m sundae_ns.cli.bench.job OUT KEY`` does the job that ``OUT/jobs/KEY/job.json`` describes.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from sundae_ns.cli.bench.plan import Job, done_file, job_folder
 from sundae_ns.errors import BackendError, CheckpointError, SundaeError
 from sundae_ns.evaluation import Lpips, lpips_weights_available
 from sundae_ns.evaluation.records import wait_for_lock
+from sundae_ns.model import SundaeModelConfig
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.storage.atomic import write_text
@@ -50,7 +51,7 @@ def read_result(path: Path) -> dict[str, Any] | None:
 
 
 def perform(job: Job, out: Path) -> None:
-    """Do a job, unless it is done; a process that does the same one meanwhile is waited for.
+    """Do a job unless it is done; wait for another process that does the same job.
 
     Raises:
         SundaeError: it cannot be done here.
@@ -65,26 +66,26 @@ def perform(job: Job, out: Path) -> None:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Hold a file's lock, which goes with the process."""
+    """Hold a file's lock; the system releases it when the process ends."""
     with path.open("a") as file:
         wait_for_lock(file.fileno())
         yield
 
 
 def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
-    """Train, save, open what was saved, and measure it: ``{"job", "measured"}`` as plain values.
+    """Train, save, open the saved run and measure it; return ``{"job", "measured"}`` as plain values.
 
-    Nothing is evaluated or saved while training is timed, for all methods alike.
+    Nothing is evaluated or saved while training is timed, whatever the method.
 
     Raises:
-        BackendError: the job needs a CUDA device and there is none.
-        CheckpointError: the warm-up that it needs is not done.
+        BackendError: the method needs a CUDA device and there is none.
+        CheckpointError: its warm-up is not done.
     """
     cuda = torch.cuda.is_available()
-    if job.kind == "stock" and not cuda:
-        raise BackendError(f"{job.arm} needs a CUDA device and gsplat's kernels; leave it out with --arms here")
     config, command = configure(job, out)
-    # What an attempt that was stopped has left: its records would be taken for this one's.
+    if not cuda and not isinstance(config.pipeline.model, SundaeModelConfig):
+        raise BackendError(f"{job.arm} needs a CUDA device and gsplat's kernels; leave it out with --arms here")
+    # Records of an attempt that was stopped would be taken for this one's.
     shutil.rmtree(config.get_base_dir(), ignore_errors=True)
     config.save_config()
     _set_random_seed(config.machine.seed)
@@ -125,10 +126,10 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
 
 
 def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
-    """The configuration as ``ns-train`` would parse it, and that command.
+    """The configuration as ``ns-train`` parses it, and that command.
 
     Raises:
-        CheckpointError: the warm-up that it needs is not done.
+        CheckpointError: its warm-up is not done.
     """
     arguments = [job.method, "--data", job.data, "--machine.seed", str(job.seed)]
     arguments += ["--max-num-iterations", str(job.steps), *job.options]
@@ -149,7 +150,7 @@ def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
 
 
 def _cap(job: Job, out: Path) -> int:
-    """Primitives that a branch of the same share keeps."""
+    """Number of primitives that a branch of the same share keeps."""
     result = read_result(done_file(out, str(job.needs)))
     if result is None:
         raise CheckpointError(f"{job.key} needs the count of {job.needs}, which is not done; run the whole plan")
@@ -160,12 +161,12 @@ def _run_folder(out: Path, key: str | None) -> Path:
     result = read_result(done_file(out, str(key)))
     if result is None:
         raise CheckpointError(f"the warm-up {key} is not done; run the whole plan")
-    # Not what the result says: the folder of a comparison may have moved since.
+    # Not the folder in the result: the comparison may have moved since.
     return job_folder(out, str(key)) / result["job"]["arm"] / result["job"]["method"] / "run"
 
 
 class _Peak:
-    """Most primitives before any step of a training. Fields of ours know of those within a step too."""
+    """Largest number of primitives before any step of a training; sundae's model counts within a step too."""
 
     def __init__(self, trainer: Trainer) -> None:
         self.peak = 0
@@ -178,7 +179,7 @@ class _Peak:
 
 
 class _Nothing(torch.nn.Module):
-    """Stands in for LPIPS in stock splatfacto, which else downloads weights in its constructor."""
+    """Replaces LPIPS in stock splatfacto, whose constructor would download its weights."""
 
     def __init__(self, **_: Any) -> None:
         super().__init__()
@@ -189,7 +190,7 @@ class _Nothing(torch.nn.Module):
 
 @contextlib.contextmanager
 def _no_lpips() -> Iterator[None]:
-    """Keep stock splatfacto from building LPIPS; nothing is evaluated while it trains."""
+    """Keep stock splatfacto from building LPIPS; training evaluates nothing."""
     import torchmetrics.image.lpip as module
 
     real = module.LearnedPerceptualImagePatchSimilarity
@@ -201,7 +202,7 @@ def _no_lpips() -> Iterator[None]:
 
 
 def _forget() -> None:
-    """Free what a training leaves behind: nerfstudio keeps its loggers in globals."""
+    """Free the loggers that nerfstudio keeps in globals, and unused memory."""
     for writers in (writer.EVENT_WRITERS, writer.EVENT_STORAGE, profiler.PROFILER):
         writers.clear()
     writer.GLOBAL_BUFFER.clear()
@@ -211,13 +212,13 @@ def _forget() -> None:
 
 
 def read_job(path: Path) -> Job:
-    """Description of a job, from the ``job.json`` that ``bench.quality`` writes into its folder."""
+    """A job from its ``job.json``, which ``bench.quality`` writes into its folder."""
     plain = json.loads(path.read_text(encoding="utf-8"))
     return Job(**{**plain, "options": tuple(plain["options"]), "parser": tuple(plain["parser"])})
 
 
 def main() -> None:
-    """Do one job; exits with 2 and one line on an error of ours."""
+    """Do one job; exit with 2 and one line on an error of this package."""
     out, key = Path(sys.argv[1]), sys.argv[2]
     try:
         perform(read_job(job_folder(out, key) / "job.json"), out)

@@ -1,7 +1,6 @@
-"""Options of the comparisons: what the command line is parsed into, what the runners take, and what their pages name.
+"""Options of the comparisons, as the command line is parsed into them.
 
-No base holds what both have: the order of the fields is that of ``--help`` and of the command on a page, and fields of a
-base would come before the others.
+The two classes share no base: its fields would come first in ``--help`` and in the command that a page names.
 """
 
 from __future__ import annotations
@@ -14,8 +13,6 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.bench.plan import ARMS
-
 
 @dataclass(frozen=True)
 class QualityOptions:
@@ -24,29 +21,30 @@ class QualityOptions:
     scene: Annotated[Path, tyro.conf.Positional]
     """folder of a capture: COLMAP layout (sparse/0, images), or with a transforms.json."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """folder for jobs, results and tables; what is finished in it is not done again."""
-    arms: tuple[str, ...] = ARMS
-    """what to compare: sundae, band, contribution, random, each also with -no-head; mcmc, splatfacto, splatfacto-7k."""
+    """folder for jobs, results and tables; its finished jobs are not run again."""
+    arms: tuple[str, ...] = ()
+    """files of arms (.yaml), and names of default arms: sundae, band, contribution, random, each also with -no-head;
+    mcmc, splatfacto, splatfacto-7k. All default arms if none is given."""
     keep_ratios: tuple[float, ...] = (0.01, 0.1)
-    """shares of the warm-up's primitives."""
+    """shares of the warm-up's primitives to keep."""
     seeds: tuple[int, ...] = (42, 43, 44)
-    """the first for everything, the others for what is at --repeat-at."""
+    """the first for every job, the others for the shares of --repeat-at."""
     repeat_at: tuple[float, ...] = (0.1,)
-    """shares that all seeds are run for."""
+    """shares that run with all seeds."""
     method: str = "sundae"
-    """method of ours whose options the jobs have."""
+    """method of arms that name none; one of this package that prunes once."""
     warmup_steps: int | None = None
-    """length of the warm-up instead of the method's own."""
+    """steps of the warm-up, instead of the method's own."""
     finetune_steps: int | None = None
-    """length of the fine-tuning instead of the method's own."""
+    """steps of the fine-tuning, instead of the method's own."""
     steps_scale: float = 1.0
     """factor on all lengths, for a trial."""
     downscale: int = 1
-    """take the pictures of images_2, images_4 ... (COLMAP layout)."""
+    """use the images of images_2, images_4 ... (COLMAP layout)."""
     shard: str = "1/1"
-    """i/n does the i-th of n parts."""
+    """i/n runs the i-th of n parts."""
     jobs: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """list the jobs, and which are done, and do nothing."""
+    """only list the jobs, and which are done."""
 
     def command(self) -> str:
         """The command that a page names."""
@@ -58,29 +56,29 @@ class PaperOptions:
     """Options of ``sundae bench paper``."""
 
     root: Annotated[Path, tyro.conf.Positional]
-    """folder with the archives as they unpack: 360_v2, tandt and db, or the scenes themselves."""
+    """folder with the unpacked archives (360_v2, tandt, db), or with the scenes themselves."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """folder for jobs, results and tables; what is finished in it is not done again."""
+    """folder for jobs, results and tables; its finished jobs are not run again."""
     scenes: tuple[str, ...] = ()
-    """some of the eleven; all that are there by default."""
+    """some of the eleven; by default all that the folder has."""
     arms: tuple[str, ...] = ("sundae", "sundae-no-head", "splatfacto")
-    """as in bench quality."""
+    """files of arms and names of default arms, as in bench quality."""
     keep_ratios: tuple[float, ...] = (0.01, 0.1, 0.3, 0.5)
-    """shares of the warm-up's primitives."""
+    """shares of the warm-up's primitives to keep."""
     seed: int = 42
-    """of everything."""
+    """of every job."""
     method: str = "sundae"
-    """method of ours whose options the jobs have."""
+    """method of arms that name none; one of this package that prunes once."""
     warmup_steps: int | None = None
-    """length of the warm-up instead of the method's own."""
+    """steps of the warm-up, instead of the method's own."""
     finetune_steps: int | None = None
-    """length of the fine-tuning instead of the method's own."""
+    """steps of the fine-tuning, instead of the method's own."""
     steps_scale: float = 1.0
     """factor on all lengths, for a trial."""
     shard: str = "1/1"
-    """i/n does the i-th of n parts."""
+    """i/n runs the i-th of n parts."""
     jobs: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """list the jobs, and which are done, and do nothing."""
+    """only list the jobs, and which are done."""
 
     def command(self) -> str:
         """The command that a page names."""
@@ -88,7 +86,7 @@ class PaperOptions:
 
 
 def _command(name: str, options: QualityOptions | PaperOptions) -> str:
-    """The command of the whole comparison, whichever part of it was done here."""
+    """The command of the whole comparison, without the shard."""
     positional, *others = (field.name for field in fields(options))
     words = ["sundae", "bench", name, str(getattr(options, positional)), "-o", str(options.out)]
     for other in others:

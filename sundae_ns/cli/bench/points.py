@@ -1,4 +1,4 @@
-"""Point sets to measure on: like a real field, and such as break neighbour searches."""
+"""Point sets to measure on: one like a trained field, and ones that are hard for neighbour searches."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Distribution = Literal["field", "clusters", "duplicates", "uniform"]
 def draw(distribution: Distribution, n: int, seed: int) -> Tensor:
     """Draw positions, float32 on the CPU ``[n, 3]``.
 
-    - ``field``: a thousand discs of the same number of points, a thousandth to three units wide and a fiftieth of that
-      thick, so that spacings differ a thousandfold; one point in fifty is a floater, out to a hundred units; and one in
-      a hundred is a clone of another, as densification leaves them.
+    - ``field``: a thousand discs with equal counts, 0.001 to 3 units wide and a fiftieth as thick, so spacings differ a
+      thousandfold; one point in 50 is a floater, out to 100 units; one in 100 is a clone of another, as after
+      densification.
     - ``clusters``: half in clusters of 1e-5, a quarter in clusters of 1e-2, the rest spread over 1e3.
-    - ``duplicates``: as ``clusters``, and half of all points coincide with another one.
+    - ``duplicates``: as ``clusters``, but half of all points coincide with another.
     - ``uniform``: in the unit cube.
 
     Raises:
@@ -29,7 +29,7 @@ def draw(distribution: Distribution, n: int, seed: int) -> Tensor:
     if distribution not in get_args(Distribution):
         raise ConfigError(f"unknown distribution {distribution!r}: use one of {', '.join(get_args(Distribution))}")
     if n < 1:
-        raise ConfigError(f"{n} points are none to measure on: use at least 1")
+        raise ConfigError(f"{n} points cannot be measured: use at least 1")
     generator = torch.Generator().manual_seed(seed)
     makers: dict[str, Callable[[int, torch.Generator], Tensor]] = {
         "field": _field,
@@ -61,7 +61,7 @@ def _field(n: int, generator: torch.Generator) -> Tensor:
 def _clusters(n: int, generator: torch.Generator) -> Tensor:
     points = _normal(n, generator)
     for part, clusters, width in ((slice(0, n // 2), 50, 1e-5), (slice(n // 2, 3 * n // 4), 50, 1e-2)):
-        # Near the origin, so that float32 can tell the points of a cluster of 1e-5 apart.
+        # Near the origin: float32 must tell the points of a cluster of 1e-5 apart.
         centres = 1e-3 * _normal(clusters, generator)
         cluster = torch.randint(clusters, (len(points[part]),), generator=generator)
         points[part] = centres[cluster] + width * points[part]
@@ -70,7 +70,7 @@ def _clusters(n: int, generator: torch.Generator) -> Tensor:
 
 
 def _cloned(points: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """The points, a share of them moved onto others."""
+    """The points, with a share of them moved onto others."""
     order = torch.randperm(len(points), generator=generator)
     count = min(round(share * len(points)), len(points) // 2)
     cloned = points.clone()

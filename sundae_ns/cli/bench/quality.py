@@ -1,4 +1,4 @@
-"""``sundae bench quality`` and ``sundae bench paper``: whole comparisons that can be stopped and continued."""
+"""``sundae bench quality`` and ``sundae bench paper``: comparisons that can be stopped and resumed."""
 
 from __future__ import annotations
 
@@ -12,18 +12,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
+from sundae_ns.cli.bench.arms import Lengths, choose_arms
 from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
-from sundae_ns.cli.bench.plan import (
-    Job,
-    Schedule,
-    done_file,
-    job_folder,
-    jobs_of_shard,
-    parser_of,
-    plan_scene,
-    schedule_of,
-)
-from sundae_ns.cli.bench.recipes import plan_paper
+from sundae_ns.cli.bench.paper import plan_paper
+from sundae_ns.cli.bench.plan import Arm, Job, done_file, job_folder, jobs_of_shard, parser_of, plan_scene
 from sundae_ns.cli.bench.results import Result, paper_page, quality_page, read_results, write_results
 from sundae_ns.cli.bench.shards import parse_shard
 from sundae_ns.cli.process import percent_of, run_logged
@@ -32,14 +24,14 @@ from sundae_ns.evaluation.document import table
 from sundae_ns.storage.atomic import write_text, writing
 
 SAID = "sundae: "
-"""How a line begins in which a job says why it ends."""
+"""Start of the line in which a job says why it failed."""
 
 STOPPED = 130
-"""Exit code after an interrupt, as shells have it."""
+"""Exit code after an interrupt, as in shells."""
 
 OnPercent = Callable[[float], object]
 Runner = Callable[[Job, Path, OnPercent], None]
-"""Does one job, and leaves its result in ``done/``."""
+"""Runs one job, which writes its result to ``done/``."""
 
 
 def run_quality(options: QualityOptions, *, runner: Runner | None = None, console: Console | None = None) -> int:
@@ -47,28 +39,30 @@ def run_quality(options: QualityOptions, *, runner: Runner | None = None, consol
 
     Args:
         options: those of the command.
-        runner: does a job; by default in a process of its own (:func:`spawn`).
-        console: to report to.
+        runner: runs a job; by default in a process of its own (:func:`spawn`).
+        console: for progress and messages.
 
     Raises:
-        ConfigError: an option cannot work, or the folder holds results of other jobs of the same names.
-        DataError: there is no such capture.
+        ConfigError: an option or an arm cannot work, or the folder holds results of other jobs with the same names.
+        DataError: the folder is no capture.
         StorageError: the folder cannot be written to.
     """
-    console, part, schedule = console or Console(), parse_shard(options.shard), _schedule(options)
+    console, part, arms = console or Console(), parse_shard(options.shard), _arms(options)
     data = options.scene.resolve()
     plan = plan_scene(
         data.name,
         data,
         parser_of(data, options.downscale),
-        schedule,
-        arms=options.arms,
+        arms,
         keep_ratios=options.keep_ratios,
         seeds=options.seeds,
         repeat_at=options.repeat_at,
     )
-    own = jobs_of_shard(plan, *part)
-    return _list_or_do(own, options, lambda results: quality_page(results, options.command()), runner, console)
+
+    def page(results: Sequence[Result]) -> str:
+        return quality_page(results, arms, options.command())
+
+    return _list_or_run(jobs_of_shard(plan, *part), options, page, runner, console)
 
 
 def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: Console | None = None) -> int:
@@ -77,29 +71,26 @@ def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: C
     Raises:
         ConfigError, DataError, StorageError: as in :func:`run_quality`.
     """
-    console, part, schedule = console or Console(), parse_shard(options.shard), _schedule(options)
+    console, part, arms = console or Console(), parse_shard(options.shard), _arms(options)
     plan, missing = plan_paper(
-        options.root.resolve(),
-        schedule,
-        scenes=options.scenes,
-        arms=options.arms,
-        keep_ratios=options.keep_ratios,
-        seed=options.seed,
+        options.root.resolve(), arms, scenes=options.scenes, keep_ratios=options.keep_ratios, seed=options.seed
     )
     if missing:
-        console.print(f"[yellow]Not there, and left out: {', '.join(missing)}", highlight=False)
-    own = jobs_of_shard(plan, *part)
-    return _list_or_do(own, options, lambda results: paper_page(results, missing, options.command()), runner, console)
+        console.print(f"[yellow]Scenes that are missing and left out: {', '.join(missing)}", highlight=False)
+
+    def page(results: Sequence[Result]) -> str:
+        return paper_page(results, arms, missing, options.command())
+
+    return _list_or_run(jobs_of_shard(plan, *part), options, page, runner, console)
 
 
-def _schedule(options: QualityOptions | PaperOptions) -> Schedule:
-    return schedule_of(
-        options.method, warmup=options.warmup_steps, finetune=options.finetune_steps, scale=options.steps_scale
-    )
+def _arms(options: QualityOptions | PaperOptions) -> list[Arm]:
+    lengths = Lengths(options.warmup_steps, options.finetune_steps, options.steps_scale)
+    return choose_arms(options.arms, options.method, lengths)
 
 
 def show_jobs(jobs: Sequence[Job], out: Path, console: Console) -> None:
-    """List jobs, and which of them are done."""
+    """List jobs, and mark finished ones."""
     done = _finished(out)
     rows = [[job.key, job.method, f"{job.steps:,}", job.needs or "", "done" if job.key in done else ""] for job in jobs]
     for line in table(["job", "method", "steps", "needs", ""], rows):
@@ -108,20 +99,20 @@ def show_jobs(jobs: Sequence[Job], out: Path, console: Console) -> None:
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, runner: Runner, console: Console) -> dict[str, str]:
-    """Do what is not done yet; a job that fails does not keep the others from their turn.
+    """Run the jobs that are not done; a job that fails stops only the jobs that need it.
 
     Returns:
-        Why it failed, by key, for each job that did.
+        The reason of each failure, by key.
 
     Raises:
-        ConfigError: the folder holds another job's result under the same name.
+        ConfigError: the folder holds the result of another job under the same name.
         StorageError: the folder cannot be written to.
     """
     done = _finished(out)
     for job in jobs:
         if job.key in done:
             _check_same(job, done[job.key], out)
-    # Results may have come without the runs that they are of, and a branch needs its warm-up itself.
+    # Results may lie here without their runs, and a branch needs the run of its warm-up.
     needed = {job.needs for job in jobs if job.key not in done}
     done = {key: result for key, result in done.items() if key not in needed or done_file(out, key).exists()}
     failed: dict[str, str] = {}
@@ -133,7 +124,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, runner: Runner, console: Console) -
                 task = progress.add_task(job.key, total=100)
                 try:
                     if job.needs in failed:
-                        raise SundaeError(f"what it needs has failed: {job.needs}")
+                        raise SundaeError(f"its warm-up has failed: {job.needs}")
                     _describe(job, out)
                     runner(job, out, lambda percent, task=task: progress.update(task, completed=percent))  # type: ignore[misc]
                 except SundaeError as error:
@@ -145,20 +136,20 @@ def run_jobs(jobs: Sequence[Job], out: Path, runner: Runner, console: Console) -
 
 
 def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
-    """Do a job in a process of its own, so that its memory, its crash and its random numbers are its own."""
+    """Run a job in a process of its own: memory, crashes and random numbers stay apart."""
 
     def on_line(line: str) -> None:
         percent = percent_of(line)
         if percent is not None:
             on_percent(percent)
 
-    # Another shard may wait for the same warm-up meanwhile.
+    # Another shard may wait for the same warm-up.
     log = job_folder(out, job.key) / f"log-{os.getpid()}.txt"
     try:
         run_logged([sys.executable, "-m", "sundae_ns.cli.bench.job", str(out), job.key], log, on_line)
     except SundaeError as error:
         *_, last = str(error).splitlines()
-        if last.startswith(SAID):  # it ended in one of our own lines, which says all
+        if last.startswith(SAID):  # an error of this package, complete in one line
             raise SundaeError(f"{last.removeprefix(SAID)} (log: {log})") from error
         raise
 
@@ -175,24 +166,24 @@ def _finished(out: Path) -> dict[str, Result]:
 
 
 def _check_same(job: Job, result: Result, out: Path) -> None:
-    """A result must be of this very job; where its capture lies does not matter."""
+    """Refuse the result of another job; the capture may have moved."""
     ours, theirs = json.loads(json.dumps(asdict(job))), dict(result["job"])
     odd = [name for name, value in ours.items() if name != "data" and theirs.get(name) != value]
     if odd:
         name = odd[0]
         raise ConfigError(
-            f"{out} holds {job.key} with other {name} ({theirs.get(name)}, now {ours[name]}); choose another folder"
+            f"{out} holds {job.key} with other {name} ({theirs.get(name)}, now {ours[name]}); give another folder"
         )
 
 
-def _list_or_do(
+def _list_or_run(
     jobs: Sequence[Job],
     options: QualityOptions | PaperOptions,
     page: Callable[[Sequence[Result]], str],
     runner: Runner | None,
     console: Console,
 ) -> int:
-    """List the jobs of this shard, or do them and write the tables; the exit code."""
+    """List the jobs, or run them and write the tables; the exit code."""
     out = options.out
     if options.jobs:
         show_jobs(jobs, out, console)
@@ -200,12 +191,12 @@ def _list_or_do(
     try:
         failed = run_jobs(jobs, out, runner or spawn, console)
     except KeyboardInterrupt:
-        console.print("stopped; the same command goes on from here", highlight=False)
+        console.print("stopped; the same command resumes", highlight=False)
         return STOPPED
     results = read_results(out)
     if results:
         write_results(out, results, page(results))
         console.print(f"wrote {out / 'table.md'}, results.csv and results.jsonl", highlight=False, soft_wrap=True)
     if failed:
-        console.print(f"{len(failed)} jobs failed; the same command does them again", highlight=False)
+        console.print(f"{len(failed)} jobs failed; the same command runs them again", highlight=False)
     return 1 if failed else 0

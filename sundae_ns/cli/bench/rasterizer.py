@@ -1,4 +1,4 @@
-"""``sundae bench rasterizer``: milliseconds of the rasterisers, each beside the error of the very view that was timed."""
+"""``sundae bench rasterizer``: milliseconds of the rasterisers, each with the error of the timed view."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from sundae_ns.rasterization import Backend, BackendName, rasterize, select_back
 
 DTYPES = {"float32": torch.float32, "float64": torch.float64}
 DEPTHS = (2.0, 4.0)
-"""Between these the primitives lie, in world units; it takes two to have an order."""
+"""Nearest and farthest depth of primitives, world units."""
 WORTH_IT = 20.0
-"""Seconds after which no further repeat is begun."""
+"""Seconds after which no further repeat starts."""
 
 
 CANDIDATES: tuple[tuple[BackendName, str], ...] = (
@@ -36,12 +36,12 @@ CANDIDATES: tuple[tuple[BackendName, str], ...] = (
     ("cpu", "cpu"),
     ("reference", "cpu"),
 )
-"""Rasterisers and their devices, of which all that run here are measured by default."""
+"""Rasterisers and their devices; by default all that run here are measured."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is measured: the fields that tell one row from another."""
+    """One measurement: the fields that tell rows apart."""
 
     rasterizer: BackendName
     device: str
@@ -56,7 +56,7 @@ class Case:
 
 
 Drawn = dict[str, Tensor]
-"""Tensors by name: primitives after activation, a camera, or what came out for them."""
+"""Tensors by name: activated primitives, a camera, or the results of rendering them."""
 
 
 def run_rasterizer(
@@ -111,10 +111,10 @@ def run_rasterizer(
 
 
 def draw_view(case: Case) -> tuple[Drawn, Drawn]:
-    """Primitives after activation, and the camera; float64 on the CPU, rounded to float32, so that errors are arithmetic's.
+    """Activated primitives and a camera, float64 on the CPU; rounded to float32, so that all dtypes get the same inputs.
 
-    Centres are spread evenly over picture and depth. Standard deviations are, on the screen, between half of and one and a
-    half times the pixels asked for. Opacities are even between 0 and 1.
+    Centres are uniform over image and depth, opacities in [0, 1]. Standard deviations on the screen are uniform between 0.5
+    and 1.5 times ``case.pixels``.
     """
     generator = torch.Generator().manual_seed(case.seed)
 
@@ -139,40 +139,40 @@ def draw_view(case: Case) -> tuple[Drawn, Drawn]:
 def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
     """Times in milliseconds, medians after one run that is not timed; errors against the oracle.
 
-    ``cpu_ms`` is what all threads together computed: where it is less than the other on one thread, the machine was shared.
+    ``cpu_ms`` is processor time of all threads. If it is less than the wall clock of one thread, the machine was shared.
 
     Args:
-        case: what to measure.
+        case: the measurement.
         exact: from :func:`render` by the reference in float64.
-        repeats: timed runs, fewer where they take longer than ``WORTH_IT`` seconds together.
+        repeats: timed runs; fewer if together they take longer than ``WORTH_IT`` seconds.
     """
     backend = select_backend(case.rasterizer, case.device)
-    pulls = _pulls(case, DTYPES[case.dtype], case.device)
+    cotangents = _cotangents(case, DTYPES[case.dtype], case.device)
     scene, camera = (
         {key: value.to(case.device, DTYPES[case.dtype]) for key, value in part.items()} for part in draw_view(case)
     )
-    found = render(case, scene, camera, pulls, backend)
+    found = render(case, scene, camera, cotangents, backend)
     errors = {key: (found[key].cpu().double() - exact[key]) for key in exact}
     gradients = {
         key: float(errors[key].norm()) / max(float(exact[key].norm()), 1e-30) for key in errors if key in scene
     }
-    picture = torch.cat([errors["picture"], errors["alpha"]], dim=-1).abs()
+    image = torch.cat([errors["image"], errors["alpha"]], dim=-1).abs()
     del found, errors
 
     def forward() -> None:
         with torch.no_grad():
-            _picture(case, scene, camera, backend)
+            _image(case, scene, camera, backend)
 
     forward_ms, forward_cpu_ms, _ = _median_ms(forward, repeats, case.device)
-    both = _median_ms(lambda: render(case, scene, camera, pulls, backend), repeats, case.device)
+    both = _median_ms(lambda: render(case, scene, camera, cotangents, backend), repeats, case.device)
     return {
         "forward_ms": significant(forward_ms),
         "forward_backward_ms": significant(both[0]),
         "forward_cpu_ms": significant(forward_cpu_ms),
         "forward_backward_cpu_ms": significant(both[1]),
         "repeats": both[2],
-        "max_error": significant(float(picture.max())),
-        "mean_error": significant(float(picture.mean())),
+        "max_error": significant(float(image.max())),
+        "mean_error": significant(float(image.mean())),
         "gradient_error": significant(max(gradients.values())),
         **{f"gradient_error_{key}": significant(value) for key, value in gradients.items()},
         "device_name": torch.cuda.get_device_name() if case.device == "cuda" else f"CPU, {case.threads} threads",
@@ -180,20 +180,20 @@ def measure(case: Case, exact: Drawn, repeats: int) -> dict[str, Any]:
     }
 
 
-def render(case: Case, scene: Drawn, camera: Drawn, pulls: tuple[Tensor, Tensor], backend: Backend) -> Drawn:
-    """Picture ``[H, W, C]``, alpha ``[H, W, 1]``, and the gradients of what their products with the pulls add up to.
+def render(case: Case, scene: Drawn, camera: Drawn, cotangents: tuple[Tensor, Tensor], backend: Backend) -> Drawn:
+    """Image ``[H, W, C]``, alpha ``[H, W, 1]``, and the gradients of their inner products with the cotangents.
 
-    Nothing of torch's stands between rasteriser and gradients: it would be timed, and its threads would go on waiting on the
-    cores that the way back needs.
+    No torch operation stands between rasteriser and gradients: it would be timed, and its idle threads would occupy the cores
+    of the backward pass.
     """
     leaves = {key: value.detach().requires_grad_() for key, value in scene.items()}
-    picture, alpha = _picture(case, leaves, camera, backend)
-    gradients = torch.autograd.grad((picture, alpha), list(leaves.values()), pulls)
-    return {"picture": picture.detach(), "alpha": alpha.detach(), **dict(zip(leaves, gradients))}
+    image, alpha = _image(case, leaves, camera, backend)
+    gradients = torch.autograd.grad((image, alpha), list(leaves.values()), cotangents)
+    return {"image": image.detach(), "alpha": alpha.detach(), **dict(zip(leaves, gradients))}
 
 
 class _Oracle:
-    """The reference in float64 on the CPU, kept for the rows of the same view."""
+    """Result of the reference in float64 on the CPU, cached for rows of the same view."""
 
     def __init__(self) -> None:
         self._view: tuple[object, ...] | None = None
@@ -202,12 +202,12 @@ class _Oracle:
     def __call__(self, case: Case) -> Drawn:
         view = (case.primitives, case.width, case.height, case.channels, case.pixels, case.seed)
         if view != self._view:
-            self._exact = render(case, *draw_view(case), _pulls(case), select_backend("reference", "cpu"))
+            self._exact = render(case, *draw_view(case), _cotangents(case), select_backend("reference", "cpu"))
             self._view = view
         return self._exact
 
 
-def _picture(case: Case, scene: Drawn, camera: Drawn, backend: Backend) -> tuple[Tensor, Tensor]:
+def _image(case: Case, scene: Drawn, camera: Drawn, backend: Backend) -> tuple[Tensor, Tensor]:
     view = rasterize(
         scene["means"],
         scene["quats"],
@@ -223,15 +223,15 @@ def _picture(case: Case, scene: Drawn, camera: Drawn, backend: Backend) -> tuple
     return view.colors, view.alpha
 
 
-def _pulls(case: Case, dtype: torch.dtype = torch.float64, device: str = "cpu") -> tuple[Tensor, Tensor]:
-    """What the loss pulls at each value of the picture and of alpha: fixed random numbers, of float32."""
+def _cotangents(case: Case, dtype: torch.dtype = torch.float64, device: str = "cpu") -> tuple[Tensor, Tensor]:
+    """Cotangents of image and alpha: fixed random numbers, exact in float32."""
     generator = torch.Generator().manual_seed(case.seed + 1)
-    pull = torch.randn(case.height, case.width, case.channels + 1, generator=generator).to(device, dtype)
-    return pull[..., :-1].contiguous(), pull[..., -1:].contiguous()
+    cotangent = torch.randn(case.height, case.width, case.channels + 1, generator=generator).to(device, dtype)
+    return cotangent[..., :-1].contiguous(), cotangent[..., -1:].contiguous()
 
 
 def _backends(names: Sequence[BackendName]) -> Iterator[tuple[BackendName, str]]:
-    """Rasterisers and their devices: those that were named, or by default all that run here."""
+    """Rasterisers and their devices: the named ones, or by default all that run here."""
     if names:
         for name in names:
             device = "cuda" if name == "gsplat" else "cpu"
@@ -249,7 +249,7 @@ def _backends(names: Sequence[BackendName]) -> Iterator[tuple[BackendName, str]]
 
 
 def _median_ms(function: Callable[[], object], repeats: int, device: str) -> tuple[float, float, int]:
-    """Milliseconds by the clock, milliseconds of the processor, and the number of runs."""
+    """Median wall-clock milliseconds, median processor milliseconds, and the number of runs."""
     function()
     times: list[float] = []
     busy: list[float] = []
@@ -281,7 +281,7 @@ def _case_of(row: dict[str, Any]) -> Case | None:
 
 
 def _table(rows: Sequence[dict[str, Any]], title: str) -> Table:
-    caption = "milliseconds; largest and mean error of the picture, worst relative error of a gradient"
+    caption = "milliseconds; largest and mean error of the image, worst relative error of a gradient"
     table = Table(title=title, caption=caption, box=None, pad_edge=False)
     for column in ("N", "rasterizer", "in", "forward", "both ways", "max", "mean", "gradient"):
         table.add_column(column, justify="right", no_wrap=True)

@@ -1,4 +1,4 @@
-"""Results of a comparison: read from their files, put into rows of runs.csv, and into tables."""
+"""Results of a comparison: read from their files, and written as rows and tables."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from sundae_ns.cli.bench.plan import ARMS
+from sundae_ns.cli.bench.plan import Arm
 from sundae_ns.errors import DataError
 from sundae_ns.evaluation import COLUMNS
 from sundae_ns.evaluation.document import METRICS, number, table
@@ -19,11 +19,11 @@ from sundae_ns.evaluation.published import DATASETS, MEMBERS, NOTE, SCENES
 from sundae_ns.storage.atomic import write_text
 
 Result = Mapping[str, Any]
-"""What a job leaves in ``done/``: its description as ``job``, its figures as ``measured``."""
+"""Content of a file in ``done/``: the job's description as ``job``, its figures as ``measured``."""
 
 
 def read_results(out: Path) -> list[Result]:
-    """All results in a folder, each job once: files of ``done/``, and ``*.jsonl`` beside them, which may be concatenated.
+    """All results in a folder, each job once: of ``done/``, and of ``*.jsonl`` beside it, which may be concatenated.
 
     Raises:
         DataError: a line is damaged.
@@ -56,7 +56,7 @@ def write_results(out: Path, results: Sequence[Result], page: str) -> None:
 
 
 def _cells(result: Result) -> list[Any]:
-    """A row of runs.csv: as ``Measured.row``, of a result that was read from a file."""
+    """A row of runs.csv, as ``Measured.row`` makes it, from a result that was read."""
     measured = result["measured"]
     full, bare = measured["configurations"][0], measured["configurations"][-1]
     renamed = {
@@ -69,14 +69,14 @@ def _cells(result: Result) -> list[Any]:
     return [renamed.get(name, measured.get(name)) for name in COLUMNS]
 
 
-def _group(results: Sequence[Result]) -> dict[tuple[str, str, float | None], list[Result]]:
-    """By scene, arm and share; in the order of scenes, shares and :data:`ARMS`."""
+def _group(results: Sequence[Result], arms: Sequence[Arm]) -> dict[tuple[str, str, float | None], list[Result]]:
+    """Results by scene, arm and share; in the order of scenes, shares and arms, warm-ups first."""
     groups: dict[tuple[str, str, float | None], list[Result]] = {}
     for result in results:
         job = result["job"]
         groups.setdefault((job["scene"], job["arm"], job["keep_ratio"]), []).append(result)
-    order = {arm: place for place, arm in enumerate(("warm-up", *ARMS))}
-    return dict(sorted(groups.items(), key=lambda item: (item[0][0], item[0][2] or -1.0, order.get(item[0][1], 99))))
+    order = {arm.name: place for place, arm in enumerate(arms)}
+    return dict(sorted(groups.items(), key=lambda item: (item[0][0], item[0][2] or -1.0, order.get(item[0][1], -1))))
 
 
 def _percent(ratio: float | None) -> str:
@@ -84,33 +84,38 @@ def _percent(ratio: float | None) -> str:
 
 
 def spread(values: Sequence[float | None], digits: int) -> str:
-    """Mean and, of several, the standard deviation: ``29.03 ± 0.12``; a dash where one is missing."""
+    """Mean and, of several, the standard deviation: ``29.03 ± 0.12``; a dash if one is missing."""
     mean = number(_mean(values), digits)
     known = [value for value in values if value is not None]
     return mean if len(known) < max(len(values), 2) else f"{mean} ± {number(statistics.stdev(known), digits)}"
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """Mean, if all are known."""
+    """Mean; None unless all values are known."""
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if known and len(known) == len(values) else None
 
 
-def quality_page(results: Sequence[Result], command: str) -> str:
-    """The comparison as a page: every way of rendering has a line, its time beside its error."""
+def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -> str:
+    """The comparison as a page: every way of rendering has a line, its time beside its error.
+
+    Args:
+        results: of all jobs.
+        arms: the sides of the comparison, in the order of the lines.
+        command: the command of the whole comparison.
+    """
     lines = ["# Comparison of quality", "", f"    {command}", ""]
     lines += [
-        "Mean over the seeds, ± their standard deviation. Warm-ups are shared by all arms of a seed; keep is a share of their",
-        "primitives, and their training comes before the arms' own. Arms: ours (`sundae`), the paper's band rule on positions",
-        "(`band`), the highest contribution, as LightGaussian prunes (`contribution`), the control (`random`), each with the",
-        "head and without one (`-no-head`); 3DGS-MCMC of warm-up and fine-tuning together, with as many primitives as the arms",
-        "keep (`mcmc`); stock splatfacto of nerfstudio. ms, MB and errors of a line are of the same way of rendering.",
+        "Mean over the seeds, ± their standard deviation. All arms of a method and a seed share a warm-up. Keep is a share",
+        "of its primitives; its training comes before the arms' own. Time, MB and errors of a line are of one rendering.",
+        "",
+        *_described(arms),
     ]
     heads = ["arm", "rendered with", "keep", "seeds", "primitives", "PSNR, dB", "SSIM", "FLIP", "LPIPS", "MB"]
     heads += ["ms a frame", "training, s"]
     for scene in dict.fromkeys(result["job"]["scene"] for result in results):
         rows = []
-        for (_, arm, ratio), own in _group([r for r in results if r["job"]["scene"] == scene]).items():
+        for (_, arm, ratio), own in _group([r for r in results if r["job"]["scene"] == scene], arms).items():
             ways = [r["measured"]["configurations"] for r in own]
             for place in range(min(len(way) for way in ways)):
                 chosen = [way[place] for way in ways]
@@ -131,26 +136,42 @@ def quality_page(results: Sequence[Result], command: str) -> str:
     return "\n".join([*lines, ""])
 
 
-def paper_page(results: Sequence[Result], missing: Sequence[str], command: str) -> str:
-    """The paper's scenes at its keep ratios, measured figures beside printed ones."""
-    groups = _group([r for r in results if r["job"]["kind"] != "warm-up"])
-    arms = list(dict.fromkeys((arm, ratio) for _, arm, ratio in groups))
+def _described(arms: Sequence[Arm]) -> list[str]:
+    """A line for each arm: its method, how it starts, and its options."""
+    starts = {
+        "branch": "from the warm-up",
+        "mcmc": "as 3DGS-MCMC from scratch, with as many primitives as a branch keeps",
+        "whole": "from scratch",
+    }
+    lines = []
+    for arm in arms:
+        options = ", ".join(f"`{name} {' '.join(words)}`" for name, words in arm.options.items())
+        lines.append(
+            f"- `{arm.name}`: `{arm.method}` {starts[arm.kind]}, {arm.steps:,} steps" + (options and f"; {options}")
+        )
+    return lines
+
+
+def paper_page(results: Sequence[Result], arms: Sequence[Arm], missing: Sequence[str], command: str) -> str:
+    """The paper's scenes at its keep ratios: measured figures beside printed ones; see :func:`quality_page`."""
+    groups = _group([r for r in results if r["job"]["kind"] != "warm-up"], arms)
+    columns = list(dict.fromkeys((arm, ratio) for _, arm, ratio in groups))
     lines = ["# The paper's scenes", "", f"    {command}", ""]
     lines += [
-        f"Figures in italics are {NOTE}: its pictures may be cut down otherwise, its SSIM and LPIPS be other variants.",
-        "Measured: means over the test views, with the head where there is one. A mean over a data set stands only where",
-        "all of its scenes are measured; the paper's 3DGS rows of Mip-NeRF 360 are means over nine scenes, not seven.",
+        f"Figures in italics are {NOTE}: it may resize images otherwise, and use other variants of SSIM and LPIPS.",
+        "Measured: means over the test views, head enabled. A data set has a mean only if all its scenes are measured; the",
+        "paper's 3DGS rows of Mip-NeRF 360 are means over nine scenes, not seven.",
     ]
     shares = [0.01, 0.1, 0.3, 0.5]
     for metric, name, digits in (("psnr", "PSNR, dB", 2), ("ssim", "SSIM", 4)):
-        heads = ["scene", *(f"{arm} {_percent(ratio)}".rstrip() for arm, ratio in arms)]
+        heads = ["scene", *(f"{arm} {_percent(ratio)}".rstrip() for arm, ratio in columns)]
         heads += [f"*paper {share:.0%}*" for share in shares]
         rows = []
         for dataset, members in MEMBERS.items():
-            by_arm: dict[tuple[str, float | None], list[float | None]] = {arm: [] for arm in arms}
+            by_arm: dict[tuple[str, float | None], list[float | None]] = {arm: [] for arm in columns}
             for scene in members:
                 cells = []
-                for arm in arms:
+                for arm in columns:
                     own = groups.get((scene, *arm), [])
                     values = [r["measured"]["configurations"][0]["mean"][metric] for r in own]
                     by_arm[arm].append(_mean(values))
@@ -160,7 +181,7 @@ def paper_page(results: Sequence[Result], missing: Sequence[str], command: str) 
             rows.append([f"**{dataset}**", *means, *_printed(DATASETS, dataset, shares, metric)])
         lines += ["", f"## {name}", "", *table(heads, rows, words=1)]
     if missing:
-        lines += ["", f"Not there: {', '.join(missing)}."]
+        lines += ["", f"Missing: {', '.join(missing)}."]
     return "\n".join([*lines, "", *_sizes(groups), ""])
 
 
@@ -170,7 +191,7 @@ def _printed(rows: Sequence[Any], where: str, shares: Sequence[float], metric: s
 
 
 def _sizes(groups: Mapping[tuple[str, str, float | None], Sequence[Result]]) -> list[str]:
-    """What each of them costs."""
+    """Size and time of each arm, beside the PSNR of the same rendering."""
     heads = ["scene", "arm", "keep", "primitives", "MB", "ms a frame", "PSNR of that rendering", "head off: ms", "PSNR"]
     rows = []
     for (scene, arm, ratio), own in groups.items():

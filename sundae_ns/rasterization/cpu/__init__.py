@@ -1,10 +1,11 @@
-"""The CPU backend: numba compiles its loops for the machine it runs on; importing this package imports numba.
+"""The CPU backend: loops compiled by numba. Importing this package imports numba.
 
-- ``parallel``: how loops are compiled, cached on disk and shared among threads;
-- ``projection``: primitives to the screen and back, with hand-written derivatives;
-- ``tiles``: order of depth, and the list of every tile;
-- ``compositing``: blending front to back, and its derivatives back to front;
-- ``backend``: the three in one view.
+- ``parallel``: compilation, its cache on disk, and threads;
+- ``lanes``: SIMD values for compiled loops;
+- ``projection``: projection of primitives, with hand-written derivatives;
+- ``tiles``: sorting by depth, and the list of each tile;
+- ``compositing``: front-to-back blending, and its derivatives back to front;
+- ``backend``: the backend made of these stages.
 """
 
 from sundae_ns.rasterization.cpu.backend import CpuBackend

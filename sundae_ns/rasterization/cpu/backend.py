@@ -1,6 +1,8 @@
-"""The backend itself: projection, lists and blending of one view, and the strategy's information."""
+"""The CPU backend: the stages of the reference, in compiled loops."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,34 +11,19 @@ from sundae_ns.errors import BackendError
 from sundae_ns.rasterization.cpu.compositing import composite
 from sundae_ns.rasterization.cpu.projection import project
 from sundae_ns.rasterization.cpu.tiles import build_lists
-from sundae_ns.rasterization.harmonics import evaluate_harmonics
-from sundae_ns.rasterization.reference import assemble
+from sundae_ns.rasterization.reference import ReferenceBackend
 from sundae_ns.rasterization.types import Rasterization
 
 
-class CpuBackend:
-    """Compiled loops on the CPU, float32 or float64: what the reference computes, bit for bit the same on any threads."""
+class CpuBackend(ReferenceBackend):
+    """The reference in compiled loops, for float32 and float64 on a CPU; independent of the number of threads."""
 
     name = "cpu"
+    _project = staticmethod(project)
+    _build_lists = staticmethod(build_lists)
+    _composite = staticmethod(composite)
 
-    def rasterize(
-        self,
-        means: Tensor,  # [N, 3]
-        quats: Tensor,  # [N, 4]
-        scales: Tensor,  # [N, 3]
-        opacities: Tensor,  # [N]
-        colors: Tensor,  # [N, C]
-        viewmat: Tensor,  # [4, 4]
-        K: Tensor,  # [3, 3]
-        width: int,
-        height: int,
-        *,
-        near_plane: float,
-        far_plane: float,
-        antialiased: bool,
-        absgrad: bool,
-        render_depth: bool,
-    ) -> Rasterization:
+    def rasterize(self, means: Tensor, *args: Any, **options: Any) -> Rasterization:
         """Render one view; see :func:`sundae_ns.rasterization.rasterize`.
 
         Raises:
@@ -47,17 +34,4 @@ class CpuBackend:
                 f"the cpu rasterizer takes float32 or float64 on a CPU, not {means.dtype} on {means.device}; "
                 "convert, or use 'reference'"
             )
-        projection = project(means, quats, scales, viewmat, K, width, height, near_plane, far_plane)
-        if antialiased:
-            opacities = opacities * projection.compensations
-        channels = colors.shape[1]
-        if render_depth:
-            colors = torch.cat([colors, projection.depths[:, None]], dim=-1)
-        means2d = projection.means2d[None]
-        lists = build_lists(projection, opacities, width, height)
-        image, alpha = composite(means2d, projection.conics, opacities, colors, lists, width, height, absgrad)
-        return assemble(image, alpha, means2d, projection.radii, channels)
-
-    def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-        """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""
-        return evaluate_harmonics(degree, directions, coeffs)
+        return super().rasterize(means, *args, **options)

@@ -1,9 +1,10 @@
-"""Front-to-back blending of tile lists, and its derivatives back to front; the mathematics stands in
-:mod:`sundae_ns.rasterization.compositing`.
+"""Front-to-back blending of tile lists, and its derivatives back to front.
 
-A loop over the pixels of a tile does for one primitive what a row of SIMD lanes can do at once, without a branch. The way
-back starts from the transmittance that was left, and divides by (1 - alpha) where the way there multiplied; who was
-blended in a pixel, it knows from the number of the last one.
+The equations are in :mod:`sundae_ns.rasterization.compositing`.
+
+A loop over the pixels of a tile handles one primitive at a time, many pixels in SIMD lanes, without branches. The
+backward pass starts from the final transmittance and divides by (1 - alpha) where the forward pass multiplied; the
+position of the last blended entry of each pixel tells which entries were blended.
 """
 
 from __future__ import annotations
@@ -18,30 +19,30 @@ from torch.autograd.function import once_differentiable
 from sundae_ns.rasterization.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
 from sundae_ns.rasterization.cpu.lanes import (
     WIDTH,
-    anywhere,
-    both,
-    choose,
-    decay,
-    fused,
-    least,
+    absolute,
+    any_lane,
+    broadcast,
+    exp_negative,
+    fma,
     load,
-    magnitude,
-    spread,
+    logical_and,
+    minimum,
+    select,
     store,
-    store_totals,
+    store_sums,
     zeros,
 )
-from sundae_ns.rasterization.cpu.parallel import as_array, compiled, compiled_into, share
+from sundae_ns.rasterization.cpu.parallel import as_array, compiled, inlined, parallel_for
 from sundae_ns.rasterization.cpu.tiles import HALF_XX, HALF_YY, OPACITY, XY, Lists, U, V
 from sundae_ns.rasterization.tiles import MIN_ALPHA, TILE
 
 _PIXELS = TILE * TILE
-_LOOK = 8  # list entries between two looks at whether a tile is opaque
-_FAINTEST = 20.0  # exponents end here, far beyond log(255)
-_WORTH_A_THREAD = 8  # tiles
-_ABREAST = 8  # channels whose gradients are summed together
-_MOMENTS = 8  # of a primitive in a tile, behind its channels: six, and two absolute gradients
-_WORTH_A_THREAD_TO_SUM = 5_000  # primitives
+_CHECK_EVERY = 8  # list entries between two checks for opaque tiles
+_FAINTEST = 20.0  # upper bound of negated exponents, far beyond log(255)
+_MIN_PER_THREAD = 8  # tiles
+_CHANNEL_GROUP = 8  # channels whose gradients are summed together
+_MOMENTS = 8  # sums per primitive and tile after the channels: six moments, two absolute gradients
+_MIN_PER_THREAD_TO_SUM = 5_000  # primitives
 
 
 def composite(
@@ -54,7 +55,7 @@ def composite(
     height: int,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """As :func:`sundae_ns.rasterization.compositing.composite`; the lists hold centres, conics and opacities too."""
+    """As :func:`sundae_ns.rasterization.compositing.composite`; the geometry is read from the lists."""
     return _Composite.apply(means2d, conics, opacities, colors, lists, width, height, absgrad)
 
 
@@ -74,21 +75,21 @@ class _Composite(torch.autograd.Function):
         image = np.zeros((height, width, colors.shape[1]), lists.table.dtype)
         alpha = np.zeros((height, width, 1), lists.table.dtype)
         tiles = lists.columns * lists.rows
-        left = np.empty((tiles, _PIXELS), lists.table.dtype)
+        transmittances = np.empty((tiles, _PIXELS), lists.table.dtype)
         last = np.empty((tiles, _PIXELS), np.int32)
-        share(
+        parallel_for(
             _blend,
-            len(lists.busiest),
+            len(lists.longest_first),
             *lists.for_blending(),
             as_array(colors),
             image,
             alpha,
-            left,
+            transmittances,
             last,
-            at_least=_WORTH_A_THREAD,
+            min_per_thread=_MIN_PER_THREAD,
         )
         ctx.save_for_backward(means2d, conics, opacities, colors)
-        ctx.lists, ctx.left, ctx.last, ctx.absgrad = lists, left, last, absgrad
+        ctx.lists, ctx.transmittances, ctx.last, ctx.absgrad = lists, transmittances, last, absgrad
         return torch.from_numpy(image), torch.from_numpy(alpha)
 
     @staticmethod
@@ -96,29 +97,29 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, grad_image: Tensor, grad_alpha: Tensor) -> tuple[Tensor | None, ...]:
         means2d, conics, opacities, colors = ctx.saved_tensors
         lists: Lists = ctx.lists
-        want_geometry, want_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
-        absgrad = ctx.absgrad and want_geometry
-        padded = -(-colors.shape[1] // _ABREAST) * _ABREAST
+        needs_geometry, needs_colors = any(ctx.needs_input_grad[:3]), ctx.needs_input_grad[3]
+        absgrad = ctx.absgrad and needs_geometry
+        padded = -(-colors.shape[1] // _CHANNEL_GROUP) * _CHANNEL_GROUP
         parts = np.empty((len(lists.slots), padded + _MOMENTS), lists.table.dtype)
-        share(
+        parallel_for(
             _blend_backward,
-            len(lists.busiest),
+            len(lists.longest_first),
             *lists.for_blending(),
             as_array(colors),
             lists.slots,
-            ctx.left,
+            ctx.transmittances,
             ctx.last,
             as_array(grad_image),
             as_array(grad_alpha),
-            want_geometry,
-            want_colors,
+            needs_geometry,
+            needs_colors,
             absgrad,
             parts,
-            at_least=_WORTH_A_THREAD,
+            min_per_thread=_MIN_PER_THREAD,
         )
         outputs = [np.zeros(value.shape, lists.table.dtype) for value in ctx.saved_tensors]
-        absolute = np.zeros(means2d.shape if absgrad else (0, 0, 0), lists.table.dtype)
-        share(
+        absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), lists.table.dtype)
+        parallel_for(
             _sum_slots,
             len(lists.ids),
             lists.ids,
@@ -126,25 +127,25 @@ class _Composite(torch.autograd.Function):
             lists.table,
             parts,
             *outputs,
-            absolute,
-            at_least=_WORTH_A_THREAD_TO_SUM,
+            absolute_grads,
+            min_per_thread=_MIN_PER_THREAD_TO_SUM,
         )
         if ctx.absgrad:
-            means2d.absgrad = torch.from_numpy(absolute) if absgrad else torch.zeros_like(means2d)
-        wanted = (want_geometry, want_geometry, want_geometry, want_colors)
+            means2d.absgrad = torch.from_numpy(absolute_grads) if absgrad else torch.zeros_like(means2d)
+        wanted = (needs_geometry, needs_geometry, needs_geometry, needs_colors)
         grads = (torch.from_numpy(output) if want else None for output, want in zip(outputs, wanted))
         return *grads, None, None, None, None
 
 
-@compiled_into
-def _uncapped_alphas(dx: Any, dy: Any, half_xx: Any, xy: Any, half_yy: Any, opacity: Any) -> Any:
-    exponents = fused(fused(dx, half_xx, dy * xy), dx, dy * dy * half_yy)
-    return decay(least(exponents, _FAINTEST)) * opacity
+@inlined
+def _unclamped_alphas(dx: Any, dy: Any, half_xx: Any, xy: Any, half_yy: Any, opacity: Any) -> Any:
+    exponents = fma(fma(dx, half_xx, dy * xy), dx, dy * dy * half_yy)
+    return exp_negative(minimum(exponents, _FAINTEST)) * opacity
 
 
 @compiled
 def _pixel_centres(like: Any) -> Any:
-    """Coordinates of the pixels of a tile: x ``[P]`` and y ``[P]``."""
+    """Coordinates of the pixel centres of a tile: x ``[P]`` and y ``[P]``."""
     across, down = np.empty(_PIXELS, like.dtype), np.empty(_PIXELS, like.dtype)
     for p in range(_PIXELS):
         across[p], down[p] = p % TILE + 0.5, p // TILE + 0.5
@@ -165,20 +166,20 @@ def _blend(
     colors: Any,
     image: Any,
     alpha_image: Any,
-    left_over: Any,
+    transmittances: Any,
     last: Any,
 ) -> None:
     number = table.dtype.type
     height, width, channels = image.shape
     across, down = _pixel_centres(table)
     x = load(across, 0)
-    # Channels of as many pixels as there are lanes stand together.
+    # Pixels are the fastest axis within a group of WIDTH, then channels.
     summed, blended = np.empty(_PIXELS, table.dtype), np.empty((_PIXELS // WIDTH, channels, WIDTH), table.dtype)
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        # Light that comes through a pixel; negative once it has ended, and outside of the image.
-        through, blended_last = left_over[tile], last[tile]
+        # Transmittance of each pixel; negative once it is finished, and outside the image.
+        through, blended_last = transmittances[tile], last[tile]
         for p in range(_PIXELS):
             inside = left + p % TILE < width and top + p // TILE < height
             through[p] = number(1) if inside else number(-1)
@@ -195,21 +196,21 @@ def _blend(
             place = entry - start + 1
             for step in range(spans[entry, 0], spans[entry, 1]):
                 p = step * WIDTH
-                alphas = least(_uncapped_alphas(dx, load(down, p) - v, half_xx, xy, half_yy, opacity), MAX_ALPHA)
+                alphas = minimum(_unclamped_alphas(dx, load(down, p) - v, half_xx, xy, half_yy, opacity), MAX_ALPHA)
                 before = load(through, p)
                 behind = before * (1.0 - alphas)
-                counts = alphas >= MIN_ALPHA
-                taken = both(counts, behind > MIN_TRANSMITTANCE)
-                store(through, p, choose(taken, behind, choose(counts, 0.0 - magnitude(before), before)))
-                if not anywhere(taken):
+                visible = alphas >= MIN_ALPHA
+                blends = logical_and(visible, behind > MIN_TRANSMITTANCE)
+                store(through, p, select(blends, behind, select(visible, 0.0 - absolute(before), before)))
+                if not any_lane(blends):
                     continue
-                weights = choose(taken, alphas * before, 0.0)
-                store(blended_last, p, choose(taken, place, load(blended_last, p)))
+                weights = select(blends, alphas * before, 0.0)
+                store(blended_last, p, select(blends, place, load(blended_last, p)))
                 store(summed, p, load(summed, p) + weights)
                 for c in range(channels):
                     at = p * channels + c * WIDTH
-                    store(blended, at, fused(weights, spread(colors, color + c), load(blended, at)))
-            if place % _LOOK == 0 and not _light(through):
+                    store(blended, at, fma(weights, broadcast(colors, color + c), load(blended, at)))
+            if place % _CHECK_EVERY == 0 and not _any_unfinished(through):
                 break
         for p in range(_PIXELS):
             through[p] = abs(through[p])
@@ -221,13 +222,13 @@ def _blend(
                 alpha_image[top + y, left + x_of_pixel, 0] = summed[p]
 
 
-@compiled_into
-def _light(through: Any) -> bool:
-    """Whether any pixel of a tile has not ended."""
-    light = False
+@inlined
+def _any_unfinished(through: Any) -> bool:
+    """Whether any pixel of a tile is unfinished."""
+    unfinished = False
     for p in range(0, _PIXELS, WIDTH):
-        light = light or anywhere(load(through, p) > 0.0)
-    return light
+        unfinished = unfinished or any_lane(load(through, p) > 0.0)
+    return unfinished
 
 
 @compiled
@@ -243,16 +244,16 @@ def _blend_backward(
     table: Any,
     colors: Any,
     slots: Any,
-    left_over: Any,
+    transmittances: Any,
     last: Any,
     grad_image: Any,
     grad_alpha: Any,
-    want_geometry: bool,
-    want_colors: bool,
+    needs_geometry: bool,
+    needs_colors: bool,
     absgrad: bool,
     parts: Any,
 ) -> None:
-    """Write, for every slot, the gradient of the channels, the moments of dL/de, and the absolute gradient of the centre."""
+    """Write for each slot the gradients of channels, the moments of dL/de, and the absolute gradient of the centre."""
     number = table.dtype.type
     height, width, channels = grad_image.shape
     padded = parts.shape[1] - _MOMENTS
@@ -264,10 +265,10 @@ def _blend_backward(
     for k in range(begin, end):
         tile = tiles[k]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        through[:] = left_over[tile]
+        through[:] = transmittances[tile]
         behind[:] = 0
         blended_last = last[tile]
-        # Pixels outside of the image keep what the tile before left there: nothing was blended in them.
+        # Pixels outside the image keep stale values of the previous tile: nothing was blended in them.
         for y in range(min(TILE, height - top)):
             for x_of_pixel in range(min(TILE, width - left)):
                 p = y * TILE + x_of_pixel
@@ -288,59 +289,61 @@ def _blend_backward(
             for step in range(spans[entry, 0], spans[entry, 1]):
                 p = step * WIDTH
                 dy = load(down, p) - v
-                uncapped = _uncapped_alphas(dx, dy, half_xx, xy, half_yy, opacity)
-                alphas = least(uncapped, MAX_ALPHA)
-                taken = both(alphas >= MIN_ALPHA, load(blended_last, p) >= place)
+                unclamped = _unclamped_alphas(dx, dy, half_xx, xy, half_yy, opacity)
+                alphas = minimum(unclamped, MAX_ALPHA)
+                blends = logical_and(alphas >= MIN_ALPHA, load(blended_last, p) >= place)
                 inverse = 1.0 / (1.0 - alphas)
                 before = load(through, p) * inverse
-                weight = choose(taken, alphas * before, 0.0)
+                weight = select(blends, alphas * before, 0.0)
                 store(weights, p, weight)
-                if not anywhere(taken):
+                if not any_lane(blends):
                     continue
-                store(through, p, choose(taken, before, load(through, p)))
-                if want_geometry:
+                store(through, p, select(blends, before, load(through, p)))
+                if needs_geometry:
                     gain = weight * (load(alpha_grads, p) + _product(grads, p * padded, colors, color, channels))
-                    light = load(behind, p)
-                    store(behind, p, light + gain)
-                    pull = choose(both(taken, uncapped < MAX_ALPHA), gain - alphas * inverse * light, 0.0)
-                    pull_x, pull_y = pull * dx, pull * dy
-                    m, mx, my = m + pull, mx + pull_x, my + pull_y
-                    mxx, mxy, myy = fused(pull_x, dx, mxx), fused(pull_x, dy, mxy), fused(pull_y, dy, myy)
+                    later = load(behind, p)
+                    store(behind, p, later + gain)
+                    grad_exponent = select(
+                        logical_and(blends, unclamped < MAX_ALPHA), gain - alphas * inverse * later, 0.0
+                    )
+                    grad_x, grad_y = grad_exponent * dx, grad_exponent * dy
+                    m, mx, my = m + grad_exponent, mx + grad_x, my + grad_y
+                    mxx, mxy, myy = fma(grad_x, dx, mxx), fma(grad_x, dy, mxy), fma(grad_y, dy, myy)
                     if absgrad:
-                        slope_x = fused(dx, number(2) * half_xx, dy * xy)
-                        slope_y = fused(dx, xy, dy * (number(2) * half_yy))
-                        absolute_x = absolute_x + magnitude(pull * slope_x)
-                        absolute_y = absolute_y + magnitude(pull * slope_y)
+                        slope_x = fma(dx, number(2) * half_xx, dy * xy)
+                        slope_y = fma(dx, xy, dy * (number(2) * half_yy))
+                        absolute_x = absolute_x + absolute(grad_exponent * slope_x)
+                        absolute_y = absolute_y + absolute(grad_exponent * slope_y)
             part = slots[entry] * parts.shape[1]
-            if want_colors:
-                for c in range(0, padded, _ABREAST):
-                    _weigh(weights, grads, spans[entry, 0], spans[entry, 1], c, parts, part + c)
-            store_totals(parts, part + padded, m, mx, my, mxx, mxy, myy, absolute_x, absolute_y)
+            if needs_colors:
+                for c in range(0, padded, _CHANNEL_GROUP):
+                    _sum_channels(weights, grads, spans[entry, 0], spans[entry, 1], c, parts, part + c)
+            store_sums(parts, part + padded, m, mx, my, mxx, mxy, myy, absolute_x, absolute_y)
 
 
-@compiled_into
+@inlined
 def _product(grads: Any, at: int, colors: Any, color: int, channels: int) -> Any:
-    """<g, c> of some pixels; in two sums, since either waits for itself."""
+    """<g, c> of WIDTH pixels; two sums, whose latencies overlap."""
     even = odd = zeros(grads)
     for c in range(0, channels, 2):
-        even = fused(load(grads, at + c * WIDTH), spread(colors, color + c), even)
+        even = fma(load(grads, at + c * WIDTH), broadcast(colors, color + c), even)
         if c + 1 < channels:
-            odd = fused(load(grads, at + c * WIDTH + WIDTH), spread(colors, color + c + 1), odd)
+            odd = fma(load(grads, at + c * WIDTH + WIDTH), broadcast(colors, color + c + 1), odd)
     return even + odd
 
 
-@compiled_into
-def _weigh(weights: Any, grads: Any, first: int, beyond: int, channel: int, parts: Any, part: int) -> None:
-    """Write the sums over some pixels of a tile, of the weights times the gradients of eight channels."""
+@inlined
+def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: int, parts: Any, part: int) -> None:
+    """Write the sums, over the touched pixels of a tile, of weights times the gradients of eight channels."""
     a = b = c = d = e = f = g = h = zeros(weights)
     for step in range(first, beyond):
         weight = load(weights, step * WIDTH)
         at = (step * grads.shape[1] + channel) * WIDTH
-        a, b = fused(weight, load(grads, at), a), fused(weight, load(grads, at + WIDTH), b)
-        c, d = fused(weight, load(grads, at + 2 * WIDTH), c), fused(weight, load(grads, at + 3 * WIDTH), d)
-        e, f = fused(weight, load(grads, at + 4 * WIDTH), e), fused(weight, load(grads, at + 5 * WIDTH), f)
-        g, h = fused(weight, load(grads, at + 6 * WIDTH), g), fused(weight, load(grads, at + 7 * WIDTH), h)
-    store_totals(parts, part, a, b, c, d, e, f, g, h)
+        a, b = fma(weight, load(grads, at), a), fma(weight, load(grads, at + WIDTH), b)
+        c, d = fma(weight, load(grads, at + 2 * WIDTH), c), fma(weight, load(grads, at + 3 * WIDTH), d)
+        e, f = fma(weight, load(grads, at + 4 * WIDTH), e), fma(weight, load(grads, at + 5 * WIDTH), f)
+        g, h = fma(weight, load(grads, at + 6 * WIDTH), g), fma(weight, load(grads, at + 7 * WIDTH), h)
+    store_sums(parts, part, a, b, c, d, e, f, g, h)
 
 
 @compiled
@@ -355,9 +358,9 @@ def _sum_slots(
     grad_conics: Any,
     grad_opacities: Any,
     grad_colors: Any,
-    absolute: Any,
+    absolute_grads: Any,
 ) -> None:
-    """Add up the slots of each primitive, in float64, and turn moments into gradients."""
+    """Sum the slots of each primitive in float64, and convert moments to gradients."""
     channels, width = parts.shape[1] - _MOMENTS, parts.shape[1]
     sums = np.empty(width)
     for rank in range(begin, end):
@@ -375,6 +378,6 @@ def _sum_slots(
         grad_conics[i, 1] = -sums[channels + 4]
         grad_conics[i, 2] = -0.5 * sums[channels + 5]
         grad_opacities[i] = sums[channels] / table[rank, OPACITY]
-        if len(absolute) > 0:
-            absolute[0, i, 0] = sums[channels + 6]
-            absolute[0, i, 1] = sums[channels + 7]
+        if len(absolute_grads) > 0:
+            absolute_grads[0, i, 0] = sums[channels + 6]
+            absolute_grads[0, i, 1] = sums[channels + 7]

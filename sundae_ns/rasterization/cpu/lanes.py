@@ -1,13 +1,13 @@
-"""Sixteen numbers side by side: what a processor computes at once, as a type that compiled loops hold in variables.
+"""SIMD values for loops compiled by numba: sixteen numbers that a loop holds in one variable.
 
-LLVM finds such rows by itself in simple loops only, and not in sums, whose order it must not change. Here they are written
-down: sixteen pixels are one value, every sum has its order, and a product is rounded unless :func:`fused` is asked for. So
-what comes out of them does not depend on how many numbers a processor has room for.
+LLVM vectorises simple loops only, and no sums, whose order it must not change. These types make vectorisation explicit:
+a variable holds sixteen pixels, every sum has a fixed order, and only :func:`fma` leaves a product unrounded. Results
+do not depend on the width of the processor's registers.
 
-    alphas = decay(exponents) * opacity
-    weights = choose(alphas >= MIN_ALPHA, alphas * through, 0.0)
+    alphas = exp_negative(exponents) * opacity
+    weights = select(alphas >= MIN_ALPHA, alphas * through, 0.0)
 
-Operators and functions take lanes, or a number that stands in all of them.
+Operators and functions take lanes, or a scalar that is broadcast to all of them.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from numba.extending import intrinsic, overload, register_model
 from numba.np import arrayobj
 
 WIDTH = 16
-"""Lanes: in float32 one register of AVX-512, two of AVX, four of SSE or NEON. More registers than one are worth having
-too, since what has to wait is done beside the other half."""
+"""Number of lanes: in float32 one register of AVX-512, two of AVX, four of SSE or NEON. Several registers are
+worthwhile too, because their latencies overlap."""
 
 _WORD = ir.IntType(32)
 
 
 class Lanes(types.Type):
-    """Numba's type of sixteen numbers, or of sixteen truths, whose number is ``boolean``."""
+    """Numba's type of sixteen numbers, or of a mask of sixteen booleans."""
 
     def __init__(self, number: types.Type) -> None:
         self.number = number
@@ -45,57 +45,57 @@ class _Model(models.PrimitiveModel):
         super().__init__(manager, kind, ir.VectorType(one, WIDTH))
 
 
-TRUTHS = Lanes(types.boolean)
+MASK = Lanes(types.boolean)
 
 
 def _intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
     return cast(Callable[..., Any], intrinsic(function))
 
 
-def _spread(context: Any, builder: Any, value: Any, kind: Any, lanes: Lanes) -> Any:
-    """A number in all lanes; lanes as they are."""
+def _broadcast(context: Any, builder: Any, value: Any, kind: Any, lanes: Lanes) -> Any:
+    """Broadcast a scalar to all lanes; return lanes unchanged."""
     if isinstance(kind, Lanes):
         return value
     number = context.cast(builder, value, kind, lanes.number)
-    nothing = ir.Constant(ir.VectorType(number.type, WIDTH), ir.Undefined)
-    first = builder.insert_element(nothing, number, ir.Constant(_WORD, 0))
-    return _shuffled(builder, first, nothing, [0] * WIDTH)
+    undefined = ir.Constant(ir.VectorType(number.type, WIDTH), ir.Undefined)
+    first = builder.insert_element(undefined, number, ir.Constant(_WORD, 0))
+    return _shuffled(builder, first, undefined, [0] * WIDTH)
 
 
 def _shuffled(builder: Any, a: Any, b: Any, places: Sequence[int]) -> Any:
-    """Lanes of ``a``, numbered from 0, and of ``b``, numbered from 16."""
+    """Shuffle lanes of ``a``, numbered from 0, and of ``b``, numbered from 16."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_WORD, len(places)), list(places)))
 
 
 def _lane_by_lane(operands: Sequence[Any], write: Callable[..., Any], result: Lanes | None = None) -> Any:
-    """What an intrinsic returns: signature, and code that ``write(builder, *lanes)`` adds. None without lanes of numbers."""
-    lanes = next((kind for kind in operands if isinstance(kind, Lanes) and kind != TRUTHS), None)
+    """Signature and code generator of an elementwise intrinsic, from ``write(builder, *lanes)``; None without lanes."""
+    lanes = next((kind for kind in operands if isinstance(kind, Lanes) and kind != MASK), None)
     if lanes is None:
         return None
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        spread = [
-            value if kind == TRUTHS else _spread(context, builder, value, kind, lanes)
+        broadcast = [
+            value if kind == MASK else _broadcast(context, builder, value, kind, lanes)
             for value, kind in zip(arguments, operands)
         ]
-        return write(builder, *spread)
+        return write(builder, *broadcast)
 
     return (result or lanes)(*operands), generate
 
 
 def _operator(function: Callable[..., Any], write: Callable[..., Any], result: Lanes | None = None) -> None:
-    """Let an operator take lanes on one side or on both."""
+    """Define an operator that takes lanes on one side or on both."""
 
     @_intrinsic
     def action(typing: Any, a: Any, b: Any) -> Any:
         return _lane_by_lane((a, b), write, result)
 
     @overload(function)
-    def chosen(a: Any, b: Any) -> Any:
-        def of_lanes(a: Any, b: Any) -> Any:
+    def implementation(a: Any, b: Any) -> Any:
+        def call(a: Any, b: Any) -> Any:
             return action(a, b)
 
-        return of_lanes if isinstance(a, Lanes) or isinstance(b, Lanes) else None
+        return call if isinstance(a, Lanes) or isinstance(b, Lanes) else None
 
 
 def _comparison(sign: str) -> Callable[..., Any]:
@@ -111,55 +111,55 @@ _operator(operator.add, lambda builder, a, b: builder.fadd(a, b))
 _operator(operator.sub, lambda builder, a, b: builder.fsub(a, b))
 _operator(operator.mul, lambda builder, a, b: builder.fmul(a, b))
 _operator(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
-_operator(operator.lt, _comparison("<"), TRUTHS)
-_operator(operator.le, _comparison("<="), TRUTHS)
-_operator(operator.gt, _comparison(">"), TRUTHS)
-_operator(operator.ge, _comparison(">="), TRUTHS)
+_operator(operator.lt, _comparison("<"), MASK)
+_operator(operator.le, _comparison("<="), MASK)
+_operator(operator.gt, _comparison(">"), MASK)
+_operator(operator.ge, _comparison(">="), MASK)
 
 
 @_intrinsic
-def both(typing: Any, a: Any, b: Any) -> Any:
-    """Where ``a`` and ``b`` are true."""
-    return TRUTHS(a, b), lambda context, builder, signature, arguments: builder.and_(*arguments)
+def logical_and(typing: Any, a: Any, b: Any) -> Any:
+    """Mask of the lanes where ``a`` and ``b`` are true."""
+    return MASK(a, b), lambda context, builder, signature, arguments: builder.and_(*arguments)
 
 
 @_intrinsic
-def anywhere(typing: Any, truths: Any) -> Any:
+def any_lane(typing: Any, mask: Any) -> Any:
     """Whether any lane is true."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         bits = builder.bitcast(arguments[0], ir.IntType(WIDTH))
         return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
-    return types.boolean(truths), generate
+    return types.boolean(mask), generate
 
 
 @_intrinsic
-def choose(typing: Any, truths: Any, a: Any, b: Any) -> Any:
-    """``a`` where it is true, else ``b``; one of the two may be a number."""
-    return _lane_by_lane((truths, a, b), lambda builder, *three: builder.select(*three))
+def select(typing: Any, mask: Any, a: Any, b: Any) -> Any:
+    """``a`` where the mask is true, else ``b``; one of the two may be a scalar."""
+    return _lane_by_lane((mask, a, b), lambda builder, *three: builder.select(*three))
 
 
 @_intrinsic
-def least(typing: Any, a: Any, b: Any) -> Any:
-    """The smaller of the two; ``b`` where one is no number."""
+def minimum(typing: Any, a: Any, b: Any) -> Any:
+    """The smaller of the two; ``b`` where one is NaN."""
     return _lane_by_lane((a, b), lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
 
 
 @_intrinsic
-def magnitude(typing: Any, a: Any) -> Any:
+def absolute(typing: Any, a: Any) -> Any:
     """The absolute value."""
     return _lane_by_lane((a,), lambda builder, a: _call(builder, "fabs", a))
 
 
 @_intrinsic
-def fused(typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """a * b + c, rounded once."""
+def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
+    """``a * b + c``, rounded once."""
     return _lane_by_lane((a, b, c), lambda builder, *three: _call(builder, "fma", *three))
 
 
 def _call(builder: Any, name: str, *lanes: Any) -> Any:
-    """One of LLVM's functions of lanes."""
+    """Call one of LLVM's vector intrinsics."""
     kind = lanes[0].type
     suffix = f"v{WIDTH}f{32 if isinstance(kind.element, ir.FloatType) else 64}"
     signature = ir.FunctionType(kind, [kind] * len(lanes))
@@ -167,7 +167,7 @@ def _call(builder: Any, name: str, *lanes: Any) -> Any:
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, place: Any) -> Any:
-    """Where a lane's number of a C-contiguous array lies, as the address of lanes."""
+    """Address of an element of a C-contiguous array, as a pointer to lanes."""
     data = arrayobj.make_array(kind)(context, builder, array).data
     lanes = ir.VectorType(context.get_data_type(kind.dtype), WIDTH)
     return builder.bitcast(builder.gep(data, [place]), lanes.as_pointer())
@@ -175,7 +175,7 @@ def _address(context: Any, builder: Any, kind: Any, array: Any, place: Any) -> A
 
 @_intrinsic
 def load(typing: Any, array: Any, place: Any) -> Any:
-    """Sixteen numbers of a C-contiguous array, from ``place`` on in the order of memory. Bounds are not checked."""
+    """Load sixteen elements of a C-contiguous array, from flat index ``place`` on. Bounds are not checked."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_address(context, builder, array, *arguments), align=array.dtype.bitwidth // 8)
@@ -184,23 +184,23 @@ def load(typing: Any, array: Any, place: Any) -> Any:
 
 
 @_intrinsic
-def spread(typing: Any, array: Any, place: Any) -> Any:
-    """One number of a C-contiguous array, at ``place`` in the order of memory, in all lanes."""
+def broadcast(typing: Any, array: Any, place: Any) -> Any:
+    """Load one element of a C-contiguous array, at flat index ``place``, into all lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         data = arrayobj.make_array(array)(context, builder, arguments[0]).data
         number = builder.load(builder.gep(data, [arguments[1]]))
-        return _spread(context, builder, number, array.dtype, signature.return_type)
+        return _broadcast(context, builder, number, array.dtype, signature.return_type)
 
     return Lanes(array.dtype)(array, types.intp), generate
 
 
 @_intrinsic
 def store(typing: Any, array: Any, place: Any, values: Any) -> Any:
-    """Write what :func:`load` reads; a number is written sixteen times."""
+    """Store lanes where :func:`load` would read them; a scalar is stored sixteen times."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        lanes = _spread(context, builder, arguments[2], values, Lanes(array.dtype))
+        lanes = _broadcast(context, builder, arguments[2], values, Lanes(array.dtype))
         address = _address(context, builder, array, *arguments[:2])
         builder.store(lanes, address, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
@@ -210,7 +210,7 @@ def store(typing: Any, array: Any, place: Any, values: Any) -> Any:
 
 @_intrinsic
 def zeros(typing: Any, array: Any) -> Any:
-    """Lanes of zeros, of the kind of an array's numbers."""
+    """Lanes of zeros, of the dtype of an array."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return ir.Constant(context.get_value_type(signature.return_type), None)
@@ -219,10 +219,10 @@ def zeros(typing: Any, array: Any) -> Any:
 
 
 @_intrinsic
-def store_totals(
+def store_sums(
     typing: Any, array: Any, place: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any
 ) -> Any:
-    """Write the sums of eight lanes side by side: of each its halves are added, then neighbours, pairs and quadruples."""
+    """Store eight sums over lanes side by side; each adds its halves first, then neighbours, pairs, quadruples."""
     rows = (a, b, c, d, e, f, g, h)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -231,7 +231,7 @@ def store_totals(
             for row in arguments[2:]
         ]
         for size in (1, 2, 4):
-            # Blocks of `size` numbers of one row stand beside those of the next.
+            # Interleave blocks of `size` numbers of two rows.
             first = [row * 8 + block + i for block in range(0, 8, 2 * size) for row in (0, 1) for i in range(size)]
             second = [place + size for place in first]
             sums = [
@@ -246,22 +246,22 @@ def store_totals(
 
 
 @_intrinsic
-def decay(typing: Any, x: Any) -> Any:
-    """exp(-x) of lanes between 0 and 80, within one and a half units in the last place.
+def exp_negative(typing: Any, x: Any) -> Any:
+    """exp(-x) for lanes between 0 and 80, within one and a half units in the last place.
 
-    2^n exp(-r) with n the integer next to -x / log(2), and Taylor's series for -r, which is at most log(2) / 2.
+    2^n exp(-r), with n the integer nearest to -x / log(2), and a Taylor series in r, which is at most log(2) / 2.
     """
 
     def write(builder: Any, x: Any) -> Any:
         single = isinstance(x.type.element, ir.FloatType)
         mantissa, terms = (23, 8) if single else (52, 14)
-        # log(2) in two parts, of which the first has so few bits that its product with n is exact.
+        # log(2) in two parts; the first has so few bits that its product with n is exact.
         high, low = (0.693359375, -2.12194440e-4) if single else (0.693147180369123816490, 1.90821492927058770002e-10)
 
         def constant(value: float) -> Any:
             return ir.Constant(x.type, [value] * WIDTH)
 
-        # Added to a number this large, -x / log(2) is rounded to an integer, which stands in the lowest bits.
+        # Adding a number this large rounds -x / log(2) to an integer, held in the lowest bits.
         large = constant(1.5 * 2.0**mantissa)
         shifted = _call(builder, "fma", x, constant(-1.4426950408889634), large)
         n = builder.fsub(shifted, large)

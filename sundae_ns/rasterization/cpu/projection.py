@@ -1,6 +1,7 @@
-"""EWA projection and its derivatives in one loop each, with the mathematics of :mod:`sundae_ns.rasterization.projection`.
+"""EWA projection and its derivatives, one compiled loop each.
 
-Numbers are read and written in the tensors' dtype; between, everything is float64, which costs little beside the blending.
+The equations are in :mod:`sundae_ns.rasterization.projection`. Loops read and write the tensors' dtype and compute in
+float64, which costs little next to the blending.
 """
 
 from __future__ import annotations
@@ -13,12 +14,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sundae_ns.rasterization.cpu.parallel import as_array, compiled, share
+from sundae_ns.rasterization.cpu.parallel import as_array, compiled, parallel_for
 from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN, MAX_RADIUS, Projection
 from sundae_ns.rasterization.projection import project as project_with_autograd
 
-_WORTH_A_THREAD = 2_500  # primitives: below a tenth of a millisecond, waking a thread costs more than it saves
-_SHORTEST = 1e-12  # quaternions that are shorter are divided by this, as torch's normalize() does
+_MIN_PER_THREAD = 2_500  # primitives: below 0.1 ms of work, waking a thread costs more than it saves
+_SHORTEST = 1e-12  # lower bound of a quaternion's divisor, as in torch's normalize()
 
 
 def project(
@@ -32,15 +33,15 @@ def project(
     near_plane: float,
     far_plane: float,
 ) -> Projection:
-    """As :func:`sundae_ns.rasterization.projection.project`; once differentiable.
+    """As :func:`sundae_ns.rasterization.projection.project`, once differentiable.
 
-    Cameras that are optimised go through that function, since the loops here have no derivatives for them.
+    If a camera requires gradients, that function runs instead, because the loops here have none for cameras.
     """
     if torch.is_grad_enabled() and (viewmat.requires_grad or K.requires_grad):
         return project_with_autograd(means, quats, scales, viewmat, K, width, height, near_plane, far_plane)
     lens = as_array(K)[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float64)
     size = np.array([width, height], dtype=np.float64)
-    # As torch compares a tensor with a number: in the tensor's dtype.
+    # Round the planes to the tensors' dtype, as torch does when it compares a tensor with a number.
     planes = np.array([near_plane, far_plane], np.float32 if means.dtype == torch.float32 else np.float64)
     planes = planes.astype(np.float64)
     outputs = _Project.apply(means, quats, scales, viewmat, (lens, size, planes))
@@ -60,7 +61,7 @@ class _Project(torch.autograd.Function):
         outputs = (means2d, conics, depths, compensations, covars2d, radii)
         view = as_array(viewmat.double())
         inputs = [as_array(value) for value in (means, quats, scales)]
-        share(_project, n, *inputs, view, *camera, *map(as_array, outputs), at_least=_WORTH_A_THREAD)
+        parallel_for(_project, n, *inputs, view, *camera, *map(as_array, outputs), min_per_thread=_MIN_PER_THREAD)
         ctx.save_for_backward(means, quats, scales)
         ctx.view, ctx.camera = view, camera
         ctx.mark_non_differentiable(covars2d, radii)
@@ -73,13 +74,13 @@ class _Project(torch.autograd.Function):
         outputs = [torch.empty_like(value, memory_format=torch.contiguous_format) for value in inputs]
         arrays = [as_array(value) for value in (*inputs, *grads[:4])]
         arguments = (*arrays, ctx.view, *ctx.camera, *map(as_array, outputs))
-        share(_project_backward, inputs[0].shape[0], *arguments, at_least=_WORTH_A_THREAD)
+        parallel_for(_project_backward, inputs[0].shape[0], *arguments, min_per_thread=_MIN_PER_THREAD)
         return outputs[0], outputs[1], outputs[2], None, None
 
 
 @compiled
 def _rotation(quats: Any, i: int, out: Any) -> float:
-    """Write the rotation matrix of a quaternion ``[3, 3]``, and its unit form ``[3, :]``; its length is returned."""
+    """Write a quaternion's rotation matrix ``[3, 3]`` and its unit form ``[3, :]``; return its length."""
     w, x, y, z = float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
     length = max(sqrt(w * w + x * x + y * y + z * z), _SHORTEST)
     w, x, y, z = w / length, x / length, y / length, z / length
@@ -92,7 +93,7 @@ def _rotation(quats: Any, i: int, out: Any) -> float:
 
 @compiled
 def _slope_limits(lens: Any, size: Any) -> tuple[float, float, float, float]:
-    """Least and largest x / z, least and largest y / z, between which footprints are linearised."""
+    """Bounds of the slopes at which footprints are linearised: min and max of x / z, min and max of y / z."""
     margin_x, margin_y = FOV_MARGIN * 0.5 * size[0] / lens[0], FOV_MARGIN * 0.5 * size[1] / lens[1]
     return (
         -lens[2] / lens[0] - margin_x,
@@ -120,7 +121,7 @@ def _project(
     covars2d: Any,
     radii: Any,
 ) -> None:
-    turn, root, row_x, row_y = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    rotation, root, row_x, row_y = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3)
     min_x, max_x, min_y, max_y = _slope_limits(lens, size)
     for i in range(begin, end):
         x = view[0, 0] * means[i, 0] + view[0, 1] * means[i, 1] + view[0, 2] * means[i, 2] + view[0, 3]
@@ -133,12 +134,12 @@ def _project(
             depths[i], compensations[i], radii[i] = 0, 0, 0
             continue
         centre_x, centre_y = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
-        _rotation(quats, i, turn)
+        _rotation(quats, i, rotation)
         for r in range(3):
             for c in range(3):
-                root[r, c] = (view[r, 0] * turn[0, c] + view[r, 1] * turn[1, c] + view[r, 2] * turn[2, c]) * scales[
-                    i, c
-                ]
+                root[r, c] = (
+                    view[r, 0] * rotation[0, c] + view[r, 1] * rotation[1, c] + view[r, 2] * rotation[2, c]
+                ) * scales[i, c]
         slope_x, slope_y = min(max(x / z, min_x), max_x), min(max(y / z, min_y), max_y)
         for c in range(3):
             row_x[c] = lens[0] / z * (root[0, c] - slope_x * root[2, c])
@@ -159,9 +160,9 @@ def _project(
 
         spread = sqrt(max(0.25 * (xx - yy) * (xx - yy) + xy * xy, 0.01))
         radius = min(np.ceil(3.0 * sqrt(0.5 * (xx + yy) + spread)), MAX_RADIUS)
-        seen_x = centre_x + radius > 0 and centre_x - radius < size[0]
-        seen_y = centre_y + radius > 0 and centre_y - radius < size[1]
-        radii[i] = np.int32(radius) if seen_x and seen_y else 0
+        inside_x = centre_x + radius > 0 and centre_x - radius < size[0]
+        inside_y = centre_y + radius > 0 and centre_y - radius < size[1]
+        radii[i] = np.int32(radius) if inside_x and inside_y else 0
 
 
 @compiled
@@ -183,9 +184,9 @@ def _project_backward(
     grad_quats: Any,
     grad_scales: Any,
 ) -> None:
-    turn, root, row_x, row_y = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    rotation, root, row_x, row_y = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3)
     normal, sharp_x, sharp_y = np.empty(3), np.empty(3), np.empty(3)
-    pull_x, pull_y, pull_root, pull_turn = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
+    grad_row_x, grad_row_y, grad_root, grad_rotation = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     min_x, max_x, min_y, max_y = _slope_limits(lens, size)
     for i in range(begin, end):
         u, v, depth, blur = grad_means2d[i, 0], grad_means2d[i, 1], grad_depths[i], grad_compensations[i]
@@ -195,16 +196,16 @@ def _project_backward(
         z = view[2, 0] * means[i, 0] + view[2, 1] * means[i, 1] + view[2, 2] * means[i, 2] + view[2, 3]
         z = float(means.dtype.type(z))
         culled = not (z >= planes[0] and z <= planes[1] and z > 0)
-        still = u == 0 and v == 0 and depth == 0 and blur == 0 and a == 0 and b == 0 and c == 0
-        if culled or still:
+        no_gradient = u == 0 and v == 0 and depth == 0 and blur == 0 and a == 0 and b == 0 and c == 0
+        if culled or no_gradient:
             grad_means[i], grad_quats[i], grad_scales[i] = 0, 0, 0
             continue
 
-        # The way there again ...
-        length = _rotation(quats, i, turn)
+        # Recompute the forward pass ...
+        length = _rotation(quats, i, rotation)
         for r in range(3):
             for k in range(3):
-                root[r, k] = view[r, 0] * turn[0, k] + view[r, 1] * turn[1, k] + view[r, 2] * turn[2, k]
+                root[r, k] = view[r, 0] * rotation[0, k] + view[r, 1] * rotation[1, k] + view[r, 2] * rotation[2, k]
         slope_x, slope_y = min(max(x / z, min_x), max_x), min(max(y / z, min_y), max_y)
         zoom_x, zoom_y = lens[0] / z, lens[1] / z
         for k in range(3):
@@ -220,61 +221,61 @@ def _project_backward(
         sharp_det = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
         det = sharp_det + BLUR * (xx + yy) + BLUR * BLUR
 
-        # ... and back: from conic and compensation to the covariance and its determinants,
-        pull_det = -(a * (yy + BLUR) - b * xy + c * (xx + BLUR)) / (det * det)
-        pull_xx, pull_xy, pull_yy = c / det, -b / det, a / det
-        pull_sharp = 0.0
+        # ... and differentiate: from conic and compensation to the covariance and its determinants,
+        grad_det = -(a * (yy + BLUR) - b * xy + c * (xx + BLUR)) / (det * det)
+        grad_xx, grad_xy, grad_yy = c / det, -b / det, a / det
+        grad_sharp_det = 0.0
         ratio = sharp_det / det
         if ratio > 0:
-            pull_ratio = 0.5 * blur / sqrt(ratio)
-            pull_sharp += pull_ratio / det
-            pull_det -= pull_ratio * ratio / det
-        pull_sharp += pull_det
-        pull_xx += BLUR * pull_det
-        pull_yy += BLUR * pull_det
-        # to the rows of its root; the sharp determinant is the square of their cross product,
+            grad_ratio = 0.5 * blur / sqrt(ratio)
+            grad_sharp_det += grad_ratio / det
+            grad_det -= grad_ratio * ratio / det
+        grad_sharp_det += grad_det
+        grad_xx += BLUR * grad_det
+        grad_yy += BLUR * grad_det
+        # to the rows of its root (the sharp determinant is the squared length of their cross product),
         for k in range(3):
             n, m = (k + 1) % 3, (k + 2) % 3
-            pull_x[k] = 2 * pull_sharp * (row_y[n] * normal[m] - row_y[m] * normal[n])
-            pull_x[k] += 2 * row_x[k] * pull_xx + row_y[k] * pull_xy
-            pull_y[k] = 2 * pull_sharp * (normal[n] * row_x[m] - normal[m] * row_x[n])
-            pull_y[k] += 2 * row_y[k] * pull_yy + row_x[k] * pull_xy
+            grad_row_x[k] = 2 * grad_sharp_det * (row_y[n] * normal[m] - row_y[m] * normal[n])
+            grad_row_x[k] += 2 * row_x[k] * grad_xx + row_y[k] * grad_xy
+            grad_row_y[k] = 2 * grad_sharp_det * (normal[n] * row_x[m] - normal[m] * row_x[n])
+            grad_row_y[k] += 2 * row_y[k] * grad_yy + row_x[k] * grad_xy
         # to zoom, slopes, scales and the rotated axes,
-        pull_zoom_x = pull_zoom_y = pull_slope_x = pull_slope_y = 0.0
+        grad_zoom_x = grad_zoom_y = grad_slope_x = grad_slope_y = 0.0
         for k in range(3):
-            pull_zoom_x += pull_x[k] * sharp_x[k]
-            pull_zoom_y += pull_y[k] * sharp_y[k]
-            inner_x, inner_y = zoom_x * pull_x[k], zoom_y * pull_y[k]
+            grad_zoom_x += grad_row_x[k] * sharp_x[k]
+            grad_zoom_y += grad_row_y[k] * sharp_y[k]
+            inner_x, inner_y = zoom_x * grad_row_x[k], zoom_y * grad_row_y[k]
             inner_z = -(slope_x * inner_x + slope_y * inner_y)
-            pull_slope_x -= inner_x * root[2, k] * scales[i, k]
-            pull_slope_y -= inner_y * root[2, k] * scales[i, k]
+            grad_slope_x -= inner_x * root[2, k] * scales[i, k]
+            grad_slope_y -= inner_y * root[2, k] * scales[i, k]
             grad_scales[i, k] = inner_x * root[0, k] + inner_y * root[1, k] + inner_z * root[2, k]
-            pull_root[0, k], pull_root[1, k], pull_root[2, k] = inner_x, inner_y, inner_z
+            grad_root[0, k], grad_root[1, k], grad_root[2, k] = inner_x, inner_y, inner_z
         for r in range(3):
             for k in range(3):
-                turned = view[0, r] * pull_root[0, k] + view[1, r] * pull_root[1, k] + view[2, r] * pull_root[2, k]
-                pull_turn[r, k] = turned * scales[i, k]
-        # to the centre in front of the camera and in the world,
+                grad_axis = view[0, r] * grad_root[0, k] + view[1, r] * grad_root[1, k] + view[2, r] * grad_root[2, k]
+                grad_rotation[r, k] = grad_axis * scales[i, k]
+        # to the centre in camera and world coordinates,
         cam_x, cam_y = zoom_x * u, zoom_y * v
-        cam_z = depth - (cam_x * x + cam_y * y + pull_zoom_x * zoom_x + pull_zoom_y * zoom_y) / z
+        cam_z = depth - (cam_x * x + cam_y * y + grad_zoom_x * zoom_x + grad_zoom_y * zoom_y) / z
         if min_x <= x / z <= max_x:
-            cam_x += pull_slope_x / z
-            cam_z -= pull_slope_x * x / (z * z)
+            cam_x += grad_slope_x / z
+            cam_z -= grad_slope_x * x / (z * z)
         if min_y <= y / z <= max_y:
-            cam_y += pull_slope_y / z
-            cam_z -= pull_slope_y * y / (z * z)
+            cam_y += grad_slope_y / z
+            cam_z -= grad_slope_y * y / (z * z)
         for k in range(3):
             grad_means[i, k] = view[0, k] * cam_x + view[1, k] * cam_y + view[2, k] * cam_z
         # and to the quaternion, through its unit form.
-        w, p, q, s = turn[3, 0], turn[3, 1], turn[3, 2], turn[3, 3]
-        g = pull_turn
-        pull_w = 2 * (s * (g[1, 0] - g[0, 1]) + q * (g[0, 2] - g[2, 0]) + p * (g[2, 1] - g[1, 2]))
-        pull_p = 2 * (q * (g[0, 1] + g[1, 0]) + s * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]))
-        pull_p -= 4 * p * (g[1, 1] + g[2, 2])
-        pull_q = 2 * (p * (g[0, 1] + g[1, 0]) + s * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]))
-        pull_q -= 4 * q * (g[0, 0] + g[2, 2])
-        pull_s = 2 * (p * (g[0, 2] + g[2, 0]) + q * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]))
-        pull_s -= 4 * s * (g[0, 0] + g[1, 1])
-        radial = w * pull_w + p * pull_p + q * pull_q + s * pull_s if length > _SHORTEST else 0.0
-        grad_quats[i, 0], grad_quats[i, 1] = (pull_w - w * radial) / length, (pull_p - p * radial) / length
-        grad_quats[i, 2], grad_quats[i, 3] = (pull_q - q * radial) / length, (pull_s - s * radial) / length
+        w, p, q, s = rotation[3, 0], rotation[3, 1], rotation[3, 2], rotation[3, 3]
+        g = grad_rotation
+        grad_w = 2 * (s * (g[1, 0] - g[0, 1]) + q * (g[0, 2] - g[2, 0]) + p * (g[2, 1] - g[1, 2]))
+        grad_p = 2 * (q * (g[0, 1] + g[1, 0]) + s * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]))
+        grad_p -= 4 * p * (g[1, 1] + g[2, 2])
+        grad_q = 2 * (p * (g[0, 1] + g[1, 0]) + s * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]))
+        grad_q -= 4 * q * (g[0, 0] + g[2, 2])
+        grad_s = 2 * (p * (g[0, 2] + g[2, 0]) + q * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]))
+        grad_s -= 4 * s * (g[0, 0] + g[1, 1])
+        radial = w * grad_w + p * grad_p + q * grad_q + s * grad_s if length > _SHORTEST else 0.0
+        grad_quats[i, 0], grad_quats[i, 1] = (grad_w - w * radial) / length, (grad_p - p * radial) / length
+        grad_quats[i, 2], grad_quats[i, 3] = (grad_q - q * radial) / length, (grad_s - s * radial) / length

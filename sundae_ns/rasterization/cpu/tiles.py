@@ -1,8 +1,8 @@
 """Depth-ordered lists of the primitives of each tile, by the rule of :mod:`sundae_ns.rasterization.tiles`.
 
-Primitives are sorted by depth once; from then on a primitive goes by its rank. It owns a run of slots, one for each tile that
-it can touch, and the list of a tile is a list of slots. What the derivatives add up per tile lies in the slots, so that
-the sum over a primitive's tiles is one over neighbours in memory, always in the same order.
+Primitives are sorted by depth once and are then identified by their rank. A rank owns consecutive slots, one per tile
+that it can touch; the list of a tile is a list of slots. The backward pass writes its sums per tile into the slots, so
+the sum over the tiles of a primitive reads adjacent memory in a fixed order.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ import torch
 from torch import Tensor
 
 from sundae_ns.rasterization.cpu.lanes import WIDTH
-from sundae_ns.rasterization.cpu.parallel import as_array, compiled, share
+from sundae_ns.rasterization.cpu.parallel import as_array, compiled, parallel_for
 from sundae_ns.rasterization.projection import Projection
 from sundae_ns.rasterization.tiles import BIN, MIN_ALPHA, ROUNDING, TILE
 
 U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, HALF_WIDTH, HALF_HEIGHT = range(9)
-"""Columns of the table: centre, conic, opacity, the largest exponent that counts, and how far from the centre it occurs."""
+"""Columns of the table: centre, conic, opacity, largest exponent that is blended, and its distance from the centre."""
 
 STEP = WIDTH // TILE
 """Rows of pixels of a tile that are blended in one step."""
 
-_WORTH_A_THREAD = 2_500  # primitives: below a tenth of a millisecond, waking a thread costs more than it saves
-_DIGIT = 11  # bits that one pass of the sort looks at
+_MIN_PER_THREAD = 2_500  # primitives: below 0.1 ms of work, waking a thread costs more than it saves
+_DIGIT_BITS = 11  # bits per pass of the radix sort
 
 
 @dataclass(frozen=True)
@@ -37,46 +37,48 @@ class Lists:
     columns: int
     rows: int
     ids: Any  # [V], int32: primitive of each rank
-    table: Any  # [V, 9]: see the names of the columns
-    first_slots: Any  # [V + 1], int64: the slots of a rank begin here
-    starts: Any  # [T + 1], int64: the list of a tile begins here
-    ranks: Any  # [L], int32: in the order of the lists
-    slots: Any  # [L], int32: in the order of the lists
-    spans: Any  # [L, 2], uint8, in the order of the lists: the steps of a tile that are touched, from one to before another
-    busiest: Any  # [B], int32: tiles with a list, the longest first
+    table: Any  # [V, 9]: see the column names above
+    first_slots: Any  # [V + 1], int64: first slot of each rank
+    starts: Any  # [T + 1], int64: start of each tile's list
+    ranks: Any  # [L], int32, in list order
+    slots: Any  # [L], int32, in list order
+    spans: Any  # [L, 2], uint8, in list order: the steps of a tile that are touched, the last excluded
+    longest_first: Any  # [B], int32: tiles with a list, the longest first
 
     def for_blending(self) -> tuple[Any, ...]:
-        """What loops over the tiles look at, both ways."""
-        return self.columns, self.busiest, self.starts, self.ranks, self.spans, self.ids, self.table
+        """Arguments that both loops over the tiles share."""
+        return self.columns, self.longest_first, self.starts, self.ranks, self.spans, self.ids, self.table
 
 
 @torch.no_grad()
 def build_lists(projection: Projection, opacities: Tensor, width: int, height: int) -> Lists:
-    """List the primitives of each tile; ``opacities`` ``[N]`` are those that will be blended."""
+    """List the primitives of each tile; ``opacities`` ``[N]`` are those to blend."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     depths, radii, opacity = (as_array(value) for value in (projection.depths, projection.radii, opacities))
-    # Bits of positive floats are in the order of the floats.
+    # The bits of positive floats have the order of the floats.
     keys = depths.view(np.uint32 if depths.dtype == np.float32 else np.uint64)
     ids = _visible_by_depth(keys, radii, opacity)
     count = len(ids)
     table, boxes = np.empty((count, 9), depths.dtype), np.empty((count, 4), np.int32)
-    first_bands, first_slots = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
+    first_intervals, first_slots = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
     inputs = [as_array(value) for value in (projection.means2d, projection.covars2d, projection.conics)]
-    measured = (ids, *inputs, radii, opacity, columns, rows, table, boxes, first_bands)
-    share(_measure, count, *measured, at_least=_WORTH_A_THREAD)
-    np.cumsum(first_bands, out=first_bands)
-    bands = np.empty((first_bands[-1], 2), np.int32)
-    share(_find_bands, count, table, boxes, first_bands, bands, first_slots, at_least=_WORTH_A_THREAD)
+    measured = (ids, *inputs, radii, opacity, columns, rows, table, boxes, first_intervals)
+    parallel_for(_measure, count, *measured, min_per_thread=_MIN_PER_THREAD)
+    np.cumsum(first_intervals, out=first_intervals)
+    intervals = np.empty((first_intervals[-1], 2), np.int32)
+    parallel_for(
+        _find_intervals, count, table, boxes, first_intervals, intervals, first_slots, min_per_thread=_MIN_PER_THREAD
+    )
     np.cumsum(first_slots, out=first_slots)
-    starts, ranks, slots, spans = _sort_by_tile(boxes, first_bands, bands, first_slots, columns, rows)
+    starts, ranks, slots, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
     lengths = np.diff(starts)
-    busiest = np.argsort(-lengths, kind="stable").astype(np.int32)[: np.count_nonzero(lengths)]
-    return Lists(columns, rows, ids, table, first_slots, starts, ranks, slots, spans, busiest)
+    longest_first = np.argsort(-lengths, kind="stable").astype(np.int32)[: np.count_nonzero(lengths)]
+    return Lists(columns, rows, ids, table, first_slots, starts, ranks, slots, spans, longest_first)
 
 
 @compiled
 def _visible_by_depth(keys: Any, radii: Any, opacities: Any) -> Any:
-    """Primitives that can be seen, nearest first, ties by index: a radix sort from the last digit to the first."""
+    """Visible primitives, nearest first, ties by index: a radix sort from the last digit to the first."""
     smallest = opacities.dtype.type(MIN_ALPHA)
     ids = np.empty(len(keys), np.int32)
     count = 0
@@ -86,18 +88,18 @@ def _visible_by_depth(keys: Any, radii: Any, opacities: Any) -> Any:
             count += 1
     ids = ids[:count].copy()
     other = np.empty_like(ids)
-    ends: Any = np.empty(1 << _DIGIT, np.int64)
-    for shift in range(0, 8 * keys.itemsize, _DIGIT):
+    ends: Any = np.empty(1 << _DIGIT_BITS, np.int64)
+    for shift in range(0, 8 * keys.itemsize, _DIGIT_BITS):
         ends[:] = 0
         for i in ids:
-            ends[(np.int64(keys[i]) >> shift) & ((1 << _DIGIT) - 1)] += 1
+            ends[(np.int64(keys[i]) >> shift) & ((1 << _DIGIT_BITS) - 1)] += 1
         total: Any = 0
-        for digit in range(1 << _DIGIT):
+        for digit in range(1 << _DIGIT_BITS):
             size = ends[digit]
             ends[digit] = total
             total += size
         for i in ids:
-            place = (np.int64(keys[i]) >> shift) & ((1 << _DIGIT) - 1)
+            place = (np.int64(keys[i]) >> shift) & ((1 << _DIGIT_BITS) - 1)
             other[ends[place]] = i
             ends[place] += 1
         ids, other = other, ids
@@ -120,62 +122,65 @@ def _measure(
     boxes: Any,
     counts: Any,
 ) -> None:
-    """Write a row of the table, the rectangle of tiles to look at, and at rank + 1 how many columns it has."""
+    """Write a rank's row of the table and its rectangle of tiles, and at rank + 1 the number of columns of tiles."""
     number = table.dtype.type
     per_bin = BIN // TILE
     for rank in range(begin, end):
         i = ids[rank]
         radius = number(radii[i])
-        known = abs(float(means2d[i, 0]) + means2d[i, 1] + conics[i, 0] + conics[i, 1] + conics[i, 2]) < np.inf
+        finite = abs(float(means2d[i, 0]) + means2d[i, 1] + conics[i, 0] + conics[i, 1] + conics[i, 2]) < np.inf
         reach = number(log(opacities[i] / number(MIN_ALPHA))) + number(ROUNDING)
         for axis in range(2):
             centre = means2d[i, axis]
             half = number(sqrt(number(2) * reach * covars2d[i, 2 * axis]))
             low = max(np.floor((centre - radius) / BIN) * per_bin, np.floor((centre - half) / TILE))
             high = min(np.ceil((centre + radius) / BIN) * per_bin, np.ceil((centre + half) / TILE))
-            most = columns if axis == 0 else rows
-            boxes[rank, axis] = np.int32(min(max(low, 0), most))
-            boxes[rank, 2 + axis] = np.int32(min(max(high, 0), most))
+            limit = columns if axis == 0 else rows
+            boxes[rank, axis] = np.int32(min(max(low, 0), limit))
+            boxes[rank, 2 + axis] = np.int32(min(max(high, 0), limit))
             table[rank, HALF_WIDTH + axis] = half
         table[rank, U], table[rank, V] = means2d[i, 0], means2d[i, 1]
         table[rank, HALF_XX] = number(0.5) * conics[i, 0]
         table[rank, XY] = conics[i, 1]
         table[rank, HALF_YY] = number(0.5) * conics[i, 2]
         table[rank, OPACITY], table[rank, LIMIT] = opacities[i], reach
-        if not known:
+        if not finite:
             boxes[rank] = 0
         counts[rank + 1] = max(boxes[rank, 2] - boxes[rank, 0], 0)
 
 
 @compiled
-def _find_bands(begin: int, end: int, table: Any, boxes: Any, first_bands: Any, bands: Any, counts: Any) -> None:
-    """Write the rows of pixels that a rank touches in each column of tiles, and at rank + 1 the number of tiles."""
+def _find_intervals(
+    begin: int, end: int, table: Any, boxes: Any, first_intervals: Any, intervals: Any, counts: Any
+) -> None:
+    """Write the pixel rows that a rank touches in each column of tiles, and at rank + 1 the number of tiles."""
     for rank in range(begin, end):
         first_row, end_row = boxes[rank, 1] * TILE, boxes[rank, 3] * TILE
         tiles = 0
         for column in range(boxes[rank, 0], boxes[rank, 2]):
-            low, high = _touched(table, rank, column * TILE)
-            # No number, of footprints beyond all numbers, is as far as can be.
+            low, high = _touched_rows(table, rank, column * TILE)
+            # A NaN, from footprints that overflow, gives the whole column.
             first = np.int64(min(np.ceil(low), end_row)) if low > first_row else first_row
             beyond = np.int64(max(np.floor(high) + 1, first_row)) if high < end_row - 1 else end_row
-            band = first_bands[rank] + column - boxes[rank, 0]
-            bands[band, 0], bands[band, 1] = first, beyond
-            tiles += _tiles_of(first, beyond)
+            interval = first_intervals[rank] + column - boxes[rank, 0]
+            intervals[interval, 0], intervals[interval, 1] = first, beyond
+            tiles += _num_tiles(first, beyond)
         counts[rank + 1] = tiles
 
 
 @compiled
-def _tiles_of(first: int, beyond: int) -> int:
-    """How many tiles have rows of pixels from ``first`` to before ``beyond``."""
+def _num_tiles(first: int, beyond: int) -> int:
+    """Number of tiles with pixel rows from ``first`` to ``beyond``, excluded."""
     return (beyond - 1) // TILE - first // TILE + 1 if beyond > first else 0
 
 
 @compiled
-def _touched(table: Any, rank: int, left: int) -> tuple[float, float]:
-    """The lowest and the highest place, in rows of pixels, of exponents that count within a column of tiles.
+def _touched_rows(table: Any, rank: int, left: int) -> tuple[float, float]:
+    """The lowest and highest position, in pixel rows, of exponents that are blended within a column of tiles.
 
-    They are those inside of an ellipse, from ``slope dx - rise`` to ``slope dx + rise`` at ``dx`` from its centre. Where
-    its top is outside of the column, the highest place is on the edge that is nearer to it; the bottom lies opposite.
+    These exponents fill an ellipse, from ``slope dx - rise`` to ``slope dx + rise`` at ``dx`` from its centre. If its
+    topmost point is outside the column, the highest position is on the nearer edge of the column; the lowest is
+    symmetric.
     """
     xx, xy, yy = float(table[rank, HALF_XX]), float(table[rank, XY]), float(table[rank, HALF_YY])
     half_width, half_height = float(table[rank, HALF_WIDTH]), float(table[rank, HALF_HEIGHT])
@@ -194,15 +199,15 @@ def _touched(table: Any, rank: int, left: int) -> tuple[float, float]:
 
 @compiled
 def _sort_by_tile(
-    boxes: Any, first_bands: Any, bands: Any, first_slots: Any, columns: int, rows: int
+    boxes: Any, first_intervals: Any, intervals: Any, first_slots: Any, columns: int, rows: int
 ) -> tuple[Any, Any, Any, Any]:
-    """Slots, their ranks and their rows of pixels, in the order of the tiles, by rank in each; and where each tile begins."""
+    """Starts of the lists, and in list order (by tile, then by rank) the ranks, slots and touched steps."""
     starts: Any = np.zeros(columns * rows + 1, np.int64)
-    for rank in range(len(first_bands) - 1):
-        for band in range(first_bands[rank], first_bands[rank + 1]):
-            column = boxes[rank, 0] + band - first_bands[rank]
-            row = bands[band, 0] // TILE
-            for _ in range(_tiles_of(bands[band, 0], bands[band, 1])):
+    for rank in range(len(first_intervals) - 1):
+        for interval in range(first_intervals[rank], first_intervals[rank + 1]):
+            column = boxes[rank, 0] + interval - first_intervals[rank]
+            row = intervals[interval, 0] // TILE
+            for _ in range(_num_tiles(intervals[interval, 0], intervals[interval, 1])):
                 starts[row * columns + column + 1] += 1
                 row += 1
     for tile in range(columns * rows):
@@ -211,12 +216,12 @@ def _sort_by_tile(
     ranks, slots, spans = np.empty(count, np.int32), np.empty(count, np.int32), np.empty((count, 2), np.uint8)
     ends: Any = starts.copy()
     slot = 0
-    for rank in range(len(first_bands) - 1):
-        for band in range(first_bands[rank], first_bands[rank + 1]):
-            first, beyond = bands[band, 0], bands[band, 1]
-            column = boxes[rank, 0] + band - first_bands[rank]
+    for rank in range(len(first_intervals) - 1):
+        for interval in range(first_intervals[rank], first_intervals[rank + 1]):
+            first, beyond = intervals[interval, 0], intervals[interval, 1]
+            column = boxes[rank, 0] + interval - first_intervals[rank]
             row = first // TILE
-            for _ in range(_tiles_of(first, beyond)):
+            for _ in range(_num_tiles(first, beyond)):
                 tile = row * columns + column
                 place = ends[tile]
                 ranks[place], slots[place] = rank, slot

@@ -1,4 +1,4 @@
-"""Packed scenes: a field, its head and its cameras in one small file that can be checked and cannot be run."""
+"""Packed scenes: a field, its head and its cameras in one small, checksummed file without executable content."""
 
 from sundae_ns.storage.packing.codecs import Codecs
 from sundae_ns.storage.packing.config import FINETUNED, PackConfig

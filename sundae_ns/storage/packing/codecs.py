@@ -1,7 +1,7 @@
-"""How each attribute of a scene is rounded: grids, bases, books and steps, fitted once, then used to write and to train.
+"""Codecs of the attributes of a scene, fitted once, then used for writing and for training with rounding.
 
-A codec has two sides. ``encode`` makes what is stored of an attribute; ``rounded`` makes the values that a reader will decode
-from it, without the detour, on the device of its argument. On a CPU they are the same to the bit.
+``encode`` returns the stored form of an attribute. ``rounded`` returns the values that a reader decodes from it,
+directly and on the device of its argument; on a CPU they are equal bit for bit.
 """
 
 from __future__ import annotations
@@ -27,88 +27,88 @@ from sundae_ns.storage.packing.transform import Basis
 
 Floats = NDArray[np.float32]
 Encoded = tuple[dict[str, Any], dict[str, Array]]
-"""What the header says of an attribute, and its sections, by what they are of it."""
-Moved = TypeVar("Moved")
+"""Entry of an attribute in the header, and its sections by name."""
+T = TypeVar("T")
 
 
 class Codec(Protocol):
-    """How one attribute ``[N, C]`` is stored."""
+    """Codec of one attribute ``[N, C]``."""
 
     def encode(self, values: Floats) -> Encoded:
-        """What is stored."""
+        """Return the stored form."""
         ...
 
     def rounded(self, values: Tensor) -> Tensor:
-        """What will be read."""
+        """Return the values that a reader decodes."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class UniformCodec:
-    """Even levels a channel."""
+    """Uniform quantisation of each channel."""
 
     grid: Grid
     differences: bool = False
-    """Whether channels 0 and 2 of three are told by how far they are from channel 1, as those of a colour are alike."""
+    """Store channels 0 and 2 of a colour as differences from channel 1, because they correlate."""
 
     def encode(self, values: Floats) -> Encoded:
-        """What is stored."""
-        made = quantize.quantize(values, self.grid)
+        """Return the stored form."""
+        packed = quantize.quantize(values, self.grid)
         about = {
             "codec": "uniform",
             "bits": self.grid.bits,
-            "low": made.low.tolist(),
-            "step": made.step.tolist(),
-            "bound": (made.step / 2).tolist(),
+            "low": packed.low.tolist(),
+            "step": packed.step.tolist(),
+            "bound": (packed.step / 2).tolist(),
         }
-        codes = made.codes
+        codes = packed.codes
         if self.differences:
             about["differences"] = True
             codes = np.stack([codes[0] - codes[1], codes[1], codes[2] - codes[1]])
-        return about, {"codes": codes, "places": made.places, "exceptions": made.exceptions}
+        return about, {"codes": codes, "places": packed.places, "exceptions": packed.exceptions}
 
     def rounded(self, values: Tensor) -> Tensor:
-        """What will be read."""
+        """Return the values that a reader decodes."""
         return quantize.rounded(values, self.grid)
 
 
 @dataclass(frozen=True, eq=False)
 class RotationCodec:
-    """Smallest three."""
+    """The three smallest components of each quaternion."""
 
     bits: int
 
     def encode(self, values: Floats) -> Encoded:
-        """What is stored."""
-        made = quantize.quantize_rotations(values, self.bits)
+        """Return the stored form."""
+        packed = quantize.quantize_rotations(values, self.bits)
         about = {"codec": "smallest-three", "bits": self.bits, "bound": quantize.rotation_bound(self.bits)}
-        return about, {"codes": made.codes, "largest": join_crumbs(made.largest)}
+        return about, {"codes": packed.codes, "largest": pack_pairs_of_bits(packed.largest)}
 
     def rounded(self, values: Tensor) -> Tensor:
-        """What will be read."""
+        """Return the values that a reader decodes."""
         return quantize.rounded_rotations(values, self.bits)
 
 
 @dataclass(frozen=True, eq=False)
 class TransformCodec:
-    """Karhunen-Loeve transform, rounded."""
+    """Karhunen-Loeve transform with rounded coefficients."""
 
     basis: Basis
 
     def encode(self, values: Floats) -> Encoded:
-        """What is stored."""
-        made = transform.forward(values, self.basis)
+        """Return the stored form."""
+        packed = transform.forward(values, self.basis)
         arrays: dict[str, Array] = {
-            "codes": made.codes,
-            "basis": made.basis.reshape(-1),
-            "rows": made.rows,
-            "exact": made.exact,
+            "codes": packed.codes,
+            "basis": packed.basis.reshape(-1),
+            "rows": packed.rows,
+            "exact": packed.exact,
         }
-        about = {"codec": "transform", "step": made.step, "bound": transform.bound(made)}
+        about = {"codec": "transform", "step": packed.step, "bound": transform.bound(packed)}
         return about, arrays
 
     def rounded(self, values: Tensor) -> Tensor:
-        """What will be read."""
+        """Return the values that a reader decodes."""
         return transform.rounded(values, self.basis)
 
 
@@ -119,37 +119,37 @@ class BooksCodec:
     books: Books
 
     def encode(self, values: Floats) -> Encoded:
-        """What is stored."""
-        made = codebooks.encode(values, self.books)
+        """Return the stored form."""
+        packed = codebooks.encode(values, self.books)
         arrays: dict[str, Array] = {
-            "indices": made.indices,
-            "entries": made.entries.reshape(len(made.entries), -1),
-            "steps": made.steps,
-            "rows": made.rows,
-            "exact": made.exact,
+            "indices": packed.indices,
+            "entries": packed.entries.reshape(len(packed.entries), -1),
+            "steps": packed.steps,
+            "rows": packed.rows,
+            "exact": packed.exact,
         }
-        about = {"codec": "codebooks", "width": values.shape[1], "bound": made.bound}
+        about = {"codec": "codebooks", "width": values.shape[1], "bound": packed.bound}
         return about, arrays
 
     def rounded(self, values: Tensor) -> Tensor:
-        """What will be read."""
+        """Return the values that a reader decodes."""
         return codebooks.rounded(values, self.books)
 
 
 @dataclass(frozen=True, eq=False)
 class HeadCodec:
-    """Weights of a network: int8 with a step for each output channel, or fp16; tensors of one dimension stay as they are."""
+    """Weights of the head: int8 with one step per output channel, or fp16. One-dimensional tensors stay float32."""
 
     bits: int
-    """Of each weight, at most 8; 16 stands for fp16."""
+    """Bits of each weight, at most 8; 16 means fp16."""
     steps: dict[str, Tensor]
-    """Of each tensor that has more than one dimension ``[O]``; empty for fp16."""
+    """Steps ``[O]`` of each tensor with more than one dimension; empty for fp16."""
 
     def encode(self, head: Mapping[str, Tensor]) -> Encoded:
-        """What is stored.
+        """Return the stored form.
 
         Raises:
-            PackError: there are weights that are not finite, or too large for fp16.
+            PackError: weights are not finite, or too large for fp16.
         """
         names = sorted(head)
         values = {name: as_array(head[name]) for name in names}
@@ -174,7 +174,7 @@ class HeadCodec:
         return {"codec": "int8" if self.bits <= 8 else "fp16", "tensors": tensors}, arrays
 
     def rounded(self, name: str, values: Tensor) -> Tensor:
-        """What will be read of the tensor of this name."""
+        """Return the values that a reader decodes for the tensor ``name``."""
         if values.ndim <= 1:
             return values
         return (
@@ -182,69 +182,73 @@ class HeadCodec:
         )
 
     def within(self, name: str, values: Tensor) -> Tensor:
-        """Weights cut to what the steps reach, which were fitted to earlier ones."""
+        """Clamp weights to the range of the steps, which were fitted to earlier weights."""
         if name not in self.steps:
             return values
-        most = self.steps[name] * (2 ** (self.bits - 1) - 1)
-        most = most.reshape(-1, *([1] * (values.ndim - 1)))
-        return values.clamp(-most, most)
+        limit = self.steps[name] * (2 ** (self.bits - 1) - 1)
+        limit = limit.reshape(-1, *([1] * (values.ndim - 1)))
+        return values.clamp(-limit, limit)
 
 
 class Codecs(NamedTuple):
-    """How a whole scene is stored; see :func:`fit`."""
+    """Codecs of a whole scene; see :func:`fit`."""
 
     config: PackConfig
     blocks: Blocks
-    """Positions, as they are stored."""
+    """The positions in their stored form."""
     field: dict[str, Codec]
-    """All attributes but positions."""
+    """Codecs of all other attributes."""
     head: HeadCodec | None
 
     def to(self, device: torch.device) -> Codecs:
-        """The same on another device."""
+        """Return a copy on another device."""
         return _moved(self, device)
 
     @torch.no_grad()
     def rounded(self, field: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """What will be read of a field whose primitives stand in the order of these codecs; positions stay as they are."""
-        made = dict(field)
+        """Return the field that a reader decodes; positions are unchanged.
+
+        Args:
+            field: primitives in the order of these codecs.
+        """
+        result = dict(field)
         for name, codec in self.field.items():
             values = field[name]
-            made[name] = codec.rounded(values.reshape(len(values), -1)).reshape(values.shape)
-        return made
+            result[name] = codec.rounded(values.reshape(len(values), -1)).reshape(values.shape)
+        return result
 
     @torch.no_grad()
     def rounded_head(self, head: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """What will be read of the head."""
+        """Return the head that a reader decodes."""
         return {name: value if self.head is None else self.head.rounded(name, value) for name, value in head.items()}
 
 
-def _moved(value: Moved, device: torch.device) -> Moved:
-    """Tensors in tuples, mappings and data classes, moved."""
-    made: Any = value
+def _moved(value: T, device: torch.device) -> T:
+    """Copy a structure of named tuples, dictionaries and codecs, with its tensors on ``device``."""
+    moved: Any = value
     if isinstance(value, Tensor):
-        made = value.to(device)
+        moved = value.to(device)
     elif isinstance(value, tuple) and hasattr(value, "_fields"):
-        made = type(value)(*(_moved(inner, device) for inner in value))
+        moved = type(value)(*(_moved(inner, device) for inner in value))
     elif isinstance(value, dict):
-        made = {name: _moved(inner, device) for name, inner in value.items()}
+        moved = {name: _moved(inner, device) for name, inner in value.items()}
     elif isinstance(value, (UniformCodec, TransformCodec, BooksCodec, HeadCodec)):
-        made = replace(value, **{field.name: _moved(getattr(value, field.name), device) for field in fields(value)})
-    return made
+        moved = replace(value, **{field.name: _moved(getattr(value, field.name), device) for field in fields(value)})
+    return moved
 
 
 def fit(
     field: Mapping[str, Tensor], head: Mapping[str, Tensor], config: PackConfig
 ) -> tuple[dict[str, Tensor], Codecs]:
-    """Choose how to store a field and a head.
+    """Fit codecs to a field and a head.
 
     Args:
-        field: parameters as ``gaussians.parameters`` has them, at least one primitive, all finite.
-        head: state of the compensation head; empty without one.
-        config: in how many bits.
+        field: see :mod:`sundae_ns.gaussians.parameters`; at least one primitive, all finite.
+        head: state of the head; empty without a head.
+        config: bits and codec of each attribute.
 
     Returns:
-        The field in the order in which it is stored, its positions already rounded, and the codecs.
+        The field in the stored order, with rounded positions, and the codecs.
     """
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in field]
     values = {name: as_matrix(field[name]) for name in names}
@@ -252,7 +256,7 @@ def fit(
     blocks, within = quantize.quantize_positions(values["means"][order], config.position_bits, config.block)
     order = order[within]
     values = {name: value[order] for name, value in values.items()}
-    made: dict[str, Codec] = {
+    codecs: dict[str, Codec] = {
         "quats": RotationCodec(config.rotation_bits),
         "scales": UniformCodec(quantize.fit_grid(values["scales"], config.scale_bits)),
         "opacities": UniformCodec(quantize.fit_grid(values["opacities"], config.opacity_bits)),
@@ -261,16 +265,16 @@ def fit(
     rest = values["features_rest"]
     if rest.shape[1]:
         if config.harmonics == "transform":
-            made["features_rest"] = TransformCodec(transform.fit_basis(rest, config.harmonics_step))
+            codecs["features_rest"] = TransformCodec(transform.fit_basis(rest, config.harmonics_step))
         else:
-            made["features_rest"] = _books(rest, config.harmonics_books)
+            codecs["features_rest"] = _books(rest, config.harmonics_books)
     if FEATURES in values and config.feature_books:
-        made[FEATURES] = _books(values[FEATURES], config.feature_books)
+        codecs[FEATURES] = _books(values[FEATURES], config.feature_books)
     elif FEATURES in values:
-        made[FEATURES] = UniformCodec(quantize.fit_grid(values[FEATURES], config.feature_bits))
+        codecs[FEATURES] = UniformCodec(quantize.fit_grid(values[FEATURES], config.feature_bits))
     positions = quantize.dequantize_positions(blocks, config.position_bits, min(config.block, len(order)))
     ordered = {name: torch.from_numpy(values[name]).reshape(field[name].shape) for name in names}
-    return {**ordered, "means": torch.from_numpy(positions)}, Codecs(config, blocks, made, _fit_head(head, config))
+    return {**ordered, "means": torch.from_numpy(positions)}, Codecs(config, blocks, codecs, _fit_head(head, config))
 
 
 def _books(values: Floats, books: int) -> BooksCodec:
@@ -289,18 +293,18 @@ def _fit_head(head: Mapping[str, Tensor], config: PackConfig) -> HeadCodec | Non
 
 
 def as_array(values: Tensor) -> Floats:
-    """float32 on the CPU."""
+    """Return a tensor as float32 on the CPU."""
     array: Floats = values.detach().to("cpu", torch.float32).numpy()
     return array
 
 
 def as_matrix(values: Tensor) -> Floats:
-    """``[N, ...]`` as contiguous float32 ``[N, C]`` on the CPU."""
+    """Return a tensor ``[N, ...]`` as contiguous float32 ``[N, C]`` on the CPU."""
     return np.ascontiguousarray(as_array(values).reshape(len(values), -1))
 
 
-def join_crumbs(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Numbers of two bits ``[N]``, four to a byte, the first lowest."""
+def pack_pairs_of_bits(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pack two-bit numbers ``[N]`` four to a byte, the first in the lowest bits."""
     padded = np.zeros(-(-len(values) // 4) * 4, np.uint8)
     padded[: len(values)] = values
     four = padded.reshape(-1, 4)
@@ -308,7 +312,7 @@ def join_crumbs(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return joined
 
 
-def part_crumbs(packed: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
-    """Counterpart of :func:`join_crumbs`."""
-    parted: NDArray[np.uint8] = packed[:, None] >> np.array([0, 2, 4, 6], np.uint8) & np.uint8(3)
-    return parted.reshape(-1)[:n]
+def unpack_pairs_of_bits(packed: NDArray[np.uint8], n: int) -> NDArray[np.uint8]:
+    """Return the ``n`` numbers given to :func:`pack_pairs_of_bits`."""
+    four: NDArray[np.uint8] = packed[:, None] >> np.array([0, 2, 4, 6], np.uint8) & np.uint8(3)
+    return four.reshape(-1)[:n]

@@ -1,4 +1,4 @@
-"""In how many bits a packed scene stores each attribute."""
+"""Options of packing: bits and codec of each attribute."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ HarmonicsCodec = Literal["transform", "codebooks"]
 
 @dataclass
 class PackConfig:
-    """In how many bits each attribute is stored."""
+    """Bits and codec of each attribute."""
 
     position_bits: int = 16
     """Bits of each coordinate within a block, 4 to 21."""
     block: int = 1024
-    """Primitives of a block of positions: smaller ones are more exact and take more bytes."""
+    """Primitives per block of positions; smaller blocks are more exact and take more bytes."""
     scale_bits: int = 8
     """Bits of each log-scale, 4 to 16."""
     rotation_bits: int = 8
-    """Bits of each of the three components that are stored of a rotation, 4 to 16."""
+    """Bits of each of the three stored components of a rotation, 4 to 16."""
     color_bits: int = 8
     """Bits of each channel of the view-independent colour, 4 to 16."""
     opacity_bits: int = 8
     """Bits of the logit of the opacity, 4 to 16."""
     harmonics: HarmonicsCodec = "transform"
-    """How the view-dependent colour is stored: transformed and rounded, or by residual codebooks, which take fewer bytes
-    and lose more."""
+    """Codec of the view-dependent colour: a rounded transform, or residual codebooks, which take fewer bytes and lose
+    more."""
     harmonics_step: float = 0.02
-    """Step that transformed coefficients are rounded to, in units of the spherical harmonics' coefficients."""
+    """Step of the transformed coefficients, in units of the SH coefficients, 0.0001 to 1."""
     harmonics_books: int = 4
-    """Residual codebooks of the view-dependent colour: bytes a primitive, 1 to 32."""
+    """Residual codebooks of the view-dependent colour, each one byte per primitive, 1 to 32."""
     feature_bits: int = 7
-    """Bits of each feature, 4 to 16; the residual codebooks of feature-books replace them."""
+    """Bits of each feature, 4 to 16; unused with feature-books."""
     feature_books: int = 0
-    """Residual codebooks of the feature vectors, up to 32; 0: each feature by itself, with feature-bits."""
+    """Residual codebooks of the feature vectors, up to 32; 0 quantises each feature with feature-bits instead."""
     head: HeadFormat = "int8"
-    """Weights of the head: int8 with a step for each output channel, or fp16."""
+    """Weights of the head: int8 with one step per output channel, or fp16."""
     head_bits: int = 7
-    """Bits of each weight of an int8 head, 3 to 8: fewer are stored in fewer bytes."""
+    """Bits of each weight of an int8 head, 3 to 8; fewer bits compress to fewer bytes."""
     level: int = 19
-    """Effort of the entropy coder (zstandard), 1 to 22; unpacking is as fast at all of them."""
+    """Compression level of zstandard, 1 to 22; the speed of unpacking does not depend on it."""
 
     def validate(self) -> None:
         """Check every option.
 
         Raises:
-            ConfigError: the first option that cannot work, and what it may be.
+            ConfigError: names the first invalid option and its valid values.
         """
         bits = ("scale_bits", "rotation_bits", "color_bits", "opacity_bits", "feature_bits")
         ranges = {name: (4, 16) for name in bits} | {
@@ -60,10 +60,10 @@ class PackConfig:
             "head_bits": (3, 8),
             "level": (1, 22),
         }
-        for name, (least, most) in ranges.items():
+        for name, (minimum, maximum) in ranges.items():
             value = getattr(self, name)
-            if not least <= value <= most:
-                raise ConfigError(f"{name.replace('_', '-')} is {value}; give {least} to {most}")
+            if not minimum <= value <= maximum:
+                raise ConfigError(f"{name.replace('_', '-')} is {value}; give {minimum} to {maximum}")
         if not 1e-4 <= self.harmonics_step <= 1:
             raise ConfigError(f"harmonics-step is {self.harmonics_step}; give 0.0001 to 1")
         for name, choices in (("head", HeadFormat), ("harmonics", HarmonicsCodec)):
@@ -72,4 +72,4 @@ class PackConfig:
 
 
 FINETUNED: dict[str, int | float] = {"harmonics_step": 0.03, "feature_bits": 6, "head_bits": 6}
-"""Coarser options, for scenes that have learnt to live with them (``sundae_ns.scenes.finetune``)."""
+"""Coarser options for scenes that were fine-tuned with them (``sundae_ns.scenes.finetune``)."""

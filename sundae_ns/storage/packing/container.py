@@ -1,21 +1,21 @@
-"""One file of named arrays behind a JSON header: every byte under a checksum, nothing in it can be run.
+"""A file of named arrays behind a JSON header: all bytes are under checksums, and none can be executed.
 
     offset  bytes
     0       8      magic, ``89 53 55 4E 44 41 45 0A`` (``\\x89SUNDAE\\n``)
     8       4      version of the format, unsigned, little-endian
     12      4      length H of the header, unsigned, little-endian, at most 4 MiB
     16      32     SHA-256 of the header
-    48      H      header: a JSON object in UTF-8; its key ``sections`` lists the sections in their order
-    48 + H  ...    the sections, one behind the other, to the end of the file
+    48      H      header: a JSON object in UTF-8; its key ``sections`` lists the sections in order
+    48 + H  ...    the sections, contiguous, to the end of the file
 
-A section is one array, little-endian. Its bytes are cut into planes of equal length: one for each index of its first
-dimension where it has more than one, and of each of those one for each byte of a number, the lowest first. Each plane is one
-zstandard frame that states its size, or, where that would not be shorter, the plane itself. The header has for every section
-``name``, ``dtype`` (numpy's, as ``<u2``), ``shape``, ``parts`` (length of each plane in the file) and ``sha256`` of these
+A section is one little-endian array, split into planes of equal length. An array of two or more dimensions is split
+along the first one; then each piece is split into the bytes of its numbers, lowest byte first. A plane is stored as one
+zstandard frame that states its size, or uncompressed if that is not longer. The header lists for each section ``name``,
+``dtype`` (numpy's, such as ``<u2``), ``shape``, ``parts`` (stored length of each plane) and ``sha256`` of the stored
 bytes.
 
-Sizes are checked before anything is allocated: all sections together may unpack to ``SPARE`` bytes and ``MAX_RATIO`` bytes for
-each byte of the file. A writer of something that unpacks to more adds a section ``padding``.
+Readers check sizes before they allocate: all sections together may unpack to at most ``SPARE`` bytes plus ``MAX_RATIO``
+bytes per byte of the file. If they unpack to more, the writer adds a section ``padding``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ Array = NDArray[Any]
 
 
 class Section(NamedTuple):
-    """Where an array lies in the file."""
+    """An array in the file."""
 
     name: str
     dtype: np.dtype[Any]
@@ -70,12 +70,12 @@ class Section(NamedTuple):
 
     @property
     def planes(self) -> int:
-        """Parts that the array is cut into."""
+        """Number of planes of the array."""
         return _rows(self.shape) * self.dtype.itemsize
 
 
 class Header(NamedTuple):
-    """What a file says of itself."""
+    """The header of a file."""
 
     meta: dict[str, Any]
     """The JSON object, ``sections`` included."""
@@ -88,8 +88,8 @@ def _rows(shape: tuple[int, ...]) -> int:
     return shape[0] if len(shape) > 1 else 1
 
 
-def _cut(array: Array) -> list[bytes]:
-    """The planes of an array."""
+def _split(array: Array) -> list[bytes]:
+    """Split an array into planes."""
     if array.size == 0:
         return []
     flat = np.ascontiguousarray(array).reshape(_rows(array.shape), -1)
@@ -98,7 +98,7 @@ def _cut(array: Array) -> list[bytes]:
 
 
 def _join(planes: list[bytes], section: Section) -> Array:
-    """Counterpart of :func:`_cut`."""
+    """Join planes that :func:`_split` returned."""
     if not planes:
         return np.zeros(section.shape, section.dtype)
     rows, size = _rows(section.shape), section.dtype.itemsize
@@ -110,13 +110,13 @@ def _join(planes: list[bytes], section: Section) -> Array:
     return table.reshape(-1).view(section.dtype).reshape(section.shape)
 
 
-def _squeeze(plane: bytes, level: int) -> bytes:
+def _compress(plane: bytes, level: int) -> bytes:
     frame = zstandard.ZstdCompressor(level=level, write_checksum=False).compress(plane)
     return frame if len(frame) < len(plane) else plane
 
 
-def _expand(part: memoryview, size: int) -> bytes:
-    """A plane of ``size`` bytes; the frame's own idea of its size is never trusted."""
+def _decompress(part: memoryview, size: int) -> bytes:
+    """Decompress a plane of ``size`` bytes; a frame that states another size is refused."""
     if len(part) == size:
         return bytes(part)
     try:
@@ -130,34 +130,34 @@ def _expand(part: memoryview, size: int) -> bytes:
 def write(
     path: Path, meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0, level: int = 19
 ) -> int:
-    """Write a file, whole or not at all.
+    """Write a file, atomically.
 
     Args:
         path: the file; its folder must exist.
-        meta: for the header: plain values of JSON; must not have ``sections``.
+        meta: JSON values for the header, without the key ``sections``.
         arrays: arrays of the dtypes in ``_DTYPES``.
-        unpacked: bytes that a reader makes of the arrays, if more than they have themselves.
-        level: of zstandard, 1 to 22.
+        unpacked: bytes that a reader decodes from the arrays, if more than their own size.
+        level: compression level of zstandard, 1 to 22.
 
     Returns:
         Bytes of the file.
 
     Raises:
-        PackError: the header is longer than a reader takes.
-        StorageError: no room or no right to write.
+        PackError: the header is too long for a reader.
+        StorageError: the disk is full or not writable.
     """
     named = {name: np.asarray(array) for name, array in arrays.items()}
 
     def encode(array: Array) -> list[bytes]:
         little = array.astype(array.dtype.newbyteorder("<"), copy=False)
-        return [_squeeze(plane, level) for plane in _cut(little)]
+        return [_compress(plane, level) for plane in _split(little)]
 
     with ThreadPoolExecutor(_THREADS) as pool:
         parts = dict(zip(named, pool.map(encode, named.values()), strict=True))
     sections = [_entry(name, named[name], parts[name]) for name in named]
     body = sum(len(part) for planes in parts.values() for part in planes)
-    most = max(unpacked, sum(array.nbytes for array in named.values()))
-    lacking = (most - SPARE) // MAX_RATIO + 1 - body
+    size = max(unpacked, sum(array.nbytes for array in named.values()))
+    lacking = (size - SPARE) // MAX_RATIO + 1 - body
     if lacking > 0:
         padding = np.zeros(lacking, np.uint8)
         parts[PADDING] = [padding.tobytes()]
@@ -165,7 +165,7 @@ def write(
     header = json.dumps({**meta, "sections": sections}, allow_nan=False, separators=(",", ":")).encode()
     if len(header) > MAX_HEADER:
         raise PackError(
-            f"the header would take {len(header):,} bytes, at most {MAX_HEADER:,} can be read; give fewer cameras"
+            f"the header takes {len(header):,} bytes, but readers accept {MAX_HEADER:,}; give fewer cameras"
         )
     with replacing(path) as partial, partial.open("wb") as file:
         file.write(_PREAMBLE.pack(MAGIC, VERSION, len(header), hashlib.sha256(header).digest()))
@@ -193,16 +193,16 @@ def read_header(path: Path) -> Header:
     """Read and check the header, without the sections.
 
     Raises:
-        PackError: no packed scene, of another version, cut short, altered, or stating sizes that cannot be.
+        PackError: the file is not a packed scene, of another version, truncated, altered, or states impossible sizes.
     """
     try:
         with path.open("rb") as file:
             size = path.stat().st_size
             preamble = file.read(_PREAMBLE.size)
             if preamble[: len(MAGIC)] != MAGIC:
-                raise PackError(f"{path} is no packed scene; give a file that sundae pack wrote")
+                raise PackError(f"{path} is not a packed scene; give a file that sundae pack wrote")
             if len(preamble) < _PREAMBLE.size:
-                raise _damaged(path, "it ends in its first bytes")
+                raise _damaged(path, "it ends before its header")
             _, version, length, digest = _PREAMBLE.unpack(preamble)
             if version != VERSION:
                 raise PackError(f"{path} has version {version} of the format, this program reads {VERSION}; update it")
@@ -216,7 +216,7 @@ def read_header(path: Path) -> Header:
     try:
         meta = json.loads(text, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
-        raise _damaged(path, "its header is no JSON") from error
+        raise _damaged(path, "its header is not JSON") from error
     return Header(meta, _sections(path, meta, _PREAMBLE.size + length, size), size)
 
 
@@ -225,7 +225,7 @@ def _damaged(path: Path, reason: str) -> PackError:
 
 
 def _no_constant(name: str) -> None:
-    raise ValueError(f"{name} is no number")
+    raise ValueError(f"{name} is not a number")
 
 
 def _is_count(value: Any) -> bool:
@@ -236,33 +236,33 @@ def _sections(path: Path, meta: Any, offset: int, size: int) -> dict[str, Sectio
     entries = meta.get("sections") if isinstance(meta, dict) else None
     if not isinstance(entries, list):
         raise _damaged(path, "its header lists no sections")
-    found: dict[str, Section] = {}
+    sections: dict[str, Section] = {}
     total = 0
     for entry in entries:
         section = _section(entry, offset)
-        if section is None or section.name in found:
-            raise _damaged(path, "its header describes a section that cannot be")
-        found[section.name] = section
+        if section is None or section.name in sections:
+            raise _damaged(path, "its header describes an invalid section")
+        sections[section.name] = section
         offset += section.length
         total += section.size
     if offset != size:
         raise _damaged(path, f"its header states {offset:,} bytes, it has {size:,}")
     check_ratio(path, total, size)
-    return found
+    return sections
 
 
 def check_ratio(path: Path, unpacked: int, size: int) -> None:
-    """Refuse what would unpack to far more than the file has.
+    """Refuse a file that unpacks to far more bytes than it has.
 
     Raises:
-        PackError: ``unpacked`` bytes are more than a file of ``size`` bytes may become.
+        PackError: a file of ``size`` bytes may not unpack to ``unpacked`` bytes.
     """
     if unpacked > SPARE + MAX_RATIO * size:
         raise _damaged(path, f"{size:,} bytes would unpack to {unpacked:,}")
 
 
 def _section(entry: Any, offset: int) -> Section | None:
-    """A section of the header, or None if it cannot be."""
+    """A section listed in the header, or None if it is invalid."""
     if not isinstance(entry, dict) or not all(
         isinstance(entry.get(key), kind)
         for key, kind in (("name", str), ("dtype", str), ("shape", list), ("parts", list), ("sha256", str))
@@ -271,18 +271,18 @@ def _section(entry: Any, offset: int) -> Section | None:
     shape, parts = entry["shape"], entry["parts"]
     if entry["dtype"] not in _DTYPES or not 1 <= len(shape) <= 3 or not all(map(_is_count, [*shape, *parts])):
         return None
-    made = Section(entry["name"], np.dtype(entry["dtype"]), tuple(shape), tuple(parts), entry["sha256"], offset)
-    empty = made.size == 0
-    if len(parts) != (0 if empty else made.planes):
+    section = Section(entry["name"], np.dtype(entry["dtype"]), tuple(shape), tuple(parts), entry["sha256"], offset)
+    empty = section.size == 0
+    if len(parts) != (0 if empty else section.planes):
         return None
-    return None if not empty and any(part > made.size // made.planes for part in parts) else made
+    return None if not empty and any(part > section.size // section.planes for part in parts) else section
 
 
 def read_sections(path: Path, header: Header) -> dict[str, Array]:
-    """All sections but padding.
+    """Read all sections except padding.
 
     Raises:
-        PackError: a section is altered or cut short.
+        PackError: a section is altered or truncated.
     """
     wanted = [section for section in header.sections.values() if section.name != PADDING]
     try:
@@ -297,7 +297,7 @@ def read_sections(path: Path, header: Header) -> dict[str, Array]:
     def decode(section: Section) -> Array:
         planes, start = [], section.offset
         for part in section.parts:
-            planes.append(_expand(content[start : start + part], section.size // section.planes))
+            planes.append(_decompress(content[start : start + part], section.size // section.planes))
             start += part
         return _join(planes, section)
 

@@ -1,4 +1,4 @@
-"""Morton (Z-order) codes of positions: bits of three coordinates, interleaved (Morton, 1966)."""
+"""Morton (Z-order) codes of positions: the interleaved bits of three coordinates (Morton, 1966)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_BITS = 21
-"""Most bits a coordinate, so that three fit in 64."""
+"""Maximum number of bits per coordinate; three fit in 64 bits."""
 
 _SPREADS = (
     (32, 0x001F00000000FFFF),
@@ -18,7 +18,7 @@ _SPREADS = (
 
 
 def interleave(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Codes ``[N]`` of cells ``[N, 3]`` with coordinates below 2^21; the first coordinate has the lowest bit."""
+    """Codes ``[N]`` of cells ``[N, 3]`` with coordinates below 2^21; the first coordinate takes the lowest bit."""
     code = np.zeros(len(cells), np.uint64)
     for axis in range(3):
         x = cells[:, axis].astype(np.uint64)
@@ -29,7 +29,7 @@ def interleave(cells: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def separate(codes: NDArray[np.uint64], axis: int) -> NDArray[np.uint64]:
-    """One coordinate ``[N]`` of the cells that codes ``[N]`` were made of."""
+    """One coordinate ``[N]`` of the cells of codes ``[N]``."""
     x = codes >> np.uint64(axis)
     x &= np.uint64(_SPREADS[-1][1])
     masks = [mask for _, mask in _SPREADS[-2::-1]] + [(1 << MAX_BITS) - 1]
@@ -40,10 +40,10 @@ def separate(codes: NDArray[np.uint64], axis: int) -> NDArray[np.uint64]:
 
 
 def scene_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """An order of primitives ``[N]`` in which neighbours in space are near each other.
+    """Permutation ``[N]`` that sorts primitives along a space-filling curve.
 
-    Coordinates are centred on their medians and taken through an inverse hyperbolic sine first, so that a few far
-    primitives do not push all others into one cell.
+    Coordinates are centred on their medians and compressed by an inverse hyperbolic sine, so that a few far primitives
+    do not push all others into one cell.
 
     Args:
         means: centres ``[N, 3]``, all finite.

@@ -1,6 +1,6 @@
-"""A whole scene in one file: the field, the head and the cameras as sections of ``container``, the rest in its header.
+"""A scene in one file: field, head and cameras are sections of ``container``, all else is in its header.
 
-``docs/packing.md`` has the names, the shapes and the error bounds of all sections.
+``docs/formats.md`` lists the names, shapes and error bounds of all sections.
 """
 
 from __future__ import annotations
@@ -22,44 +22,44 @@ from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, odd_shapes, sh_degree_of
 from sundae_ns.storage.packing import codebooks, container, quantize, transform
 from sundae_ns.storage.packing.codebooks import Codebooks
-from sundae_ns.storage.packing.codecs import Codecs, as_matrix, fit, part_crumbs
+from sundae_ns.storage.packing.codecs import Codecs, as_matrix, fit, unpack_pairs_of_bits
 from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array
 from sundae_ns.storage.packing.quantize import Blocks, Rotations, Uniform
 from sundae_ns.storage.packing.transform import Transformed
 
 CAMERAS = {"poses": ("<f4", (3, 4)), "intrinsics": ("<f8", (4,)), "sizes": ("<u4", (2,))}
-"""Arrays of the cameras, ``[M, ...]`` each: camera-to-world with OpenGL axes in the model's coordinates; fx, fy, cx, cy in
-pixels; width and height in pixels."""
-_MOST_FEATURES = 256
+"""dtype and shape, after ``[M, ...]``, of the arrays of M cameras: camera-to-world with OpenGL axes in the model's
+coordinates; fx, fy, cx, cy in pixels; width and height in pixels."""
+_MAX_FEATURES = 256
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything that is needed to show a scene."""
+    """All that is needed to render a scene."""
 
     field: dict[str, Tensor]
-    """Parameters as ``gaussians.parameters`` has them, float32 on the CPU."""
+    """See :mod:`sundae_ns.gaussians.parameters`; float32 on the CPU."""
     head: dict[str, Tensor] = default(default_factory=dict)
-    """State of the compensation head; empty without one."""
+    """State of the head; empty without a head."""
     cameras: dict[str, Tensor] | None = None
-    """Cameras to show it from, by the names of :data:`CAMERAS`."""
+    """Cameras by the names of :data:`CAMERAS`."""
     meta: dict[str, Any] = default(default_factory=dict)
-    """Plain values of JSON: the model's configuration, the frame, and whatever else the caller wants to keep."""
+    """JSON values: configuration of the model, coordinate frame, and other entries of the caller."""
 
 
 class PackReport(NamedTuple):
-    """What a packed scene takes."""
+    """Size of a packed scene."""
 
     primitives: int
     bytes: int
-    """Of the whole file."""
+    """Bytes of the file."""
     sections: dict[str, int]
     """Bytes of each section, and of ``header``."""
 
     @property
     def bits(self) -> dict[str, float]:
-        """Bits a primitive of each attribute; of ``head``, ``cameras`` and ``header``, their share."""
+        """Bits per primitive of each attribute, and of ``head``, ``cameras`` and ``header``."""
         sums: dict[str, float] = {}
         for name, count in self.sections.items():
             attribute = name.partition("/")[0]
@@ -78,9 +78,9 @@ def _check(params: Mapping[str, Tensor]) -> None:
         raise PackError(odd)
     features = params.get(FEATURES)
     if features is not None and not (
-        features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MOST_FEATURES
+        features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MAX_FEATURES
     ):
-        raise PackError(f"features has shape {list(features.shape)}; it must be [{n}, 1 to {_MOST_FEATURES}]")
+        raise PackError(f"features has shape {list(features.shape)}; it must be [{n}, 1 to {_MAX_FEATURES}]")
     known = {name: params[name].float() for name in (*SPLAT_NAMES, FEATURES) if name in params}
     broken = n - int(finite_mask(known).sum())
     if broken:
@@ -91,18 +91,18 @@ def _check(params: Mapping[str, Tensor]) -> None:
 
 
 def fit_scene(scene: Scene, config: PackConfig | None = None) -> tuple[Scene, Codecs]:
-    """Choose how to store a scene.
+    """Fit codecs to a scene.
 
     Args:
         scene: at least one primitive, all finite.
-        config: in how many bits.
+        config: bits and codec of each attribute.
 
     Returns:
-        The scene with its primitives in the order in which they are stored and their positions rounded, and the codecs.
+        The scene with its primitives in the stored order and with rounded positions, and the codecs.
 
     Raises:
-        ConfigError: an option cannot work.
-        PackError: the field has no primitives, odd shapes or values that are not finite.
+        ConfigError: an option is invalid.
+        PackError: the field has no primitives, wrong shapes or values that are not finite.
     """
     config = config or PackConfig()
     config.validate()
@@ -112,32 +112,32 @@ def fit_scene(scene: Scene, config: PackConfig | None = None) -> tuple[Scene, Co
 
 
 def write_scene(path: Path, scene: Scene, config: PackConfig | None = None) -> PackReport:
-    """Pack a scene into one file, whole or not at all.
+    """Pack a scene into one file, atomically.
 
     Args:
         path: the file; its folder must exist.
-        scene: at least one primitive, all finite. Its primitives come back in another order.
-        config: in how many bits.
+        scene: at least one primitive, all finite. The file stores its primitives in another order.
+        config: bits and codec of each attribute.
 
     Raises:
-        ConfigError: an option cannot work.
-        PackError: the field has no primitives, odd shapes or values that are not finite.
-        StorageError: no room or no right to write.
+        ConfigError: an option is invalid.
+        PackError: the field has no primitives, wrong shapes or values that are not finite.
+        StorageError: the disk is full or not writable.
     """
     return write_fitted(path, *fit_scene(scene, config))
 
 
 def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
-    """Pack a scene by codecs that were fitted to it, or to what it was before it was trained with them.
+    """Pack a scene with codecs that were fitted to it, before or after training with rounding.
 
     Args:
         path: the file; its folder must exist.
-        scene: primitives in the order of :func:`fit_scene`. Positions are those of the codecs, whatever it has.
+        scene: primitives in the order of :func:`fit_scene`. Its positions are ignored; the codecs hold them.
         codecs: from :func:`fit_scene`.
 
     Raises:
-        PackError: values are not finite, or it is another scene.
-        StorageError: no room or no right to write.
+        PackError: values are not finite, or the codecs do not fit the scene.
+        StorageError: the disk is full or not writable.
     """
     _check(scene.field)
     config, blocks = codecs.config, codecs.blocks
@@ -150,9 +150,9 @@ def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
     encoded = {name: codec.encode(as_matrix(scene.field[name])) for name, codec in codecs.field.items()}
     if codecs.head is not None:
         encoded["head"] = codecs.head.encode(scene.head)
-    for name, (described, made) in encoded.items():
-        about[name] = described
-        arrays |= {f"{name}/{part}": array for part, array in made.items()}
+    for name, (entry, parts) in encoded.items():
+        about[name] = entry
+        arrays |= {f"{name}/{part}": array for part, array in parts.items()}
     if scene.cameras is not None:
         for name, (dtype, _) in CAMERAS.items():
             arrays[f"cameras/{name}"] = scene.cameras[name].detach().cpu().numpy().astype(dtype)
@@ -169,7 +169,7 @@ def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
 
 
 class _Reader:
-    """Sections of a file, each checked for what it must be before it is used."""
+    """Sections of a file; each is checked before use."""
 
     def __init__(self, path: Path, header: container.Header, arrays: Mapping[str, Array]) -> None:
         self.path = path
@@ -177,9 +177,10 @@ class _Reader:
         self.arrays = arrays
 
     def refuse(self, reason: str) -> PackError:
-        return PackError(f"{self.path} is no scene that can be shown ({reason}); pack it again")
+        return PackError(f"{self.path} is not a valid scene ({reason}); pack it again")
 
     def section(self, name: str, dtypes: tuple[str, ...], shape: tuple[int | None, ...]) -> Array:
+        """A finite array with one of the dtypes and the shape, in which None matches any length."""
         array = self.arrays.get(name)
         fits = array is not None and array.dtype.str in dtypes and len(array.shape) == len(shape)
         if array is None or not fits or any(w is not None and w != s for w, s in zip(shape, array.shape)):
@@ -188,20 +189,23 @@ class _Reader:
             raise self.refuse(f"{name} has values that are not finite")
         return array
 
-    def about(self, name: str, codec: tuple[str, ...]) -> dict[str, Any]:
+    def about(self, name: str, codecs: tuple[str, ...]) -> dict[str, Any]:
+        """The header's entry of an attribute, with one of the codecs."""
         attributes = self.meta.get("attributes")
-        found = attributes.get(name) if isinstance(attributes, dict) else None
-        if not isinstance(found, dict) or found.get("codec") not in codec:
-            raise self.refuse(f"it does not say how {name} is stored")
-        return found
+        entry = attributes.get(name) if isinstance(attributes, dict) else None
+        if not isinstance(entry, dict) or entry.get("codec") not in codecs:
+            raise self.refuse(f"its header has no valid codec for {name}")
+        return entry
 
-    def number(self, about: Mapping[str, Any], key: str, least: int, most: int) -> int:
+    def number(self, about: Mapping[str, Any], key: str, minimum: int, maximum: int) -> int:
+        """A whole number from ``minimum`` to ``maximum``."""
         value = about.get(key)
-        if not isinstance(value, int) or isinstance(value, bool) or not least <= value <= most:
-            raise self.refuse(f"{key} is not one of {least} to {most}")
+        if not isinstance(value, int) or isinstance(value, bool) or not minimum <= value <= maximum:
+            raise self.refuse(f"{key} is not one of {minimum} to {maximum}")
         return value
 
     def numbers(self, about: Mapping[str, Any], key: str, count: int) -> NDArray[np.float64]:
+        """A list of ``count`` numbers within the range of float32."""
         value = about.get(key)
         if not isinstance(value, list) or len(value) != count or not all(type(v) in (int, float) for v in value):
             raise self.refuse(f"{key} is not a list of {count} numbers")
@@ -209,15 +213,16 @@ class _Reader:
             array = np.array(value, np.float64)
         except OverflowError:
             array = np.array([np.inf])
-        # Grids reach up to 2^16 steps, times a few in a transform; what is shown must still be a number in float32.
+        # A grid has up to 2^16 steps and a transform adds several; the sums must stay finite in float32.
         if not (np.abs(array) < np.finfo(np.float32).max / 2**20).all():
-            raise self.refuse(f"{key} has values that are no numbers of float32")
+            raise self.refuse(f"{key} has values beyond float32")
         return array
 
     def places(self, name: str, limit: int) -> Array:
+        """A section of indices below ``limit``."""
         array = self.section(name, ("<u4",), (None,))
         if len(array) and int(array.max()) >= limit:
-            raise self.refuse(f"{name} points outside of the field")
+            raise self.refuse(f"{name} has an index outside of the field")
         return array
 
 
@@ -234,7 +239,7 @@ def _decode_quats(reader: _Reader, n: int) -> NDArray[np.float32]:
     about = reader.about("quats", ("smallest-three",))
     bits = reader.number(about, "bits", 4, 16)
     codes = reader.section("quats/codes", (_code(bits),), (3, n))
-    largest = part_crumbs(reader.section("quats/largest", ("|u1",), (-(-n // 4),)), n)
+    largest = unpack_pairs_of_bits(reader.section("quats/largest", ("|u1",), (-(-n // 4),)), n)
     return quantize.dequantize_rotations(Rotations(codes, largest), bits)
 
 
@@ -248,7 +253,7 @@ def _decode_uniform(reader: _Reader, name: str, n: int, width: int) -> NDArray[n
     codes = reader.section(f"{name}/codes", (_code(bits),), (width, n))
     if about.get("differences") is True:
         if width != 3:
-            raise reader.refuse(f"{name} has no three channels")
+            raise reader.refuse(f"{name} does not have three channels")
         codes = np.stack([codes[0] + codes[1], codes[1], codes[2] + codes[1]])
     places = reader.places(f"{name}/places", width * n)
     exceptions = reader.section(f"{name}/exceptions", ("<f4",), (len(places),))
@@ -275,10 +280,10 @@ def _decode_books(reader: _Reader, name: str, n: int, width: int) -> NDArray[np.
     flat = reader.section(f"{name}/entries", ("|i1",), (books, None))
     entries = flat.reshape(books, -1, width) if flat.shape[1] % width == 0 else flat[:, :0, None]
     if entries.shape[1] <= int(indices.max()):
-        raise reader.refuse(f"{name} points outside of its codebooks")
+        raise reader.refuse(f"{name} has an index outside of its codebooks")
     steps = reader.section(f"{name}/steps", ("<f4",), (books,))
     if not np.abs(steps).max() < np.finfo(np.float32).max / 2**13:
-        raise reader.refuse(f"{name} has values that are no numbers of float32")
+        raise reader.refuse(f"{name} has values beyond float32")
     rows = reader.places(f"{name}/rows", n)
     exact = reader.section(f"{name}/exact", ("<f4",), (len(rows), width))
     return codebooks.restore(Codebooks(indices, entries, steps, rows, exact, 0.0))
@@ -316,16 +321,16 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
 
 
 def _tensors(reader: _Reader, listed: Any) -> list[tuple[str, tuple[int, ...]]]:
-    """Names and shapes of the head's tensors."""
+    """Names and shapes of the head's tensors, as listed in the header."""
     if not isinstance(listed, list) or len(listed) > 10_000:
-        raise reader.refuse("it does not list the tensors of the head")
-    found = []
+        raise reader.refuse("its header does not list the tensors of the head")
+    tensors = []
     for entry in listed:
-        fits = isinstance(entry, list) and len(entry) == 2 and isinstance(entry[0], str) and isinstance(entry[1], list)
-        if not fits or len(entry[1]) > 5 or not all(type(side) is int and 0 < side < 1 << 28 for side in entry[1]):
-            raise reader.refuse("a tensor of the head has an odd shape")
-        found.append((entry[0], tuple(entry[1])))
-    return found
+        valid = isinstance(entry, list) and len(entry) == 2 and isinstance(entry[0], str) and isinstance(entry[1], list)
+        if not valid or len(entry[1]) > 5 or not all(type(side) is int and 0 < side < 1 << 28 for side in entry[1]):
+            raise reader.refuse("a tensor of the head has an invalid shape")
+        tensors.append((entry[0], tuple(entry[1])))
+    return tensors
 
 
 def _decode_cameras(reader: _Reader) -> dict[str, Tensor] | None:
@@ -336,16 +341,16 @@ def _decode_cameras(reader: _Reader) -> dict[str, Tensor] | None:
         name: reader.section(f"cameras/{name}", (dtype,), (count, *shape)) for name, (dtype, shape) in CAMERAS.items()
     }
     if count and (int(arrays["sizes"].min()) < 1 or int(arrays["sizes"].max()) > 1 << 16):
-        raise reader.refuse("a camera has no size that a picture can have")
+        raise reader.refuse("a camera has an invalid image size")
     arrays["sizes"] = arrays["sizes"].astype(np.int64)
     return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
 
 def read_scene(path: Path) -> Scene:
-    """Unpack a file. Nothing in it is run, and what it may allocate is bounded by its size.
+    """Unpack a file, without executing anything in it, and with memory bounded by its size.
 
     Raises:
-        PackError: the file is missing, of another version, cut short, altered, or no scene.
+        PackError: the file is missing, of another version, truncated, altered, or not a valid scene.
     """
     path = Path(path)
     header = container.read_header(path)
@@ -353,7 +358,7 @@ def read_scene(path: Path) -> Scene:
     container.check_ratio(path, 4 * n * (14 + width + features), header.size)
     reader = _Reader(path, header, container.read_sections(path, header))
 
-    # The largest first, so that the threads end together.
+    # Start with the largest jobs, so that the threads end together.
     jobs: dict[str, Callable[[], NDArray[np.float32]]] = {}
     decoders = {"transform": _decode_transform, "codebooks": _decode_books, "uniform": _decode_uniform}
     for name, channels in (("features_rest", width), (FEATURES, features)):
@@ -375,8 +380,8 @@ def read_scene(path: Path) -> Scene:
 
 
 def _shape(path: Path, header: container.Header) -> tuple[int, int, int]:
-    """Primitives, coefficients of bands 1 and up, and features, as the sections' sizes say, before any is read."""
-    refusal = PackError(f"{path} is no scene that can be shown (its header contradicts itself); pack it again")
+    """Numbers of primitives, of SH values of degrees 1 and up, and of features, from the header alone."""
+    refusal = PackError(f"{path} is not a valid scene (its header contradicts itself); pack it again")
     attributes, n = header.meta.get("attributes"), header.meta.get("primitives")
     if not isinstance(attributes, dict) or type(n) is not int or not 1 <= n < 1 << 28:
         raise refusal
@@ -390,7 +395,7 @@ def _shape(path: Path, header: container.Header) -> tuple[int, int, int]:
             raise refusal
         codes = header.sections.get(f"{name}/codes")
         width = about.get("width") if codes is None else codes.shape[0]
-        if type(width) is not int or not 1 <= width <= _MOST_FEATURES:
+        if type(width) is not int or not 1 <= width <= _MAX_FEATURES:
             raise refusal
         widths.append(width)
     if widths[0] % 3 or sh_degree_of(widths[0] // 3) is None:

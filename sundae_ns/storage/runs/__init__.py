@@ -1,1 +1,1 @@
-"""What a run leaves on disk: checkpoints, its folder and its config.yml."""
+"""Files of a training run: checkpoints, its folder, and its ``config.yml``."""

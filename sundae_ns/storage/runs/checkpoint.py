@@ -1,6 +1,6 @@
-"""Checkpoints: written whole, what a SUNDAE checkpoint says of itself, and fields read from other sources.
+"""Checkpoints: atomic writes, the state beside the tensors, checks before loading, and fields from other sources.
 
-Files are read weights-only, never by running what a file asks for, and only after their checksums have been found right.
+Files are read weights-only, so that no code of theirs runs, and only after their checksums were verified.
 """
 
 from __future__ import annotations
@@ -13,29 +13,30 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, StorageError
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes, rgb_to_sh
+from sundae_ns.gaussians.field import Encoding, Field
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.kinds import kind_of, refuse
 from sundae_ns.storage.ply import read_ply
 from sundae_ns.storage.point_cloud import is_nerfstudio_ply
 
 EXTRA_STATE = "_extra_state"
-FORMAT = 1
+FORMAT = 2
 _PREFIX = "gauss_params."
 _NAME = re.compile(r"step-(\d+)\.ckpt")
 _PARTIAL = "partial--1.tmp"
-"""A checkpoint in the making. nerfstudio reads a step off the name of every file in the folder: off this one, step -1."""
+"""Name of an unfinished checkpoint. nerfstudio parses a step from every file name in the folder; this one gives step -1."""
 
 
 def random_state() -> dict[str, Any]:
-    """State of every generator of random numbers that training draws from, as plain numbers and tensors."""
+    """State of all random generators that training uses, as plain numbers and tensors."""
     kind, keys, position, has_gauss, gauss = np.random.get_state()
     return {
         "python": random.getstate(),
@@ -46,7 +47,7 @@ def random_state() -> dict[str, Any]:
 
 
 def set_random_state(state: Mapping[str, Any]) -> None:
-    """Counterpart of :func:`random_state`; generators of another number of CUDA devices are left as they are."""
+    """Counterpart of :func:`random_state`; CUDA generators are left alone if the number of devices differs."""
     random.setstate(state["python"])
     kind, keys, position, has_gauss, gauss = state["numpy"]
     np.random.set_state((kind, np.array(keys, dtype=np.uint32), position, has_gauss, gauss))
@@ -56,34 +57,34 @@ def set_random_state(state: Mapping[str, Any]) -> None:
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """The checkpoints in a folder by step, the newest last; names that nerfstudio does not write are passed over."""
+    """Checkpoints of a folder by step, the newest last; other file names are ignored."""
     found = {path: match for path in folder.glob("*.ckpt") if (match := _NAME.fullmatch(path.name))}
     return sorted(found, key=lambda path: int(found[path][1]))
 
 
 def save(state: Mapping[str, Any], path: Path) -> None:
-    """Write a checkpoint, whole or not at all; a file of that name stays as it is until the new one is on the disk.
+    """Write a checkpoint atomically: an older file of that name stays until the new one is on the disk.
 
     Raises:
-        StorageError: no room or no right to write; says which older checkpoint is whole.
+        StorageError: no space or no right to write; names the newest older checkpoint that is whole.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # A fixed name: what a killed run has left behind is written over by the next save.
+        # A fixed name: the next save overwrites what a killed run left behind.
         with replacing(path, path.with_name(_PARTIAL)) as partial, partial.open("wb") as file:
-            # Through a Python file: torch's own writer hides from its caller why a write failed.
+            # Through a Python file, because torch's own writer hides the reason of a failed write.
             torch.save(dict(state), file)
     except OSError as error:
         older = [other for other in checkpoints(path.parent) if other != path]
-        kept = f"{older[-1].name} is whole, go on from it with --load-dir" if older else "no older checkpoint"
+        kept = f"{older[-1].name} is whole, resume from it with --load-dir" if older else "no older checkpoint"
         reason = str(error) if isinstance(error, StorageError) else f"cannot write {path}: {error.strerror or error}"
         raise StorageError(f"{reason} ({kept})") from error
 
 
 def _damage(path: Path) -> str | None:
-    """What is wrong with a file that should be a checkpoint; None if its checksums are right.
+    """Reason why a file is no whole checkpoint; None if its checksums are right.
 
-    torch neither checks them nor minds a file that unpacks to more than its own size.
+    torch neither verifies checksums nor refuses a file that unpacks to more than its size.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -99,7 +100,7 @@ def _damage(path: Path) -> str | None:
 
 
 def _check_extent(value: Any, path: Path) -> None:
-    """Refuse tensors that claim more elements than their storage holds, for copying one would fill the memory; and odd ones."""
+    """Refuse sparse or quantized tensors, and tensors with more elements than their storage, whose copy would fill memory."""
     if isinstance(value, Tensor):
         if value.layout is not torch.strided or value.is_quantized or value.is_meta:
             raise CheckpointError(
@@ -116,7 +117,7 @@ def _check_extent(value: Any, path: Path) -> None:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a checkpoint of nerfstudio's trainer on the CPU, without running anything that it asks for.
+    """Read a checkpoint of nerfstudio's trainer on the CPU, without running code from it.
 
     Raises:
         CheckpointError: the file is missing, damaged, cut short, or of another kind.
@@ -130,7 +131,7 @@ def load(path: Path) -> dict[str, Any]:
                 loaded = torch.load(path, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:
             reason = "it holds more than tensors and plain values, or nothing that can be read"
-        except Exception as error:  # torch.load raises many kinds; each means the same to the user
+        except Exception as error:  # torch.load raises many kinds with one meaning for the user
             reason = str(error).partition("\n")[0] or type(error).__name__
         else:
             state = loaded.get("pipeline") if isinstance(loaded, dict) else None
@@ -145,7 +146,7 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def newest_whole(folder: Path) -> tuple[Path, list[str]]:
-    """The newest checkpoint of a folder that is whole, and a line for each newer one that is not.
+    """The newest whole checkpoint of a folder, and a line for each newer damaged one.
 
     Raises:
         CheckpointError: there is none.
@@ -161,37 +162,46 @@ def newest_whole(folder: Path) -> tuple[Path, list[str]]:
 
 
 def extra_state(
+    *,
     step: int,
     num_features: int,
-    strategy: Mapping[str, Any],
-    pruning: Mapping[str, Any],
+    encoding: Encoding,
+    running: Mapping[str, Mapping[str, Any]],
+    extensions: Mapping[str, Mapping[str, Any]],
     trained_focal: tuple[float, float] | None,
 ) -> dict[str, Any]:
-    """What a checkpoint carries beside the tensors of the model: plain numbers, strings, and tensors."""
+    """State of a model beside its tensors: plain numbers, strings, and tensors.
+
+    Args:
+        step: training step.
+        num_features: configured length of the feature vectors; 0 without a head.
+        encoding: how the field stores colours.
+        running: running states of ``densification`` and ``pruning``.
+        extensions: states of the extensions, by name.
+        trained_focal: shortest and longest focal length that the head was trained at, pixels.
+    """
     return {
         "method": "sundae",
         "format": FORMAT,
         "step": step,
         "num_features": num_features,
-        "strategy": dict(strategy),
-        "pruning": dict(pruning),
+        "encoding": encoding,
+        "running": {name: dict(value) for name, value in running.items()},
+        "extensions": {name: dict(value) for name, value in extensions.items()},
         "trained_focal": None if trained_focal is None else list(trained_focal),
     }
 
 
-def check_model_state(
-    state: Mapping[str, Any], expected: Mapping[str, Tensor], num_features: int, *, shard: bool = False
-) -> None:
-    """Check that a model's state fits the model, before anything is changed.
+def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Encoding) -> Mapping[str, Any]:
+    """The state beside the tensors, checked against the model.
 
     Args:
         state: state of the checkpoint's model, without the pipeline's prefix.
-        expected: ``state_dict`` of the model it is loaded into.
-        num_features: feature width of that model; 0 without a head.
-        shard: whether it is a rank's part of one, which may be empty.
+        num_features: configured length of the model's feature vectors; 0 without a head.
+        encoding: how the model's field stores colours.
 
     Raises:
-        CheckpointError: another method's checkpoint, another format, feature width or head.
+        CheckpointError: a checkpoint of another method, format, feature width or encoding of colours.
     """
     extra = state.get(EXTRA_STATE)
     if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
@@ -199,16 +209,42 @@ def check_model_state(
         raise CheckpointError(
             f"this is {kind}, not one of sundae; start from it with --pipeline.model.warm-start PATH, not --load-dir"
         )
-    if extra.get("format") != FORMAT:
-        raise CheckpointError(
-            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; use the version that wrote it"
-        )
+    _check_format(extra)
     features = extra.get("num_features")
     if features != num_features:
         raise CheckpointError(
             f"the checkpoint has feature vectors of length {features}, the model of length {num_features}; "
             f"give --pipeline.model.head.num-features {features} (0 means a model without a head)"
         )
+    if extra.get("encoding") != encoding:
+        raise CheckpointError(
+            f"the checkpoint stores colours as {extra.get('encoding')}, the model as {encoding}; load it with the "
+            "--pipeline.model.sh-degree that it was trained with (0 stores logits)"
+        )
+    parts = [extra.get("running"), extra.get("extensions")]
+    if not all(isinstance(part, Mapping) for part in parts) or "trained_focal" not in extra:
+        raise CheckpointError("the checkpoint does not say where training stopped; give another")
+    return extra
+
+
+def _check_format(extra: Mapping[str, Any]) -> None:
+    if extra.get("format") != FORMAT:
+        raise CheckpointError(
+            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; use the version that wrote it"
+        )
+
+
+def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], *, may_be_empty: bool = False) -> None:
+    """Check that the tensors of a checkpoint fit the model.
+
+    Args:
+        state: state of the checkpoint's model, whose extra state was checked.
+        expected: ``state_dict`` of the model.
+        may_be_empty: whether there may be no primitive, as in a shard.
+
+    Raises:
+        CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
+    """
     for name, value in expected.items():
         if not isinstance(value, Tensor) or name == EXTRA_STATE:
             continue
@@ -218,18 +254,18 @@ def check_model_state(
         theirs, ours = state[name].shape, value.shape
         if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
             mend = "load it with the options that it was trained with"
-            if name.startswith("head."):
-                mend += ", such as --pipeline.model.head.size compact, which was the default before wide"
+            if name.startswith("networks.head."):
+                mend += ", such as its --pipeline.model.head.size"
             raise CheckpointError(f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {mend}")
     rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
-    if len(rows) != 1 or (rows[0] == 0 and not shard):
+    if len(rows) != 1 or (rows[0] == 0 and not may_be_empty):
         raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")
-    _check_running_state(extra, rows[0])
+    _check_running_state(state[EXTRA_STATE], rows[0])
 
 
 def _check_running_state(extra: Mapping[str, Any], n: int) -> None:
-    """Check what densification and pruning go on from, for ``n`` primitives."""
-    pruning, strategy = extra.get("pruning"), extra.get("strategy")
+    """Check the running states of densification and pruning for ``n`` primitives."""
+    pruning, strategy = extra["running"].get("pruning"), extra["running"].get("densification")
     numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
     if not all(isinstance(value, int) for value in numbers) or not isinstance(strategy, Mapping):
         raise CheckpointError("the checkpoint does not say where training stopped; give another")
@@ -240,7 +276,7 @@ def _check_running_state(extra: Mapping[str, Any], n: int) -> None:
 
 @contextmanager
 def _numpy_numbers_allowed() -> Iterator[None]:
-    """Let weights-only loading read the numpy floats that stock nerfstudio leaves in a scheduler's state."""
+    """Allow the numpy floats that stock nerfstudio leaves in a scheduler's state."""
     scalar = np.float64(0.0).__reduce__()[0]
     allowed: list[Any] = [
         scalar,
@@ -261,12 +297,11 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         path: ``.ckpt`` file, a folder of them (the newest counts), or ``.ply`` file.
 
     Returns:
-        The parameters of ``gaussians.parameters`` without features, float32 on the CPU, colours as harmonics; and whether
-        they are in the coordinates of nerfstudio's model (checkpoints, ``ns-export``) rather than in those of the capture
-        (other ``.ply``).
+        Parameters without features, float32 on the CPU, colours as harmonics; and True if they are in the coordinates of
+        nerfstudio's model (checkpoints, ``ns-export``), False if in those of the capture (other ``.ply``).
 
     Raises:
-        CheckpointError: there is no such file, or it holds no Gaussian field.
+        CheckpointError: there is no such file, it holds no Gaussian field, or it is a SUNDAE checkpoint of another format.
     """
     path = Path(path)
     if path.is_dir():
@@ -286,25 +321,22 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
     field = {name: state[key].float() for name, key in keys.items()}
     _check_field(field, path)
-    if field["features_rest"].shape[1] == 0 and _holds_logits(state.get(f"_model.{EXTRA_STATE}")):
-        field["features_dc"] = rgb_to_sh(field["features_dc"].sigmoid())
-    return field, True
+    return dict(Field(field, _encoding(field, state.get(f"_model.{EXTRA_STATE}"))).as_harmonics()), True
 
 
-def _holds_logits(extra: Any) -> bool:
-    """Whether band 0 of a checkpoint without other bands holds logits of colours, as of a model without harmonics.
-
-    A field that a search for a budget has left without bands holds harmonics. Checkpoints that do not say are told apart by
-    that, and those of splatfacto have no extra state.
-    """
-    if not isinstance(extra, Mapping):
-        return True
-    said = extra.get("logits")
-    return said if isinstance(said, bool) else "budget" not in extra
+def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:
+    """How the field of a checkpoint stores colours; splatfacto, which does not say, stores logits at SH degree 0."""
+    if not isinstance(extra, Mapping) or extra.get("method") != "sundae":
+        return "logits" if field["features_rest"].shape[1] == 0 else "harmonics"
+    _check_format(extra)
+    for encoding in get_args(Encoding):
+        if extra.get("encoding") == encoding:
+            return encoding  # type: ignore[no-any-return]
+    raise CheckpointError("the checkpoint does not say how it stores colours; give another")
 
 
 def _check_field(field: Mapping[str, Tensor], path: Path) -> None:
-    """Check that there are primitives, and that each parameter has its shape."""
+    """Check that there are primitives, and the shape of each parameter."""
     n = len(field["means"]) if field["means"].ndim else 0
     if n == 0:
         raise CheckpointError(f"{path} holds no primitives; give another file")

@@ -1,51 +1,66 @@
-"""The head of a search: it joins where it is small beside the field, goes where it does not pay, and is rebuilt on loading."""
+"""The head of a search: enabled if it is small beside the field, removed if it does not pay, reshaped for a checkpoint."""
 
 from __future__ import annotations
 
+import math
+
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.compensation import HeadConfig
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.snapshot import narrow
 from sundae_ns.training.budget import sizes
-from sundae_ns.training.budget.run import Run
 from sundae_ns.training.budget.search import Search
+from sundae_ns.training.budget.searched_field import SearchedField
+from sundae_ns.training.field_state import FieldState
 
 
-def may_pay(run: Run, largest: HeadConfig | None) -> bool:
-    """Whether a head, up to the one given, is small beside the field without it."""
-    count = run.model.num_points
-    return largest is not None and sizes.head_for(count * run.row, count, largest) is not None
+def follow(state: FieldState, search: Search) -> None:
+    """Enable or disable the head as the search says."""
+    state.head_starts_at = -math.inf if search.head else math.inf
 
 
-def join(run: Run, search: Search, largest: HeadConfig | None, primitives: int) -> bool:
-    """Let the head that suits a field of so many primitives take part; whether one does."""
-    head = run.model.head
-    config = None if largest is None else sizes.head_for(primitives * run.row, primitives, largest)
-    if config is None or head is None:
+def may_pay(searched: SearchedField, largest: HeadConfig | None) -> bool:
+    """Whether a head, at most the one given, is small beside the field without it."""
+    count = searched.count
+    return largest is not None and sizes.head_for(count * searched.row, count, largest) is not None
+
+
+def enable(searched: SearchedField, search: Search, largest: HeadConfig | None, primitives: int) -> bool:
+    """Enable the head that suits a field of ``primitives``; returns whether there is one."""
+    state = searched.state
+    config = None if largest is None else sizes.head_for(primitives * searched.row, primitives, largest)
+    if config is None or state.head is None:
         return False
     search.head, search.head_size, search.num_features = True, config.size, config.num_features
-    if config != head.config:
-        head.resize(config)
-        narrow(run.params, run.optimizers.optimizers, FEATURES, config.num_features)
-    CONSOLE.log(f"a {config.size} head joins, with {config.num_features} features a primitive")
-    run.restart_rates(head=True)
+    if config != state.head.config:
+        state.head.resize(config)
+        narrow(state.field, state.optimizers, FEATURES, config.num_features)
+    follow(state, search)
+    CONSOLE.log(f"a {config.size} head is enabled, with {config.num_features} features a primitive")
+    searched.restart_rates(head=True)
     return True
 
 
-def drop(run: Run, search: Search) -> None:
-    """Do without a head, and without features, for good."""
-    run.model.head = None
-    run.optimizers.optimizers["compensation"].state.clear()
-    narrow(run.params, run.optimizers.optimizers, FEATURES, 0)
+def remove(searched: SearchedField, search: Search) -> None:
+    """Remove the head and the features for good."""
+    state = searched.state
+    state.remove_head()
+    state.optimizers["compensation"].state.clear()
+    narrow(state.field, state.optimizers, FEATURES, 0)
     search.head_dropped, search.head_size, search.num_features = True, "", 0
 
 
-def prepared(search: Search, largest: HeadConfig | None, head: CompensationHead | None) -> CompensationHead | None:
-    """The head of a model as a search has left it, its values still to be loaded; None where it has none."""
-    chosen = sizes.chosen_head(search, largest)
-    if head is None or chosen is None:
-        return None
-    if head.config != chosen:
-        head.resize(chosen)
-    return head
+def reshape(state: FieldState, search: Search, largest: HeadConfig | None) -> None:
+    """Give field and head the shapes that a search has left in a checkpoint; values are loaded afterwards."""
+    field, chosen = state.field, sizes.chosen_head(search, largest)
+    if search.degree >= 0:
+        rest = field["features_rest"]
+        rest.data = rest.data[:, : (search.degree + 1) ** 2 - 1]
+    if chosen is None:
+        state.remove_head()
+    elif state.head is not None and state.head.config != chosen:
+        state.head.resize(chosen)
+    if FEATURES in field:
+        features = field[FEATURES]
+        features.data = features.data[:, : 0 if chosen is None else chosen.num_features]

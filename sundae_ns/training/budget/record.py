@@ -1,4 +1,4 @@
-"""What a search leaves in the run's folder: ``budget.json``, and the curve drawn in ``budget.txt``."""
+"""Records of a search in the run's folder: ``budget.json``, and its curve as text in ``budget.txt``."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from sundae_ns.compensation import HeadConfig
 from sundae_ns.evaluation import without_nan
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.storage.atomic import write_text
-from sundae_ns.training.budget.run import Run
 from sundae_ns.training.budget.search import Point, Search
+from sundae_ns.training.budget.searched_field import SearchedField
 from sundae_ns.training.budget.sizes import bytes_of, chosen_head
 
 
-def wanted(config: PruningConfig) -> tuple[str, float]:
-    """The option that says what is to be kept, and how much."""
+def budget_of(config: PruningConfig) -> tuple[str, float]:
+    """Name and value of the option that sets the budget."""
     for name in ("max_bytes", "max_primitives"):
         value = getattr(config, name)
         if value is not None:
@@ -24,55 +24,63 @@ def wanted(config: PruningConfig) -> tuple[str, float]:
     return "max_psnr_drop", config.tolerated_drop
 
 
-def point_of(run: Run, search: Search, largest: HeadConfig | None, psnr: float, *, phase: str, verdict: str) -> Point:
-    """One look at the held-back views, for the curve.
+def point_of(
+    searched: SearchedField, search: Search, largest: HeadConfig | None, psnr: float, *, phase: str, verdict: str
+) -> Point:
+    """One evaluation on the held-out views, for the curve.
 
     Args:
-        run: whose field was looked at.
-        search: where it stands.
-        largest: the largest head that may be chosen.
+        searched: the field.
+        search: state of the search.
+        largest: the largest head that the search may choose.
         psnr: mean over the views, dB.
         phase, verdict: see :class:`sundae_ns.training.budget.search.Point`.
     """
     head = chosen_head(search, largest) if search.head else None
+    state = searched.state
     return Point(
-        step=run.model.step,
+        step=state.step,
         phase=phase,
-        primitives=run.model.num_points,
-        bytes=bytes_of(run.params if search.head else run.bare, head),
+        primitives=searched.count,
+        bytes=bytes_of(searched.field if search.head else searched.bare, head),
         psnr=psnr,
         verdict=verdict,
-        since_cut=run.model.schedule_step - search.cut_at,
+        since_cut=state.schedule_step - search.cut_at,
     )
 
 
-def write(run: Run, config: PruningConfig, search: Search) -> None:
-    """Write the curve, the choice, and what it cost, if there is a folder to write to.
+def write(searched: SearchedField, search: Search) -> None:
+    """Write curve, choice and cost of a search, if the run has a folder.
 
     Raises:
-        StorageError: no room or no right to write.
+        StorageError: no space or no right to write.
     """
-    trainer = run.attributes.trainer
-    if trainer is None:
+    folder, num_steps = searched.run.folder, searched.run.num_steps
+    if folder is None or num_steps is None:
         return
     content = {
-        "budget": dict([wanted(config)]),
+        "budget": dict([budget_of(searched.config)]),
         **asdict(search),
-        "primitives": run.model.num_points,
+        "primitives": searched.count,
         "cost": {
             "steps_lost": search.steps_lost,
-            "share_of_steps": search.steps_lost / trainer.config.max_num_iterations,
+            "share_of_steps": search.steps_lost / num_steps,
             "seconds": search.seconds,
         },
     }
-    folder = trainer.base_dir
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "budget.json", json.dumps(without_nan(content), indent=2, allow_nan=False))
     write_text(folder / "budget.txt", curve_text(search.curve, search.target) + "\n")
 
 
 def curve_text(points: Sequence[Point], target: float, width: int = 40) -> str:
-    """The curve as lines of text, one a look, the fewest primitives last; bars are dB above the worst look."""
+    """The curve as text, one line for each evaluation, sorted by falling number of primitives.
+
+    Args:
+        points: the evaluations.
+        target: PSNR to keep, dB; a ``|`` marks it.
+        width: characters of the longest bar. Bars are dB above the lowest evaluation.
+    """
     if not points:
         return ""
     low = min([point.psnr for point in points] + [target])

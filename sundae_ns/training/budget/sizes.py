@@ -1,4 +1,4 @@
-"""What a field and its head weigh, and which head is small beside a field."""
+"""Bytes of a field and its head, and the head that is small beside a field."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from sundae_ns.storage import accounting
 from sundae_ns.training.budget.search import Search
 
 HEAD_SHARE = 0.25
-"""A head may join that is at most this share of the field, with features that are at most this share of a primitive."""
+"""Largest share of the field's bytes that a head may take, and of a primitive's bytes that its features may take."""
 WIDTHS = (1, 5, 13, 29)
-"""Feature widths that splat without padding."""
+"""Numbers of features that splat without padding."""
 
 
 def bytes_of(field: Mapping[str, Tensor], head: HeadConfig | None) -> int:
-    """Bytes that a field and its head are stored in. The one place where a budget counts bytes.
+    """Bytes of a stored field and its head. The one place where a budget counts bytes.
 
     Args:
-        field: the parameters, rows and columns as they would be stored.
-        head: the head; None, or its mode off, for none.
+        field: the parameters, in the shapes in which they are stored.
+        head: configuration of the head; None, or mode off, for none.
     """
     return accounting.bytes_of(field) + head_bytes(head)
 
 
 def head_bytes(head: HeadConfig | None) -> int:
-    """Bytes of a head, without building its weights."""
+    """Bytes of a head, computed without allocating its weights."""
     if head is None or head.mode == "off":
         return 0
     with torch.device("meta"):
@@ -38,16 +38,16 @@ def head_bytes(head: HeadConfig | None) -> int:
 
 
 def head_for(stored: int, primitives: int, largest: HeadConfig) -> HeadConfig | None:
-    """The largest head, up to the one given, that is small beside a field; None if not one is.
+    """The largest head, at most the one given, that is small beside a field; None if none is.
 
     Args:
         stored: bytes of the field without features.
-        primitives: how many these are.
-        largest: the head that would be taken for a field of any size.
+        primitives: number of primitives.
+        largest: the head for a field of any size.
     """
     narrower = [width for width in WIDTHS if width < largest.num_features]
-    room = HEAD_SHARE * stored / primitives / accounting.BYTES_PER_FLOAT
-    widths = [width for width in (*narrower, largest.num_features) if width <= room]
+    floats = HEAD_SHARE * stored / primitives / accounting.BYTES_PER_FLOAT
+    widths = [width for width in (*narrower, largest.num_features) if width <= floats]
     sizes = list(SIZES)[: list(SIZES).index(largest.size) + 1]
     for size in reversed(sizes if widths else []):
         config = replace(largest, size=size, num_features=widths[-1])  # type: ignore[arg-type]
@@ -57,7 +57,7 @@ def head_for(stored: int, primitives: int, largest: HeadConfig) -> HeadConfig | 
 
 
 def chosen_head(search: Search, largest: HeadConfig | None) -> HeadConfig | None:
-    """The head that a search has chosen, before that the largest that it may choose; None for none at all."""
+    """The head that a search has chosen, before that the largest that it may choose; None for none."""
     if largest is None or search.head_dropped:
         return None
     if not search.head_size:

@@ -11,14 +11,14 @@ import pytest
 from budget_runs import Make, Run, set_up, tidy
 
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.data import write_scene
+from sundae_ns.data import write_embedded_capture
 from sundae_ns.training import budget
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("budget") / "scene"
-    return write_scene(folder, train_views=12, test_views=2, width=24, height=24, points=200, samples=1)
+    return write_embedded_capture(folder, train_views=12, test_views=2, width=24, height=24, points=200, samples=1)
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def done(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]
 
 @pytest.fixture
 def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """A head of half a megabyte, with 5 features, joins a field of a few kilobytes, in place of a larger one."""
+    """Options of a head with 13 features; the search enables one of half a megabyte with 5, beside a field of kilobytes."""
     monkeypatch.setattr(
         budget.sizes, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
     )

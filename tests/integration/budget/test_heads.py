@@ -1,4 +1,4 @@
-"""The head of a search: whether it joins, stays and is loaded again."""
+"""The head of a search: whether it is enabled, kept, and loaded again."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from budget_runs import PRUNE_AT, SAVE, STEPS, Make, Run, same, shown_alike_when
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.scenes.measure import sizes
 from sundae_ns.training import budget
-from sundae_ns.training.budget.run import Run as Searched
+from sundae_ns.training.budget.searched_field import SearchedField
 
 
 def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:
@@ -24,22 +24,22 @@ def test_a_small_field_has_no_head_and_no_features(done: Run) -> None:
     assert done.model.gauss_params["features_rest"].shape[1] == columns
 
 
-def test_what_is_lost_with_a_head_is_counted_once(
+def test_steps_lost_with_a_head_are_counted_once(
     make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Searched, "measure", lambda run: 20.0 if run.model.num_points == 200 else 5.0)
+    monkeypatch.setattr(SearchedField, "measure", lambda searched: 20.0 if searched.count == 200 else 5.0)
     trainer = make(model_options=small_head)
     trainer.train()
     found = Run(trainer).found
     *_, last, _ = found["curve"]
-    taken_back = [p["since_cut"] for p in found["curve"] if (p["phase"], p["verdict"]) == ("field", "rejected")]
+    rejected = [p["since_cut"] for p in found["curve"] if (p["phase"], p["verdict"]) == ("field", "rejected")]
     assert [point["verdict"] for point in found["curve"] if point["phase"] == "head"].count("rejected") > 1
     assert found["head_dropped"]
-    # One of two trials, cuts without the head, and all since it joined.
-    assert found["steps_lost"] == 12 + sum(taken_back) + last["step"] - found["head_at"]
+    # One of two trials, rejected cuts without the head, and all steps since the head was enabled.
+    assert found["steps_lost"] == 12 + sum(rejected) + last["step"] - found["head_at"]
 
 
-def test_a_head_of_the_chosen_size_joins_and_is_loaded_again(
+def test_a_head_of_the_chosen_size_is_enabled_and_loaded_again(
     make: Make, small_head: dict[str, Any], tmp_path: Path
 ) -> None:
     options = {"model_options": small_head, "max_psnr_drop": None, "max_primitives": 37}
@@ -62,7 +62,7 @@ def test_a_head_of_the_chosen_size_joins_and_is_loaded_again(
     shown_alike_when_packed(run, tmp_path)
 
 
-def test_a_head_that_does_not_pay_goes_again(make: Make, small_head: dict[str, Any]) -> None:
+def test_a_head_that_does_not_pay_is_removed(make: Make, small_head: dict[str, Any]) -> None:
     trainer = make(model_options=small_head)
     trainer.train()
     found = Run(trainer).found

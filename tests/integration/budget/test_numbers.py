@@ -1,4 +1,4 @@
-"""A search among numbers that are none: heads, primitives and pictures that broke, and what fails of itself."""
+"""A search with heads, primitives and images that are not finite, and a search that fails."""
 
 from __future__ import annotations
 
@@ -8,126 +8,134 @@ from typing import Any
 
 import pytest
 import torch
-from budget_runs import PRUNE_AT, Make, Run
+from budget_runs import PRUNE_AT, Make, Run, search_of
 from torch import Tensor
 
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import DataError
 from sundae_ns.training import budget
-from sundae_ns.training.budget import Budget
-from sundae_ns.training.budget.run import Run as Searched
-from sundae_ns.training.budget.search import NO_PICTURE, Search
+from sundae_ns.training.budget import BudgetSearch
+from sundae_ns.training.budget.search import NO_IMAGE, Search
+from sundae_ns.training.budget.searched_field import SearchedField
+from sundae_ns.training.extension import TrainingRun
+from sundae_ns.training.field_state import FieldState
+
+When = Callable[[BudgetSearch, SearchedField], bool]
 
 
-def spoil(monkeypatch: pytest.MonkeyPatch, when: Callable[[Searched], bool], values: Callable[[Any], Tensor]) -> None:
-    """Make some numbers of a model NaN after the first step of training at which it is time."""
-    after_step, done = Budget.after_step, []
+def spoil(monkeypatch: pytest.MonkeyPatch, when: When, values: Callable[[FieldState], Any]) -> None:
+    """Make some numbers of a field NaN after the first training step for which ``when`` is true."""
+    after_step, done = BudgetSearch.after_step, []
 
-    def spoiled(self: Budget, model: Any, attributes: Any) -> None:
-        if not done and when(Searched.of(model, attributes)):
-            values(model).data.fill_(torch.nan)
-            done.append(model.step)
-        after_step(self, model, attributes)
+    def spoiled(self: BudgetSearch, run: TrainingRun) -> None:
+        if not done and when(self, SearchedField(run, self.config)):
+            values(run.state).data.fill_(torch.nan)
+            done.append(run.state.step)
+        after_step(self, run)
 
-    monkeypatch.setattr(Budget, "after_step", spoiled)
+    monkeypatch.setattr(BudgetSearch, "after_step", spoiled)
 
 
-def about_to_look(run: Searched, phase: str, *, trying: bool) -> bool:
-    found: Budget = run.model.budget  # type: ignore[assignment]
-    return (found.search.phase, found.search.trying) == (phase, trying) and found._look_is_due(run)
+def about_to_evaluate(extension: BudgetSearch, searched: SearchedField, phase: str, *, trying: bool) -> bool:
+    search = extension.search
+    return (search.phase, search.trying) == (phase, trying) and extension._evaluation_is_due(searched)
 
 
 @pytest.mark.parametrize("trying", [False, True])
-def test_a_head_that_is_no_longer_numbers_is_taken_back(
+def test_a_head_that_is_not_finite_is_removed(
     make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch, trying: bool
 ) -> None:
-    def when(run: Searched) -> bool:
-        return about_to_look(run, "head", trying=trying)
+    def when(extension: BudgetSearch, searched: SearchedField) -> bool:
+        return about_to_evaluate(extension, searched, "head", trying=trying)
 
-    spoil(monkeypatch, when, lambda model: next(model.head.parameters()))
+    spoil(monkeypatch, when, weights_of_head)
     trainer = make(model_options=small_head)
     trainer.train()
     found = Run(trainer).found
-    looks = [(look["verdict"], look["psnr"]) for look in found["curve"]]
-    assert ("rejected" if trying else "resting", NO_PICTURE) in looks
-    assert (found["phase"], found["head"], looks[-1][0]) == ("done", False, "reached")
-    assert [psnr for _, psnr in looks].count(NO_PICTURE) == 1, "it is not waited for"
+    points = [(point["verdict"], point["psnr"]) for point in found["curve"]]
+    assert ("rejected" if trying else "resting", NO_IMAGE) in points
+    assert (found["phase"], found["head"], points[-1][0]) == ("done", False, "reached")
+    assert [psnr for _, psnr in points].count(NO_IMAGE) == 1, "the search does not wait for it"
     assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
 
 
-def test_a_head_that_makes_no_picture_does_not_stay_for_its_bytes(
+def weights_of_head(state: FieldState) -> Tensor:
+    assert state.head is not None
+    return next(state.head.parameters())
+
+
+def test_a_head_that_renders_no_image_is_not_kept_for_its_bytes(
     make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def when(run: Searched) -> bool:
-        found: Budget = run.model.budget  # type: ignore[assignment]
-        return found.search.cuts > 0 and about_to_look(run, "head", trying=False)
+    def when(extension: BudgetSearch, searched: SearchedField) -> bool:
+        return extension.search.cuts > 0 and about_to_evaluate(extension, searched, "head", trying=False)
 
-    spoil(monkeypatch, when, lambda model: next(model.head.parameters()))
+    spoil(monkeypatch, when, weights_of_head)
     monkeypatch.setattr(budget.sizes, "head_bytes", lambda _: 0)
     trainer = make(model_options=small_head, max_psnr_drop=3.0)
     trainer.train()
     found = Run(trainer).found
-    assert found["curve"][-2]["psnr"] == NO_PICTURE
+    assert found["curve"][-2]["psnr"] == NO_IMAGE
     assert (found["phase"], found["head"], found["curve"][-1]["verdict"]) == ("done", False, "reached")
 
 
-def test_where_no_trial_makes_a_picture_the_warm_up_field_stays(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    restore, gone_back = Searched.restore, []
-
-    def noted(run: Searched, saved: Any) -> None:
-        trained = run.model.means.detach().clone()
-        restore(run, saved)
-        gone_back.append((run.model.schedule_step, torch.equal(run.model.means, trained)))
-
-    def measure(run: Searched) -> float:
-        return 20.0 if run.model.budget.search.phase == "before" else NO_PICTURE  # type: ignore[union-attr]
-
-    monkeypatch.setattr(Searched, "restore", noted)
-    monkeypatch.setattr(Searched, "measure", measure)
+def test_the_warm_up_field_stays_if_no_trial_renders_an_image(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    restore, restored = SearchedField.restore, []
     trainer = make(model_options={"head": HeadConfig(mode="off")})
+    search = search_of(trainer.pipeline.model.extensions).search
+
+    def noted(searched: SearchedField, saved: Any) -> None:
+        trained = searched.field["means"].detach().clone()
+        restore(searched, saved)
+        restored.append((searched.state.schedule_step, torch.equal(searched.field["means"], trained)))
+
+    monkeypatch.setattr(SearchedField, "restore", noted)
+    monkeypatch.setattr(SearchedField, "measure", lambda _: 20.0 if search.phase == "before" else NO_IMAGE)
     trainer.train()
     found = Run(trainer).found
-    assert gone_back == [(PRUNE_AT + 12, False)]
-    assert (found["degrees"], found["degree"], found["steps_lost"]) == ({"1": NO_PICTURE}, 1, 12)
-    assert (found["phase"], found["zeroed"], found["primitives"]) == ("done", 0, 200), "nothing to tell flat colours by"
+    assert restored == [(PRUNE_AT + 12, False)]
+    assert (found["degrees"], found["degree"], found["steps_lost"]) == ({"1": NO_IMAGE}, 1, 12)
+    assert (found["phase"], found["zeroed"], found["primitives"]) == ("done", 0, 200), (
+        "no PSNR to judge flat colours by"
+    )
 
 
-def test_primitives_that_are_no_longer_numbers_go_at_the_next_look(
+def test_primitives_that_are_not_finite_are_removed_at_the_next_evaluation(
     make: Make, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def when(run: Searched) -> bool:
-        return about_to_look(run, "field", trying=False)
+    def when(extension: BudgetSearch, searched: SearchedField) -> bool:
+        return about_to_evaluate(extension, searched, "field", trying=False)
 
-    spoil(monkeypatch, when, lambda model: model.gauss_params["features_dc"][:3])
-    # Nothing is cut at once: what is looked at next rests.
+    spoil(monkeypatch, when, lambda state: state.field["features_dc"][:3])
+    # Nothing is cut at once: the verdict of the next evaluation is "resting".
     monkeypatch.setattr(Search, "next_count", lambda self, *_: 100 if self.looks > 1 and self.accepted == 197 else None)
     trainer = make(max_psnr_drop=3.0)
     trainer.train()
     found = Run(trainer).found
-    rested = [look["primitives"] for look in found["curve"] if look["verdict"] == "resting"]
-    assert rested[:1] == [197], "and the look is one at the others"
+    rested = [point["primitives"] for point in found["curve"] if point["verdict"] == "resting"]
+    assert rested[:1] == [197], "the other primitives are evaluated"
     assert found["dropped_nonfinite"] == 3
-    assert "dropped 3 primitives that were not finite" in capsys.readouterr().out
-    assert all(look["psnr"] > 5 for look in found["curve"])
+    assert "removed 3 primitives that were not finite" in capsys.readouterr().out
+    assert all(point["psnr"] > 5 for point in found["curve"])
     (report,) = json.loads((trainer.base_dir / "prune.json").read_text())
     assert (report["dropped_nonfinite"], report["before"], report["after"]) == (3, 200, 100)
 
 
-def test_primitives_that_are_no_longer_numbers_go_before_the_contribution(
+def test_primitives_that_are_not_finite_are_removed_before_the_contribution(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cut_to, contribution, asked = Searched.cut_to, Searched.contribution, []
+    cut_to, contribution, asked = SearchedField.cut_to, SearchedField.contribution, []
 
-    def spoiled(run: Searched, *arguments: Any) -> int:
-        run.params["opacities"].data[:2] = torch.nan
-        return cut_to(run, *arguments)
+    def spoiled(searched: SearchedField, count: int) -> int:
+        searched.field["opacities"].data[:2] = torch.nan
+        return cut_to(searched, count)
 
-    def noted(run: Searched, share: float | None = None) -> Tensor:
-        asked.append((run.model.num_points, share))
-        return contribution(run, share)
+    def noted(searched: SearchedField, keep_ratio: float | None = None) -> Tensor:
+        asked.append((searched.count, keep_ratio))
+        return contribution(searched, keep_ratio)
 
-    monkeypatch.setattr(Searched, "cut_to", spoiled)
-    monkeypatch.setattr(Searched, "contribution", noted)
+    monkeypatch.setattr(SearchedField, "cut_to", spoiled)
+    monkeypatch.setattr(SearchedField, "contribution", noted)
     trainer = make(max_psnr_drop=None, max_primitives=37)
     trainer.train()
     assert asked[0] == (198, 37 / 198)
@@ -135,10 +143,12 @@ def test_primitives_that_are_no_longer_numbers_go_before_the_contribution(
     assert Run(trainer).found["dropped_nonfinite"] == 2
 
 
-def test_a_warm_up_without_pictures_says_so_and_is_saved(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warm_up_that_diverged_is_reported_and_saved(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = make()
-    monkeypatch.setattr(Searched, "measure", lambda _: NO_PICTURE)
-    with pytest.raises(DataError, match="warm-up field .* the training has diverged, go back to an earlier checkpoint"):
+    monkeypatch.setattr(SearchedField, "measure", lambda _: NO_IMAGE)
+    with pytest.raises(
+        DataError, match="warm-up field .* the training has diverged, resume from an earlier checkpoint"
+    ):
         trainer.train()
     assert (trainer.checkpoint_dir / f"step-{PRUNE_AT:09d}.ckpt").exists()
 
@@ -148,7 +158,7 @@ def test_a_search_that_fails_does_not_lose_the_warm_up(make: Make, monkeypatch: 
         raise DataError("the cause; the mend")
 
     trainer = make()
-    monkeypatch.setattr(Budget, "_begin", fail)
+    monkeypatch.setattr(BudgetSearch, "_begin", fail)
     with pytest.raises(DataError, match="the cause"):
         trainer.train()
     assert (trainer.checkpoint_dir / f"step-{PRUNE_AT:09d}.ckpt").exists()

@@ -1,25 +1,37 @@
-"""The budget finds itself: what it keeps, what it writes, and going on in its midst."""
+"""A budget search: what it keeps and writes, and how it resumes."""
 
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from budget_runs import PRUNE_AT, SAVE, STEPS, STOP, Make, Run, same, set_up, shown_alike_when_packed, tidy
+from budget_runs import (
+    PRUNE_AT,
+    SAVE,
+    STEPS,
+    STOP,
+    Make,
+    Run,
+    same,
+    search_of,
+    set_up,
+    shown_alike_when_packed,
+    tidy,
+)
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.scenes.measure import sizes
-from sundae_ns.training.budget import bytes_of, driver
-from sundae_ns.training.budget.run import Run as Searched
+from sundae_ns.scenes.opening import open_scene
+from sundae_ns.training.budget import bytes_of, extension
+from sundae_ns.training.budget.search import Search
+from sundae_ns.training.budget.searched_field import SearchedField
 
 
 def test_it_cuts_and_keeps_the_target(done: Run) -> None:
@@ -43,17 +55,17 @@ def test_it_cuts_and_keeps_the_target(done: Run) -> None:
     assert (done.folder / "budget.txt").read_text().count("\n") == len(found["curve"])
     (report,) = json.loads((done.folder / "prune.json").read_text())
     assert (report["before"], report["after"], report["peak"]) == (200, found["primitives"], 200)
+    assert open_scene(done.folder).kept == found["primitives"] / 200
 
 
-def recovering(at_last: float) -> Callable[[Searched], float]:
-    """PSNR on held-back views: 20 dB of the whole field, and of a cut one what is foreseen to reach 19.5 and does not."""
+def recovering(search: Search, at_last: float) -> Callable[[SearchedField], float]:
+    """PSNR on held-out views: 20 dB for the whole field; a cut one is predicted to reach 19.5 dB, and does not."""
 
-    def measure(run: Searched) -> float:
-        model = run.model
-        if model.num_points == 200:
-            return 20.0 if run.degree > 0 else 19.0
-        age = model.schedule_step - model.budget.search.cut_at
-        return at_last if run.steps_left == 0 else {4: 18.0, 8: 19.0}.get(age, 19.45)
+    def measure(searched: SearchedField) -> float:
+        if searched.count == 200:
+            return 20.0 if searched.field.sh_degree > 0 else 19.0
+        age = searched.state.schedule_step - search.cut_at
+        return at_last if searched.steps_left == 0 else {4: 18.0, 8: 19.0}.get(age, 19.45)
 
     return measure
 
@@ -64,18 +76,21 @@ def test_the_last_cut_may_take_until_the_last_step(
 ) -> None:
     least: list[float] = []
 
-    def flatten(run: Searched, lowest: float) -> Tensor:
+    def flatten(searched: SearchedField, lowest: float) -> Tensor:
         least.append(lowest)
-        return torch.zeros(run.model.num_points, dtype=torch.bool)
+        return torch.zeros(searched.count, dtype=torch.bool)
 
-    monkeypatch.setattr(driver, "flatten", flatten)
-    monkeypatch.setattr(Searched, "measure", recovering(at_last))
     trainer = make(model_options={"head": HeadConfig(mode="off")})
+    monkeypatch.setattr(extension, "flatten", flatten)
+    search = search_of(trainer.pipeline.model.extensions).search
+    monkeypatch.setattr(SearchedField, "measure", recovering(search, at_last))
     trainer.train()
     run = Run(trainer)
-    assert least == [pytest.approx(19.5 if kept == 100 else 20 - 0.25 * 0.5)], "no training makes up for less"
-    *looks, last, final = run.found["curve"]
-    assert {look["verdict"] for look in looks} == {"waiting"}
+    assert least == [pytest.approx(19.5 if kept == 100 else 20 - 0.25 * 0.5)], (
+        "no training follows that could recover more"
+    )
+    *points, last, final = run.found["curve"]
+    assert {point["verdict"] for point in points} == {"waiting"}
     assert (last["step"], last["primitives"]) == (STEPS - 1, 100)
     assert last["verdict"] == ("accepted" if kept == 100 else "rejected")
     assert (final["verdict"], final["primitives"], run.found["phase"]) == ("reached", kept, "done")
@@ -83,43 +98,44 @@ def test_the_last_cut_may_take_until_the_last_step(
 
 
 def test_a_run_that_ends_before_its_search_may_be_trained_on(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Searched, "measure", recovering(19.49))
     trainer = make(model_options={"head": HeadConfig(mode="off")}, stop=STEPS)
+    search = search_of(trainer.pipeline.model.extensions).search
+    monkeypatch.setattr(SearchedField, "measure", recovering(search, 19.49))
     trainer.train()
     found = Run(trainer).found
     assert (found["phase"], found["trying"], found["curve"][-1]["verdict"]) == ("field", True, "missed")
 
 
-END_OF_BANDS = PRUNE_AT + 2 * 12
-"""Step at which a field of degree 1 has been compared with one of degree 0."""
+END_OF_TRIALS = PRUNE_AT + 2 * 12
+"""Step at which SH degree 1 has been compared with degree 0."""
 
 
-def degree_0_will_do(run: Searched) -> float:
+def degree_0_suffices(searched: SearchedField) -> float:
     return 20.0
 
 
 @pytest.mark.parametrize(
     ("stop", "steps", "degree", "lost"),
     [
-        (PRUNE_AT + 1, STEPS, 0, 12),  # the trials go on behind it
-        (END_OF_BANDS, END_OF_BANDS + 1, 0, 12),
-        (END_OF_BANDS + 1, END_OF_BANDS + 2, 0, 12),  # no time to judge another cut
-        (END_OF_BANDS - 4, END_OF_BANDS - 3, 1, 8),  # the run ends in the midst of the second trial
-        (PRUNE_AT + 5, PRUNE_AT + 6, 1, 0),  # of the first
+        (PRUNE_AT + 1, STEPS, 0, 12),  # the trials go on after it
+        (END_OF_TRIALS, END_OF_TRIALS + 1, 0, 12),
+        (END_OF_TRIALS + 1, END_OF_TRIALS + 2, 0, 12),  # no time to judge another cut
+        (END_OF_TRIALS - 4, END_OF_TRIALS - 3, 1, 8),  # the run ends during the second trial
+        (PRUNE_AT + 5, PRUNE_AT + 6, 1, 0),  # during the first
         (PRUNE_AT, PRUNE_AT + 1, 1, 0),
     ],
 )
-def test_nothing_is_tried_that_nobody_can_judge(
+def test_nothing_is_tried_that_cannot_be_judged(
     make: Make, monkeypatch: pytest.MonkeyPatch, stop: int, steps: int, degree: int, lost: int
 ) -> None:
-    snapshot, kept = Searched.snapshot, []
+    snapshot, kept = SearchedField.snapshot, []
 
-    def noted(run: Searched, *, head: bool) -> Any:
-        kept.append(run.model.means.detach().clone())
-        return snapshot(run, head=head)
+    def noted(searched: SearchedField, *, head: bool) -> Any:
+        kept.append(searched.field["means"].detach().clone())
+        return snapshot(searched, head=head)
 
-    monkeypatch.setattr(Searched, "snapshot", noted)
-    monkeypatch.setattr(Searched, "measure", degree_0_will_do)
+    monkeypatch.setattr(SearchedField, "snapshot", noted)
+    monkeypatch.setattr(SearchedField, "measure", degree_0_suffices)
     trainer = make(model_options={"head": HeadConfig(mode="off")}, stop=stop, max_num_iterations=steps)
     trainer.train()
     run = Run(trainer)
@@ -131,8 +147,8 @@ def test_nothing_is_tried_that_nobody_can_judge(
         assert torch.equal(trainer.pipeline.model.means, kept[-1]), "the field of the first trial"
 
 
-def test_a_count_is_kept_by_a_run_that_ends_in_the_midst_of_a_trial(make: Make) -> None:
-    at = END_OF_BANDS - 4
+def test_a_run_that_ends_during_a_trial_keeps_the_count(make: Make) -> None:
+    at = END_OF_TRIALS - 4
     trainer = make(max_psnr_drop=None, max_primitives=37, stop=at, max_num_iterations=at + 1)
     trainer.train()
     found = Run(trainer).found
@@ -140,31 +156,31 @@ def test_a_count_is_kept_by_a_run_that_ends_in_the_midst_of_a_trial(make: Make) 
 
 
 @pytest.mark.parametrize("stop", [STOP, 200])
-def test_no_head_joins_and_nothing_is_cut_where_too_few_steps_are_left(
+def test_no_head_is_enabled_and_nothing_is_cut_if_too_few_steps_are_left(
     make: Make, small_head: dict[str, Any], monkeypatch: pytest.MonkeyPatch, stop: int
 ) -> None:
-    monkeypatch.setattr(Searched, "measure", degree_0_will_do)
-    steps = END_OF_BANDS + (5 if stop == STOP else 4)
+    monkeypatch.setattr(SearchedField, "measure", degree_0_suffices)
+    steps = END_OF_TRIALS + (5 if stop == STOP else 4)
     trainer = make(model_options=small_head, stop=stop, max_num_iterations=steps)
     trainer.train()
     found = Run(trainer).found
     assert (found["primitives"], found["trying"], found["head_at"]) == (200, False, 0)
-    assert found["phase"] == ("done" if stop == STOP else "field"), "the half that comes before the head may go on"
+    assert found["phase"] == ("done" if stop == STOP else "field"), "the phase before the head may go on"
 
 
 @pytest.mark.parametrize("warm", [False, True])
-def test_a_run_that_ends_in_the_midst_says_how_far_to_train_on(
+def test_a_run_that_ends_during_its_search_says_how_far_to_train_on(
     done: Run, make: Make, capsys: pytest.CaptureFixture[str], warm: bool
 ) -> None:
     start = {"warm_start": done.trainer.checkpoint_dir / f"step-{SAVE:09d}.ckpt"} if warm else {}
     trainer = make(model_options=start, max_num_iterations=PRUNE_AT + 4)
     trainer.train()
-    assert Run(trainer).found["phase"] == "bands"
+    assert Run(trainer).found["phase"] == "degrees"
     expected = STOP - PRUNE_AT if warm else STOP
     assert f"train on to step {expected}." in " ".join(capsys.readouterr().out.split())
 
 
-def test_what_is_written_is_json(done: Run) -> None:
+def test_its_record_is_json(done: Run) -> None:
     def refuse(constant: str) -> None:
         pytest.fail(f"{constant} is no JSON")
 
@@ -183,21 +199,22 @@ def test_flat_colours_stay_flat(done: Run) -> None:
         assert int(flat.sum()) >= done.found["zeroed"]
 
 
-def test_what_was_chosen_is_loaded_again(done: Run) -> None:
+def test_its_choice_is_loaded_again(done: Run) -> None:
     _, pipeline, _, step = eval_setup(done.folder / "config.yml", test_mode="test")
     model: Any = pipeline.model
     assert step == STEPS - 1
     assert model.head is None
-    assert not model.head_active
+    assert not model.state.head_enabled
     for name, value in done.model.gauss_params.items():
         assert torch.equal(model.gauss_params[name], value), name
     assert pipeline.get_average_eval_image_metrics()["psnr"] > 10
 
 
-@pytest.mark.parametrize("phase", ["before", "bands", "field", "done"])
-def test_a_run_resumed_in_the_midst_goes_on_as_if_never_stopped(done: Run, make: Make, phase: str) -> None:
+@pytest.mark.parametrize("phase", ["before", "degrees", "field", "done"])
+def test_a_run_resumed_during_its_search_ends_like_one_that_never_stopped(done: Run, make: Make, phase: str) -> None:
     states = {step: done.checkpoint(step) for step in range(SAVE, STEPS, SAVE)}
-    phases = {step: s["pipeline"]["_model._extra_state"]["budget"]["numbers"]["phase"] for step, s in states.items()}
+    extras = {step: state["pipeline"]["_model._extra_state"] for step, state in states.items()}
+    phases = {step: extra["extensions"]["budget"]["numbers"]["phase"] for step, extra in extras.items()}
     start = next(step for step, at in phases.items() if at == phase)
     left = STEPS - 1 - start
     trainer = make(load_dir=done.trainer.checkpoint_dir, load_step=start, max_num_iterations=left)
@@ -221,9 +238,9 @@ def test_primitives_are_kept_exactly(make: Make) -> None:
     trainer = make(max_psnr_drop=None, max_primitives=37)
     trainer.train()
     assert trainer.pipeline.model.num_points == 37
-    look, final = Run(trainer).found["curve"]
-    assert (look["verdict"], look["primitives"], final["primitives"]) == ("cut", 37, 37)
-    assert (look["since_cut"], final["since_cut"]) == (0, final["step"] - look["step"])
+    point, final = Run(trainer).found["curve"]
+    assert (point["verdict"], point["primitives"], final["primitives"]) == ("cut", 37, 37)
+    assert (point["since_cut"], final["since_cut"]) == (0, final["step"] - point["step"])
 
 
 def test_a_warm_up_by_mcmc_ends_at_its_cap(make: Make) -> None:
@@ -231,22 +248,7 @@ def test_a_warm_up_by_mcmc_ends_at_its_cap(make: Make) -> None:
     trainer = make(model_options=chain, max_psnr_drop=None, max_primitives=37)
     trainer.train()
     model: Any = trainer.pipeline.model
-    assert (Run(trainer).found["before"], model.pruning_state["peak"], model.num_points) == (260, 260, 37)
-
-
-def test_a_plain_wall_comes_out_tiny(tmp_path: Path) -> None:
-    """At the same allowed drop a flat, painted wall keeps a tenth of what the embedded scene keeps, and fewer bands."""
-    script, out = Path(__file__).parents[3] / "benchmarks" / "budget.py", tmp_path / "budget.json"
-    subprocess.run(
-        [sys.executable, str(script), "--out", str(out), "--work", str(tmp_path)], check=True, stdout=subprocess.DEVNULL
-    )
-    still, wall = json.loads(out.read_text())["rows"]
-    assert (still["kind"], wall["kind"]) == ("still-life", "wall")
-    assert 10 * wall["primitives"] <= still["primitives"]
-    assert wall["degree"] < still["degree"]
-    for found in (still, wall):
-        # Looks scatter, so that a run may end a little below its target; not by another allowed drop.
-        assert found["curve"][-1]["psnr"] > found["target"] - found["budget"]["max_psnr_drop"]
+    assert (Run(trainer).found["before"], model.state.pruning["peak"], model.num_points) == (260, 260, 37)
 
 
 def test_bytes_too_few_for_one_primitive(make: Make) -> None:
@@ -254,7 +256,7 @@ def test_bytes_too_few_for_one_primitive(make: Make) -> None:
         make(max_psnr_drop=None, max_bytes=10)
 
 
-def test_views_have_to_be_held_back(scene: Path, tmp_path: Path) -> None:
+def test_views_have_to_be_held_out(scene: Path, tmp_path: Path) -> None:
     trainer = set_up(scene, tmp_path)
     config = trainer.config
     tidy()
@@ -267,8 +269,10 @@ def test_views_have_to_be_held_back(scene: Path, tmp_path: Path) -> None:
 def test_a_checkpoint_without_its_search_is_refused(done: Run, make: Make) -> None:
     model: Any = make().pipeline.model
     state = {name[len("_model.") :]: value for name, value in done.checkpoint(STEPS - 1)["pipeline"].items()}
-    broken = {**state, "_extra_state": {k: v for k, v in state["_extra_state"].items() if k != "budget"}}
-    with pytest.raises(CheckpointError, match="without a search for a budget"):
+    extra = state["_extra_state"]
+    others = {name: value for name, value in extra["extensions"].items() if name != "budget"}
+    broken = {**state, "_extra_state": {**extra, "extensions": others}}
+    with pytest.raises(CheckpointError, match="without a budget search"):
         model.load_state_dict(broken)
     model.load_state_dict(state)
     assert model.num_points == done.model.num_points

@@ -1,4 +1,4 @@
-"""What a codec rounds to is what a reader decodes, to the bit, also for values that it was not fitted to."""
+"""A codec rounds to the values that a reader decodes, bit for bit, also for values to which it was not fitted."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hard_values import hard_values
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from torch import Tensor
@@ -26,34 +27,22 @@ from sundae_ns.storage.packing import (
 )
 
 Floats = NDArray[np.float32]
-few = settings(max_examples=40, deadline=None)
 hard = given(
     st.sampled_from(["normal", "constant", "huge", "tiny", "outliers"]), st.integers(1, 500), st.integers(0, 2**16)
 )
 
 
-def values(kind: str, n: int, width: int, seed: int) -> Floats:
-    rng = np.random.default_rng(seed)
-    x = rng.normal(size=(n, width))
-    if kind == "constant":
-        x[:] = 0.3
-    elif kind == "outliers":
-        x[rng.random((n, width)) < 0.002] *= 1e6
-    return (x * {"huge": 1e6, "tiny": 1e-30}.get(kind, 1.0)).astype(np.float32)
-
-
 def drifted(x: Floats, seed: int) -> Floats:
-    """What training makes of values: some leave the range."""
+    """Values after training: moved, and some out of range."""
     rng = np.random.default_rng(seed + 1)
     moved = x + 0.05 * x.std() * rng.normal(size=x.shape)
     moved[rng.random(len(x)) < 0.01] *= 3
     return moved.astype(np.float32)
 
 
-@few
 @hard
 def test_uniform(kind: str, n: int, seed: int) -> None:
-    x = values(kind, n, 3, seed)
+    x = hard_values(kind, n, 3, seed)
     grid = quantize.fit_grid(x, 4 + seed % 13, shared=seed % 2 == 0)
     for y in (x, drifted(x, seed)):
         packed = quantize.quantize(y, grid)
@@ -61,20 +50,18 @@ def test_uniform(kind: str, n: int, seed: int) -> None:
         assert packed.codes.max() < 2**grid.bits
 
 
-@few
 @given(st.integers(1, 500), st.integers(0, 2**16), st.integers(4, 16))
 def test_rotations(n: int, seed: int, bits: int) -> None:
-    q = values("normal", n, 4, seed)
+    q = hard_values("normal", n, 4, seed)
     q[::7] = [0.5, -0.5, 0.5, 0.5]
     q[::11] = 0
     found = quantize.dequantize_rotations(quantize.quantize_rotations(q, bits), bits)
     assert np.array_equal(quantize.rounded_rotations(torch.from_numpy(q), bits).numpy(), found)
 
 
-@few
 @hard
 def test_weights(kind: str, n: int, seed: int) -> None:
-    x, bits = values(kind, n, 18, seed).reshape(n, 2, 3, 3), 3 + seed % 6
+    x, bits = hard_values(kind, n, 18, seed).reshape(n, 2, 3, 3), 3 + seed % 6
     step = quantize.weight_steps(torch.from_numpy(x), bits)
     for y in (x, drifted(x, seed)):
         codes = quantize.quantize_weights(y, step.numpy(), bits)
@@ -83,10 +70,9 @@ def test_weights(kind: str, n: int, seed: int) -> None:
         assert np.abs(codes.astype(int)).max() < 2 ** (bits - 1)
 
 
-@few
 @hard
 def test_transform(kind: str, n: int, seed: int) -> None:
-    x = values(kind, n, 9, seed)
+    x = hard_values(kind, n, 9, seed)
     basis = transform.fit_basis(x, 0.03)
     for y in (x, drifted(x, seed)):
         packed = transform.forward(y, basis)
@@ -94,10 +80,9 @@ def test_transform(kind: str, n: int, seed: int) -> None:
         assert np.abs(packed.codes.astype(int)).max(initial=0) <= basis.limit
 
 
-@few
 @hard
 def test_codebooks(kind: str, n: int, seed: int) -> None:
-    x = values(kind, n, 9, seed)
+    x = hard_values(kind, n, 9, seed)
     books = codebooks.books_of(codebooks.fit(x, 1 + seed % 3))
     for y in (x, drifted(x, seed)):
         packed = codebooks.encode(y, books)
@@ -128,7 +113,7 @@ def scene(n: int = 700) -> Scene:
         PackConfig(harmonics="codebooks", feature_books=2, head="fp16", feature_bits=12),
     ],
 )
-def test_a_file_holds_what_training_saw(tmp_path: Path, config: PackConfig) -> None:
+def test_a_file_holds_the_values_rounded_in_training(tmp_path: Path, config: PackConfig) -> None:
     fitted, codecs = fit_scene(scene(), config)
     g = torch.Generator().manual_seed(1)
     moved = {name: value + 0.02 * torch.randn(value.shape, generator=g) for name, value in fitted.field.items()}
@@ -136,14 +121,14 @@ def test_a_file_holds_what_training_saw(tmp_path: Path, config: PackConfig) -> N
     head = {name: codecs.head.within(name, 1.1 * value) for name, value in fitted.head.items()}
     write_fitted(tmp_path / "a.sundae", Scene(moved, head), codecs)
     found = read_scene(tmp_path / "a.sundae")
-    seen, seen_head = codecs.rounded(moved), codecs.rounded_head(head)
+    rounded, rounded_head = codecs.rounded(moved), codecs.rounded_head(head)
     assert torch.equal(found.field["means"], fitted.field["means"])
     for name in codecs.field:
-        assert torch.equal(found.field[name], seen[name]), name
-        assert not torch.equal(seen[name], moved[name]), name
+        assert torch.equal(found.field[name], rounded[name]), name
+        assert not torch.equal(rounded[name], moved[name]), name
     assert found.head.keys() == head.keys()
     for name, value in found.head.items():
-        assert torch.equal(value, seen_head[name]), name
+        assert torch.equal(value, rounded_head[name]), name
 
 
 def test_packing_is_fitting_and_writing(tmp_path: Path) -> None:
@@ -181,12 +166,12 @@ def test_fewer_bits_of_the_head_are_fewer_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.gpu
 def test_rounding_is_the_same_on_a_gpu() -> None:
-    """The same levels; values but for the last bits, since a GPU takes roots, quotients and sums its own way."""
+    """Levels are equal; values differ in the last bits, because a GPU rounds roots, quotients and sums differently."""
     fitted, codecs = fit_scene(scene(), PackConfig(feature_bits=5))
     cuda = torch.device("cuda")
-    here, there = codecs.rounded(fitted.field), codecs.to(cuda).rounded(_moved(fitted.field, cuda))
+    on_cpu, on_gpu = codecs.rounded(fitted.field), codecs.to(cuda).rounded(_moved(fitted.field, cuda))
     for name in codecs.field:
-        torch.testing.assert_close(there[name].cpu(), here[name], rtol=1e-6, atol=1e-6, msg=name)
+        torch.testing.assert_close(on_gpu[name].cpu(), on_cpu[name], rtol=1e-6, atol=1e-6, msg=name)
     head = codecs.to(cuda).rounded_head(_moved(fitted.head, cuda))
     for name, value in codecs.rounded_head(fitted.head).items():
         torch.testing.assert_close(head[name].cpu(), value, rtol=1e-6, atol=0, msg=name)

@@ -1,4 +1,4 @@
-"""Both ends of everything that has ends: options that are just right and just wrong, and headers that state the same."""
+"""Limits of options, headers and sections: values at each limit are accepted, values just beyond it are refused."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.storage.packing import PackConfig, Scene, codebooks, container, morton, quantize, read_scene, write_scene
 
 Json = dict[str, Any]
-ENDS: dict[str, tuple[Any, Any, Any, Any]] = {
-    # too little, least, most, too much
+LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {
+    # below the minimum, minimum, maximum, above the maximum
     "position_bits": (3, 4, 21, 22),
     "block": (15, 16, 1 << 20, (1 << 20) + 1),
     "scale_bits": (3, 4, 16, 17),
@@ -55,10 +55,10 @@ def scene(n: int = 40, degree: int = 1, features: int = 3) -> Scene:
     return Scene(field, head, cameras)
 
 
-@pytest.mark.parametrize("name", ENDS)
-def test_options_reach_to_their_ends_and_no_further(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", LIMITS)
+def test_options_are_accepted_up_to_their_limits(tmp_path: Path, name: str) -> None:
     config = PackConfig(harmonics="codebooks" if name == "harmonics_books" else "transform")
-    below, least, most, above = ENDS[name]
+    below, least, most, above = LIMITS[name]
     for value in (below, above):
         with pytest.raises(ConfigError, match=name.replace("_", "-")):
             replace(config, **{name: value}).validate()
@@ -75,7 +75,7 @@ def test_options_reach_to_their_ends_and_no_further(tmp_path: Path, name: str) -
 
 
 def restated(path: Path, change: Callable[[Json], None]) -> None:
-    """The same sections behind a header that states something else, its checksum right."""
+    """Change the header of a file and keep its checksum valid."""
     content = path.read_bytes()
     (length,) = struct.unpack("<I", content[12:16])
     meta = json.loads(content[48 : 48 + length])
@@ -87,7 +87,7 @@ def restated(path: Path, change: Callable[[Json], None]) -> None:
 
 
 def resectioned(path: Path, name: str, array: Any) -> None:
-    """The same file with another array in the place of a section, all checksums right."""
+    """Replace a section of a file and keep all checksums valid."""
     header = container.read_header(path)
     meta = {key: value for key, value in header.meta.items() if key != "sections"}
     container.write(path, meta, {**container.read_sections(path, header), name: array})
@@ -106,7 +106,7 @@ STATED: dict[str, tuple[str, str, tuple[Any, ...]]] = {
 
 
 @pytest.mark.parametrize("case", STATED)
-def test_headers_just_beyond_the_ends_are_refused(tmp_path: Path, case: str) -> None:
+def test_headers_beyond_the_limits_are_refused(tmp_path: Path, case: str) -> None:
     attribute, key, values = STATED[case]
     for value in values:
         path = tmp_path / "a.sundae"
@@ -117,8 +117,8 @@ def test_headers_just_beyond_the_ends_are_refused(tmp_path: Path, case: str) -> 
 
 
 SECTIONS: dict[str, tuple[str, Any]] = {
-    "a picture without width": ("cameras/sizes", np.array([[64, 48], [0, 24]], np.uint32)),
-    "a picture of 65,537 pixels": ("cameras/sizes", np.array([[65537, 48], [32, 24]], np.uint32)),
+    "an image without width": ("cameras/sizes", np.array([[64, 48], [0, 24]], np.uint32)),
+    "an image of 65,537 pixels": ("cameras/sizes", np.array([[65537, 48], [32, 24]], np.uint32)),
     "a camera too few": ("cameras/sizes", np.array([[64, 48]], np.uint32)),
     "a pose that is infinite": ("cameras/poses", np.full((2, 3, 4), np.inf, np.float32)),
     "an exception outside": ("scales/places", np.array([120], np.uint32)),
@@ -129,13 +129,13 @@ SECTIONS: dict[str, tuple[str, Any]] = {
     "a head without its last bias": ("head/plain", np.zeros(3, np.float32)),
     "a head with a step too few": ("head/steps", np.zeros(3, np.float32)),
     "weights that are not finite": ("head/steps", np.full(4, np.nan, np.float32)),
-    "blocks that are too few": ("means/low", np.zeros((0, 3), np.float32)),
-    "crumbs that are too few": ("quats/largest", np.zeros(9, np.uint8)),
+    "too few blocks": ("means/low", np.zeros((0, 3), np.float32)),
+    "too few indices of largest components": ("quats/largest", np.zeros(9, np.uint8)),
 }
 
 
 @pytest.mark.parametrize("case", SECTIONS)
-def test_sections_just_beyond_the_ends_are_refused(tmp_path: Path, case: str) -> None:
+def test_sections_beyond_the_limits_are_refused(tmp_path: Path, case: str) -> None:
     path = tmp_path / "a.sundae"
     write_scene(path, scene())
     name, array = SECTIONS[case]
@@ -145,7 +145,7 @@ def test_sections_just_beyond_the_ends_are_refused(tmp_path: Path, case: str) ->
         read_scene(path)
 
 
-def test_what_lies_at_the_ends_is_read(tmp_path: Path) -> None:
+def test_sections_at_the_limits_are_read(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     write_scene(path, scene())
     before = read_scene(path)
@@ -177,7 +177,7 @@ def test_books_of_a_file(tmp_path: Path, books: int, fits: bool) -> None:
 
 @pytest.mark.parametrize(("entry", "width", "fits"), [(0, 3, True), (1, 3, False), (0, 4, False)])
 def test_entries_of_a_book(tmp_path: Path, entry: int, width: int, fits: bool) -> None:
-    """One book with one entry: index 1 is outside, and an entry of 4 numbers is none of 3 features."""
+    """One book with one entry: index 1 is out of range, and an entry of 4 numbers does not fit 3 features."""
     path = tmp_path / "a.sundae"
     write_scene(path, scene(), PackConfig(feature_books=1))
     indices = np.zeros((1, 40), np.uint8)
@@ -206,15 +206,15 @@ def test_shapes_of_the_head(tmp_path: Path, shape: list[int], fits: bool) -> Non
             read_scene(path)
 
 
-def test_a_header_that_nobody_could_read_is_not_written(tmp_path: Path) -> None:
+def test_a_header_too_long_for_readers_is_not_written(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     meta = {"name": "x" * container.MAX_HEADER}
-    with pytest.raises(PackError, match="the header would take"):
+    with pytest.raises(PackError, match="the header takes"):
         write_scene(path, replace(scene(), meta=meta))
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_that_goes_away_meanwhile_is_said_to(tmp_path: Path) -> None:
+def test_a_file_removed_after_its_header_was_read_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     write_scene(path, scene())
     header = container.read_header(path)
@@ -233,7 +233,7 @@ def test_codes_are_as_wide_as_their_bits(tmp_path: Path, bits: int) -> None:
     assert quantize.code_type(bits) == expected
 
 
-def test_a_centre_that_nobody_is_nearest_to_stays_where_it_is() -> None:
+def test_a_centre_without_rows_is_unchanged() -> None:
     rows = torch.full((50, 2), 3.0).double()
     centres = codebooks.kmeans(rows, 4, torch.Generator().manual_seed(0))
     assert torch.equal(centres, rows[:4])
@@ -249,8 +249,8 @@ def test_small_fields_get_small_books_and_a_thousandth_of_the_rows_is_exact() ->
         assert (np.abs(found.entries).max(axis=(1, 2)) == 127).all() or n == 1
 
 
-def test_the_order_of_points_on_a_line_is_the_line() -> None:
-    """At both ends too, where a code of one bit too many would begin anew; and where most points are one."""
+def test_scene_order_sorts_points_on_a_line() -> None:
+    """Also at both ends, where a code with one bit too many would wrap around, and if most points coincide."""
     x = np.random.default_rng(0).permutation(np.linspace(-3, 5, 500)).astype(np.float32)
     for axis in range(3):
         means = np.zeros((500, 3), np.float32)
@@ -261,7 +261,7 @@ def test_the_order_of_points_on_a_line_is_the_line() -> None:
         assert (np.diff(ordered) >= 0).all()
 
 
-def test_a_head_that_shrinks_to_nothing_is_padded_too(tmp_path: Path) -> None:
+def test_a_head_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     head = {"a.weight": torch.zeros(1000, 3500)}
     report = write_scene(path, Scene(scene().field, head))
@@ -271,7 +271,7 @@ def test_a_head_that_shrinks_to_nothing_is_padded_too(tmp_path: Path) -> None:
     assert torch.equal(read_scene(path).head["a.weight"], head["a.weight"])
 
 
-def test_steps_of_books_that_are_too_large_are_refused_one_by_one(tmp_path: Path) -> None:
+def test_a_too_large_step_of_one_book_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     write_scene(path, scene(), PackConfig(feature_books=2))
     resectioned(path, "features/steps", np.array([0.5, 1e38], np.float32))
@@ -288,7 +288,7 @@ def test_a_head_has_a_list_of_tensors(tmp_path: Path, tensors: Any) -> None:
         read_scene(path)
 
 
-def test_what_is_no_json_is_not_written(tmp_path: Path) -> None:
+def test_a_nan_in_the_header_is_not_written(tmp_path: Path) -> None:
     """Readers refuse a header with NaN."""
     with pytest.raises(ValueError, match="JSON"):
         write_scene(tmp_path / "a.sundae", replace(scene(), meta={"scale": float("nan")}))

@@ -1,4 +1,4 @@
-"""Packed scenes as a whole: what comes back, how exact, how large, and what is refused."""
+"""Packed scenes: round trip, error bounds, sizes and refusals."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def matched(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Ten
 
 
 @pytest.mark.parametrize("config", [PackConfig(), PackConfig(harmonics="codebooks", feature_books=2, head="fp16")])
-def test_everything_comes_back_within_the_stated_bounds(tmp_path: Path, config: PackConfig) -> None:
+def test_everything_is_decoded_within_the_stated_bounds(tmp_path: Path, config: PackConfig) -> None:
     path, truth = tmp_path / "a.sundae", field()
     meta = {"model": {"sh_degree": 2}, "name": "überall"}
     write_scene(path, Scene(truth, head(), cameras(), meta), config)
@@ -71,7 +71,7 @@ def test_everything_comes_back_within_the_stated_bounds(tmp_path: Path, config: 
         assert found[name].shape == truth[name].shape
         bound = torch.tensor(about[name]["bound"])
         off = (found[name] - truth[name]).abs()
-        if about[name]["codec"] == "codebooks":  # but for the few rows that are exact
+        if about[name]["codec"] == "codebooks":  # one bound for all columns
             off = off.reshape(600, -1)
         assert (off <= bound + 1e-5).all(), name
         assert off.max() > 0.3 * bound.min(), name
@@ -97,7 +97,7 @@ def test_small_fields(tmp_path: Path, n: int, degree: int, features: int) -> Non
     assert sum(report.bits.values()) * n / 8 == pytest.approx(report.bytes)
 
 
-def test_constant_attributes_come_back_exactly(tmp_path: Path) -> None:
+def test_constant_attributes_are_exact(tmp_path: Path) -> None:
     one = field(1)
     truth = {name: value.repeat(40, *([1] * (value.ndim - 1))) for name, value in one.items()}
     write_scene(tmp_path / "a.sundae", Scene(truth))
@@ -106,7 +106,7 @@ def test_constant_attributes_come_back_exactly(tmp_path: Path) -> None:
         assert torch.equal(found[name], truth[name]), name
 
 
-def test_a_scene_that_shrinks_to_nothing_is_padded_so_that_it_can_be_read(tmp_path: Path) -> None:
+def test_a_scene_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     one = field(1, 3, 13)
     truth = {name: value.expand(60_000, *value.shape[1:]) for name, value in one.items()}
@@ -118,8 +118,8 @@ def test_a_scene_that_shrinks_to_nothing_is_padded_so_that_it_can_be_read(tmp_pa
     assert torch.equal(read_scene(path).field["means"], truth["means"])
 
 
-def test_it_takes_few_bytes(tmp_path: Path) -> None:
-    """A guard against a codec that has stopped to compress: this field takes 29 bytes a primitive instead of 272."""
+def test_packing_takes_few_bytes(tmp_path: Path) -> None:
+    """This field takes 29 bytes per primitive instead of 272."""
     g = torch.Generator().manual_seed(0)
     truth = field(20_000, 3, 9)
     truth["features_rest"] = (
@@ -131,14 +131,14 @@ def test_it_takes_few_bytes(tmp_path: Path) -> None:
     assert sum(report.bits.values()) / 8 < 30
 
 
-def test_packing_is_a_function_of_the_scene(tmp_path: Path) -> None:
+def test_packing_is_deterministic(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_scene(tmp_path / name, Scene(field(), head(), cameras()), PackConfig(harmonics="codebooks"))
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
 @pytest.mark.parametrize(("name", "value"), [("means", torch.nan), ("features", torch.inf), ("quats", -torch.inf)])
-def test_what_is_not_finite_is_refused(tmp_path: Path, name: str, value: float) -> None:
+def test_values_that_are_not_finite_are_refused(tmp_path: Path, name: str, value: float) -> None:
     broken = field()
     broken[name][5, 1] = value
     with pytest.raises(PackError, match="1 of 600 primitives are not finite"):
@@ -146,7 +146,7 @@ def test_what_is_not_finite_is_refused(tmp_path: Path, name: str, value: float) 
     assert not list(tmp_path.iterdir())
 
 
-def test_what_cannot_be_packed_is_refused(tmp_path: Path) -> None:
+def test_invalid_fields_heads_and_options_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     with pytest.raises(PackError, match="no primitives"):
         write_scene(path, Scene(field(0)))
@@ -182,7 +182,7 @@ def test_a_pack_that_fails_leaves_the_older_file(tmp_path: Path, monkeypatch: py
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.sundae", b"years of work")]
 
 
-def test_any_altered_byte_is_noticed(tmp_path: Path) -> None:
+def test_any_altered_byte_is_detected(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     write_scene(path, Scene(field(40, 1, 1), head()))
     good = path.read_bytes()
@@ -192,14 +192,14 @@ def test_any_altered_byte_is_noticed(tmp_path: Path) -> None:
             read_scene(path)
     for length in (0, 7, 20, 47, 48, 300, len(good) - 1):
         path.write_bytes(good[:length])
-        with pytest.raises(PackError, match=r"not a whole packed scene|no packed scene"):
+        with pytest.raises(PackError, match=r"not a whole packed scene|not a packed scene"):
             read_scene(path)
     path.write_bytes(good + b"\0")
     with pytest.raises(PackError, match="its header states"):
         read_scene(path)
 
 
-def test_another_version_is_told_apart_from_damage(tmp_path: Path) -> None:
+def test_another_version_has_an_error_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     write_scene(path, Scene(field(20)))
     content = bytearray(path.read_bytes())
@@ -211,8 +211,8 @@ def test_another_version_is_told_apart_from_damage(tmp_path: Path) -> None:
         read_scene(tmp_path / "b.sundae")
 
 
-def test_the_file_is_what_its_documentation_says(tmp_path: Path) -> None:
-    """Read by the words of ``docs/packing.md`` alone."""
+def test_the_file_follows_its_documentation(tmp_path: Path) -> None:
+    """Decode a section by ``docs/formats.md``, without the package's reader."""
     import zstandard
 
     path = tmp_path / "a.sundae"

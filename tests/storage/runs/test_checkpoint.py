@@ -1,4 +1,4 @@
-"""Checkpoints: what is accepted, what is refused in one line, and fields read from other programs' files."""
+"""Checkpoints: those that load, those that are refused in one line, and fields from files of other programs."""
 
 from __future__ import annotations
 
@@ -35,14 +35,27 @@ def field(n: int = 6, degree: int = 3) -> dict[str, Tensor]:
 def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
     state: dict[str, Any] = {f"gauss_params.{name}": value for name, value in field(n, degree).items()}
     state["gauss_params.features"] = torch.zeros(n, 5)
-    state["head.weight"] = torch.zeros(4, 4)
-    about = checkpoint.extra_state(7, 5, {"grad2d": None}, {"pruned_at": -1}, None)
+    state["networks.head.weight"] = torch.zeros(4, 4)
+    about = checkpoint.extra_state(
+        step=7,
+        num_features=5,
+        encoding="harmonics",
+        running={"densification": {"grad2d": None}, "pruning": {"pruned_at": -1}},
+        extensions={},
+        trained_focal=None,
+    )
     state["_extra_state"] = {**about, **extra}
     return state
 
 
+def check(state: dict[str, Any], **options: Any) -> None:
+    """The checks of a checkpoint against a model of 6 primitives, in the order of loading."""
+    checkpoint.check_extra_state(state, 5, "harmonics")
+    checkpoint.check_model_state(state, model_state(6), **options)
+
+
 def stock_checkpoint(path: Path, prefix: str = "_model.", n: int = 6) -> dict[str, Tensor]:
-    """What nerfstudio's trainer writes for splatfacto: its own scheduler leaves a numpy number in it."""
+    """A checkpoint of splatfacto by nerfstudio's trainer, whose scheduler leaves a numpy number in it."""
     params = field(n)
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.6e-4)
     config = ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=100)
@@ -67,13 +80,13 @@ def one_line(error: BaseException) -> bool:
 
 
 def test_another_number_of_primitives_fits() -> None:
-    checkpoint.check_model_state(model_state(9), model_state(6), 5)
+    check(model_state(9))
 
 
-def test_a_part_of_a_field_may_be_empty_and_a_field_may_not() -> None:
-    checkpoint.check_model_state(model_state(0), model_state(6), 5, shard=True)
+def test_a_shard_may_be_empty_and_a_field_may_not() -> None:
+    check(model_state(0), may_be_empty=True)
     with pytest.raises(CheckpointError, match=r"parameters of \[0\] primitives"):
-        checkpoint.check_model_state(model_state(0), model_state(6), 5)
+        check(model_state(0))
 
 
 def _without(name: str) -> dict[str, Any]:
@@ -86,16 +99,32 @@ def _without(name: str) -> dict[str, Any]:
         (_without("_extra_state"), "splatfacto checkpoint.*warm-start"),
         ({"field.weight": torch.zeros(1)}, "another method.*warm-start"),
         (model_state(method="other"), "not one of sundae"),
+        (model_state(format=1), "format 1, this version reads 2; use the version that wrote it"),
         (model_state(format=99), "format 99"),
+        (model_state(encoding="logits"), "colours as logits, the model as harmonics; .*sh-degree"),
+        (model_state(running=None), "where training stopped"),
+        (model_state(extensions=[]), "where training stopped"),
+        (
+            {
+                **model_state(),
+                "_extra_state": {"method": "sundae", "format": 2, "num_features": 5, "encoding": "harmonics"},
+            },
+            "where training stopped",
+        ),
+        (model_state(running={"densification": {}, "pruning": {"pruned_at": "x"}}), "where training stopped"),
+        (model_state(running={"densification": {"grad2d": torch.zeros(7)}, "pruning": {}}), "grad2d has 7 rows"),
         (model_state(num_features=13), "length 13.*length 5.*num-features 13"),
-        (_without("head.weight"), "no head.weight"),
-        ({**model_state(), "head.weight": torch.zeros(8, 4)}, r"head.weight is \[8, 4\].*\[4, 4\].*head.size compact"),
+        (_without("networks.head.weight"), "no networks.head.weight"),
+        (
+            {**model_state(), "networks.head.weight": torch.zeros(8, 4)},
+            r"networks.head.weight is \[8, 4\].*\[4, 4\].*--pipeline.model.head.size",
+        ),
         (model_state(degree=2), r"features_rest is \[6, 8, 3\].*\[6, 15, 3\]"),
     ],
 )
-def test_what_does_not_fit_is_refused(state: dict[str, Any], cause: str) -> None:
+def test_a_checkpoint_that_does_not_fit_is_refused(state: dict[str, Any], cause: str) -> None:
     with pytest.raises(CheckpointError, match=cause) as caught:
-        checkpoint.check_model_state(state, model_state(), 5)
+        check(state)
     assert one_line(caught.value)
 
 
@@ -110,28 +139,55 @@ def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> Non
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
 
 
+SUNDAE = {"method": "sundae", "format": checkpoint.FORMAT}
+
+
+def save_without_harmonics(folder: Path, extra: Any) -> None:
+    """A checkpoint of SH degree 0, with the state of a model beside its tensors if any is given."""
+    state = {f"_model.gauss_params.{name}": value for name, value in field().items()}
+    state["_model.gauss_params.features_rest"] = state["_model.gauss_params.features_rest"][:, :0]
+    if extra is not None:
+        state["_model._extra_state"] = extra
+    torch.save({"step": 1, "pipeline": state}, folder / "step-000000001.ckpt")
+
+
 @pytest.mark.parametrize(
     ("extra", "logits"),
     [
         (None, True),
         ({}, True),
-        ({"logits": True, "budget": {}}, True),
-        ({"logits": False}, False),
-        ({"budget": {}}, False),
-        ({"logits": torch.zeros(2)}, True),
+        ({"method": "other"}, True),
+        ({**SUNDAE, "encoding": "logits"}, True),
+        ({**SUNDAE, "encoding": "harmonics"}, False),
     ],
 )
-def test_a_field_without_bands_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
-    """Logits in a model without harmonics; harmonics where a search has left them out."""
-    state = {f"_model.gauss_params.{name}": value for name, value in field().items()}
-    state["_model.gauss_params.features_rest"] = state["_model.gauss_params.features_rest"][:, :0]
-    if extra is not None:
-        state["_model._extra_state"] = extra
-    torch.save({"step": 1, "pipeline": state}, tmp_path / "step-000000001.ckpt")
+def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
+    """Logits if the model was built at degree 0, harmonics if a search has lowered the degree."""
+    save_without_harmonics(tmp_path, extra)
     read, _ = checkpoint.read_field(tmp_path)
     stored = field()["features_dc"]
     expected = sh_to_rgb(read["features_dc"]).logit() if logits else read["features_dc"]
     torch.testing.assert_close(expected, stored)
+
+
+@pytest.mark.parametrize(
+    ("extra", "cause"),
+    [
+        (
+            {"method": "sundae", "format": 1, "logits": True},
+            "format 1, this version reads 2; use the version that wrote",
+        ),
+        (SUNDAE, "does not say how it stores colours"),
+        ({**SUNDAE, "encoding": "words"}, "does not say how it stores colours"),
+        ({**SUNDAE, "encoding": torch.zeros(2)}, "does not say how it stores colours"),
+    ],
+)
+def test_a_field_of_another_format_is_refused(tmp_path: Path, extra: Any, cause: str) -> None:
+    """Its colours could be misread silently."""
+    save_without_harmonics(tmp_path, extra)
+    with pytest.raises(CheckpointError, match=cause) as caught:
+        checkpoint.read_field(tmp_path)
+    assert one_line(caught.value)
 
 
 @pytest.mark.parametrize("inside", [".", "nerfstudio_models"])
@@ -197,7 +253,7 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_what_is_no_field(tmp_path: Path, wrong: str) -> None:
+def test_a_file_without_a_field_is_refused(tmp_path: Path, wrong: str) -> None:
     make, cause = WRONG[wrong]
     path = tmp_path / "a.ckpt"
     make(path)
@@ -208,7 +264,15 @@ def test_what_is_no_field(tmp_path: Path, wrong: str) -> None:
 
 def test_extra_state_is_plain_data(tmp_path: Path) -> None:
     state = checkpoint.extra_state(
-        12, 5, {"grad2d": torch.ones(3), "scene_scale": 1.0}, {"pruned_at": 7}, (900.0, 1100.0)
+        step=12,
+        num_features=5,
+        encoding="harmonics",
+        running={"densification": {"grad2d": torch.ones(3), "scene_scale": 1.0}, "pruning": {"pruned_at": 7}},
+        extensions={"budget": {"numbers": {"phase": "before"}}},
+        trained_focal=(900.0, 1100.0),
     )
     torch.save(state, tmp_path / "a.pt")
-    assert torch.load(tmp_path / "a.pt", weights_only=True)["pruning"] == {"pruned_at": 7}
+    loaded = torch.load(tmp_path / "a.pt", weights_only=True)
+    assert loaded["running"]["pruning"] == {"pruned_at": 7}
+    assert loaded["extensions"] == {"budget": {"numbers": {"phase": "before"}}}
+    assert loaded["trained_focal"] == [900.0, 1100.0]

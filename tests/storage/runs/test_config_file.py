@@ -1,4 +1,4 @@
-"""config.yml made into objects again: what ns-train wrote comes back as it was, and nothing that a file asks for is run."""
+"""``config.yml`` as objects: a configuration of ns-train comes back unchanged, and no code that a file names runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import yaml
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sundae_ns.errors import CheckpointError
+from sundae_ns.errors import CheckpointError, DataError
+from sundae_ns.scenes.cameras import training_cameras
 from sundae_ns.scenes.opening import load_run, open_scene
 from sundae_ns.scenes.packed import scene_of_run
 from sundae_ns.storage.runs.config_file import load_config
@@ -19,7 +20,7 @@ METHODS = sorted(name for name in all_methods if name.startswith("sundae")) + ["
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_was_saved_comes_back(tmp_path: Path, method: str) -> None:
+def test_a_saved_configuration_comes_back(tmp_path: Path, method: str) -> None:
     config = copy.deepcopy(all_methods[method])
     config.data = config.pipeline.datamanager.data = tmp_path / "a capture, ünïcode"
     path = tmp_path / "config.yml"
@@ -31,7 +32,7 @@ def test_what_was_saved_comes_back(tmp_path: Path, method: str) -> None:
     assert found.pipeline.datamanager.data is found.data
 
 
-def test_options_that_came_later_have_their_defaults(tmp_path: Path) -> None:
+def test_options_of_later_versions_have_their_defaults(tmp_path: Path) -> None:
     path = tmp_path / "config.yml"
     path.write_text("!!python/object:nerfstudio.engine.trainer.TrainerConfig {}")
     found = load_config(path)
@@ -61,15 +62,18 @@ HOSTILE = {
     "a tag of nobody": "!unknown 3",
     "half a file": "a: [1",
     "deep lists": "[" * 3000,
+    "an impossible date": "a: 2024-99-99",
+    "a list as a key": "? {{a: 1}}\n: 2",
+    "a merge of a number": "!!python/object:nerfstudio.engine.trainer.TrainerConfig\n<<: 3",
     "no text": "\x00",
 }
 
 
 @pytest.mark.parametrize("kind", HOSTILE)
-def test_nothing_that_it_asks_for_is_run(tmp_path: Path, kind: str) -> None:
+def test_no_code_that_it_names_runs(tmp_path: Path, kind: str) -> None:
     mark, path = tmp_path / "ran", tmp_path / "config.yml"
     path.write_text(HOSTILE[kind].format(mark) if "{}" in HOSTILE[kind] else HOSTILE[kind])
-    for read in (load_config, scene_of_run, open_scene, load_run):
+    for read in (load_config, scene_of_run, open_scene, load_run, training_cameras):
         with pytest.raises(CheckpointError) as raised:
             read(path)
         assert "\n" not in str(raised.value)
@@ -77,7 +81,7 @@ def test_nothing_that_it_asks_for_is_run(tmp_path: Path, kind: str) -> None:
 
 
 def test_nerfstudios_own_reader_runs_it(tmp_path: Path) -> None:
-    """As README warns; if this fails one day, the warning can go."""
+    """README warns of this; if the test fails one day, remove the warning."""
     from nerfstudio.utils.eval_utils import eval_setup
 
     mark, path = tmp_path / "ran", tmp_path / "config.yml"
@@ -88,12 +92,19 @@ def test_nerfstudios_own_reader_runs_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["3", "- 1", "!!python/object:nerfstudio.engine.trainer.TrainerConfig {pipeline: 3}"])
-def test_what_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
+def test_a_file_that_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "config.yml"
     path.write_text(text)
+    with pytest.raises(DataError, match="another layout"):
+        training_cameras(path)
     with pytest.raises(CheckpointError):
         scene_of_run(path)
     with pytest.raises(CheckpointError):
         open_scene(path)
     with pytest.raises(CheckpointError, match=r"cannot be read \(No such file"):
         load_config(tmp_path / "gone.yml")
+    path.write_bytes(b"\xff\xfe\x80")
+    with pytest.raises(CheckpointError, match="is no text"):
+        load_config(path)
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        load_config(tmp_path)

@@ -1,7 +1,8 @@
-"""What a search for a budget takes from a checkpoint, and what it refuses before it has changed anything."""
+"""What a budget search takes from a checkpoint, and what it refuses before it has changed anything."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -9,74 +10,92 @@ import torch
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError
+from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning import PruningConfig
-from sundae_ns.training.budget import Budget
+from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.budget.search import Search
+from sundae_ns.training.densification import ChainStrategy, Densification
+from sundae_ns.training.field_state import FieldState
 
 FIELD = {"field": {"means": torch.zeros(2, 3)}}
 
 
-def budget() -> Budget:
-    return Budget(PruningConfig(mode="auto", stop=20000), HeadConfig())
+def a_state() -> FieldState:
+    """A field of two primitives of SH degree 3, with a tiny head."""
+    params = {"means": torch.zeros(2, 3), "features_rest": torch.zeros(2, 15, 3), "features": torch.zeros(2, 13)}
+    return FieldState(Field(params), torch.nn.ModuleDict({"head": CompensationHead(HeadConfig(size="tiny"))}))
 
 
-def numbers(phase: str, *, trying: bool = False) -> dict[str, Any]:
+def a_search(state: FieldState) -> BudgetSearch:
+    config = PruningConfig(mode="auto", stop=20000)
+    return BudgetSearch(config, HeadConfig(size="tiny"), Densification(ChainStrategy(cap=10)), state)
+
+
+def numbers(phase: str, *, trying: bool = False, **changes: Any) -> dict[str, Any]:
     search = Search(reference=30.1, target=30.0)
     search.begin(phase, 1000)  # type: ignore[arg-type]
     if trying:
         search.cut(30.2, 500, step=3)
-    return search.state()
+    return {**search.state(), **changes}
 
 
 @pytest.mark.parametrize(
-    ("state", "reason"),
+    ("saved", "reason"),
     [
-        (None, "without a search"),
-        ([1], "without a search"),
-        ({}, "without a search"),
-        ({"numbers": 3}, "without a search"),
-        ({"numbers": {}}, "where its search for a budget stood"),
+        ({}, "without a budget search"),
+        ({"numbers": 3}, "without a budget search"),
+        ({"numbers": {}}, "damaged budget search"),
         ({"numbers": numbers("field", trying=True)}, "lacks the field"),
         ({"numbers": numbers("field", trying=True), "accepted": [1]}, "lacks the field"),
-        ({"numbers": numbers("bands"), "accepted": FIELD}, "lacks the field"),
+        ({"numbers": numbers("degrees"), "accepted": FIELD}, "lacks the field"),
         ({"numbers": numbers("head"), "fallback": 3}, "lacks the field"),
     ],
 )
-def test_a_state_that_cannot_be_gone_on_with_is_refused_and_changes_nothing(state: Any, reason: str) -> None:
-    made = budget()
-    before = made.state()
+def test_a_state_that_cannot_be_resumed_is_refused_and_changes_nothing(saved: Any, reason: str) -> None:
+    state = a_state()
+    extension = a_search(state)
+    before = extension.state_dict()
     with pytest.raises(CheckpointError, match=reason) as raised:
-        made.load_state(state)
+        extension.load_state_dict(state, saved)
     assert "\n" not in str(raised.value)
-    assert made.state() == before
+    assert extension.state_dict() == before
 
 
-@pytest.mark.parametrize("phase", ["field", "bands", "head", "done"])
+@pytest.mark.parametrize("phase", ["field", "degrees", "head", "done"])
 def test_a_state_goes_from_one_search_to_the_next(phase: str) -> None:
-    made = budget()
-    made.load_state({"numbers": numbers(phase, trying=True), "accepted": FIELD, "fallback": FIELD, "flat": None})
-    assert made.search.phase == phase
-    assert made.search.trying
-    again = budget()
-    again.load_state(made.state())
-    assert again.state() == made.state()
+    state = a_state()
+    first, second = a_search(state), a_search(state)
+    saved = {"numbers": numbers(phase, trying=True), "accepted": FIELD, "fallback": FIELD, "flat": None}
+    first.load_state_dict(state, saved)
+    assert first.search.phase == phase
+    assert first.search.trying
+    second.load_state_dict(state, first.state_dict())
+    assert second.state_dict() == first.state_dict()
 
 
-def test_once_it_is_decided_that_a_scene_needs_no_head_there_is_none() -> None:
-    made = budget()
-    assert made.head_config == HeadConfig()
-    made.search.head_size, made.search.num_features = "tiny", 5
-    assert made.head_config == HeadConfig(size="tiny", num_features=5)
-    made.search.head_dropped, made.search.head_size, made.search.num_features = True, "", 0
-    assert made.head_config is None
-    expected = {"gauss_params.features": torch.zeros(2, 13), "head.weight": torch.zeros(3)}
-    extra = {"method": "sundae", "budget": {"numbers": {**made.search.state(), "degree": -1}}}
-    shaped = made.shapes(extra, expected)
-    assert {name: value.shape for name, value in shaped.items()} == {"gauss_params.features": (2, 0)}
-    assert made.prepare_head(extra, CompensationHead(HeadConfig())) is None
+@pytest.mark.parametrize("enabled", [True, False])
+def test_the_search_enables_the_head(enabled: bool) -> None:
+    state = a_state()
+    extension = a_search(state)
+    assert state.head_starts_at == math.inf
+    extension.load_state_dict(state, {"numbers": numbers("done", head=enabled)})
+    assert state.head_enabled == enabled
 
 
-def test_of_another_methods_checkpoint_nothing_is_known() -> None:
-    expected = {"gauss_params.means": torch.zeros(2, 3)}
-    for extra in (None, 3, {}, {"method": "splatfacto"}):
-        assert budget().shapes(extra, expected) == expected
+def test_a_checkpoint_gives_field_and_head_their_shapes() -> None:
+    state = a_state()
+    extension = a_search(state)
+    extension.prepare_loading(state, {"numbers": numbers("done", degree=1, head_size="tiny", num_features=5)})
+    assert [state.field[name].shape for name in ("features_rest", "features")] == [(2, 3, 3), (2, 5)]
+    assert state.head is not None
+    assert state.head.config.num_features == 5
+
+
+def test_once_the_search_has_decided_against_a_head_there_is_none() -> None:
+    state = a_state()
+    extension = a_search(state)
+    assert extension.head_config == HeadConfig(size="tiny")
+    extension.prepare_loading(state, {"numbers": numbers("done", head_dropped=True, num_features=0)})
+    assert state.head is None
+    assert state.field["features"].shape == (2, 0)
+    assert state.field["features_rest"].shape == (2, 15, 3), "the degree is not known yet"

@@ -1,0 +1,177 @@
+"""nerfstudio's training callbacks: they call the extensions, which know nothing of nerfstudio's trainer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.utils import writer
+from torch import Tensor
+
+from sundae_ns.datamanager import SundaeDatamanager
+from sundae_ns.rendering import FieldSource, RenderSettings, TrainingView, View
+from sundae_ns.training.extension import Extension, HeldOutView
+from sundae_ns.training.field_state import FieldState
+
+
+class Trained(Protocol):
+    """What the callbacks need of the model."""
+
+    state: FieldState
+    source: FieldSource
+    extensions: list[Extension]
+    step: int
+
+    @property
+    def shown_background(self) -> Tensor:
+        """Background of images that are not trained on ``[3]``."""
+
+    def view_of(self, camera: Cameras, downscale: int = 1) -> View:
+        """The rasteriser's form of a camera."""
+
+    def target(self, image: Tensor, background: Tensor) -> Tensor:
+        """The true image at full resolution over a background ``[H, W, 3]``."""
+
+    def render_settings(self, *, training: bool) -> RenderSettings:
+        """Settings of images at this step."""
+
+
+class NerfstudioRun:
+    """A training by nerfstudio's trainer; see :class:`sundae_ns.training.extension.TrainingRun` for the members.
+
+    Args:
+        model: the model.
+        attributes: of nerfstudio's callbacks. Trainer and pipeline may be missing, as in a test.
+    """
+
+    def __init__(self, model: Trained, attributes: TrainingCallbackAttributes) -> None:
+        self.model = model
+        self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
+        self._trainer = cast(Any, attributes.trainer)
+
+    @property
+    def state(self) -> FieldState:
+        """The field in training."""
+        return self.model.state
+
+    @property
+    def source(self) -> FieldSource:
+        """Where views get their primitives from."""
+        return self.model.source
+
+    @property
+    def background(self) -> Tensor:
+        """Background of images that are not trained on ``[3]``."""
+        return self.model.shown_background
+
+    @property
+    def settings(self) -> RenderSettings:
+        """Settings of images that are not trained on, at this step."""
+        return self.model.render_settings(training=False)
+
+    @property
+    def last_step(self) -> int | None:
+        """Step at which training ends."""
+        return None if self._trainer is None else self._trainer.last_step
+
+    @property
+    def num_steps(self) -> int | None:
+        """Number of steps of the run."""
+        return None if self._trainer is None else self._trainer.config.max_num_iterations
+
+    @property
+    def images_per_step(self) -> int:
+        """Number of images in the batch of a step."""
+        return self._datamanager.place[1]
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder for records, on the first rank."""
+        first = self._datamanager.place[0] == 0
+        return self._trainer.base_dir if self._trainer is not None and first else None
+
+    @property
+    def num_heldout(self) -> int:
+        """Number of held-out training views."""
+        return len(self._datamanager.holdout_indices)
+
+    @property
+    def _datamanager(self) -> SundaeDatamanager:
+        manager: SundaeDatamanager = self._pipeline.datamanager
+        return manager
+
+    def training_views(self) -> list[TrainingView]:
+        """The training views that are not held out."""
+        return training_views(self.model, self._datamanager)
+
+    def heldout_views(self) -> Iterator[HeldOutView]:
+        """The held-out training views, loaded one at a time."""
+        model = self.model
+        for camera, batch in self._datamanager.holdout_views():
+            target = model.target(batch["image"], self.background)
+            mask = batch["mask"].to(target.device).squeeze(-1) > 0 if "mask" in batch else None
+            yield HeldOutView(model.view_of(camera), target, mask)
+
+    def evaluate(self) -> dict[str, float]:
+        """Mean ``psnr`` and ``ssim`` over all test views."""
+        if not self._datamanager.eval_dataset:
+            return {}
+        self.source.agree(self.state)
+        results = self._pipeline.get_average_eval_image_metrics(step=self.state.step)
+        return {name: results[name] for name in ("psnr", "ssim")}
+
+    def save(self) -> None:
+        """Save a checkpoint."""
+        if self._trainer is not None:
+            self._trainer.save_checkpoint(self.state.step)
+
+    def log_scalars(self, name: str, values: Mapping[str, float | int]) -> None:
+        """Write numbers to the run's event file."""
+        writer.put_dict(name=name, scalar_dict=dict(values), step=self.state.step)
+
+    # --------------------------------------------------------------------------------------------------- callbacks
+
+    def callbacks(self) -> list[TrainingCallback]:
+        """Callbacks that set the step, call the extensions after each step, and let them report at the end."""
+        places = TrainingCallbackLocation
+        return [
+            TrainingCallback([places.BEFORE_TRAIN_ITERATION], self._begin_step),
+            TrainingCallback([places.AFTER_TRAIN_ITERATION], self._end_step),
+            TrainingCallback([places.AFTER_TRAIN], self._finish),
+        ]
+
+    def start(self) -> None:
+        """Hand the optimizers to the state, and let the extensions check the run."""
+        assert self._optimizers is not None
+        self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
+        for extension in self.model.extensions:
+            extension.before_training(self)
+
+    def _begin_step(self, step: int) -> None:
+        self.model.step = step
+
+    def _end_step(self, step: int) -> None:
+        self.act(self.model.extensions)
+
+    def act(self, extensions: Sequence[Extension]) -> None:
+        """Let extensions act after a step, in their order."""
+        for extension in extensions:
+            extension.after_step(self)
+        # Surgery makes new parameters; nerfstudio keeps a list of its own.
+        assert self._optimizers is not None
+        for name, value in self.state.field.items():
+            self._optimizers.parameters[name] = [value]
+
+    def _finish(self, step: int) -> None:
+        for extension in self.model.extensions:
+            extension.finish(self)
+        writer.write_out_storage()
+
+
+def training_views(model: Trained, datamanager: SundaeDatamanager) -> list[TrainingView]:
+    """The training views of a datamanager that are not held out."""
+    return [TrainingView(partial(model.view_of, camera), mask) for camera, mask in datamanager.training_views()]

@@ -1,0 +1,284 @@
+"""Arms of a comparison: read from files, and checked against the methods of ``ns-train`` before anything is trained."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import io
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+import yaml
+
+from sundae_ns.cli.bench.plan import WARM_UP, Arm, Kind, Words
+from sundae_ns.errors import ConfigError
+
+DEFAULT_FILE = Path(__file__).with_name("arms.yaml")
+"""The default arms; also an example of a file of arms."""
+MCMC = "mcmc"
+"""In place of a method: 3DGS-MCMC from scratch, with as many primitives as a branch keeps."""
+
+_NAME = re.compile(r"[A-Za-z0-9][\w.-]*")
+_KEEP_RATIO, _STEPS = "pipeline.model.pruning.keep-ratio", "max-num-iterations"
+_SET_BY_BENCH = ("data", "machine.seed", "output-dir", "experiment-name", "timestamp", "pipeline.model.warm-start")
+_FLAGS = {"true": "True", "false": "False", "null": "None"}
+"""Values that YAML and ``ns-train`` write differently."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An arm as a file describes it."""
+
+    name: str
+    method: str | None
+    """None: the method of the command."""
+    options: Mapping[str, Words]
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Lengths of training that the command sets, in steps; None: the method's own."""
+
+    warmup: int | None = None
+    finetune: int | None = None
+    scale: float = 1.0
+    """Factor on all lengths."""
+
+    def scaled(self, steps: int) -> int:
+        """A length times the factor, at least 1."""
+        return max(round(steps * self.scale), 1)
+
+
+def choose_arms(words: Sequence[str], method: str, lengths: Lengths) -> list[Arm]:
+    """The arms that a command names, checked, with their lengths.
+
+    Args:
+        words: names of default arms and files of arms (``.yaml``); none for all default arms.
+        method: method of this package that prunes once, for arms without a method.
+        lengths: lengths that the command sets.
+
+    Raises:
+        ConfigError: a file, an arm, a method, an option or a length that cannot work.
+    """
+    if not lengths.scale > 0:
+        raise ConfigError(f"steps-scale is {lengths.scale}; give a positive factor, 0.01 for a trial")
+    defaults = {entry.name: entry for entry in read_entries(DEFAULT_FILE)}
+    entries: list[Entry] = []
+    for word in words or defaults:
+        if word in defaults:
+            entries.append(defaults[word])
+        elif Path(word).suffix in (".yaml", ".yml"):
+            entries += read_entries(Path(word))
+        else:
+            raise ConfigError(f"{word} is no arm; use some of {', '.join(defaults)}, or a file of arms (.yaml)")
+    _refuse_duplicates((entry.name for entry in entries), "--arms")
+    return [_checked(entry, method, lengths) for entry in entries]
+
+
+# ----------------------------------------------------------------------------------------------------------------- files
+
+
+def read_entries(path: Path) -> list[Entry]:
+    """The arms of a file.
+
+    Raises:
+        ConfigError: the file cannot be read, or is no list of arms.
+    """
+    try:
+        # Scalars stay text: YAML would read `off` as False.
+        loaded = yaml.load(path.read_text(encoding="utf-8"), Loader=yaml.BaseLoader)
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} cannot be read ({error}); give a file of arms") from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise ConfigError(f"{path} is no YAML ({' '.join(str(error).split())}); mend it") from error
+    if not isinstance(loaded, list) or not loaded:
+        raise ConfigError(f"{path} holds no list of arms; write `- name: NAME` for each, its method and options below")
+    entries = [_entry(item, f"{path}, arm {number}") for number, item in enumerate(loaded, start=1)]
+    _refuse_duplicates((entry.name for entry in entries), str(path))
+    return entries
+
+
+def _entry(item: Any, where: str) -> Entry:
+    """One item of a file's list."""
+    if not isinstance(item, dict) or not isinstance(item.get("name"), str):
+        raise ConfigError(f"{where} has no name; write `- name: NAME`")
+    name, method = item["name"], item.get("method")
+    unknown = sorted(set(map(str, item)) - {"name", "method", "options"})
+    if unknown:
+        raise ConfigError(f"{where} ({name}) has {unknown[0]!r}; an arm has name, method and options")
+    if not _NAME.fullmatch(name) or name.endswith(WARM_UP):
+        raise ConfigError(f"{where} cannot be named {name!r}; use letters, digits, '.', '_' and '-', not ...{WARM_UP}")
+    if not isinstance(method, str | None) or method == "":
+        raise ConfigError(f"{where} ({name}) has a method that is no name; write `method: sundae`, or leave it out")
+    return Entry(name, method, _read_options(item.get("options", {}), f"{where} ({name})"))
+
+
+def _read_options(given: Any, where: str) -> dict[str, Words]:
+    """Options by name, without the dashes: from a mapping, or from a list of ``name value``."""
+    pairs: list[tuple[str, Words]]
+    if isinstance(given, dict):
+        pairs = [(name, tuple(value) if isinstance(value, list) else (value,)) for name, value in given.items()]
+    elif isinstance(given, list) and all(isinstance(item, str) for item in given):
+        try:
+            split = [shlex.split(item) for item in given]
+        except ValueError as error:
+            raise ConfigError(f"{where} has an option with an open quote ({error}); close it") from error
+        pairs = [(words[0], tuple(words[1:])) for words in split if words]
+    else:
+        raise ConfigError(f"{where} has options that are neither a mapping nor a list of texts; write `name: value`")
+    for name, words in pairs:
+        if not words or not all(isinstance(word, str) for word in words):
+            raise ConfigError(f"{where} has option {name} without a plain value; write `{name}: value`")
+    named = [(name.lstrip("-").replace("_", "-"), words) for name, words in pairs]
+    _refuse_duplicates((name for name, _ in named), f"{where}, options")
+    for name, _ in named:
+        if name in _SET_BY_BENCH:
+            raise ConfigError(f"{where} sets {name}, which the command sets itself; remove it")
+    return {name: tuple(_FLAGS.get(word, word) for word in words) for name, words in named}
+
+
+def _refuse_duplicates(names: Iterable[str], where: str) -> None:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise ConfigError(f"{where} has {name} twice; give each once")
+        seen.add(name)
+
+
+# ---------------------------------------------------------------------------------------------------------------- checks
+
+
+def _checked(entry: Entry, default: str, lengths: Lengths) -> Arm:
+    """The arm of an entry, its options parsed by its method, its lengths resolved.
+
+    Raises:
+        ConfigError: its method, an option or a length cannot work.
+    """
+    from nerfstudio.models.splatfacto import SplatfactoModelConfig
+
+    from sundae_ns.model import SundaeModelConfig
+
+    method = default if entry.method in (None, MCMC) else entry.method
+    config, model = _config_of(entry, method), _methods()[method].pipeline.model
+    if not isinstance(model, SplatfactoModelConfig):
+        raise ConfigError(f"arm {entry.name}: {method} has no Gaussians; use splatfacto or a method of this package")
+    mode = model.pruning.mode if isinstance(model, SundaeModelConfig) else None
+    if method == default and mode != "one-shot":
+        raise ConfigError(f"{method!r} is no method of ours that prunes once; use sundae, or sundae-tiny for a trial")
+    kind: Kind = "whole"
+    if entry.method == MCMC:
+        kind = "mcmc"
+    elif mode is not None and config.pipeline.model.pruning.mode == "one-shot":
+        kind = "branch"
+    options, ratio = dict(entry.options), None
+    own_steps = lengths.scaled(config.max_num_iterations)
+    warmup, total, steps = 0, 0, own_steps
+    if kind != "whole":
+        warmup, finetune = _parts(method, lengths)
+        total = warmup + finetune
+        steps = finetune if kind == "branch" else total
+        if options.pop(_KEEP_RATIO, None) is not None:
+            ratio = config.pipeline.model.pruning.keep_ratio
+    elif mode is not None:
+        # Evaluating around a prune would count as training.
+        options = {"pipeline.model.evaluate-prune": ("False",), **options}
+    if options.pop(_STEPS, None) is not None:
+        steps = own_steps
+    return Arm(entry.name, kind, method, options, steps, warmup, total, ratio)
+
+
+def _parts(method: str, lengths: Lengths) -> tuple[int, int]:
+    """Steps of the warm-up and of the fine-tuning of a method that prunes once."""
+    config = _methods()[method]
+    prune_at = config.pipeline.model.pruning.prune_at
+    warmup = prune_at if lengths.warmup is None else lengths.warmup
+    finetune = config.max_num_iterations - prune_at if lengths.finetune is None else lengths.finetune
+    if warmup < 1 or finetune < 1:
+        raise ConfigError(f"{warmup} steps of warm-up and {finetune} of fine-tuning; give at least 1 of each")
+    return lengths.scaled(warmup), lengths.scaled(finetune)
+
+
+def _methods() -> dict[str, Any]:
+    """Configurations of all methods of ``ns-train``, by name."""
+    # Late, since it loads nerfstudio and all its plug-ins.
+    from nerfstudio.configs.method_configs import all_methods
+
+    return dict(all_methods)
+
+
+def _config_of(entry: Entry, method: str) -> Any:
+    """The configuration of a method with the options of an arm.
+
+    Raises:
+        ConfigError: there is no such method or option, or a value cannot be.
+    """
+    methods = _methods()
+    if method not in methods:
+        near = difflib.get_close_matches(method, methods) or ["sundae", "splatfacto"]
+        raise ConfigError(f"arm {entry.name}: ns-train has no method {method!r}; use {' or '.join(near)}")
+    for name in entry.options:
+        if not _has_option(methods[method], name):
+            near = difflib.get_close_matches(name, _option_names(methods[method]), n=1)
+            mend = f"did you mean {near[0]}?" if near else f"`ns-train {method} --help` lists its options"
+            raise ConfigError(f"arm {entry.name}: {method} has no option {name}; {mend}")
+    words = [word for name, value in entry.options.items() for word in (f"--{name}", *value)]
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
+            config = _parse(methods[method], words)
+        for part in ("pruning", "head"):
+            validate = getattr(getattr(config.pipeline.model, part, None), "validate", None)
+            if validate is not None:
+                validate()
+    except SystemExit as error:
+        raise ConfigError(f"arm {entry.name}: {_message_of(said.getvalue())}") from error
+    except (ConfigError, ValueError) as error:
+        raise ConfigError(f"arm {entry.name}: {error}") from error
+    return config
+
+
+def _parse(default: Any, words: Sequence[str]) -> Any:
+    """A configuration with options of the command line, as ``ns-train`` parses them."""
+    return tyro.cli(tyro.conf.FlagConversionOff[type(default)], default=default, args=words)  # type: ignore[misc]
+
+
+def _has_option(config: Any, name: str) -> bool:
+    """Whether a configuration has an option of this dotted name."""
+    *parts, last = name.replace("-", "_").split(".")
+    for part in parts:
+        config = _options_in(config).get(part)
+    options = _options_in(config)
+    return last in options and not _options_in(options[last])
+
+
+def _option_names(config: Any, prefix: str = "") -> list[str]:
+    """Dotted names of all options below a configuration."""
+    names = []
+    for option, value in _options_in(config).items():
+        name = prefix + option.replace("_", "-")
+        names += _option_names(value, f"{name}.") or [name]
+    return names
+
+
+def _options_in(config: Any) -> dict[str, Any]:
+    """Options that a configuration holds itself, by their Python names."""
+    if is_dataclass(config) and not isinstance(config, type):
+        config = {field.name: getattr(config, field.name) for field in fields(config)}
+    return {name: value for name, value in config.items() if name[0] != "_"} if isinstance(config, dict) else {}
+
+
+def _message_of(box: str) -> str:
+    """The message in tyro's box of an error, in one line: between the title and the rule below it."""
+    lines = [line.strip("╭╮╰╯│ ") for line in box.splitlines()]
+    is_rule = [set(line) <= {"─", "-"} for line in lines]
+    words: list[str] = []
+    for line, rule in zip(lines[1:], is_rule[1:], strict=True):
+        if rule and words:
+            break
+        words += [] if rule else line.split()
+    return " ".join(words) or "ns-train refuses its options; try them there first"

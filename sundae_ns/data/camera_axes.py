@@ -1,0 +1,46 @@
+"""Camera poses from nerfstudio's convention to the rasteriser's.
+
+nerfstudio stores camera-to-world with OpenGL axes (x right, y up, view along -z). The rasteriser takes world-to-camera
+with OpenCV axes (x right, y down, view along z). Both functions invert the rigid motion and flip y and z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+OPENGL_TO_OPENCV = (1.0, -1.0, -1.0)
+"""Sign of each camera axis."""
+
+
+def world_to_camera(pose: Tensor) -> Tensor:
+    """World-to-camera matrix ``[4, 4]``, OpenCV axes; differentiable.
+
+    Args:
+        pose: camera-to-world, OpenGL axes, ``[3, 4]``: a rotation and a translation.
+
+    Returns:
+        The matrix, with dtype and device of ``pose``.
+    """
+    rotation = pose[:, :3] * pose.new_tensor(OPENGL_TO_OPENCV)
+    top = torch.cat([rotation.T, -rotation.T @ pose[:, 3:]], dim=1)
+    return torch.cat([top, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+
+def world_to_camera_floats(pose: Sequence[float]) -> list[float]:
+    """Compute :func:`world_to_camera` on Python floats, without a tensor or a GPU kernel.
+
+    Args:
+        pose: the 12 entries of camera-to-world ``[3, 4]``, OpenGL axes, row by row.
+
+    Returns:
+        The 16 entries of world-to-camera ``[4, 4]``, OpenCV axes, row by row.
+    """
+    x, y, z = pose[3::4]
+    matrix: list[float] = []
+    for axis, sign in enumerate(OPENGL_TO_OPENCV):
+        a, b, c = (sign * value for value in pose[axis::4])
+        matrix += [a, b, c, -(a * x + b * y + c * z)]
+    return [*matrix, 0.0, 0.0, 0.0, 1.0]

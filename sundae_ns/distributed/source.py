@@ -1,0 +1,215 @@
+"""A field sharded over ranks, as a source of primitives: each view gets the primitives of all ranks that it may see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from sundae_ns.distributed.ahead import Ahead, Timetable, slack_of_step, stamped
+from sundae_ns.distributed.shards import Shards
+from sundae_ns.gaussians import FEATURES
+from sundae_ns.gaussians.field import Field
+from sundae_ns.rasterization.reference import largest_axis
+from sundae_ns.rasterization.sharded import (
+    Cameras,
+    Route,
+    exchange,
+    gather_cameras,
+    give_back,
+    may_be_seen,
+    plan_exchange,
+)
+from sundae_ns.rendering.source import (
+    NEAR_PLANE,
+    ColorSettings,
+    Primitives,
+    StepResolution,
+    Trained,
+    TrainingView,
+    ViewBatch,
+    colors_from,
+)
+from sundae_ns.rendering.views import View
+from sundae_ns.training.densification import Statistics
+
+_GEOMETRY = ("means", "quats", "scales", "opacities")
+_COLORS = ("features_dc", "features_rest")
+
+
+class ReceivedPrimitives(Primitives):
+    """Primitives that this rank has received for one view."""
+
+    route: Route
+    """How they came."""
+
+
+class Exchange(NamedTuple):
+    """One exchange of primitives: the cameras of all ranks, and the route."""
+
+    cameras: Cameras
+    route: Route
+
+
+def _exchange_now(params: Mapping[str, Tensor], cameras: Cameras) -> Exchange:
+    with torch.no_grad():
+        seen = may_be_seen(params["means"], params["scales"], cameras.bounds)
+    return Exchange(cameras, plan_exchange(seen).route())
+
+
+class ShardedField:
+    """A :class:`sundae_ns.rendering.FieldSource` on several ranks. Every render is collective.
+
+    Args:
+        shards: the ranks.
+        field: the primitives of this rank.
+        timetable: the views of all ranks at each training step.
+    """
+
+    collective = True
+    replayable = False
+
+    def __init__(self, shards: Shards, field: Field, timetable: Timetable) -> None:
+        self.shards, self.field, self.timetable = shards, field, timetable
+        self._planned: Ahead | None = None
+
+    @property
+    def total(self) -> int:
+        """Number of primitives of all ranks."""
+        return self.shards.total
+
+    def forget_plan(self) -> None:
+        """Let the next step plan its own exchange, because the field has changed."""
+        self._planned = None
+
+    # ----------------------------------------------------------------------------------------------------- primitives
+
+    def primitives(
+        self,
+        view: View,
+        settings: ColorSettings,
+        *,
+        features: bool,
+        colors: bool = True,
+        at: StepResolution | None = None,
+    ) -> ReceivedPrimitives:
+        """The primitives of all ranks that the view may see; differentiable. Collective.
+
+        Args:
+            view: the camera of this rank.
+            settings: how colours are evaluated; the rank that holds a primitive evaluates them.
+            features: whether feature vectors are needed.
+            colors: colours always come along.
+            at: the training step, whose exchange was planned; None lets the ranks gather their cameras.
+        """
+        cameras, route = self._exchange(view, at)
+        params = self.field
+        names = [*_GEOMETRY, FEATURES] if features else list(_GEOMETRY)
+        # Selected for all cameras at once: the backward pass then fills one gradient for each parameter, not for each camera.
+        going = {name: params[name].index_select(0, route.ids) for name in [*names, *_COLORS]}
+        centers = cameras.centers.index_select(0, route.cameras)
+        rows = torch.cat([*(going[name] for name in names), colors_from(going, params, centers, settings)], dim=1)
+        columns = [params[name].shape[1] for name in names]
+        pieces = exchange(rows, route).split([*columns, 3], dim=1)
+        received = ReceivedPrimitives(zip([*names, "colors"], pieces))
+        received.route = route
+        return received
+
+    @torch.no_grad()
+    def _exchange(self, view: View, at: StepResolution | None) -> Exchange:
+        """The exchange for a view. All ranks do the same, because plans are made and dropped in collectives."""
+        if at is None:
+            cameras = gather_cameras(view.viewmat, view.K, view.width, view.height, NEAR_PLANE)
+            return _exchange_now(self.field, cameras)
+        planned, self._planned = self._planned, None
+        if planned is not None and planned.at == at:
+            return Exchange(planned.cameras, planned.route(self.field))
+        return _exchange_now(self.field, self.timetable.cameras(at))
+
+    def training_view(self, at: StepResolution, make: Callable[[], View], index: int | None) -> View:
+        """The view of this rank, from a table: to build it anew would wait for the GPU."""
+        expected = self.timetable.views(at.step)[self.shards.rank]
+        assert index == expected, f"view {index} was served at step {at.step}, the timetable has {expected}"
+        return self.timetable.view(at)
+
+    @torch.no_grad()
+    def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
+        """Plan the exchange of a later step, for wherever the optimizers may move the field; wait for nothing. Collective.
+
+        Without a bound on the optimizers' step, the same on all ranks, nothing is planned.
+        """
+        slack = slack_of_step(optimizers)
+        if slack is None:
+            return
+        cameras = self.timetable.cameras(at)
+        plan = plan_exchange(may_be_seen(self.field["means"], self.field["scales"], cameras.bounds, slack))
+        self._planned = Ahead(at, cameras, plan, stamped(self.field))
+
+    def part(self, mask: Tensor, values: Mapping[str, Tensor] | None = None) -> ShardedField:
+        """A source of the primitives under a mask of this rank's, bool ``[N_r]``."""
+        rows = self.field.rows(mask)
+        return ShardedField(self.shards, rows if values is None else rows.replaced(values), self.timetable)
+
+    # ------------------------------------------------------------------------------------------------------- training
+
+    def follow(self, primitives: Primitives, info: MutableMapping[str, Any], *, absgrad: bool) -> None:
+        """Let the statistics for densification travel back with the gradients.
+
+        Args:
+            primitives: of this rank's view.
+            info: of that view, whose centres keep their gradient.
+            absgrad: whether absolute gradients are summed.
+        """
+        assert isinstance(primitives, ReceivedPrimitives)
+        route = primitives.route
+
+        def statistics() -> Tensor:
+            centres, width, height = info["means2d"], info["width"], info["height"]
+            gradients = (centres.absgrad if absgrad else centres.grad)[0]
+            # With plain numbers: a tensor of them would be copied to the GPU, and waited for.
+            norms = torch.hypot(gradients[:, 0] * (width / 2), gradients[:, 1] * (height / 2))
+            return torch.stack([norms, (largest_axis(info["radii"][0]) / max(width, height)).to(norms)], dim=1)
+
+        route.ask = statistics
+        info["route"] = route
+
+    def agree(self, trained: Trained) -> None:
+        """Share the focal lengths that the head was trained on. Collective."""
+        trained.trained_focal = self.shards.widest(trained.trained_focal)
+
+    # --------------------------------------------------------------------------------------------------- contribution
+
+    def num_batches(self, views: Sequence[TrainingView]) -> int:
+        """Number of rounds of one view for each rank."""
+        return -(-len(views) // self.shards.ranks)
+
+    def batches(self, views: Sequence[TrainingView]) -> Iterator[ViewBatch]:
+        """One view for each rank at a time. The last view is repeated if views run out, and not counted."""
+        shards = self.shards
+        for first in range(0, len(views), shards.ranks):
+            own = views[min(first + shards.rank, len(views) - 1)]
+            yield ViewBatch(own, min(shards.ranks, len(views) - first))
+
+    @torch.no_grad()
+    def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
+        """Return the values to the ranks that hold the primitives, and add them view by view. Collective."""
+        assert isinstance(primitives, ReceivedPrimitives)
+        route = primitives.route
+        returned = give_back(values[:, None], route)[:, 0]
+        by_view = zip(route.ids.split(route.sent), returned.split(route.sent))
+        for ids, added in list(by_view)[: batch.num_views]:
+            total[ids] += added
+
+
+def statistics_of(info: Mapping[str, Any]) -> Statistics:
+    """Statistics of this rank's primitives in the views of all ranks, after a backward pass.
+
+    Args:
+        info: of this rank's view, which :meth:`ShardedField.follow` has prepared.
+    """
+    route: Route = info["route"]
+    assert route.told is not None
+    return Statistics(route.ids, *route.told.unbind(dim=1))

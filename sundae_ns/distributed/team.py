@@ -1,0 +1,201 @@
+"""The processes that train together, one or several, behind one set of verbs.
+
+:class:`OneProcess` has nothing to share; :class:`Ranks` shards the field over the ranks of the default process group. The
+trainer calls the verbs and does not ask which of both it has.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from nerfstudio.engine.optimizers import Optimizers
+from nerfstudio.utils.rich_utils import CONSOLE
+
+from sundae_ns.compensation import CompensationHead
+from sundae_ns.distributed.ahead import Timetable
+from sundae_ns.distributed.batches import SharedOptimizers, scale_rates, shorten
+from sundae_ns.distributed.checkpoints import state_of_rank, whole_state
+from sundae_ns.distributed.densification import ShardedDensification
+from sundae_ns.distributed.pruning import GlobalPruning
+from sundae_ns.distributed.shards import Shards, bounds
+from sundae_ns.distributed.source import ShardedField
+from sundae_ns.distributed.start import check_options, without_viewer
+from sundae_ns.rendering.source import NEAR_PLANE, FieldSource
+from sundae_ns.storage.atomic import writing
+from sundae_ns.training.densification import CappedStrategy, Densification
+from sundae_ns.training.extension import Extension
+from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.pruning import ScheduledPruning
+
+State = dict[str, Any]
+
+
+class OneProcess:
+    """One process that holds the whole field."""
+
+    def configured(self, config: Any) -> Any:
+        """The configuration, unchanged."""
+        return config
+
+    def make_folder(self, folder: Path) -> None:
+        """Nothing to do: nerfstudio makes the folder of the run."""
+
+    def share(
+        self, state: FieldState, source: FieldSource, extensions: list[Extension], datamanager: Any, seed: int
+    ) -> tuple[FieldSource, list[Extension]]:
+        """Source and extensions, unchanged."""
+        return source, extensions
+
+    def optimizers(self, make: Callable[[], Optimizers], config: Any, groups: Any, names: list[str]) -> Optimizers:
+        """The optimizers that ``make`` builds."""
+        return make()
+
+    def check_copies(self, head: CompensationHead | None) -> None:
+        """Nothing to compare."""
+
+    def gathered(self, state: State, names: list[str]) -> State | None:
+        """The state, unchanged."""
+        return state
+
+    def part(self, loaded: State, names: list[str]) -> State:
+        """The checkpoint, unchanged."""
+        return loaded
+
+    def restored(self, state: FieldState, seed: int, step: int) -> None:
+        """Nothing to share."""
+
+
+class Ranks(OneProcess):
+    """One of several ranks that shard the field. Verbs are collective.
+
+    Args:
+        rank: rank of this process on this machine.
+        count: number of ranks.
+    """
+
+    shards: Shards
+    """Set by :meth:`share`."""
+
+    def __init__(self, rank: int, count: int) -> None:
+        self.rank, self.count = rank, count
+
+    def configured(self, config: Any) -> Any:
+        """A copy with as many images in fewer, larger steps, without a viewer, and with images in host memory.
+
+        Raises:
+            ConfigError: several ranks cannot train with these options.
+        """
+        check_options(config)
+        config = shorten(config, self.count)
+        config.vis = without_viewer(config.vis)
+        # A copy of all images on each GPU could take more memory than its shard.
+        config.pipeline.datamanager.cache_images = "cpu"
+        CONSOLE.quiet = self.rank != 0
+        if config.machine.device_type == "cuda":
+            torch.cuda.set_device(self.rank)
+        return config
+
+    def make_folder(self, folder: Path) -> None:
+        """Make the folder of the run; nerfstudio's own way fails if two ranks do so at once.
+
+        Raises:
+            StorageError: no right to write.
+        """
+        with writing(f"cannot make the run's folder {folder}"):
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def share(
+        self, state: FieldState, source: FieldSource, extensions: list[Extension], datamanager: Any, seed: int
+    ) -> tuple[FieldSource, list[Extension]]:
+        """Give all ranks the field and head of rank 0, and keep the shard of this rank.
+
+        Args:
+            state: as built, the same number of primitives on each rank.
+            source: of the whole field.
+            extensions: of one process.
+            datamanager: gives the training views; each rank draws in their order.
+            seed: seed of draws that all ranks must share, such as the image to evaluate.
+
+        Returns:
+            Source and extensions of the shards.
+        """
+        shards = self.shards = Shards(state.device)
+        take_shard(state, shards)
+        random.seed(seed)
+        cameras = datamanager.train_dataset.cameras
+        timetable = Timetable(cameras, datamanager.view_of_step, state.device, NEAR_PLANE)
+        sharded = ShardedField(shards, state.field, timetable)
+        shards.on_change(sharded.forget_plan)
+        datamanager.place = (shards.rank, shards.ranks)
+        return sharded, [self._sharded(extension, len(cameras)) for extension in extensions]
+
+    def _sharded(self, extension: Extension, num_images: int) -> Extension:
+        if isinstance(extension, Densification):
+            strategy = extension.strategy
+            if isinstance(strategy, CappedStrategy):
+                # After a reset of the opacities each image is seen once before the field grows again.
+                strategy.pause_refine_after_reset = -(-num_images // self.count) + strategy.refine_every
+            return ShardedDensification(strategy, self.shards)
+        if isinstance(extension, ScheduledPruning):
+            return ScheduledPruning(GlobalPruning(extension.schedule, self.shards), evaluate=extension.evaluate)
+        return extension
+
+    def optimizers(self, make: Callable[[], Optimizers], config: Any, groups: Any, names: list[str]) -> Optimizers:
+        """Optimizers for batches of one image a rank.
+
+        Args:
+            make: builds those of one process; not called.
+            config: of the optimizers.
+            groups: parameter groups of the pipeline.
+            names: parameters of the field.
+        """
+        optimizers = SharedOptimizers(config.copy(), groups)
+        scale_rates(optimizers, names, self.count)
+        return optimizers
+
+    def check_copies(self, head: CompensationHead | None) -> None:
+        """Warn if the copies of the head differ between ranks."""
+        apart = 0.0 if head is None else self.shards.apart(head.parameters())
+        if apart != 0 and self.shards.rank == 0:
+            CONSOLE.print(
+                f"[yellow]Warning: the heads of the ranks differ by up to {apart:.2g}, which is a bug of sundae; the "
+                "checkpoint holds the head of the first rank, and resuming from it makes them equal"
+            )
+
+    def gathered(self, state: State, names: list[str]) -> State | None:
+        """The checkpoint of the whole field on rank 0; None on the others."""
+        return whole_state(state, self.shards, names)
+
+    def part(self, loaded: State, names: list[str]) -> State:
+        """The part of a checkpoint that this rank holds.
+
+        Raises:
+            CheckpointError: the checkpoint holds no primitives.
+        """
+        return state_of_rank(loaded, self.shards.rank, self.count, names)
+
+    def restored(self, state: FieldState, seed: int, step: int) -> None:
+        """Share the counts, and give each rank random numbers of its own."""
+        self.shards.recount(state.field)
+        torch.manual_seed(seed + step * self.count + self.shards.rank)
+
+
+def team_of(rank: int, count: int) -> OneProcess:
+    """The processes of a training: :class:`Ranks` if there are several."""
+    return Ranks(rank, count) if count > 1 else OneProcess()
+
+
+def take_shard(state: FieldState, shards: Shards) -> None:
+    """Give all ranks the field and the head of rank 0, and keep this rank's block of the field. Collective."""
+    head = [] if state.head is None else [*state.head.parameters(), *state.head.buffers()]
+    for value in [*state.field.values(), *head]:
+        dist.broadcast(value.data, 0)
+    start, end = bounds(state.field.num_primitives, shards.ranks)[shards.rank : shards.rank + 2]
+    for value in state.field.values():
+        value.data = value.data[start:end].clone()
+    shards.recount(state.field)

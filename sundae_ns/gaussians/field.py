@@ -1,0 +1,87 @@
+"""A field: the parameters of its primitives, and how they store colours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, MutableMapping
+from typing import Any, Literal
+
+from torch import Tensor
+
+from sundae_ns.gaussians.parameters import num_primitives, rgb_to_sh, sh_degree
+
+Encoding = Literal["harmonics", "logits"]
+"""How a field stores colours. ``harmonics``: ``features_dc`` and ``features_rest`` are coefficients of spherical harmonics.
+``logits``: ``features_dc`` holds logits of view-independent colours, as splatfacto does at SH degree 0."""
+
+
+class Field(MutableMapping[str, Any]):
+    """Named parameters ``[N, ...]`` (see :mod:`sundae_ns.gaussians.parameters`) and the encoding of their colours.
+
+    A view of the mapping that it is given: surgery that replaces a parameter here replaces it there too.
+
+    Args:
+        params: tensors, or ``Parameter``s of a field in training.
+        encoding: how colours are stored.
+    """
+
+    def __init__(self, params: MutableMapping[str, Any], encoding: Encoding = "harmonics") -> None:
+        self.params = params
+        self.encoding: Encoding = encoding
+
+    def __getitem__(self, name: str) -> Any:
+        return self.params[name]
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self.params[name] = value
+
+    def __delitem__(self, name: str) -> None:
+        del self.params[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.params)
+
+    def __len__(self) -> int:
+        """Number of parameters; :attr:`num_primitives` counts primitives."""
+        return len(self.params)
+
+    @property
+    def num_primitives(self) -> int:
+        """Number of primitives N."""
+        return num_primitives(self.params)
+
+    @property
+    def sh_degree(self) -> int:
+        """SH degree of the stored colours."""
+        return sh_degree(self.params["features_rest"])
+
+    def detached(self) -> Field:
+        """The field without gradients."""
+        return Field({name: value.detach() for name, value in self.items()}, self.encoding)
+
+    def rows(self, mask: Tensor) -> Field:
+        """The primitives under a mask, as a field of its own.
+
+        Args:
+            mask: True for the primitives to take, bool ``[N]``.
+        """
+        return Field({name: value[mask] for name, value in self.items()}, self.encoding)
+
+    def replaced(self, values: Mapping[str, Tensor]) -> Field:
+        """The same field with other values of some parameters; this one does not change."""
+        return Field({**self, **values}, self.encoding)
+
+    def copied(self) -> Field:
+        """A field of the same tensors, in a mapping of its own that surgery does not change."""
+        return Field(dict(self.params), self.encoding)
+
+    def as_harmonics(self) -> Field:
+        """The field with colours as spherical harmonics; itself if it stores them so."""
+        if self.encoding == "harmonics":
+            return self
+        colors = rgb_to_sh(self["features_dc"].detach().sigmoid())
+        return Field({**self, "features_dc": colors}, "harmonics")
+
+
+def as_field(params: Mapping[str, Any]) -> Field:
+    """A mapping of parameters as a field; a plain mapping stores colours as harmonics."""
+    return params if isinstance(params, Field) else Field(dict(params))

@@ -1,0 +1,228 @@
+"""Where a view gets its primitives from: the field of this process, or shards on several GPUs.
+
+:func:`sundae_ns.rendering.render.render` and everything that trains takes a :class:`FieldSource`. Only the place that makes
+the source knows how many processes hold the field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+
+from sundae_ns.gaussians.field import Field
+from sundae_ns.rasterization import Backend, spherical_harmonics
+from sundae_ns.rendering.views import View
+
+NEAR_PLANE = 0.01
+"""Distance of the near plane, world units."""
+
+
+class StepResolution(NamedTuple):
+    """Size of the training images at one step: a function of the step and the options, so the same on all ranks."""
+
+    step: int
+    """Training step; with several ranks, of a batch of one image a rank."""
+    downscale: int
+    """Divisor of the sides of the images."""
+    window_pixels: int
+    """Most pixels of an image; larger images are trained on by a random window. 0 for no limit."""
+
+
+class TrainingView(NamedTuple):
+    """A training view for passes that do not train."""
+
+    view: Callable[[], View]
+    """Makes the camera."""
+    mask: Tensor | None
+    """Pixels that count, bool ``[H, W, 1]``; None for all."""
+
+
+class ViewBatch(NamedTuple):
+    """The views that the processes render at the same time, one each."""
+
+    own: TrainingView
+    """The view of this process."""
+    num_views: int
+    """Number of views in the batch that count; the last batch may repeat a view to keep every rank busy."""
+
+
+class Primitives(dict[str, Tensor]):
+    """Parameters of the primitives that one view needs ``[M, ...]``, and their ``colors`` from its camera ``[M, 3]``."""
+
+
+@dataclass(frozen=True)
+class ColorSettings:
+    """How stored colours become colours seen from a camera."""
+
+    backend: Backend
+    active_sh_degree: int | None = None
+    """Highest SH degree in use; None for the degree of the field."""
+
+
+class Trained(Protocol):
+    """State of a field in training, as far as a source shares it between ranks."""
+
+    trained_focal: tuple[float, float] | None
+
+
+class FieldSource(Protocol):
+    """What rendering and training need of a field, whoever holds its primitives."""
+
+    @property
+    def field(self) -> Field:
+        """The primitives of this process."""
+
+    @property
+    def total(self) -> int:
+        """Number of primitives of the whole field."""
+
+    @property
+    def collective(self) -> bool:
+        """Whether all ranks have to take part in a render."""
+
+    @property
+    def replayable(self) -> bool:
+        """Whether frames of this source may be recorded: its tensors stay where they are."""
+
+    def primitives(
+        self,
+        view: View,
+        settings: ColorSettings,
+        *,
+        features: bool,
+        colors: bool = True,
+        at: StepResolution | None = None,
+    ) -> Primitives:
+        """The primitives that the view may see.
+
+        Args:
+            view: the camera.
+            settings: how colours are evaluated.
+            features: whether feature vectors are needed.
+            colors: whether colours are needed.
+            at: the step, for a training image; None outside of training.
+        """
+
+    def training_view(self, at: StepResolution, make: Callable[[], View], index: int | None) -> View:
+        """The camera of this process at a training step.
+
+        Args:
+            at: the step.
+            make: builds it from the camera that was served.
+            index: of the training view that was served.
+        """
+
+    def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
+        """Prepare the next training step while the GPU works on this one."""
+
+    def follow(self, primitives: Primitives, info: dict[str, Any], *, absgrad: bool) -> None:
+        """Arrange that densification finds its statistics in ``info`` after the backward pass."""
+
+    def agree(self, trained: Trained) -> None:
+        """Share between ranks what each has noted by itself: the focal lengths that the head was trained on."""
+
+    def num_batches(self, views: Sequence[TrainingView]) -> int:
+        """Number of batches that :meth:`batches` yields."""
+
+    def batches(self, views: Sequence[TrainingView]) -> Iterator[ViewBatch]:
+        """The views in batches of one for each process, in order."""
+
+    def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
+        """Add values of the primitives of a batch ``[M]`` to a sum over the primitives of this process ``[N]``."""
+
+    def part(self, mask: Tensor, values: Mapping[str, Tensor] | None = None) -> FieldSource:
+        """A source of the primitives under a mask, bool ``[N]``, with other values of some parameters."""
+
+
+def colors_from(params: Mapping[str, Tensor], field: Field, center: Tensor, settings: ColorSettings) -> Tensor:
+    """Colours of primitives as seen from a place.
+
+    Args:
+        params: ``means`` ``[M, 3]``, ``features_dc`` and ``features_rest`` of the primitives.
+        field: the field that they belong to, for its encoding.
+        center: camera centre ``[3]``, or one for each primitive ``[M, 3]``; world units.
+        settings: backend and SH degree.
+
+    Returns:
+        ``[M, 3]``, at least 0.
+    """
+    if field.encoding == "logits":
+        return params["features_dc"].sigmoid()
+    degree = degree_in_use(field.sh_degree, settings.active_sh_degree)
+    coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
+    return (spherical_harmonics(degree, params["means"] - center, coeffs, backend=settings.backend) + 0.5).clamp_min(0)
+
+
+def degree_in_use(sh_degree: int, active: int | None) -> int:
+    """The SH degree that colours are evaluated at: ``active``, at most the field's own; None for the field's own."""
+    return sh_degree if active is None else min(active, sh_degree)
+
+
+class LocalField:
+    """The field of one process.
+
+    Args:
+        field: the primitives.
+        whole: False for a part, whose tensors are new each time.
+    """
+
+    collective = False
+
+    def __init__(self, field: Field, *, whole: bool = True) -> None:
+        self.field = field
+        self.replayable = whole
+
+    @property
+    def total(self) -> int:
+        """Number of primitives."""
+        return self.field.num_primitives
+
+    def primitives(
+        self,
+        view: View,
+        settings: ColorSettings,
+        *,
+        features: bool,
+        colors: bool = True,
+        at: StepResolution | None = None,
+    ) -> Primitives:
+        """All primitives, with their colours; see :meth:`FieldSource.primitives`."""
+        primitives = Primitives(self.field)
+        if colors:
+            primitives["colors"] = colors_from(self.field, self.field, view.center, settings)
+        return primitives
+
+    def training_view(self, at: StepResolution, make: Callable[[], View], index: int | None) -> View:
+        """The camera that was served."""
+        return make()
+
+    def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
+        """Nothing to prepare."""
+
+    def follow(self, primitives: Primitives, info: dict[str, Any], *, absgrad: bool) -> None:
+        """Nothing to arrange: ``info`` holds the gradients of this process."""
+
+    def agree(self, trained: Trained) -> None:
+        """Nothing to share."""
+
+    def num_batches(self, views: Sequence[TrainingView]) -> int:
+        """One for each view."""
+        return len(views)
+
+    def batches(self, views: Sequence[TrainingView]) -> Iterator[ViewBatch]:
+        """One view at a time."""
+        return (ViewBatch(view, 1) for view in views)
+
+    def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
+        """Add the values, one for each primitive."""
+        total += values
+
+    def part(self, mask: Tensor, values: Mapping[str, Tensor] | None = None) -> LocalField:
+        """A source of the primitives under a mask, which is not recorded."""
+        rows = self.field.rows(mask)
+        return LocalField(rows if values is None else rows.replaced(values), whole=False)

@@ -1,0 +1,434 @@
+"""The extension that carries out a budget search on the field in training."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from sundae_ns.compensation import HeadConfig
+from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
+from sundae_ns.gaussians import from_points
+from sundae_ns.gaussians.snapshot import Snapshot
+from sundae_ns.pruning import PruningConfig
+from sundae_ns.storage import accounting, megabytes
+from sundae_ns.training.budget import heads, sizes
+from sundae_ns.training.budget.record import budget_of, point_of, write
+from sundae_ns.training.budget.search import NO_IMAGE, Point, Search
+from sundae_ns.training.budget.searched_field import SearchedField
+from sundae_ns.training.budget.sh_degree import flatten, lower_degree
+from sundae_ns.training.densification import Densification
+from sundae_ns.training.extension import Extension, TrainingRun
+from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.report import PruneReport, write_report
+
+MAX_REJECTED = 5
+"""Cuts that may be rejected, before and after the head is enabled."""
+TRIAL_EVALUATIONS = 3
+"""Length of the training at one SH degree, in evaluations."""
+FLAT_SHARE = 0.25
+"""Share of the tolerated drop that view-independent colours may cost when they are introduced."""
+
+
+class _Clock(NamedTuple):
+    """Time left in a phase."""
+
+    head_to_come: bool
+    """Whether a head may be enabled after it."""
+    left: int
+    """Training steps in which a cut must recover."""
+    over: bool
+    """Whether it is too late for another cut."""
+
+
+class BudgetSearch(Extension):
+    """The search of one run: its state, and the fields that it may return to.
+
+    Args:
+        config: options of pruning, mode auto.
+        head: configuration of the largest head that may be enabled.
+        densification: its running state starts anew when the search begins.
+        state: the field; its head stays disabled until the search enables it.
+    """
+
+    name = "budget"
+
+    def __init__(
+        self, config: PruningConfig, head: HeadConfig, densification: Densification, state: FieldState
+    ) -> None:
+        self.config = config
+        self.search = Search()
+        heads.follow(state, self.search)
+        self._largest = None if head.mode == "off" else head
+        self._densification = densification
+        self._accepted: dict[str, Snapshot] | None = None
+        self._fallback: dict[str, Snapshot] | None = None
+        self._flat: Tensor | None = None
+
+    @property
+    def head_config(self) -> HeadConfig | None:
+        """The chosen head, before that the largest one; None for none."""
+        return sizes.chosen_head(self.search, self._largest)
+
+    # ------------------------------------------------------------------------------------------------- checkpoints
+
+    def state_dict(self) -> dict[str, Any]:
+        """Numbers of the search and, while it goes on, copies of the fields that it may return to."""
+        return {
+            "numbers": self.search.state(),
+            "accepted": self._accepted,
+            "fallback": self._fallback,
+            "flat": self._flat,
+        }
+
+    def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Give field and head the shapes of a checkpoint.
+
+        Raises:
+            CheckpointError: the checkpoint carries no search, or a damaged one.
+        """
+        heads.reshape(state, _search_of(saved), self._largest)
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Counterpart of :meth:`state_dict`.
+
+        Raises:
+            CheckpointError: the checkpoint carries no search, or a damaged one.
+        """
+        search = _search_of(saved)
+        needed = {"accepted": search.trying, "fallback": search.phase in ("degrees", "head")}
+        if any(due and not isinstance(saved.get(name), Mapping) for name, due in needed.items()):
+            raise CheckpointError("the checkpoint lacks the field that its search would return to; give another")
+        self.search = search
+        self._accepted, self._fallback, self._flat = saved.get("accepted"), saved.get("fallback"), saved.get("flat")
+        heads.follow(state, search)
+
+    # ---------------------------------------------------------------------------------------------------- training
+
+    def before_training(self, run: TrainingRun) -> None:
+        """Check that views are held out, and that the budget suffices for one primitive.
+
+        Raises:
+            ConfigError: no training view is held out, or the budget is too small.
+        """
+        # With its own generator, because the random state of a checkpoint has been restored by now.
+        origin, generator = torch.zeros(1, 3), torch.Generator()
+        least = sizes.bytes_of(from_points(origin, origin, sh_degree=0, num_features=0, generator=generator), None)
+        if self.config.max_bytes is not None and self.config.max_bytes < least:
+            raise ConfigError(
+                f"pruning.max-bytes is {self.config.max_bytes:,}, and one primitive takes {least}; give more"
+            )
+        if not run.num_heldout:
+            raise ConfigError(
+                "pruning.mode auto judges by held-out training views, and there are none: give "
+                "--pipeline.datamanager.holdout-every 8, or less for fewer training views"
+            )
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Evaluate or cut if it is due.
+
+        Raises:
+            DataError: the budget is too small for one primitive, or the field cannot be scored. A checkpoint is saved first.
+        """
+        search = self.search
+        searched = SearchedField(run, self.config)
+        if self._flat is not None:
+            rest = searched.field["features_rest"]
+            self._flat = self._flat.to(rest.device)
+            rest.data.mul_(~self._flat[:, None, None])
+        started = time.perf_counter()
+        try:
+            if not self._act(searched):
+                return
+        except SundaeError:
+            # Do not lose the warm-up to an option that can be corrected.
+            run.save()
+            raise
+        search.seconds += time.perf_counter() - started
+        write(searched, search)
+
+    def _act(self, searched: SearchedField) -> bool:
+        """Begin, end a trial, or evaluate if it is due; returns whether anything was due."""
+        phase = self.search.phase
+        if phase == "before" and searched.state.schedule_step >= self.config.prune_at:
+            self._begin(searched)
+        elif phase == "degrees" and (self._trained(searched) or self._time_is_up(searched)):
+            self._end_trial(searched)
+        elif phase in ("field", "head") and self._evaluation_is_due(searched):
+            self._evaluate(searched)
+        else:
+            return False
+        return True
+
+    def finish(self, run: TrainingRun) -> None:
+        """Evaluate the final field against the target, and log whether it was reached."""
+        config, search = self.config, self.search
+        if search.phase == "before":
+            CONSOLE.print("[yellow]Warning: training ended before the budget search began (pruning.prune-at)")
+            return
+        searched, state = SearchedField(run, config), run.state
+        end = self._point(searched, searched.measure(), "final", "reached")
+        drop, stored, count = search.reference - end.psnr, end.bytes, searched.count
+        option, limit = budget_of(config)
+        cost = {"max_psnr_drop": drop, "max_bytes": stored, "max_primitives": count}[option]
+        end.verdict = "reached" if cost <= limit else "missed"
+        search.curve = [old for old in search.curve if old.phase != "final"] + [end]
+        unfinished = ""
+        if search.searching:
+            # After a warm start, steps of the schedule run ahead of training steps.
+            last = max(config.stop, state.schedule_step + config.search_every) - state.schedule_step + state.step
+            unfinished = f" The search had not ended: train on to step {last}."
+        CONSOLE.log(
+            f"budget {option} {limit:,}: {end.verdict}. {count:,} of {search.before:,} primitives, "
+            f"{megabytes(stored)}, SH degree {searched.field.sh_degree}, "
+            f"{'with' if search.head else 'no'} head, {drop:+.3f} dB lost on {search.views} held-out views.{unfinished}"
+        )
+        write(searched, search)
+
+    # ---------------------------------------------------------------------------------------------------- the steps
+
+    def _begin(self, searched: SearchedField) -> None:
+        search, state = self.search, searched.state
+        self._count_dropped(searched.drop_nonfinite())
+        # Densification has ended, and its statistics would not match a field that is restored with more primitives.
+        self._densification.initialize(state)
+        search.began, search.before = state.schedule_step, searched.count
+        search.views = searched.run.num_heldout
+        search.reference = searched.measure()
+        if search.reference == NO_IMAGE:
+            raise DataError(
+                "the warm-up field renders images that are not finite: the training has diverged, resume from an earlier "
+                "checkpoint"
+            )
+        search.target = search.reference - self.config.tolerated_drop
+        CONSOLE.log(
+            f"step {state.step}: warm-up field of {searched.count:,} primitives, PSNR {search.reference:.3f} dB on "
+            f"{search.views} held-out training views"
+        )
+        searched.restart_rates(head=False)
+        search.degree = searched.field.sh_degree
+        if search.degree > 0 and not self._time_is_up(searched):
+            search.phase = "degrees"
+            self._fallback = searched.snapshot(head=search.head)
+            self._start_trial(searched, search.degree)
+        else:
+            self._after_degrees(searched)
+
+    def _after_degrees(self, searched: SearchedField) -> None:
+        if budget_of(self.config)[0] != "max_psnr_drop":
+            self._fit(searched)
+            self._done(searched)
+            return
+        self.search.begin("field", searched.count)
+        value = searched.measure()
+        if self._clock(searched).over:
+            self._end_phase(searched, value)
+        else:
+            self._cut_or_rest(searched, value)
+
+    def _time_is_up(self, searched: SearchedField) -> bool:
+        """Whether the search must end at this step. A run that ends before ``stop`` may be trained on."""
+        return searched.state.schedule_step >= self.config.stop and searched.steps_left == 0
+
+    def _clock(self, searched: SearchedField) -> _Clock:
+        config, search, step = self.config, self.search, searched.state.schedule_step
+        # Half of the time belongs to the head, if one may be enabled.
+        head_to_come = search.phase == "field" and heads.may_pay(searched, self._largest)
+        deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
+        left = deadline - step if head_to_come else searched.steps_left
+        return _Clock(head_to_come, left, self._is_over(searched, deadline, left))
+
+    def _is_over(self, searched: SearchedField, deadline: int, left: int) -> bool:
+        """Whether too few steps are left to judge another cut."""
+        return searched.state.schedule_step >= deadline or left < self.config.patience * self.config.search_every
+
+    def _evaluation_is_due(self, searched: SearchedField) -> bool:
+        regular = (searched.state.schedule_step - self.search.began) % self.config.search_every == 0
+        return regular or (self.search.trying and self._time_is_up(searched))
+
+    def _evaluate(self, searched: SearchedField) -> None:
+        search, config, state = self.search, self.config, searched.state
+        head_to_come, left, over = self._clock(searched)
+        value = searched.measure() if search.trying else self._measure_finite(searched)
+        verdict = search.judge(value, state.schedule_step, left, config.patience)
+        point = self._point(searched, value, search.phase, verdict)
+        search.curve.append(point)
+        CONSOLE.log(
+            f"step {state.step}: {point.primitives:,} primitives, {value - search.target:+.3f} dB to the target, "
+            f"{point.since_cut} steps after the cut: {verdict}"
+        )
+        searched.run.log_scalars(
+            "Budget", {"primitives": point.primitives, "psnr": value, "to_target": value - search.target}
+        )
+        if verdict == "waiting":
+            return
+        if verdict == "rejected":
+            self._restore(searched, self._accepted)
+            value = search.before_cut
+        # Do not wait for a head that does not help, or for a field while a head is to come.
+        tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
+        lost = search.head and value == NO_IMAGE  # training cannot repair its weights
+        if over or lost or search.looks >= tired * config.patience or search.rejected >= MAX_REJECTED:
+            self._end_phase(searched, value)
+        else:
+            self._cut_or_rest(searched, value)
+
+    def _cut_or_rest(self, searched: SearchedField, value: float) -> None:
+        """Cut as deep as the margin allows, or not at all."""
+        config, search = self.config, self.search
+        count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
+        if count is None or searched.steps_left < config.search_every:  # no evaluation would judge it
+            return
+        self._accepted = searched.snapshot(head=search.head)
+        self._count_dropped(searched.cut_to(count))
+        search.cut(value, count, searched.state.schedule_step)
+
+    def _end_phase(self, searched: SearchedField, value: float) -> None:
+        search, step = self.search, searched.state.schedule_step
+        too_late = self._is_over(searched, self.config.stop, searched.steps_left)
+        if search.phase == "field" and heads.may_pay(searched, self._largest) and not too_late:
+            self._fallback = searched.snapshot(head=search.head)
+            search.begin("head", search.accepted)
+            search.head_at, search.lost_at_join = step, search.steps_lost
+            heads.enable(searched, search, self._largest, searched.count)
+            return
+        if search.phase == "head":
+            assert self._fallback is not None
+            without = len(self._fallback["field"]["means"]["value"]) * searched.row
+            if value == NO_IMAGE or sizes.bytes_of(searched.field, self.head_config) >= without:
+                search.steps_lost = search.lost_at_join + step - search.head_at
+                search.head = False
+                heads.follow(searched.state, search)
+                self._restore(searched, self._fallback)
+        if not search.head and self._largest is not None:
+            heads.remove(searched, search)
+        self._done(searched)
+
+    def _fit(self, searched: SearchedField) -> None:
+        """Cut to the number of primitives that a budget of bytes or primitives allows."""
+        config, search = self.config, self.search
+        row, count = searched.row, min(config.max_primitives or searched.count, searched.count)
+        if config.max_bytes is not None:
+            count = min(config.max_bytes // row, searched.count)
+            if count == 0:
+                raise DataError(
+                    f"pruning.max-bytes is {config.max_bytes:,}, and one primitive takes {row:,}; give more"
+                )
+        if not heads.enable(searched, search, self._largest, count) and self._largest is not None:
+            heads.remove(searched, search)
+        if config.max_bytes is not None:
+            head = self.head_config if search.head else None
+            count = accounting.rows_within(searched.field, config.max_bytes, lambda rows: sizes.bytes_of(rows, head))
+        if count < searched.count:
+            self._count_dropped(searched.cut_to(count))
+            search.cut_at = searched.state.schedule_step
+        search.accepted = searched.count
+        search.curve.append(self._point(searched, searched.measure(), "field", "cut"))
+
+    def _done(self, searched: SearchedField) -> None:
+        search, state = self.search, searched.state
+        search.phase = "done"
+        self._accepted = self._fallback = None
+        value = searched.measure() if searched.field.sh_degree > 0 else NO_IMAGE
+        if value > NO_IMAGE:
+            least = value - FLAT_SHARE * self.config.tolerated_drop
+            if searched.steps_left == 0:  # no training follows that could recover it
+                least = max(least, min(value, search.target))
+            self._flat = flatten(searched, least)
+            search.zeroed = int(self._flat.sum())
+            CONSOLE.log(f"{search.zeroed:,} of {searched.count:,} primitives get view-independent colours")
+        report = PruneReport(
+            step=state.schedule_step,
+            before=search.before,
+            after=searched.count,
+            dropped_nonfinite=search.dropped_nonfinite,
+            peak=state.pruning["peak"],
+            seconds=search.seconds,
+            tau=None,
+            sigma=None,
+            isolated=None,
+        )
+        CONSOLE.log(report.summary())
+        write_report(searched.run, report, before={}, after={})
+
+    # ------------------------------------------------------------------------------------------------- the SH degree
+
+    def _start_trial(self, searched: SearchedField, degree: int) -> None:
+        """Train on from the warm-up field at an SH degree."""
+        search = self.search
+        if degree < search.degree:
+            lower_degree(searched, degree)
+            search.degree = degree
+        search.cut_at = searched.state.schedule_step
+
+    def _trained(self, searched: SearchedField) -> bool:
+        """Whether a trial has been trained as long as all others."""
+        return searched.state.schedule_step - self.search.cut_at >= TRIAL_EVALUATIONS * self.config.search_every
+
+    def _end_trial(self, searched: SearchedField) -> None:
+        search, tolerated = self.search, self.config.tolerated_drop
+        if not self._trained(searched):
+            # The run ends during the trial. The warm-up's own degree needs no proof.
+            if search.degrees:
+                search.steps_lost += searched.state.schedule_step - search.cut_at
+                self._restore(searched, self._accepted)
+            self._leave_trials(searched)
+            return
+        value = search.degrees[str(search.degree)] = self._measure_finite(searched)
+        top = max(int(name) for name in search.degrees)
+        if search.degree == search.lowest_degree(top, tolerated):
+            self._accepted = searched.snapshot(head=search.head) if value > NO_IMAGE else self._fallback
+        degree = search.next_degree(top, tolerated)
+        if len(search.degrees) > 1 or value == NO_IMAGE:  # this trial, or the one that it has replaced
+            search.steps_lost += searched.state.schedule_step - search.cut_at
+        if degree is not None:
+            self._restore(searched, self._fallback)
+            self._start_trial(searched, degree)
+            return
+        if search.degree != search.lowest_degree(top, tolerated) or value == NO_IMAGE:
+            self._restore(searched, self._accepted)
+        self._leave_trials(searched)
+
+    def _leave_trials(self, searched: SearchedField) -> None:
+        search = self.search
+        self._fallback = None
+        if search.degrees:
+            levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
+            CONSOLE.log(f"SH degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
+        self._after_degrees(searched)
+
+    # -------------------------------------------------------------------------------------------------- small things
+
+    def _measure_finite(self, searched: SearchedField) -> float:
+        """PSNR on the held-out views; without primitives that are not finite, if they spoil it."""
+        value = searched.measure()
+        dropped = searched.drop_nonfinite() if value == NO_IMAGE else 0
+        if not dropped:
+            return value
+        self._count_dropped(dropped)
+        self.search.accepted = searched.count
+        return searched.measure()
+
+    def _count_dropped(self, count: int) -> None:
+        self.search.dropped_nonfinite += count
+        if count:
+            CONSOLE.print(f"[yellow]Warning: removed {count} primitives that were not finite")
+
+    def _restore(self, searched: SearchedField, saved: Mapping[str, Snapshot] | None) -> None:
+        searched.restore(saved)
+        self.search.degree = searched.field.sh_degree
+
+    def _point(self, searched: SearchedField, psnr: float, phase: str, verdict: str) -> Point:
+        return point_of(searched, self.search, self._largest, psnr, phase=phase, verdict=verdict)
+
+
+def _search_of(saved: Mapping[str, Any]) -> Search:
+    """The search of a checkpoint."""
+    if not isinstance(saved.get("numbers"), Mapping):
+        raise CheckpointError("the checkpoint is of a run without a budget search; load it with its own method")
+    return Search.from_state(saved["numbers"])

@@ -1,0 +1,189 @@
+"""The field under search: its PSNR on held-out views, its contribution, cuts, and snapshots to return to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sundae_ns.compensation import CompensationHead
+from sundae_ns.errors import DataError
+from sundae_ns.evaluation import psnr
+from sundae_ns.gaussians import FEATURES
+from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.sh_folding import mean_basis
+from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, restore, restore_module, snapshot
+from sundae_ns.pruning import PruningConfig
+from sundae_ns.pruning.cutting import cut, drop_nonfinite
+from sundae_ns.rasterization.harmonics import harmonic_basis
+from sundae_ns.rendering.contribution import contribution, weights_by_batch
+from sundae_ns.rendering.render import render
+from sundae_ns.rendering.source import TrainingView
+from sundae_ns.training.budget.search import NO_IMAGE
+from sundae_ns.training.budget.sizes import bytes_of
+from sundae_ns.training.extension import TrainingRun
+from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.schedulers import notify_pruned
+
+EXACT = 100.0
+"""Highest PSNR of a view, dB; 8-bit images carry no more."""
+MAX_VIEWS = 64
+"""Training views, evenly chosen, for each score: a search scores the field at every cut."""
+
+
+class SearchedField:
+    """What a step of the search does to the field of a run.
+
+    Args:
+        run: the training.
+        config: options of pruning.
+    """
+
+    def __init__(self, run: TrainingRun, config: PruningConfig) -> None:
+        self.run = run
+        self.config = config
+
+    @property
+    def state(self) -> FieldState:
+        """The field in training."""
+        return self.run.state
+
+    @property
+    def field(self) -> Field:
+        """Its parameters."""
+        return self.run.state.field
+
+    @property
+    def count(self) -> int:
+        """Number of primitives."""
+        return self.field.num_primitives
+
+    @property
+    def bare(self) -> dict[str, Tensor]:
+        """Parameters without features."""
+        return {name: value for name, value in self.field.items() if name != FEATURES}
+
+    @property
+    def row(self) -> int:
+        """Bytes of a primitive without features."""
+        return bytes_of({name: value[:1] for name, value in self.bare.items()}, None)
+
+    @property
+    def steps_left(self) -> int:
+        """Training steps to come; without a trainer, those until the search has to end."""
+        last = self.run.last_step
+        return self.config.stop - self.state.schedule_step if last is None else last - self.state.step
+
+    # ------------------------------------------------------------------------------------------------------- views
+
+    def _views(self) -> list[TrainingView]:
+        views = self.run.training_views()
+        return views[:: -(-len(views) // MAX_VIEWS)]
+
+    def contribution(self, keep_ratio: float | None = None) -> Tensor:
+        """Blending weights over some training views ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
+        return contribution(self.run.source, self._views(), self.run.background, self.run.settings, keep_ratio)
+
+    @torch.no_grad()
+    def mean_basis(self, degree: int) -> tuple[Tensor, Tensor]:
+        """Means and mean products of the SH basis up to ``degree`` over the views that see each primitive."""
+
+        def weighted() -> Iterator[tuple[Tensor, Tensor]]:
+            run, means = self.run, self.field["means"].data
+            for _, view, _, weights in weights_by_batch(run.source, self._views(), run.background, run.settings):
+                directions = torch.nn.functional.normalize(means - view.center, dim=-1)
+                yield weights, harmonic_basis(degree, directions)
+
+        return mean_basis(weighted())
+
+    @torch.no_grad()
+    def measure(self) -> float:
+        """Mean PSNR over the held-out views, dB; with the head if it is enabled. Always finite.
+
+        An image that is not finite counts as ``NO_IMAGE``, a view as at most ``EXACT``. Masked pixels do not count.
+
+        Raises:
+            DataError: masks leave no pixel.
+        """
+        run, values = self.run, []
+        for view, target, mask in run.heldout_views():
+            images, _ = render(run.source, view, run.background, run.settings, depth=False)
+            image = images["rgb"]
+            if mask is not None:
+                if not mask.any():
+                    continue
+                image, target = image[mask][None], target[mask][None]
+            values.append(psnr(image, target).clamp_max(EXACT))
+        if not values:
+            raise DataError(
+                "masks leave no pixel of the held-out views; mend the masks, or hold out other views with "
+                "--pipeline.datamanager.holdout-every"
+            )
+        value = float(torch.stack(values).mean())
+        return value if math.isfinite(value) else NO_IMAGE
+
+    # ------------------------------------------------------------------------------------------------------- fields
+
+    def drop_nonfinite(self) -> int:
+        """Remove primitives with a NaN or infinite parameter; returns their number."""
+        return drop_nonfinite(self.field, self.state.optimizers, self.state.pruning)
+
+    def cut_to(self, count: int) -> int:
+        """Keep ``count`` primitives by the configured rule, or all that are finite if there are fewer.
+
+        Returns:
+            Number of primitives removed because they were not finite.
+
+        Raises:
+            DataError: the field cannot be scored.
+        """
+        state = self.state
+        options = replace(self.config, seed=self.config.seed + state.schedule_step)
+
+        def weights() -> Tensor:
+            return self.contribution(count / self.count if options.uses_detail else None)
+
+        decision = cut(
+            self.field,
+            state.optimizers,
+            state.pruning,
+            options,
+            weights,
+            step=state.schedule_step,
+            count=lambda n: min(count, n),
+        )
+        return decision.dropped_nonfinite
+
+    def snapshot(self, *, head: bool) -> dict[str, Snapshot]:
+        """Copies of the field, and of the head if asked for, with their optimizers' states."""
+        optimizers = self.state.optimizers
+        saved = {"field": snapshot(self.field, optimizers)}
+        if head:
+            saved["head"] = module_snapshot(self._head.parameters(), optimizers["compensation"])
+        return saved
+
+    def restore(self, saved: Mapping[str, Snapshot] | None) -> None:
+        """Return to a snapshot."""
+        assert saved is not None
+        optimizers: Mapping[str, Any] = self.state.optimizers
+        restore(self.field, optimizers, saved["field"])
+        if "head" in saved:
+            restore_module(self._head.parameters(), optimizers["compensation"], saved["head"])
+        # Whatever is cached by the number of prunes is stale.
+        self.state.pruning["num_prunes"] += 1
+
+    @property
+    def _head(self) -> CompensationHead:
+        head = self.state.head
+        assert head is not None
+        return head
+
+    def restart_rates(self, *, head: bool) -> None:
+        """Restart the learning rates of the field, or those of the head."""
+        schedulers = self.state.schedulers
+        restarted = {name: value for name, value in schedulers.items() if (name == "compensation") == head}
+        notify_pruned(restarted, self.state.step)

@@ -1,0 +1,112 @@
+"""The parts of a model, built from its options: parameters, networks, state and extensions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, cast
+
+import torch
+
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.errors import ConfigError
+from sundae_ns.gaussians.field import Field
+from sundae_ns.pruning import PruningConfig
+from sundae_ns.training.budget import BudgetSearch
+from sundae_ns.training.densification import Densification, GrowthOptions, make_strategy
+from sundae_ns.training.extension import Extension
+from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.initial_field import Frame, PointOptions, Points, Start, initial_field
+from sundae_ns.training.pruning import ScheduledPruning
+from sundae_ns.training.schedules import make_schedule
+
+
+class BuildOptions(GrowthOptions, PointOptions, Protocol):
+    """Options of a model that the parts depend on; ``SundaeModelConfig`` has them all."""
+
+    pruning: PruningConfig
+    head: HeadConfig
+    warmup: Literal["densify", "mcmc"]
+    mcmc_cap: int
+    warm_start: Path | None
+    sh_degree_interval: int
+    evaluate_prune: bool
+    base_loss_weight: float
+    use_bilateral_grid: bool
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a model is made of."""
+
+    gauss_params: torch.nn.ParameterDict
+    networks: torch.nn.ModuleDict
+    state: FieldState
+    """On these parameters and networks."""
+    extensions: list[Extension]
+    """Densification, scheduled pruning and, in mode auto, the budget search, in the order in which they act."""
+    start: Start
+    """To announce when training starts."""
+
+
+def check(options: BuildOptions) -> None:
+    """Check options that cannot work, alone or together.
+
+    Raises:
+        ConfigError: the first such option, and its mend.
+    """
+    options.pruning.validate()
+    if options.head.mode != "off":
+        options.head.validate()
+    if options.mcmc_cap < 1:
+        raise ConfigError(f"mcmc-cap is {options.mcmc_cap}; give the highest number of primitives, at least 1")
+    if options.base_loss_weight < 0:
+        raise ConfigError(f"base-loss-weight is {options.base_loss_weight}; give 0 or more")
+    if options.warm_start is not None and options.pruning.mode == "continuous":
+        raise ConfigError("a warm start is pruned at once, not while it grows: set pruning.mode to one-shot")
+    if options.use_bilateral_grid:
+        raise ConfigError("sundae has no bilateral grid: the head would learn against it; use splatfacto for it")
+
+
+def build(options: BuildOptions, *, num_images: int, points: Points | None, frame: Frame | None) -> Parts:
+    """Build the parts on the CPU.
+
+    Args:
+        options: of the model.
+        num_images: number of training images.
+        points: sparse points of the capture, if it has any.
+        frame: transform from the capture's coordinates to the model's, if known.
+
+    Raises:
+        ConfigError: an option cannot work.
+    """
+    check(options)
+    pruning, head, warm = options.pruning, options.head, options.warm_start is not None
+    mcmc_cap = options.mcmc_cap if options.warmup == "mcmc" else None
+    strategy = make_strategy(options, pruning, mcmc_cap=mcmc_cap, num_images=num_images)
+    params, start = initial_field(
+        options,
+        points,
+        frame,
+        num_features=0 if head.mode == "off" else head.num_features,
+        cap=strategy.cap,
+        chain=mcmc_cap is not None,
+        seed=pruning.seed,
+    )
+    gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
+    networks = torch.nn.ModuleDict({} if head.mode == "off" else {"head": CompensationHead(head)})
+    state = FieldState(
+        field=Field(cast(Any, gauss_params), "logits" if options.sh_degree == 0 else "harmonics"),
+        networks=networks,
+        offset=pruning.prune_at if warm else 0,
+        densify_until=strategy.refine_stop_iter,
+        head_starts_at=pruning.settled_at if head.start_at is None else head.start_at,
+        sh_degree_interval=None if warm else options.sh_degree_interval,
+    )
+    densification, schedule = Densification(strategy), make_schedule(pruning)
+    densification.initialize(state)
+    state.pruning = schedule.initialize_state()
+    extensions: list[Extension] = [densification, ScheduledPruning(schedule, evaluate=options.evaluate_prune)]
+    if pruning.mode == "auto":
+        extensions.append(BudgetSearch(pruning, head, densification, state))
+    return Parts(gauss_params, networks, state, extensions, start)

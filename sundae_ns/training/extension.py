@@ -1,0 +1,108 @@
+"""What takes part in training beside the step itself: densification, pruning, the search for a budget."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from torch import Tensor
+
+from sundae_ns.rendering.render import RenderSettings
+from sundae_ns.rendering.source import FieldSource, TrainingView
+from sundae_ns.rendering.views import View
+from sundae_ns.training.field_state import FieldState
+
+
+class HeldOutView(NamedTuple):
+    """A training view that is held back from training."""
+
+    view: View
+    target: Tensor
+    """The image over the background of :attr:`TrainingRun.background`, in [0, 1] ``[H, W, 3]``."""
+    mask: Tensor | None
+    """Pixels that count, bool ``[H, W]``; None for all."""
+
+
+class TrainingRun(Protocol):
+    """What an extension may ask of the program that trains. nerfstudio's trainer stands behind it in ``ns-train``."""
+
+    @property
+    def state(self) -> FieldState:
+        """The field in training."""
+
+    @property
+    def source(self) -> FieldSource:
+        """Where views get their primitives from."""
+
+    @property
+    def background(self) -> Tensor:
+        """Background of images that are not trained on ``[3]``."""
+
+    @property
+    def settings(self) -> RenderSettings:
+        """Settings of images that are not trained on, at this step."""
+
+    @property
+    def last_step(self) -> int | None:
+        """Step at which training ends; None if no trainer says so."""
+
+    @property
+    def num_steps(self) -> int | None:
+        """Number of steps of the run; None if no trainer says so."""
+
+    @property
+    def images_per_step(self) -> int:
+        """Number of images in the batch of a step: the number of ranks."""
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder for records; None without one, and on every rank but the first."""
+
+    @property
+    def num_heldout(self) -> int:
+        """Number of held-out training views."""
+
+    def training_views(self) -> list[TrainingView]:
+        """The training views that are not held out."""
+
+    def heldout_views(self) -> Iterator[HeldOutView]:
+        """The held-out training views, loaded one at a time."""
+
+    def evaluate(self) -> dict[str, float]:
+        """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without test views. With several ranks, collective."""
+
+    def save(self) -> None:
+        """Save a checkpoint, if there is a trainer."""
+
+    def log_scalars(self, name: str, values: Mapping[str, float | int]) -> None:
+        """Write numbers to the run's event file."""
+
+
+class Extension:
+    """Base of the extensions: every verb does nothing. The model calls each verb on all extensions in their order."""
+
+    name: str
+    """Key of its state in checkpoints."""
+
+    def before_training(self, run: TrainingRun) -> None:
+        """Check options and warn, before the first step and after a checkpoint has been loaded."""
+
+    def before_backward(self, state: FieldState) -> None:
+        """Prepare ``state.info`` of a training image for the backward pass."""
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Act after the optimizers' step. May replace parameters of the field."""
+
+    def finish(self, run: TrainingRun) -> None:
+        """Report after the last step."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Own state for a checkpoint, beside the running states of :class:`FieldState`; plain values and tensors."""
+        return {}
+
+    def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Give field and head the shapes that they have in a checkpoint with this state of the extension."""
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Take over the state of a checkpoint, after field and head were loaded."""

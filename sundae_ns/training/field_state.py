@@ -1,0 +1,129 @@
+"""The state of a field in training: field, head, optimizers, running states, and one clock. Knows no nerfstudio."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from sundae_ns.compensation import CompensationHead
+from sundae_ns.gaussians.field import Field
+from sundae_ns.rasterization import Backend
+from sundae_ns.rendering.render import RenderSettings
+
+_HEAD = "head"
+
+
+@dataclass
+class FieldState:
+    """Everything that training changes, and when it changes.
+
+    Surgery (densification, prunes) replaces parameters in ``field`` and in ``optimizers``, and slices the running states.
+    """
+
+    field: Field
+    """The primitives of this process."""
+    networks: torch.nn.ModuleDict
+    """Holds the head under ``head``; the model registers this module, so checkpoints follow when the head is removed."""
+    optimizers: Mapping[str, Optimizer] = dataclasses.field(default_factory=dict)
+    """By parameter name; ``compensation`` is the head's."""
+    schedulers: Mapping[str, LRScheduler] = dataclasses.field(default_factory=dict)
+    """By the same names, where rates change."""
+    densification: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Running state of densification; tensors ``[N, ...]`` and plain numbers."""
+    pruning: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Running state of pruning: plain integers."""
+    info: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """What the rasteriser says of the last training image, with gradients after the backward pass."""
+    trained_focal: tuple[float, float] | None = None
+    """Shortest and longest focal length of the images that the head was trained on, pixels."""
+
+    step: int = 0
+    """Training step."""
+    offset: int = 0
+    """Steps of the schedule that a warm start skips."""
+    densify_until: int = 0
+    """Step of the schedule at which densification ends."""
+    head_starts_at: float = math.inf
+    """Step of the schedule after which the head is enabled."""
+    sh_degree_interval: int | None = None
+    """Steps after which the next SH degree is enabled; None enables all at once, as after a warm start."""
+
+    @property
+    def schedule_step(self) -> int:
+        """Step of the schedule: a warm start begins where its warm-up would have ended."""
+        return self.step + self.offset
+
+    @property
+    def device(self) -> torch.device:
+        """Device of the field."""
+        device: torch.device = self.field["means"].device
+        return device
+
+    @property
+    def densifying(self) -> bool:
+        """Whether the field still grows."""
+        return self.schedule_step < self.densify_until
+
+    @property
+    def active_sh_degree(self) -> int | None:
+        """Highest SH degree in use; None for the degree of the field."""
+        return None if self.sh_degree_interval is None else self.step // max(self.sh_degree_interval, 1)
+
+    @property
+    def head(self) -> CompensationHead | None:
+        """The head; None if the field has none."""
+        return self.networks[_HEAD] if _HEAD in self.networks else None  # type: ignore[return-value]
+
+    @property
+    def head_enabled(self) -> bool:
+        """Whether images get the head's correction at this step."""
+        return self.head is not None and self.schedule_step > self.head_starts_at
+
+    def remove_head(self) -> None:
+        """Do without a head from now on."""
+        if _HEAD in self.networks:
+            del self.networks[_HEAD]
+
+    def remember_focal(self, focal: float) -> None:
+        """Note the focal length of an image that the head is trained on, pixels."""
+        low, high = self.trained_focal or (focal, focal)
+        self.trained_focal = (min(low, focal), max(high, focal))
+
+    def render_settings(
+        self, backend: Backend, *, antialiased: bool, training: bool = False, absgrad: bool = False
+    ) -> RenderSettings:
+        """Settings that render the field at this step.
+
+        Args:
+            backend: the rasteriser.
+            antialiased: see :class:`RenderSettings`.
+            training: whether gradients are needed.
+            absgrad: whether densification reads absolute gradients.
+        """
+        return RenderSettings(
+            backend=backend,
+            active_sh_degree=self.active_sh_degree,
+            antialiased=antialiased,
+            training=training,
+            absgrad=absgrad and training and self.densifying,
+            head=self.head if self.head_enabled else None,
+            trained_focal=self.trained_focal,
+        )
+
+    def running_states(self) -> dict[str, dict[str, Any]]:
+        """Running states for a checkpoint."""
+        return {"densification": dict(self.densification), "pruning": dict(self.pruning)}
+
+    def load_running_states(self, saved: Mapping[str, Mapping[str, Any]]) -> None:
+        """Counterpart of :meth:`running_states`; tensors move to the device of the field."""
+        for own, theirs in ((self.densification, saved["densification"]), (self.pruning, saved["pruning"])):
+            own.clear()
+            own.update({k: v.to(self.device) if isinstance(v, Tensor) else v for k, v in theirs.items()})

@@ -1,0 +1,234 @@
+"""Arms of ``sundae bench quality``: read from a file, checked before anything is trained, and made into commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sundae_ns.cli.bench.arms import DEFAULT_FILE, Entry, Lengths, choose_arms, read_entries
+from sundae_ns.cli.bench.job import configure
+from sundae_ns.cli.bench.plan import Arm, Job, plan_scene
+from sundae_ns.errors import ConfigError
+
+DEFAULTS = [
+    *("sundae", "band", "contribution", "random"),
+    *("sundae-no-head", "band-no-head", "contribution-no-head", "random-no-head"),
+    *("mcmc", "splatfacto", "splatfacto-7k"),
+]
+MINE = """
+- name: gentle  # a comment
+  method: sundae
+  options:
+    pipeline.model.pruning.keep-ratio: 0.3
+    pipeline.model.head.mode: off
+- name: listed
+  options:
+    - --pipeline.model.pruning.score contribution
+    - pipeline.model.use_scale_regularization true
+- name: stock
+  method: splatfacto
+  options: {max-num-iterations: 1000, pipeline.model.sh-degree: 2}
+- name: steady
+  method: sundae-continuous
+  options:
+    pipeline.model.pruning.keep-ratio: 0.4
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "mine.yaml"
+    path.write_text(text)
+    return path
+
+
+def chosen(path: Path, **lengths: Any) -> dict[str, Arm]:
+    return {arm.name: arm for arm in choose_arms([str(path)], "sundae", Lengths(**lengths))}
+
+
+def jobs_of(arms: dict[str, Arm]) -> dict[str, Job]:
+    jobs = plan_scene("fox", Path("fox"), (), list(arms.values()), keep_ratios=[0.1], seeds=[42], repeat_at=[])
+    return {job.arm: job for job in jobs}
+
+
+# -------------------------------------------------------------------------------------------------------- what a file says
+
+
+def test_a_file_of_arms(tmp_path: Path) -> None:
+    gentle, listed, stock, steady = read_entries(written(tmp_path, MINE))
+    assert gentle.method == "sundae"
+    assert gentle.options == {
+        "pipeline.model.pruning.keep-ratio": ("0.3",),
+        "pipeline.model.head.mode": ("off",),  # a word, not YAML's False
+    }
+    assert listed == Entry(
+        "listed",
+        None,
+        {
+            "pipeline.model.pruning.score": ("contribution",),
+            "pipeline.model.use-scale-regularization": ("True",),
+        },
+    )
+    assert (stock.method, stock.options["max-num-iterations"]) == ("splatfacto", ("1000",))
+    assert steady.method == "sundae-continuous"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("name: a", "mine.yaml holds no list of arms; write"),
+        ("", "holds no list of arms"),
+        ("- name: [a", "mine.yaml is no YAML .*; mend it"),
+        ("- sundae", "arm 1 has no name; write `- name: NAME`"),
+        ("- name: a\n- method: sundae", "arm 2 has no name"),
+        ("- name: a\n  colour: red", r"arm 1 \(a\) has 'colour'; an arm has name, method and options"),
+        ("- name: a b", "cannot be named 'a b'; use letters"),
+        ("- name: sundae-warm-up", "cannot be named 'sundae-warm-up'"),
+        ("- name: a\n  method: [sundae]", "has a method that is no name; write"),
+        ("- name: a\n- name: a", "mine.yaml has a twice; give each once"),
+        ("- name: a\n  options: 3", "has options that are neither a mapping nor a list of texts; write"),
+        ("- name: a\n  options: [{b: c}]", "neither a mapping nor a list"),
+        ("- name: a\n  options: ['b \"c']", "an option with an open quote .*; close it"),
+        ("- name: a\n  options: {b: {c: d}}", "has option b without a plain value; write `b: value`"),
+        ("- name: a\n  options: [--b]", "has option --b without a plain value"),
+        ("- name: a\n  options: [b 1, --b 2]", "options has b twice; give each once"),
+        ("- name: a\n  options: {machine.seed: 1}", "sets machine.seed, which the command sets itself; remove it"),
+    ],
+)
+def test_files_that_are_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as raised:
+        read_entries(written(tmp_path, text))
+    assert "\n" not in str(raised.value)
+
+
+def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"gone\.yaml cannot be read .*; give a file of arms"):
+        choose_arms([str(tmp_path / "gone.yaml")], "sundae", Lengths())
+    (tmp_path / "mine.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_entries(tmp_path / "mine.yaml")
+
+
+# ------------------------------------------------------------------------------------------------------------ what is chosen
+
+
+def test_the_default_arms_are_a_file_like_any_other() -> None:
+    assert [entry.name for entry in read_entries(DEFAULT_FILE)] == DEFAULTS
+    arms = choose_arms([], "sundae", Lengths())
+    assert [arm.name for arm in arms] == DEFAULTS
+    assert {arm.method for arm in arms} == {"sundae", "splatfacto"}
+    tiny = choose_arms(["random", "mcmc"], "sundae-tiny", Lengths())
+    assert [(arm.name, arm.kind, arm.method) for arm in tiny] == [
+        ("random", "branch", "sundae-tiny"),
+        ("mcmc", "mcmc", "sundae-tiny"),
+    ]
+
+
+def test_default_arms_and_those_of_a_file_together(tmp_path: Path) -> None:
+    path = str(written(tmp_path, "- name: stock\n  method: splatfacto"))
+    assert [arm.name for arm in choose_arms(["random", path], "sundae", Lengths())] == ["random", "stock"]
+    with pytest.raises(ConfigError, match="--arms has random twice; give each once"):
+        choose_arms(["random", "random"], "sundae", Lengths())
+    with pytest.raises(ConfigError, match=r"best is no arm; use some of sundae, band, .*, or a file of arms \(.yaml\)"):
+        choose_arms(["best"], "sundae", Lengths())
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("- {name: a, method: splatfact}", "arm a: ns-train has no method 'splatfact'; use splatfacto"),
+        ("- {name: a, method: nerfacto}", "arm a: nerfacto has no Gaussians; use splatfacto or a method of"),
+        (
+            "- {name: a, options: {pipeline.model.prunning.score: random}}",
+            "sundae has no option pipeline.model.prunning.score; did you mean pipeline.model.pruning.score",
+        ),
+        ("- {name: a, options: {pipeline.model.head: off}}", "sundae has no option pipeline.model.head; did you"),
+        (
+            "- {name: a, method: splatfacto, options: {pipeline.model.pruning.score: random}}",
+            "splatfacto has no option",
+        ),
+        ("- {name: a, options: {pipeline.model.pruning.score: best}}", "arm a: invalid choice 'best' for argument"),
+        (
+            "- {name: a, options: {pipeline.model.pruning.keep-ratio: many}}",
+            "arm a: .*keep-ratio: could not convert string to float: 'many'",
+        ),
+        ("- {name: a, options: {pipeline.model.pruning.keep-ratio: 3}}", r"arm a: keep_ratio is 3.0: use a share"),
+        (
+            "- {name: a, options: {pipeline.model.head.num-features: 0}}",
+            "arm a: head.num-features is 0; set at least 1",
+        ),
+    ],
+)
+def test_methods_and_options_are_checked_before_anything_is_trained(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as raised:
+        chosen(written(tmp_path, text))
+    assert "\n" not in str(raised.value)
+
+
+def test_lengths_come_from_the_method_unless_they_are_given(tmp_path: Path) -> None:
+    path = written(tmp_path, MINE)
+    lengths = {name: (arm.kind, arm.warmup, arm.steps) for name, arm in chosen(path).items()}
+    assert lengths == {
+        "gentle": ("branch", 15_000, 15_000),
+        "listed": ("branch", 15_000, 15_000),
+        "stock": ("whole", 0, 1000),
+        "steady": ("whole", 0, 30_000),
+    }
+    half = {name: (arm.warmup, arm.steps) for name, arm in chosen(path, warmup=7, scale=0.5).items()}
+    assert half == {"gentle": (4, 7500), "listed": (4, 7500), "stock": (0, 500), "steady": (0, 15_000)}
+    (mcmc,) = choose_arms(["mcmc"], "sundae", Lengths(warmup=7, finetune=5))
+    assert (mcmc.warmup, mcmc.steps) == (7, 12)
+    for method, odd in (
+        ("nerfacto", {}),
+        ("sundae-continuous", {}),
+        ("sundae", {"scale": 0.0}),
+        ("sundae", {"warmup": 0}),
+    ):
+        with pytest.raises(ConfigError):
+            choose_arms(["sundae"], method, Lengths(**odd))  # type: ignore[arg-type]
+
+
+# ---------------------------------------------------------------------------------------------------------- what is trained
+
+
+def test_arms_of_a_file_become_commands_of_ns_train(tmp_path: Path) -> None:
+    jobs = jobs_of(chosen(written(tmp_path, MINE)))
+    assert set(jobs) == {"sundae-warm-up", "gentle", "listed", "stock", "steady"}
+    assert (jobs["gentle"].keep_ratio, jobs["listed"].keep_ratio, jobs["stock"].keep_ratio) == (0.3, 0.1, None)
+    assert jobs["gentle"].key == "fox-gentle-30pct-s42"
+    assert jobs["gentle"].needs == jobs["listed"].needs == "fox-sundae-warm-up-s42"
+
+    _, command = configure(jobs["stock"], tmp_path / "out")
+    assert (
+        command
+        == "ns-train splatfacto --data fox --machine.seed 42 --max-num-iterations 1000 --pipeline.model.sh-degree 2"
+    )
+    stock, _ = configure(jobs["stock"], tmp_path / "out")
+    assert (stock.max_num_iterations, stock.pipeline.model.sh_degree) == (1000, 2)  # type: ignore[attr-defined]
+    steady, _ = configure(jobs["steady"], tmp_path / "out")
+    pruning = steady.pipeline.model.pruning  # type: ignore[attr-defined]
+    assert (steady.max_num_iterations, pruning.mode, pruning.keep_ratio) == (30_000, "continuous", 0.4)
+    assert not steady.pipeline.model.evaluate_prune  # type: ignore[attr-defined]
+
+
+def test_options_of_an_arm_override_those_of_the_plan(tmp_path: Path) -> None:
+    text = "- {name: a, options: {pipeline.model.pruning.seed: 7, max-num-iterations: 100}}"
+    job = jobs_of(chosen(written(tmp_path, text)))["a"]
+    place = job.options.index("--pipeline.model.pruning.seed")
+    assert job.options[place + 1] == "7"
+    assert job.options.count("--pipeline.model.pruning.seed") == 1
+    # Rates decay over the arm's own length; its warm-up is that of all arms.
+    assert job.steps == 100
+    assert job.options[job.options.index("--optimizers.means.scheduler.max-steps") + 1] == "100"
+
+
+def test_each_method_has_a_warm_up_of_its_own(tmp_path: Path) -> None:
+    text = "- {name: a}\n- {name: b, options: {max-num-iterations: 9}}\n- {name: c, method: sundae-tiny}"
+    jobs = jobs_of(chosen(written(tmp_path, text)))
+    assert (jobs["a"].needs, jobs["b"].needs) == ("fox-sundae-warm-up-s42",) * 2
+    assert jobs["c"].needs == "fox-sundae-tiny-warm-up-s42"
+    warm_up = jobs["sundae-warm-up"]
+    assert (warm_up.method, warm_up.steps) == ("sundae", 15_000)
+    assert warm_up.options[-1] == "30000"
+    assert jobs["sundae-tiny-warm-up"].steps < 15_000

@@ -1,0 +1,51 @@
+"""Camera poses between the conventions of nerfstudio and of the rasteriser, against the inverse of the pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from sundae_ns.data import Camera, look_at, project
+from sundae_ns.data.camera_axes import world_to_camera, world_to_camera_floats
+
+
+def random_pose(seed: int) -> Tensor:
+    """Camera-to-world ``[3, 4]`` float64."""
+    generator = torch.Generator().manual_seed(seed)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+    return torch.cat(
+        [rotation * torch.linalg.det(rotation), 10 * torch.randn(3, 1, generator=generator).double()], dim=1
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_both_functions_invert_the_pose_with_y_and_z_flipped(seed: int) -> None:
+    pose = random_pose(seed)
+    square = torch.cat([pose, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).double()])
+    expected = torch.linalg.inv(square @ torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]).double()))
+    torch.testing.assert_close(world_to_camera(pose), expected)
+    floats = world_to_camera_floats(pose.flatten().tolist())
+    torch.testing.assert_close(torch.tensor(floats, dtype=torch.float64).view(4, 4), expected)
+
+
+def test_a_point_in_front_and_below_has_positive_z_and_y() -> None:
+    pose = torch.tensor([[1.0, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7]])
+    point = torch.tensor([5.5, 5.0, 4.0, 1.0])  # half a unit to the right, one below, three in front of the camera
+    assert (world_to_camera(pose) @ point).tolist() == [0.5, 1.0, 3.0, 1.0]
+
+
+def test_depth_agrees_with_the_projection_of_the_embedded_capture() -> None:
+    camera = Camera(look_at(np.array([3.0, 2.0, 1.0]), np.zeros(3)), focal=50.0, width=40, height=30)
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    matrix = world_to_camera(torch.from_numpy(camera.camera_to_world[:3])).numpy()
+    local = points @ matrix[:3, :3].T + matrix[:3, 3]
+    image, depth = project(camera, points)
+    np.testing.assert_allclose(local[:, 2], depth)
+    np.testing.assert_allclose(50.0 * local[:, :2] / local[:, 2:] + [20, 15], image)
+
+
+def test_gradients_reach_the_pose() -> None:
+    pose = random_pose(0).requires_grad_()
+    assert torch.autograd.gradcheck(world_to_camera, (pose,))

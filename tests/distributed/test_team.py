@@ -1,0 +1,83 @@
+"""The verbs behind which the trainer does not see the number of processes."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from sundae_ns.distributed import OneProcess, Ranks, team_of
+from sundae_ns.distributed.densification import ShardedDensification
+from sundae_ns.distributed.pruning import GlobalPruning
+from sundae_ns.errors import ConfigError
+from sundae_ns.gaussians.field import Field
+from sundae_ns.method_configs import sundae_tiny
+from sundae_ns.pruning import PruningConfig
+from sundae_ns.rendering import LocalField
+from sundae_ns.training.densification import CappedStrategy, Densification
+from sundae_ns.training.extension import Extension
+from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.pruning import ScheduledPruning
+from sundae_ns.training.schedules import make_schedule
+
+
+@pytest.fixture
+def config() -> Any:
+    config: Any = copy.deepcopy(sundae_tiny.config)
+    config.machine.device_type, config.vis = "cpu", "viewer+wandb"
+    return config
+
+
+def test_one_process_changes_nothing(config: Any, tmp_path: Path) -> None:
+    team = team_of(0, 1)
+    assert type(team) is OneProcess
+    assert team.configured(config) is config
+    team.make_folder(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+    state = FieldState(field=Field({"means": torch.zeros(2, 3)}), networks=torch.nn.ModuleDict())
+    source, extensions = LocalField(state.field), [Extension()]
+    shared = team.share(state, source, extensions, None, 0)
+    assert shared[0] is source
+    assert shared[1] is extensions
+    made: Any = object()
+    assert team.optimizers(lambda: made, None, None, []) is made
+    checkpoint = {"step": 3}
+    assert team.gathered(checkpoint, []) is checkpoint
+    assert team.part(checkpoint, []) is checkpoint
+    random = torch.get_rng_state()
+    team.check_copies(None)
+    team.restored(state, 0, 4)
+    assert torch.equal(torch.get_rng_state(), random)
+
+
+def test_ranks_train_in_larger_batches_without_a_viewer(config: Any, tmp_path: Path) -> None:
+    team = team_of(0, 2)
+    assert type(team) is Ranks
+    found = team.configured(config)
+    assert (found.max_num_iterations, found.vis) == (config.max_num_iterations // 2, "wandb")
+    assert found.pipeline.datamanager.cache_images == "cpu"
+    assert config.vis == "viewer+wandb"
+    for _ in range(2):  # two ranks make the same folder
+        team.make_folder(tmp_path / "a" / "run")
+    config.pipeline.model.pruning.mode = "auto"
+    with pytest.raises(ConfigError, match="several GPUs"):
+        team.configured(config)
+
+
+def test_ranks_densify_and_prune_as_one() -> None:
+    team, shards = Ranks(0, 2), object()
+    team.shards = shards  # type: ignore[assignment]
+    strategy = CappedStrategy(refine_every=6)
+    densification = team._sharded(Densification(strategy), 7)
+    assert isinstance(densification, ShardedDensification)
+    assert densification.strategy is strategy
+    assert strategy.pause_refine_after_reset == 4 + 6, "each of 7 images is seen in 4 steps of 2"
+    pruning = team._sharded(ScheduledPruning(make_schedule(PruningConfig(prune_at=3)), evaluate=True), 7)
+    assert isinstance(pruning, ScheduledPruning)
+    assert isinstance(pruning.schedule, GlobalPruning)
+    assert (pruning.schedule.shards, pruning.schedule.config.prune_at, pruning.evaluate) == (shards, 3, True)
+    other = Extension()
+    assert team._sharded(other, 7) is other
