@@ -122,6 +122,12 @@ class CompensationHead(nn.Module):
         residual = self.config.mode == "residual"
         self._inference, self._training = FusedInference(self.net, residual), FusedTraining(self.net, residual)
         self._can_fuse = self.config.fused
+        # Listed once, because every frame asks for the addresses and a walk over all layers takes 0.1 ms.
+        self._weights = tuple(self.net.parameters())
+
+    def addresses(self) -> tuple[int, ...]:
+        """Addresses of the weights, which recorded frames read."""
+        return tuple(value.data_ptr() for value in self._weights)
 
     def train(self, mode: bool = True) -> CompensationHead:
         """Switch between training and evaluation, which no layer distinguishes."""

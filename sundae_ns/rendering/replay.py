@@ -8,7 +8,7 @@ tensors that hold camera and background.
 from __future__ import annotations
 
 import logging
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
 from typing import Any
@@ -112,8 +112,8 @@ class FrameReplay:
         of_head: tuple[object, ...] | None = None
         if head is not None:
             # The network itself and not its id, which a later network could reuse.
-            weights = tuple(value.data_ptr() for value in head.net.parameters())
-            of_head = (head.net, weights, astuple(head.config), *scale_plan(view, settings.trained_focal))
+            options = tuple(vars(head.config).values())
+            of_head = (head.net, head.addresses(), options, *scale_plan(view, settings.trained_focal))
         degree = degree_in_use(field.sh_degree, settings.active_sh_degree)
         return view.width, view.height, settings.antialiased, field.encoding, degree, of_head
 
