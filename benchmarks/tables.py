@@ -37,7 +37,7 @@ METHODS = {
     "contribution-no-head": "highest contribution, as LightGaussian",
 }
 """Arms of runs.csv in the order of a table, by the names that readers see."""
-HEADLINE = ("splatfacto", "sundae", "sundae-no-head", "mcmc", "contribution-no-head")
+HEADLINE = ("splatfacto", "sundae-warm-up", "sundae")
 
 
 def lines_of(name: str) -> list[dict[str, Any]]:

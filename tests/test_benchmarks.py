@@ -65,7 +65,7 @@ def test_commands_of_rows_are_ones_that_ns_train_takes() -> None:
     rows = [row for row in read_rows(RESULTS / "runs.csv") if row.command.startswith("ns-train ")]
     assert len(rows) >= 5
     for row in rows:
-        words = row.command.split()[1:]
+        words = row.command.partition(";")[0].split()[1:]
         config = tyro.cli(AnnotatedBaseConfigUnion, args=words)  # type: ignore[arg-type]
         assert config.max_num_iterations == row.steps  # type: ignore[attr-defined]
 
