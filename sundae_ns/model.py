@@ -109,7 +109,7 @@ class SundaeModel(SplatfactoModel):
     source: FieldSource
     """Where views get their primitives from."""
     extensions: list[Extension]
-    """What takes part in training, in the order in which it acts."""
+    """Parts of training beside the step, in the order in which they act."""
 
     def populate_modules(self) -> None:
         """Build field, head and extensions. The device of the model is not known yet."""

@@ -32,8 +32,8 @@ def view_weights(
         view: the camera.
         background: colour ``[3]``.
         settings: how images are made.
-        keep_ratio: share of the primitives that will stay. If given, pixels are weighted by the detail that so many
-            primitives can show (:func:`sundae_ns.pruning.pixel_detail`).
+        keep_ratio: share of the primitives that will stay. If given, pixels are weighted by detail at the
+            resolution of these primitives (:func:`sundae_ns.pruning.pixel_detail`).
         mask: pixels that count, bool ``[H, W, 1]``; None for all.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What takes part in training beside the step itself: densification, pruning, the search for a budget."""
+"""The protocol between training and its extensions: densification, pruning, the budget search."""
 
 from __future__ import annotations
 
