@@ -60,10 +60,10 @@ class Room(NamedTuple):
 
 
 ROOMS = {
-    "pruning": Room(("pruning/[!_]*.py",), ("pruning/test_*.py",)),
+    "pruning": Room(("pruning/[!_]*.py",), ("pruning/test_*.py", "training/test_schedules.py")),
     "schedules": Room(
         ("training/schedules.py", "training/budget/search.py"),
-        ("training/test_schedules.py", "training/budget/test_search.py"),
+        ("training/test_schedules.py", "training/budget/test_*.py"),
     ),
     "surgery": Room(
         ("gaussians/surgery.py", "gaussians/merging.py", "gaussians/rewriting.py"), ("gaussians/test_*.py",)
