@@ -8,8 +8,8 @@ import pytest
 import torch
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 
-from method_configs import sundae
 from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.method_configs import sundae
 from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.training.schedulers import PruneAwareDecayConfig, notify_pruned
 
