@@ -83,7 +83,7 @@ class FieldSource(Protocol):
 
     @property
     def collective(self) -> bool:
-        """Whether all ranks have to take part in a render."""
+        """Whether a render is collective: all ranks must call it together."""
 
     @property
     def replayable(self) -> bool:
