@@ -108,7 +108,7 @@ def finetune(
                 head.show()
                 at = opened.step + 1 + step
                 if weights:
-                    model.step = at  # chooses the window of a large picture
+                    model.step = at  # chooses the window of a large image
                 loss: Tensor = sum(pipeline.get_train_loss_dict(at)[1].values())
                 pipeline.zero_grad(set_to_none=True)
                 loss.backward()  # type: ignore[no-untyped-call]
