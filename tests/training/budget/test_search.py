@@ -292,3 +292,19 @@ def test_a_foreign_state_is_refused(change: dict[str, Any]) -> None:
 def test_states_at_the_ends_of_what_can_be_are_taken() -> None:
     for change in ({"degree": 4}, {"degree": -1}, {"num_features": 1024}, {"num_features": -1}):
         Search.from_state({**search().state(), **change})
+
+
+@pytest.mark.parametrize("phase", ["before", "degrees", "field", "head", "done"])
+def test_a_search_is_under_way_between_its_first_and_its_last_phase(phase: Any) -> None:
+    assert Search(phase=phase).searching == (phase not in ("before", "done"))
+
+
+def test_a_new_phase_counts_anew_and_remembers_the_cost_of_a_halving() -> None:
+    found = Search(
+        reference=30.1, target=30.0, rejected=2, failed=7, cuts=3, looks=5, stuck=4, lowered=29.0, best=30.0, slope=0.2
+    )
+    found.begin("head", 400)
+    assert (found.rejected, found.failed, found.cuts, found.looks, found.stuck) == (0, 0, 0, 0, 0)
+    assert math.isnan(found.lowered)
+    assert math.isnan(found.best)
+    assert (found.phase, found.accepted, found.trying, found.slope) == ("head", 400, False, 0.2)
