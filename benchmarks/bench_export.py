@@ -26,6 +26,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from sundae_ns.evaluation import psnr
+from sundae_ns.gaussians.field import Field
+from sundae_ns.rendering import LocalField, render
 from sundae_ns.scenes.opening import Opened, load_run
 from sundae_ns.scenes.packed import scene_of_run
 from sundae_ns.storage import read_ply, write_sog, write_spz
@@ -51,11 +53,11 @@ def smaller(image: Tensor, factor: int) -> Tensor:
 @torch.no_grad()
 def images_of(run: Opened, field: Mapping[str, Tensor], views: list[int], downscale: int, text: str) -> list[Tensor]:
     model = run.model
-    background = model._get_background_color()
+    background, settings = model._get_background_color(), model.render_settings(training=False).without_head()
     made = []
     for i in track(views, description=text, transient=True):
         view = model.view_of(run.cameras[i], downscale)
-        made.append(model.render(field, view, background, depth=False, compensate=False)[0]["base_rgb"])
+        made.append(render(LocalField(Field(dict(field))), view, background, settings, depth=False)[0]["base_rgb"])
     return made
 
 

@@ -77,13 +77,13 @@ def steps(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         optimizers.optimizer_step_all()
 
     with_head = median_ms(step, device=options.device, repeats=options.repeats)
-    model.config.head.start_at = 2 * config.max_num_iterations
+    model.state.head_starts_at = 2 * config.max_num_iterations
     without = median_ms(step, device=options.device, repeats=options.repeats)
     yield {
         "primitives": options.primitives,
         "size": size,
         "backend": model.backend.name,
-        "features": model.num_features,
+        "features": model.config.num_features,
         "ms_step_with_head": round(with_head.median_ms, 1),
         "ms_step_without_head": round(without.median_ms, 1),
         "ms_step_with_head_p90": round(with_head.p90_ms, 1),

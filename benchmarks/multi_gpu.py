@@ -102,8 +102,7 @@ class Clock:
 
     def look(self, step: int) -> None:
         pipeline = self.trainer.pipeline
-        if self.ranks > 1:
-            self.trainer.shards.agree_on_focal(pipeline.model)
+        pipeline.model.source.agree(pipeline.model.state)
         pipeline.eval()
         self.curve[step * self.ranks] = round(test_psnr(pipeline), 3)
         pipeline.train()
@@ -146,7 +145,7 @@ def measure(rank: int, ranks: int, meeting: str, options: argparse.Namespace, ex
             "variant": "multi-gpu" if options.field is None else f"multi-gpu-tiled-{options.primitives}",
             "gpu": name if ranks == 1 else f"{ranks} x {name}",
             "ranks": ranks,
-            "primitives": trainer.pipeline.model.total_points,
+            "primitives": trainer.pipeline.model.source.total,
             "images": clock.images,
             "seconds": round(clock.seconds, 2),
             "images_per_s": round(clock.images / clock.seconds, 1),
