@@ -22,15 +22,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.pruning import (
-    PruningConfig,
-    decide,
-    field_graph,
-    heirs,
-    merged,
-    neighbor_order,
-    select_systematic,
-)
+from sundae_ns.pruning import PruningConfig, decide, field_graph
+from sundae_ns.pruning.coverage import neighbor_order, select_systematic
+from sundae_ns.pruning.redistribution import heirs, merged
 from sundae_ns.storage.runs import checkpoint
 
 PREFIX = "_model.gauss_params."

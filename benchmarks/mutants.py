@@ -65,9 +65,7 @@ ROOMS = {
         ("training/schedules.py", "training/budget/search.py"),
         ("training/test_schedules.py", "training/budget/test_*.py"),
     ),
-    "surgery": Room(
-        ("gaussians/surgery.py", "gaussians/merging.py", "gaussians/rewriting.py"), ("gaussians/test_*.py",)
-    ),
+    "surgery": Room(("gaussians/surgery.py", "gaussians/merging.py"), ("gaussians/test_*.py",)),
     "packing": Room(("storage/packing/[!_]*.py",), ("storage/packing/test_*.py", "fuzz/test_packs.py")),
     # Tests of the collectives start processes, which import the modules on disk: only functions without any are here.
     "ranks": Room(

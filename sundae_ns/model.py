@@ -289,7 +289,7 @@ class SundaeModel(SplatfactoModel):
         if not visible.compensate:
             settings = settings.without_head()
         images = self._replay.render(visible.source, view, background, settings)
-        whole = self.state.field.copied()
+        whole = self.state.field.replaced({})
         drawn = whole if visible.mask is None else visible.source.field
         values = partial(self._response.values, whole, self.viewer_controls.field_key, self.config.pruning)
         late = late_outputs(images, drawn, whole, visible.mask, view, settings, values, splattable=splattable)

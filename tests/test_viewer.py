@@ -167,7 +167,7 @@ def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None
 
 def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
     model, _ = build()
-    known = response(model.state.field, rule_config(model.config.pruning, "band: both", 0.2)).magnitude
+    known = response(model.state.field, rule_config(model.config.pruning, "band: both", 0.2))
     masks = {rule: shown(model, rule, 0.2) for rule in RULES}
     high, low, both, top = (masks[rule] for rule in ("band: high", "band: low", "band: both", "opacity"))
     assert high is not None

@@ -199,11 +199,11 @@ def run_bands(
         next_is("Graph and response")
         config = band_rule(config, ratios[0], config.gamma)
         graph = field_graph(params, config)
-        found = response(params, config, graph)
+        magnitude = response(params, config, graph)
         next_is("Cameras")
         projections, seen_from = _project(params["means"], source, view)
         next_is("Rules")
-        scalar = torch.nan_to_num(found.magnitude, nan=-1.0)
+        scalar = torch.nan_to_num(magnitude, nan=-1.0)
         figures, thresholds, files = [], {}, []
 
         def cloud(name: str, mask: Tensor | None = None) -> None:
@@ -219,7 +219,7 @@ def run_bands(
         cloud("all.ply")
         for keep_ratio in ratios:
             masks = band_masks(params, config, graph, keep_ratio)
-            figures.append(band_figures(found.magnitude, masks, keep_ratio))
+            figures.append(band_figures(magnitude, masks, keep_ratio))
             thresholds[f"{keep_ratio:g}"] = (figures[-1]["low_to"], figures[-1]["high_from"])
             for name, mask in masks.items():
                 cloud(f"{name}-{keep_ratio:g}.ply", mask)
@@ -232,26 +232,26 @@ def run_bands(
             title += seen_from.partition(",")[0]
             save_png(f"bands-{keep_ratio:g}.png", points_sheet(projections, colors, sets, title=title))
             next_is(f"Keep ratio {keep_ratio:g}")
-        save_png("response.png", response_histogram(found.magnitude, thresholds=thresholds))
+        save_png("response.png", response_histogram(magnitude, thresholds=thresholds))
 
     result = {
         "field": str(run),
         "primitives": len(finite),
         "not_finite": len(finite) - len(params["means"]),
-        "isolated": found.isolated,
+        "isolated": int(graph.isolated.sum()),
         "signal": config.signal,
         "num_neighbors": config.num_neighbors,
         "bandwidth": config.bandwidth,
-        "tau": found.tau,
-        "sigma": found.sigma,
+        "tau": graph.tau,
+        "sigma": graph.sigma,
         "gamma": config.gamma,
-        "response": response_figures(found.magnitude),
+        "response": response_figures(magnitude),
         "bands": figures,
         "seen_from": seen_from,
         "files": files,
     }
     write_text(out / "bands.json", json.dumps(result, indent=2, allow_nan=False) + "\n")
-    console.print(f"{len(params['means']):,} primitives, sigma {found.sigma:.3g}, {seen_from}", highlight=False)
+    console.print(f"{len(params['means']):,} primitives, sigma {graph.sigma:.3g}, {seen_from}", highlight=False)
     for figure in figures:
         kept, overlap = figure["kept"]["combined"], figure["overlap"]
         shared = f"{overlap['combined and high']:,} with high-pass and {overlap['combined and low']:,} with low-pass"

@@ -42,8 +42,6 @@ def scene(
     width: int = 128,
     height: int = 128,
     points: int = 2000,
-    kind: Literal["still-life", "wall"] = "still-life",
-    sensor_noise: float = 0.0,
 ) -> int:
     """Write the embedded scene: a small ray-traced capture in nerfstudio's format, with a sparse point cloud.
 
@@ -55,8 +53,6 @@ def scene(
         width: image width in pixels.
         height: image height in pixels.
         points: number of points in the sparse point cloud.
-        kind: a still life, or one flat painted wall, for which a few primitives suffice.
-        sensor_noise: standard deviation of the noise added to each pixel; colours are in [0, 1].
     """
     from rich.progress import Progress
 
@@ -72,8 +68,6 @@ def scene(
             width=width,
             height=height,
             points=points,
-            kind=kind,
-            sensor_noise=sensor_noise,
             progress=lambda done, total: progress.update(task, completed=done, total=total),
         )
     print(f"wrote {train_views} training and {test_views} test views to {out}")

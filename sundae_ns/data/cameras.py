@@ -1,4 +1,4 @@
-"""Pinhole cameras in nerfstudio's convention, on an orbit around a scene or in front of a wall.
+"""Pinhole cameras in nerfstudio's convention, on an orbit around a scene.
 
 World: z up. Camera: OpenGL axes (x right, y up, looking along -z). Pixels: x right, y down, centres at +0.5.
 """
@@ -11,6 +11,8 @@ import numpy as np
 
 from sundae_ns.data.shapes import Array
 
+FIELD_OF_VIEW = 50.0
+"""Degrees, across the shorter side of the image."""
 GOLDEN = (5**0.5 - 1) / 2
 """Golden ratio minus 1: any number of its multiples, modulo 1, fills [0, 1) evenly."""
 
@@ -41,27 +43,16 @@ def look_at(eye: Array, target: Array) -> Array:
     return matrix
 
 
-def _focal_length(width: int, height: int, field_of_view: float) -> float:
-    """Focal length in pixels for a field of view in degrees, across the shorter side."""
-    return float(0.5 * min(width, height) / np.tan(np.radians(field_of_view) / 2))
-
-
-def orbit(
-    count: int, *, width: int, height: int, rng: np.random.Generator, field_of_view: float = 50.0
-) -> list[Camera]:
+def orbit(count: int, *, width: int, height: int, rng: np.random.Generator) -> list[Camera]:
     """``count`` cameras on one orbit around the scene, at varying heights and distances.
 
     The azimuth grows steadily; the elevation follows the golden-ratio sequence. Neighbours in the list are neighbours
     around the scene, and a few consecutive cameras cover low, middle and high views.
 
     Args:
-        count: number of cameras.
-        width: pixels.
-        height: pixels.
-        rng: source of the small jitter.
-        field_of_view: degrees, across the shorter side.
+        width, height: pixels.
     """
-    focal = _focal_length(width, height, field_of_view)
+    focal = float(0.5 * min(width, height) / np.tan(np.radians(FIELD_OF_VIEW) / 2))
     cameras = []
     for i in range(count):
         azimuth = 2 * np.pi * (i + rng.uniform(-0.2, 0.2)) / count
@@ -74,38 +65,8 @@ def orbit(
     return cameras
 
 
-def facing(
-    count: int, *, width: int, height: int, rng: np.random.Generator, field_of_view: float = 50.0
-) -> list[Camera]:
-    """``count`` cameras at y < 0 that face the plane y = 0, from up to 40 degrees to the side.
-
-    Positions advance steadily across; their height follows the golden-ratio sequence, so a few consecutive cameras
-    cover the whole range.
-
-    Args:
-        count: number of cameras.
-        width: pixels.
-        height: pixels.
-        rng: source of the small jitter.
-        field_of_view: degrees, across the shorter side.
-    """
-    focal = _focal_length(width, height, field_of_view)
-    cameras = []
-    for i in range(count):
-        across, up = 2 * ((i + 0.5) / count) - 1, 2 * ((i * GOLDEN) % 1.0) - 1
-        eye = np.array([2.6 * across, -3.2 + rng.uniform(-0.3, 0.3), 1.4 * up])
-        target = np.array([0.3 * across, 0.0, 0.2 * up]) + rng.uniform(-0.1, 0.1, 3) * [1, 0, 1]
-        cameras.append(Camera(look_at(eye, target), focal, width, height))
-    return cameras
-
-
 def pixel_rays(camera: Camera, columns: Array, rows: Array) -> tuple[Array, Array]:
-    """Rays through image points.
-
-    Args:
-        camera: the view.
-        columns: x in pixels, ``[M]``.
-        rows: y in pixels, ``[M]``.
+    """Rays through the image points at columns x and rows y, in pixels, each ``[M]``.
 
     Returns:
         Origins and unit directions in world space, each ``[M, 3]`` float32.

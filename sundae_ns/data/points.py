@@ -41,8 +41,6 @@ def observe(scene: TracedScene, cameras: Sequence[Camera], points: Array, owner:
     """Count the views that see each surface point, and average its colour over them.
 
     Args:
-        scene: solids and light.
-        cameras: the views.
         points: on the surfaces, ``[M, 3]`` float32.
         owner: index of each point's body ``[M]``.
 
@@ -71,20 +69,16 @@ def sparse_points(
     images: Sequence[Array],
     count: int,
     *,
-    noise: float,
-    outliers: float,
     rng: np.random.Generator,
+    noise: float = 0.002,
+    outliers: float = 0.01,
 ) -> tuple[Array, Array]:
     """Draw a point cloud: surface points that at least two views see, denser where the images have detail.
 
     Args:
-        scene: solids and light.
-        cameras: training views.
         images: the image of each view, ``[H, W, 3]`` in [0, 1].
-        count: number of points.
         noise: standard deviation of the error of a position, as a fraction of its distance from the camera.
         outliers: fraction of the points that are wrong matches, placed at random around the scene.
-        rng: source of randomness.
 
     Returns:
         Positions ``[count, 3]`` float32, and RGB ``[count, 3]`` uint8.

@@ -5,20 +5,16 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
 from PIL import Image
 
-from sundae_ns.data.cameras import Camera, facing, orbit
+from sundae_ns.data.cameras import Camera, orbit
 from sundae_ns.data.points import sparse_points
 from sundae_ns.data.shapes import Array
 from sundae_ns.data.still_life import still_life
 from sundae_ns.data.tracer import render
-from sundae_ns.data.wall import wall
 from sundae_ns.errors import ConfigError, DataError
-
-Kind = Literal["still-life", "wall"]
 
 TRANSFORMS = "transforms.json"
 POINT_CLOUD = "sparse_pc.ply"
@@ -99,14 +95,10 @@ def write_embedded_capture(
     width: int = 128,
     height: int = 128,
     points: int = 2000,
-    point_noise: float = 0.002,
-    outliers: float = 0.01,
     samples: int = 2,
-    kind: Kind = "still-life",
-    sensor_noise: float = 0.0,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Render the embedded still life, or a plain wall, and write it as a nerfstudio data set.
+    """Render the embedded still life and write it as a nerfstudio data set.
 
     Writes ``images/*.png``, ``sparse_pc.ply`` and, last, ``transforms.json`` with its own train/test split: a folder of
     an interrupted run has none. The same arguments give the same bytes on the same machine.
@@ -114,24 +106,16 @@ def write_embedded_capture(
     Args:
         out: folder; new, empty, or with an earlier embedded capture, which is replaced.
         seed: varies placement, textures, light, cameras and points.
-        train_views: number of training images.
         test_views: number of held-out images, spread between the training views.
-        width: pixels.
-        height: pixels.
-        points: number of points in the sparse point cloud.
-        point_noise: standard deviation of a point's error, as a fraction of its distance from the camera.
-        outliers: fraction of wrong points.
+        width, height: pixels.
         samples: each pixel is the mean of ``samples`` x ``samples`` rays.
-        kind: the still life, or one flat painted wall, which needs few primitives.
-        sensor_noise: standard deviation of the noise of each pixel and colour, in [0, 1]; a phone camera indoors has
-            about 0.015.
         progress: called with (views done, all views) after each view.
 
     Returns:
         ``out``, the value for ``--data``.
 
     Raises:
-        ConfigError: a count or size is too small, or the kind is unknown.
+        ConfigError: a count or size is too small.
         DataError: ``out`` is a file, or holds other files.
     """
     for name, value, minimum in (
@@ -142,16 +126,9 @@ def write_embedded_capture(
         ("height", height, 16),
         ("points", points, 1),
         ("samples", samples, 1),
-        ("point_noise", point_noise, 0),
-        ("outliers", outliers, 0),
-        ("sensor_noise", sensor_noise, 0),
     ):
         if not value >= minimum:
             raise ConfigError(f"{name} is {value}; it must be {minimum} or more.")
-    if kind not in get_args(Kind):
-        raise ConfigError(f"kind is {kind!r}; use one of {', '.join(get_args(Kind))}.")
-    if not outliers <= 1:
-        raise ConfigError(f"outliers is {outliers}, a fraction of the points; it must be 1 or less.")
     if test_views > train_views:
         raise ConfigError(f"{test_views} test views do not fit between {train_views} training views; give fewer.")
 
@@ -161,14 +138,11 @@ def write_embedded_capture(
     names = [f"images/frame_{i + 1:05d}.png" for i in range(total)]
     _claim(out, [*names, POINT_CLOUD, TRANSFORMS])
 
-    scene, cameras_of = (still_life(seed), orbit) if kind == "still-life" else (wall(seed), facing)
-    cameras = cameras_of(total, width=width, height=height, rng=np.random.default_rng([seed, 2]))
-    noise_rng = np.random.default_rng([seed, 5])
+    scene = still_life(seed)
+    cameras = orbit(total, width=width, height=height, rng=np.random.default_rng([seed, 2]))
     images = []
     for i, (camera, name) in enumerate(zip(cameras, names, strict=True)):
         image = render(scene, camera, samples=samples)
-        if sensor_noise:
-            image = np.clip(image + noise_rng.normal(scale=sensor_noise, size=image.shape), 0, 1)
         Image.fromarray(np.round(image * 255).astype(np.uint8)).save(out / name)
         images.append(image)
         if progress is not None:
@@ -180,8 +154,6 @@ def write_embedded_capture(
         [cameras[i] for i in training],
         [images[i] for i in training],
         points,
-        noise=point_noise,
-        outliers=outliers,
         rng=np.random.default_rng([seed, 3]),
     )
     _write_point_cloud(out / POINT_CLOUD, xyz, rgb)

@@ -1,11 +1,4 @@
-"""Analytic solids centred on the origin: ray intersections and surface normals.
-
-Every shape has ``bound``, the radius of a sphere around the origin that encloses it, and two vectorised functions:
-
-- ``intersect(origins [M, 3], directions [M, 3]) -> [M]``: distance along the (unit) direction to the nearest surface in
-  front of the origin, ``inf`` where the ray misses;
-- ``normal(points [M, 3]) -> [M, 3]``: unit outward normals at points of the surface.
-"""
+"""Analytic solids centred on the origin: ray intersections and surface normals."""
 
 from __future__ import annotations
 
@@ -22,14 +15,14 @@ EPSILON = 1e-4
 
 
 class Shape(Protocol):
-    """Interface of a solid for the tracer; see the module's docstring."""
+    """Interface of a solid for the tracer."""
 
     @property
     def bound(self) -> float:
         """Radius of an enclosing sphere around the origin."""
 
     def intersect(self, origins: Array, directions: Array) -> Array:
-        """Distances ``[M]`` to the first surface ahead, ``inf`` for a miss."""
+        """Distances ``[M]`` along unit directions to the first surface ahead, ``inf`` for a miss; inputs ``[M, 3]``."""
 
     def normal(self, points: Array) -> Array:
         """Unit outward normals ``[M, 3]`` at surface points ``[M, 3]``."""

@@ -223,17 +223,3 @@ class Landscape:
         hills = mix((0.23, 0.34, 0.30), (0.42, 0.50, 0.38), woods)
         plain = mix((0.55, 0.52, 0.40), (0.36, 0.36, 0.28), -height / 0.7)
         return mix(mix(plain, hills, _ramp(height, -0.12, 0.02)), sky, _ramp(height - crest, -0.006, 0.006))
-
-
-@dataclass(frozen=True)
-class Plaster:
-    """A painted wall: a smooth blend of two tones with features of about ``size`` units and no fine detail."""
-
-    low: Color
-    high: Color
-    size: float
-    seed: int
-
-    def __call__(self, points: Array) -> Array:
-        """Colours ``[M, 3]`` of points ``[M, 3]``."""
-        return mix(self.low, self.high, value_noise(points / self.size, self.seed))

@@ -60,12 +60,7 @@ def _distances(body: Body, origins: Array, directions: Array) -> Array:
 
 
 def first_hits(scene: TracedScene, origins: Array, directions: Array) -> tuple[Array, Array]:
-    """Nearest surfaces along rays.
-
-    Args:
-        scene: the solids.
-        origins: ``[M, 3]``.
-        directions: unit vectors ``[M, 3]``.
+    """Nearest surfaces along rays with origins ``[M, 3]`` and unit directions ``[M, 3]``.
 
     Returns:
         Distances ``[M]`` (``inf`` for a miss) and the index of the body hit ``[M]`` (-1 for a miss).
@@ -93,7 +88,6 @@ def shade(scene: TracedScene, points: Array, directions: Array, owner: Array) ->
     """Colours of surface points, seen along given directions.
 
     Args:
-        scene: solids and light.
         points: on the surfaces, ``[M, 3]``.
         directions: unit vectors from the eye to the points, ``[M, 3]``.
         owner: index of each point's body ``[M]``; -1 is black.

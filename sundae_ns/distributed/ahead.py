@@ -33,9 +33,7 @@ class Timetable:
     """The views of all ranks at each training step.
 
     Args:
-        cameras: cameras of the training views.
         order: index of the view of the k-th image; the same on all ranks.
-        device: device of the field.
         near_plane: distance of the near plane, world units.
     """
 

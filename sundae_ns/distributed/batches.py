@@ -48,11 +48,6 @@ def scale_rates(optimizers: Optimizers, names: Iterable[str], ranks: int) -> Non
 
     Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024. The rule is for primitives, which
     few images see. The head, whose weights every image uses, keeps its own rate.
-
-    Args:
-        optimizers: by group.
-        names: groups to adapt, parameters of the field.
-        ranks: number of images in a step.
     """
     for key in names:
         for group in optimizers.optimizers[key].param_groups:
@@ -72,12 +67,7 @@ def scaled_group(group: Mapping[str, Any], factor: float) -> dict[str, Any]:
 
 
 def shorten(config: Any, ranks: int) -> Any:
-    """A copy of a configuration with all steps divided by ``ranks``: the same number of images in larger batches.
-
-    Args:
-        config: ``SundaeTrainerConfig``.
-        ranks: number of images in a step.
-    """
+    """A copy of a configuration with all steps divided by ``ranks``: the same number of images in larger batches."""
     config = deepcopy(config)
     model = config.pipeline.model
     steps: tuple[tuple[Any, str], ...] = (

@@ -19,13 +19,7 @@ _EXTRA = "_model._extra_state"
 
 
 def whole_state(state: Mapping[str, Any], shards: Shards, names: Iterable[str]) -> dict[str, Any] | None:
-    """The checkpoint of the whole field, in host memory on rank 0; None on the others. Collective.
-
-    Args:
-        state: checkpoint of this rank.
-        shards: the ranks.
-        names: parameters of the field.
-    """
+    """The checkpoint of the whole field, in host memory on rank 0; None on the others. Collective."""
     n = shards.counts[shards.rank]
 
     def gathered(value: Any) -> Any:
@@ -36,13 +30,7 @@ def whole_state(state: Mapping[str, Any], shards: Shards, names: Iterable[str]) 
 
 
 def state_of_rank(loaded: Mapping[str, Any], rank: int, ranks: int, names: Iterable[str]) -> dict[str, Any]:
-    """The part of a checkpoint that a rank holds.
-
-    Args:
-        loaded: checkpoint of the whole field.
-        rank: the rank.
-        ranks: number of ranks.
-        names: parameters of the field.
+    """The part of a whole checkpoint that a rank holds; ``names`` are those of the parameters of the field.
 
     Returns:
         The part, empty if there are fewer primitives than ranks. A checkpoint of another method or format is returned

@@ -10,12 +10,7 @@ from sundae_ns.training.field_state import FieldState
 
 
 class ShardedDensification(Densification):
-    """Densification with statistics of all ranks. Collective.
-
-    Args:
-        strategy: gsplat's verbs.
-        shards: the ranks.
-    """
+    """Densification with statistics of all ranks. Collective."""
 
     def __init__(self, strategy: CappedStrategy | ChainStrategy, shards: Shards) -> None:
         super().__init__(strategy)

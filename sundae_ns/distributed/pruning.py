@@ -16,24 +16,19 @@ from sundae_ns.distributed.shards import Shards
 from sundae_ns.errors import DataError, SundaeError
 from sundae_ns.gaussians.field import Encoding, Field, as_field
 from sundae_ns.gaussians.parameters import finite_mask, num_primitives
-from sundae_ns.gaussians.rewriting import rewrite
-from sundae_ns.pruning import PruningConfig
+from sundae_ns.gaussians.surgery import rewrite
 from sundae_ns.pruning.scores import Contribution
 from sundae_ns.training.pruning import Schedule
 from sundae_ns.training.report import PruneReport
+from sundae_ns.training.schedules import PruningSchedule
 
 
 @dataclass(frozen=True)
-class GlobalPruning:
+class GlobalPruning(PruningSchedule):
     """A pruning schedule over the shards of one field."""
 
     schedule: Schedule
     shards: Shards
-
-    @property
-    def config(self) -> PruningConfig:
-        """Options of the schedule."""
-        return self.schedule.config
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
         """Whether a field of ``n`` primitives is pruned after this step."""
@@ -42,10 +37,6 @@ class GlobalPruning:
     def target(self, n: int) -> int:
         """Number of primitives that a prune keeps of ``n``."""
         return self.schedule.target(n)
-
-    def initialize_state(self) -> dict[str, Any]:
-        """Running state of a field that was not pruned yet."""
-        return self.schedule.initialize_state()
 
     @torch.no_grad()
     def step_post_backward(

@@ -18,7 +18,7 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from sundae_ns.gaussians.parameters import num_primitives
-from sundae_ns.gaussians.surgery import check_wiring, per_primitive, replace_parameter
+from sundae_ns.gaussians.surgery import change_parameter, check_wiring, per_primitive
 from sundae_ns.rasterization.sharded import swap
 
 DRIFT = 1.1
@@ -34,12 +34,7 @@ def bounds(total: int, ranks: int) -> list[int]:
 
 
 def moves(counts: Sequence[int], rank: int) -> tuple[list[int], list[int]]:
-    """Numbers of rows that a rank sends to and receives from each rank to balance the blocks in their order.
-
-    Args:
-        counts: rows of each rank now.
-        rank: the rank.
-    """
+    """Numbers of rows that a rank sends to and receives from each rank to balance the blocks in their order."""
     ranks, new = len(counts), bounds(sum(counts), len(counts))
     old = [sum(counts[:r]) for r in range(ranks + 1)]
 
@@ -50,11 +45,7 @@ def moves(counts: Sequence[int], rank: int) -> tuple[list[int], list[int]]:
 
 
 class Shards:
-    """The ranks, and the number of primitives of each.
-
-    Args:
-        device: device of the field and of the collectives.
-    """
+    """The ranks, and the number of primitives of each; collectives move tensors of ``device``."""
 
     def __init__(self, device: torch.device | str) -> None:
         self.rank, self.ranks = dist.get_rank(), dist.get_world_size()
@@ -143,25 +134,15 @@ class Shards:
         def moved(value: Tensor) -> Tensor:
             return swap(value if mask is None else value[mask], sent, received)
 
-        for name, old in list(params.items()):
-            new = Parameter(moved(old.detach()), requires_grad=old.requires_grad)
-            held = optimizers[name].state.get(old, {}) if name in optimizers else {}
-            moments = {
-                key: moved(value) if key != "step" and isinstance(value, Tensor) else value
-                for key, value in held.items()
-            }
-            replace_parameter(params, optimizers, name, new, moments)
+        for name in list(params):
+            change_parameter(params, optimizers, name, moved)
         for state in states:
             state.update({key: moved(value) for key, value in state.items() if per_primitive(value, n)})
         self.counts = [end - start for start, end in pairwise(bounds(sum(kept), self.ranks))]
 
     @torch.no_grad()
     def apart(self, copies: Iterable[Tensor]) -> float:
-        """Largest difference between ranks of tensors that should be equal; 0 without any. Collective.
-
-        Args:
-            copies: tensors of this rank, of the same shapes on all ranks.
-        """
+        """Largest difference between ranks of tensors that should be equal; 0 without any. Collective."""
         numbers = [copy.detach().flatten() for copy in copies]
         if not numbers:
             return 0.0

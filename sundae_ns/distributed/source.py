@@ -61,13 +61,7 @@ def _exchange_now(params: Mapping[str, Tensor], cameras: Cameras) -> Exchange:
 
 
 class ShardedField:
-    """A :class:`sundae_ns.rendering.FieldSource` on several ranks. Every render is collective.
-
-    Args:
-        shards: the ranks.
-        field: the primitives of this rank.
-        timetable: the views of all ranks at each training step.
-    """
+    """A :class:`sundae_ns.rendering.FieldSource` on several ranks. Every render is collective."""
 
     collective = True
     replayable = False
@@ -99,10 +93,6 @@ class ShardedField:
         """The primitives of all ranks that the view may see; differentiable. Collective.
 
         Args:
-            view: the camera of this rank.
-            settings: how colours are evaluated; the rank that holds a primitive evaluates them.
-            features: whether feature vectors are needed.
-            colors: colours always come along.
             at: the training step, whose exchange was planned; None lets the ranks gather their cameras.
         """
         cameras, route = self._exchange(view, at)
@@ -156,13 +146,7 @@ class ShardedField:
     # ------------------------------------------------------------------------------------------------------- training
 
     def follow(self, primitives: Primitives, info: MutableMapping[str, Any], *, absgrad: bool) -> None:
-        """Let the statistics for densification travel back with the gradients.
-
-        Args:
-            primitives: of this rank's view.
-            info: of that view, whose centres keep their gradient.
-            absgrad: whether absolute gradients are summed.
-        """
+        """Let the statistics for densification travel back with the gradients; ``absgrad`` as in gsplat."""
         assert isinstance(primitives, ReceivedPrimitives)
         route = primitives.route
 
@@ -205,11 +189,7 @@ class ShardedField:
 
 
 def statistics_of(info: Mapping[str, Any]) -> Statistics:
-    """Statistics of this rank's primitives in the views of all ranks, after a backward pass.
-
-    Args:
-        info: of this rank's view, which :meth:`ShardedField.follow` has prepared.
-    """
+    """Statistics of this rank's primitives in the views of all ranks, arranged by :meth:`ShardedField.follow`."""
     route: Route = info["route"]
     assert route.told is not None
     return Statistics(route.ids, *route.told.unbind(dim=1))

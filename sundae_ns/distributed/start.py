@@ -1,20 +1,12 @@
-"""Start of several ranks: options that they cannot use yet are refused, and processes on a CPU are launched."""
+"""Options and machines that several ranks cannot use yet are refused before they start."""
 
 from __future__ import annotations
 
-import tempfile
-from datetime import timedelta
-from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
-from torch.multiprocessing.spawn import ProcessExitedException, ProcessRaisedException
 
-from sundae_ns.errors import ConfigError, rank_ended
-
-TIMEOUT = timedelta(minutes=30)
-"""Timeout of a collective. It is long, because others wait while rank 0 prunes and saves; a dead rank is noticed anyway."""
+from sundae_ns.errors import ConfigError
 
 
 def check_options(config: Any) -> None:
@@ -63,33 +55,3 @@ def check_machine(ranks: int, device_type: str) -> None:
 def without_viewer(vis: str) -> str:
     """The loggers without the viewer, which could show the primitives of one rank only."""
     return "tensorboard" if vis in ("viewer", "viewer_legacy") else vis.removeprefix("viewer+")
-
-
-def launch(config: Any, ranks: int) -> None:
-    """Train on several processes of this machine's CPU over gloo; on GPUs ``ns-train`` starts the ranks.
-
-    Args:
-        config: ``SundaeTrainerConfig`` for a CPU.
-        ranks: number of processes.
-
-    Raises:
-        RankError: a rank ended early; all ranks are ended then.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        context = torch.multiprocessing.spawn(
-            _train, (ranks, Path(folder) / "meeting", config), nprocs=ranks, join=False
-        )
-        try:
-            while not context.join():
-                pass
-        except (ProcessExitedException, ProcessRaisedException) as error:
-            raise rank_ended(error) from error
-
-
-def _train(rank: int, ranks: int, meeting: Path, config: Any) -> None:
-    dist.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=ranks, timeout=TIMEOUT)
-    torch.manual_seed(config.machine.seed + rank)
-    trainer = config.setup(local_rank=rank, world_size=ranks)
-    trainer.setup()
-    trainer.train()
-    dist.destroy_process_group()

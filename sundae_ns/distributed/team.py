@@ -71,12 +71,7 @@ class OneProcess:
 
 
 class Ranks(OneProcess):
-    """One of several ranks that shard the field. Verbs are collective.
-
-    Args:
-        rank: rank of this process on this machine.
-        count: number of ranks.
-    """
+    """One of several ranks that shard the field. Verbs are collective."""
 
     shards: Shards
     """Set by :meth:`share`."""
@@ -116,9 +111,6 @@ class Ranks(OneProcess):
 
         Args:
             state: as built, the same number of primitives on each rank.
-            source: of the whole field.
-            extensions: of one process.
-            datamanager: gives the training views; each rank draws in their order.
             seed: seed of draws that all ranks must share, such as the image to evaluate.
 
         Returns:
@@ -142,18 +134,12 @@ class Ranks(OneProcess):
                 strategy.pause_refine_after_reset = -(-num_images // self.count) + strategy.refine_every
             return ShardedDensification(strategy, self.shards)
         if isinstance(extension, ScheduledPruning):
-            return ScheduledPruning(GlobalPruning(extension.schedule, self.shards), evaluate=extension.evaluate)
+            schedule = extension.schedule
+            return ScheduledPruning(GlobalPruning(schedule.config, schedule, self.shards), evaluate=extension.evaluate)
         return extension
 
     def optimizers(self, make: Callable[[], Optimizers], config: Any, groups: Any, names: list[str]) -> Optimizers:
-        """Optimizers for batches of one image a rank.
-
-        Args:
-            make: builds those of one process; not called.
-            config: of the optimizers.
-            groups: parameter groups of the pipeline.
-            names: parameters of the field.
-        """
+        """Optimizers for batches of one image a rank."""
         optimizers = SharedOptimizers(config.copy(), groups)
         scale_rates(optimizers, names, self.count)
         return optimizers

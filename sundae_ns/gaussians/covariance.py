@@ -20,12 +20,7 @@ _DIAGONAL = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
 
 
 def covariances(scales: Tensor, quats: Tensor) -> Tensor:
-    """Covariances ``R S S^T R^T`` ``[N, 3, 3]``, squared world units.
-
-    Args:
-        scales: standard deviations, world units ``[N, 3]``.
-        quats: wxyz quaternions of any length ``[N, 4]``.
-    """
+    """Covariances ``R S S^T R^T`` ``[N, 3, 3]`` of standard deviations ``[N, 3]`` and wxyz quaternions ``[N, 4]``."""
     half = rotation_matrices(quats) * scales[:, None, :]
     return half @ half.transpose(1, 2)
 
@@ -66,13 +61,10 @@ def scales_and_quaternions(covariance: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def mean_projected_area(scales: Tensor) -> Tensor:
-    """Projected area of ellipsoids, averaged over all directions and divided by pi, squared world units ``[N]``.
+    """Mean projected area of ellipsoids with half axes ``[N, 3]`` over all directions, divided by pi ``[N]``.
 
     The mean projected area is a quarter of the surface area (Cauchy), which Thomsen's formula gives. It measures how
     much of an image a primitive covers; the volume does not, because most primitives are flat.
-
-    Args:
-        scales: standard deviations, the half axes ``[N, 3]``.
     """
     a, b, c = (scales / scales.amax(dim=1, keepdim=True)).pow(SURFACE_EXPONENT).unbind(dim=1)
     return scales.amax(dim=1).square() * ((a * b + a * c + b * c) / 3).pow(1 / SURFACE_EXPONENT)
@@ -117,14 +109,10 @@ def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: 
 
 
 def _cholesky(entries: Tensor, least_variance: float) -> tuple[Tensor, ...]:
-    """Cholesky factors of symmetric matrices.
+    """Cholesky factors ``[...]`` of symmetric matrices with entries ``[..., 6]``, both in the order of ``_LOWER``.
 
     Written out, because the batched function calls LAPACK once per matrix. A pivot is never below the least eigenvalue,
     so clamping at a lower bound of it repairs pivots of needles that rounding made too small.
-
-    Args:
-        entries: in the order of ``_LOWER`` ``[..., 6]``.
-        least_variance: lower bound of all eigenvalues.
 
     Returns:
         Six factors ``[...]`` in the order of ``_LOWER``.

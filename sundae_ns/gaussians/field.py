@@ -54,25 +54,13 @@ class Field(MutableMapping[str, Any]):
         """SH degree of the stored colours."""
         return sh_degree(self.params["features_rest"])
 
-    def detached(self) -> Field:
-        """The field without gradients."""
-        return Field({name: value.detach() for name, value in self.items()}, self.encoding)
-
     def rows(self, mask: Tensor) -> Field:
-        """The primitives under a mask, as a field of its own.
-
-        Args:
-            mask: True for the primitives to take, bool ``[N]``.
-        """
+        """The primitives under a mask, bool ``[N]``, as a field of its own."""
         return Field({name: value[mask] for name, value in self.items()}, self.encoding)
 
     def replaced(self, values: Mapping[str, Tensor]) -> Field:
-        """The same field with other values of some parameters; this one does not change."""
+        """A field of the same tensors but for these values, in a mapping of its own that surgery does not change."""
         return Field({**self, **values}, self.encoding)
-
-    def copied(self) -> Field:
-        """A field of the same tensors, in a mapping of its own that surgery does not change."""
-        return Field(dict(self.params), self.encoding)
 
     def as_harmonics(self) -> Field:
         """The field with colours as spherical harmonics; itself if it stores them so."""

@@ -37,9 +37,7 @@ def from_points(
     Args:
         points: ``[N, 3]`` world units; points that are not finite, in place or colour, are dropped.
         rgb: ``[N, 3]`` colours in [0, 1].
-        sh_degree: degree of the spherical harmonics.
         num_features: length F of the feature vectors; 0 for none.
-        generator: source of the random rotations and features.
 
     Returns:
         The field by parameter name (see ``gaussians.parameters``), float32, on the device of ``points``.
@@ -72,13 +70,7 @@ def from_points(
 
 
 def initial_features(features_dc: Tensor, num_features: int, generator: torch.Generator | None = None) -> Tensor:
-    """Initial feature vectors ``[N, F]``: the colour in the first three channels, plus small noise in all.
-
-    Args:
-        features_dc: SH coefficients of degree 0 ``[N, 3]``.
-        num_features: F.
-        generator: source of the noise.
-    """
+    """Initial feature vectors ``[N, F]``: ``features_dc`` ``[N, 3]`` in the first three channels, small noise in all."""
     noise = 0.05 * torch.randn(features_dc.shape[0], num_features, generator=generator)
     features = noise.to(features_dc)
     color_channels = min(3, num_features)

@@ -15,10 +15,10 @@ from collections.abc import Mapping, MutableMapping
 import torch
 from torch import Tensor
 from torch.nn import Parameter
-from torch.nn.functional import normalize
 from torch.optim import Optimizer
 
-from sundae_ns.gaussians.surgery import replace_parameter
+from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.surgery import change_parameter, moments_of
 
 MAX_COPIES = 51
 """Larger numbers of copies are clamped to this: the terms of the alternating sum grow with N."""
@@ -66,7 +66,6 @@ def relocate(
     """Move dead primitives onto living ones, drawn by opacity; the rendered image stays the same.
 
     Args:
-        params: the field, changed in place.
         optimizers: by parameter name; the moments of the moved primitives and of their targets become 0.
         dead: True for primitives to move, bool ``[N]``.
         min_opacity: lower limit of the new opacities.
@@ -81,7 +80,7 @@ def relocate(
     _split_sources(params, sources, min_opacity)
     for name, value in params.items():
         value.data[targets] = value.data[sources]
-        for moment in _per_row(optimizers.get(name), value).values():
+        for moment in moments_of(optimizers, name, value).values():
             moment[sources] = 0
             moment[targets] = 0
     return len(targets)
@@ -96,24 +95,22 @@ def grow(
     Replaces the parameter objects, as :func:`sundae_ns.gaussians.surgery.keep` does.
 
     Args:
-        params: the field, changed in place.
         optimizers: by parameter name; the moments of the copies are 0.
-        count: number of copies.
         min_opacity: lower limit of the new opacities.
     """
     if count <= 0:
         return
     sources = draw(params["opacities"].sigmoid().flatten(), count)
     _split_sources(params, sources, min_opacity)
-    for name, value in list(params.items()):
-        new = Parameter(torch.cat([value.data, value.data[sources]]), requires_grad=value.requires_grad)
-        optimizer = optimizers.get(name)
-        state = {} if optimizer is None else optimizer.state.get(value, {})
-        longer = {
-            key: torch.cat([moment, torch.zeros_like(moment[sources])])
-            for key, moment in _per_row(optimizer, value).items()
-        }
-        replace_parameter(params, optimizers, name, new, {**state, **longer})
+
+    def longer(value: Tensor) -> Tensor:
+        return torch.cat([value, value[sources]])
+
+    def with_zeros(moment: Tensor) -> Tensor:
+        return torch.cat([moment, torch.zeros_like(moment[sources])])
+
+    for name in list(params):
+        change_parameter(params, optimizers, name, longer, with_zeros)
 
 
 @torch.no_grad()
@@ -121,12 +118,11 @@ def jitter(params: Mapping[str, Tensor], strength: float) -> None:
     """Add noise to the centres, shaped by each primitive's covariance and much weaker for opaque primitives.
 
     Args:
-        params: the field; its centres change in place.
         strength: factor of the noise; in the paper 5e5 times the learning rate of the centres.
     """
     means, scales = params["means"], params["scales"].exp()
     gate = torch.sigmoid(100 * (0.005 - params["opacities"].sigmoid()))  # 1 below an opacity of 0.005, 0 above
-    rotation = _matrices(normalize(params["quats"], dim=-1))
+    rotation = rotation_matrices(params["quats"])
     noise = torch.randn_like(means) * gate * strength
     # R S^2 R^T e, without building the covariance.
     local = torch.einsum("nji,nj->ni", rotation, noise) * scales.square()
@@ -143,24 +139,3 @@ def _split_sources(params: Mapping[str, Tensor], sources: Tensor, min_opacity: f
     eps = torch.finfo(opacities.dtype).eps
     params["opacities"].data[chosen] = torch.logit(opacities.clamp(min_opacity, 1 - eps))[:, None]
     params["scales"].data[chosen] = scales.log()
-
-
-def _per_row(optimizer: Optimizer | None, value: Tensor) -> dict[str, Tensor]:
-    """Moments of a parameter that have a row for each primitive."""
-    state = {} if optimizer is None else optimizer.state.get(value, {})
-    return {
-        key: moment
-        for key, moment in state.items()
-        if key != "step" and isinstance(moment, Tensor) and moment.shape == value.shape
-    }
-
-
-def _matrices(quats: Tensor) -> Tensor:
-    """Rotation matrices ``[N, 3, 3]`` of unit quaternions wxyz ``[N, 4]``."""
-    w, x, y, z = quats.unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)

@@ -45,7 +45,6 @@ def fold(features_dc: Tensor, features_rest: Tensor, mean: Tensor, degree: int) 
         features_dc: ``[N, 3]``.
         features_rest: ``[N, K - 1, 3]``.
         mean: mean of the basis over the views ``[N, K]``, degree 0 included.
-        degree: highest SH degree to keep.
 
     Returns:
         ``features_dc`` ``[N, 3]`` and ``features_rest`` ``[N, (degree + 1)^2 - 1, 3]``.

@@ -1,8 +1,8 @@
-"""Remove primitives from a field in training: parameters, optimizer state and per-primitive state together."""
+"""Change the primitives of a field in training: parameters, optimizer state and running states together."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from typing import Any
 
 import torch
@@ -44,18 +44,17 @@ def replace_parameter(
     params: MutableMapping[str, Parameter],
     optimizers: Mapping[str, Optimizer],
     name: str,
-    new: Parameter,
-    state: Mapping[str, Any] | None,
+    value: Tensor,
+    state: Mapping[str, Any],
 ) -> None:
     """Replace one parameter, in the field and in its optimizer.
 
     Args:
-        params: the field.
         optimizers: by parameter name, with one parameter each; may lack ``name``.
-        name: name of the parameter.
-        new: the new parameter.
-        state: optimizer state of the new parameter; None or empty resets it.
+        value: the new values; ``requires_grad`` stays.
+        state: optimizer state of the new parameter; empty resets it.
     """
+    new = Parameter(value, requires_grad=params[name].requires_grad)
     optimizer = optimizers.get(name)
     if optimizer is not None:
         optimizer.state.pop(params[name], None)
@@ -65,11 +64,37 @@ def replace_parameter(
     params[name] = new
 
 
+def moments_of(optimizers: Mapping[str, Optimizer], name: str, value: Tensor) -> dict[str, Tensor]:
+    """The optimizer state of a parameter that has its shape: Adam's moments, without the step count."""
+    state = optimizers[name].state.get(value, {}) if name in optimizers else {}
+    return {key: held for key, held in state.items() if isinstance(held, Tensor) and held.shape == value.shape}
+
+
+def change_parameter(
+    params: MutableMapping[str, Parameter],
+    optimizers: Mapping[str, Optimizer],
+    name: str,
+    change: Callable[[Tensor], Tensor],
+    change_moment: Callable[[Tensor], Tensor] | None = None,
+) -> None:
+    """Replace one parameter and its moments by functions of them; other optimizer state stays.
+
+    Args:
+        optimizers: by parameter name, with one parameter each; may lack ``name``.
+        change: returns the new values ``[M, ...]`` of old ones ``[N, ...]``.
+        change_moment: the same for moments, if they change otherwise.
+    """
+    old = params[name]
+    state = optimizers[name].state.get(old, {}) if name in optimizers else {}
+    moments = {key: (change_moment or change)(held) for key, held in moments_of(optimizers, name, old).items()}
+    replace_parameter(params, optimizers, name, change(old.detach()), {**state, **moments})
+
+
 @torch.no_grad()
 def keep(
     params: MutableMapping[str, Parameter],
     optimizers: Mapping[str, Optimizer],
-    state: MutableMapping[str, Any],
+    states: Iterable[MutableMapping[str, Any]],
     mask: Tensor,
 ) -> None:
     """Keep the primitives under a mask and remove all others, in place on the mappings.
@@ -79,16 +104,15 @@ def keep(
     count kept. New objects are needed: after resizing through ``.data``, the backward pass of a live graph fails on the
     old shape. The caller must refresh other holders of the old objects, such as nerfstudio's ``Optimizers.parameters``.
 
-    Checks and slices everything before it replaces anything, so an error leaves all arguments unchanged.
-
     Args:
         params: the field, name to parameter ``[N, ...]``.
         optimizers: optimizers with one parameter each; names that are not in ``params`` are ignored.
-        state: running state; its tensors with first dimension N are sliced, all else stays.
+        states: running states; their tensors with first dimension N are sliced, all else stays.
         mask: True for primitives to keep, bool, any device ``[N]``.
 
     Raises:
         DataError: the mask has a wrong shape or dtype or keeps nothing, or the optimizers do not hold the parameters.
+            All arguments are unchanged then.
     """
     n = num_primitives(params)
     if mask.dtype != torch.bool or mask.shape != (n,):
@@ -97,30 +121,40 @@ def keep(
         raise DataError(f"the mask removes all {n} primitives: keep at least one")
     check_wiring(params, optimizers)
 
-    new_params = {
-        name: Parameter(_slice(value.detach(), mask), requires_grad=value.requires_grad)
-        for name, value in params.items()
-    }
-    held = {name: optimizers[name].state.get(params[name], {}) for name in new_params if name in optimizers}
-    new_held = {name: {**state, **_sliced_entries(state, mask, skip="step")} for name, state in held.items()}
-    new_state = _sliced_entries(state, mask)
+    def kept(value: Tensor) -> Tensor:
+        return value[mask.to(value.device)]
 
-    for name, new in new_params.items():
-        replace_parameter(params, optimizers, name, new, new_held.get(name))
-    state.update(new_state)
+    for name in list(params):
+        change_parameter(params, optimizers, name, kept)
+    for state in states:
+        state.update({key: kept(value) for key, value in state.items() if per_primitive(value, n)})
 
 
 @torch.no_grad()
-def keep_state(state: MutableMapping[str, Any], mask: Tensor) -> None:
-    """Slice the tensors with N rows of a state mapping in place, by a mask bool ``[N]``."""
-    state.update(_sliced_entries(state, mask))
+def rewrite(params: Mapping[str, Tensor], optimizers: Mapping[str, Optimizer], values: Mapping[str, Tensor]) -> None:
+    """Overwrite parameters in place.
 
+    Where a value changes, the first moment of Adam becomes 0, because it averages gradients at the old value. The
+    second moment stays: with a zero second moment, the next step would be over three times the learning rate in every
+    direction, for any gradient (``0.1 g / sqrt(0.001 g^2)``). Adam forgets the old second moment within a thousand
+    steps. Unchanged values keep both moments.
 
-def _slice(value: Tensor, mask: Tensor) -> Tensor:
-    return value[mask.to(value.device)]
+    Args:
+        params: the field, changed in place; the optimizers keep the same tensors.
+        optimizers: optimizers by parameter name.
+        values: new values by parameter name, each with the shape of its parameter.
 
-
-def _sliced_entries(entries: Mapping[str, Any], mask: Tensor, skip: str | None = None) -> dict[str, Tensor]:
-    """Sliced copies of the per-primitive tensors of a mapping."""
-    n = mask.shape[0]
-    return {name: _slice(value, mask) for name, value in entries.items() if name != skip and per_primitive(value, n)}
+    Raises:
+        DataError: a name is unknown, a shape differs, or the optimizers do not hold the parameters.
+    """
+    check_wiring(params, optimizers)
+    for name, value in values.items():
+        if name not in params or params[name].shape != value.shape:
+            shape = list(params[name].shape) if name in params else "no such parameter"
+            raise DataError(f"cannot write {list(value.shape)} to {name!r} ({shape}): pass one row per primitive")
+    for name, value in values.items():
+        parameter = params[name]
+        value = value.to(parameter)
+        if name in optimizers and "exp_avg" in optimizers[name].state.get(parameter, {}):
+            optimizers[name].state[parameter]["exp_avg"].masked_fill_(parameter != value, 0)
+        parameter.copy_(value)

@@ -3,26 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal, get_args, get_origin, get_type_hints
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.graphs.neighbors import MOST_EXTENT
-
-Mode = Literal["one-shot", "continuous", "auto", "off"]
-ScoreName = Literal[
-    "response-contribution",
-    "detail-contribution",
-    "response",
-    "contribution",
-    "opacity",
-    "random",
-]
-SelectionName = Literal["sampled", "systematic", "band", "top"]
-SignalName = Literal["attributes", "positions"]
-EdgesName = Literal["centres", "appearance"]
-RedistributionName = Literal["none", "merge"]
-RuleName = Literal["robust", "literal"]
-DeviceName = Literal["cpu", "field"]
 
 
 @dataclass
@@ -34,32 +18,34 @@ class PruningConfig:
     signal="positions", edges="centres", redistribution="none"``.
     """
 
-    mode: Mode = "one-shot"
+    mode: Literal["one-shot", "continuous", "auto", "off"] = "one-shot"
     """Prune once (one-shot, the paper's main strategy), periodically during densification for less peak memory (continuous),
     down to a budget of PSNR, bytes or primitives (auto), or never (off)."""
     keep_ratio: float = 0.1
     """Share of the N primitives that one prune keeps, in (0, 1]: exactly round(keep_ratio * N)."""
-    selection: SelectionName = "systematic"
+    selection: Literal["sampled", "systematic", "band", "top"] = "systematic"
     """How scores select primitives: one draw in each stretch of space (systematic), independent draws (sampled), the highest
     scores (top), or both ends of the ranking as in the paper (band)."""
-    score: ScoreName = "detail-contribution"
+    score: Literal["response-contribution", "detail-contribution", "response", "contribution", "opacity", "random"] = (
+        "detail-contribution"
+    )
     """Importance of a primitive: its blending weight over the training views (contribution), the same with pixels weighted by
     the detail that the kept primitives cannot show (detail-contribution), its high-pass response, alone or times the
     contribution, its opacity, or the same for all (random)."""
-    signal: SignalName = "attributes"
+    signal: Literal["attributes", "positions"] = "attributes"
     """Signal of the response: position, colour, opacity and size (attributes), or positions alone as in the paper."""
-    edges: EdgesName = "appearance"
+    edges: Literal["centres", "appearance"] = "appearance"
     """Weights of the graph: by distance, overlap and colour (appearance), or by distance alone as in the paper (centres)."""
-    redistribution: RedistributionName = "merge"
+    redistribution: Literal["none", "merge"] = "merge"
     """Whether each dropped primitive is merged into the kept one that is nearest along the graph (merge), or discarded as in
     the paper (none). A merge needs a pass over the training views."""
     gamma: float = 0.5
     """Share of the kept primitives that the band selection takes from the high end, in [0, 1]; the others are the low end."""
     num_neighbors: int = 16
     """Most neighbours of a primitive in the graph."""
-    graph_device: DeviceName = "field"
+    graph_device: Literal["cpu", "field"] = "field"
     """Where the graph is built and filtered: on the device of the field, or on the CPU."""
-    bandwidth: RuleName = "robust"
+    bandwidth: Literal["robust", "literal"] = "robust"
     """Rule for the reach and the width of edges; the paper's literal rule gives an empty graph on most fields."""
     tau: float | None = None
     """Squared distance below which primitives are neighbours, in squared scene units; replaces the rule's."""
@@ -146,19 +132,10 @@ class PruningConfig:
         Raises:
             ConfigError: names the first invalid option and its valid values.
         """
-        for name, choices in (
-            ("mode", Mode),
-            ("selection", SelectionName),
-            ("score", ScoreName),
-            ("signal", SignalName),
-            ("edges", EdgesName),
-            ("redistribution", RedistributionName),
-            ("bandwidth", RuleName),
-            ("graph_device", DeviceName),
-        ):
-            value = getattr(self, name)
-            if value not in get_args(choices):
-                raise ConfigError(f"{name} is {value!r}: use one of {', '.join(get_args(choices))}")
+        for name, kind in get_type_hints(type(self)).items():
+            value, choices = getattr(self, name), get_args(kind) if get_origin(kind) is Literal else ()
+            if choices and value not in choices:
+                raise ConfigError(f"{name} is {value!r}: use one of {', '.join(choices)}")
         if not 0 < self.keep_ratio <= 1:
             raise ConfigError(f"keep_ratio is {self.keep_ratio}: use a share in (0, 1], 0.1 to keep a tenth")
         if not 0 <= self.gamma <= 1:

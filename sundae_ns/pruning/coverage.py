@@ -12,30 +12,19 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.graphs.tree import build_tree
+from sundae_ns.pruning.selection import as_scores
 
 LEAST_SHARE = 1e-200
 """Least score, as a share of the largest; lower scores are raised to it."""
 
 
 def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
-    """Inclusion probabilities ``p_i = min(1, c s_i)`` that sum to ``count``.
-
-    Args:
-        score: positive finite scores ``[N]``.
-        count: 1 to N.
+    """Inclusion probabilities ``p_i = min(1, c s_i)`` of positive finite scores ``[N]`` that sum to ``count``, 1 to N.
 
     Returns:
         Probabilities, float64 on the CPU ``[N]``; exactly 1 for primitives that are always included.
-
-    Raises:
-        DataError: a score is not positive and finite, or ``count`` is out of range.
     """
     values = score.detach().to(device="cpu", dtype=torch.float64)
-    n = len(values)
-    if not 1 <= count <= n:
-        raise DataError(f"cannot keep {count} of {n} primitives: ask for 1 to {n}")
-    if not bool((values > 0).all()) or bool(values.isinf().any()):
-        raise DataError("inclusion probabilities need positive finite scores: remove the others first")
     # The largest is 1, so that sums do not overflow; none is 0, so that no sum is.
     values = (values / values.max()).clamp_min(LEAST_SHARE)
     ordered = torch.sort(values, descending=True, stable=True).values
@@ -73,7 +62,6 @@ def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Te
         score: scores ``[N]``.
         count: number of primitives to keep, 1 to N.
         order: permutation of the primitives, int64 ``[N]``.
-        seed: seed of the draw.
 
     Returns:
         Mask with ``count`` True entries, bool, on the device of the scores ``[N]``.
@@ -81,15 +69,12 @@ def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Te
     Raises:
         DataError: ``count`` is not in 1 to N, or shapes do not fit.
     """
-    n = len(score)
-    if score.ndim != 1 or order.shape != score.shape:
+    if order.shape != score.shape:
         raise DataError(f"scores have shape {list(score.shape)} and their order {list(order.shape)}: pass [N] and [N]")
-    if not 1 <= count <= n:
-        raise DataError(f"cannot keep {count} of {n} primitives: ask for 1 to {n}")
     order = order.cpu()
-    values = score.detach().to(device="cpu", dtype=torch.float64)[order]
+    values = as_scores(score, count)[order]
     start = float(torch.rand((), generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
-    chosen = torch.zeros(n, dtype=torch.bool)
+    chosen = torch.zeros(len(values), dtype=torch.bool)
     infinite = values == torch.inf
     positive = (values > 0) & ~infinite
     left = count

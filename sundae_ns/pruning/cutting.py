@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from sundae_ns.gaussians.parameters import finite_mask
-from sundae_ns.gaussians.rewriting import rewrite
-from sundae_ns.gaussians.surgery import keep, keep_state
+from sundae_ns.gaussians.surgery import keep, rewrite
 from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.decision import Decision, decide
 from sundae_ns.pruning.scores import Contribution
@@ -22,10 +20,9 @@ from sundae_ns.pruning.scores import Contribution
 def drop_nonfinite(
     params: MutableMapping[str, Parameter],
     optimizers: Mapping[str, Optimizer],
-    state: MutableMapping[str, Any],
-    strategy_state: MutableMapping[str, Any] | None = None,
+    states: Iterable[MutableMapping[str, Any]],
 ) -> int:
-    """Remove the primitives with a NaN or infinite parameter, in place; arguments as in :func:`cut`.
+    """Remove the primitives with a NaN or infinite parameter, in place; see :func:`sundae_ns.gaussians.surgery.keep`.
 
     Returns:
         Number of removed primitives. If no primitive is finite, it is 0 and the field is unchanged.
@@ -35,7 +32,7 @@ def drop_nonfinite(
     if dropped == len(finite):
         return 0
     if dropped:
-        _keep(params, optimizers, state, strategy_state, finite)
+        keep(params, optimizers, states, finite)
     return dropped
 
 
@@ -54,8 +51,7 @@ def cut(
     """Prune a field in training, in place: drop primitives that are not finite, decide, remove, and merge.
 
     Args:
-        params: the field; its parameters are replaced.
-        optimizers: optimizers by parameter name; those of other names are not changed.
+        params, optimizers: see :func:`sundae_ns.gaussians.surgery.keep`.
         state: running state of a schedule; the prune is recorded in it.
         config: options of this prune.
         contribution: returns the summed blending weights of ``params`` over the training views ``[N]``; called only if
@@ -71,23 +67,12 @@ def cut(
         ConfigError, DataError: see :func:`sundae_ns.pruning.decide`.
     """
     # Before the decision: the contribution renders the field, and one NaN spreads over the image.
-    dropped = drop_nonfinite(params, optimizers, state, strategy_state)
+    states = [state] if strategy_state is None else [state, strategy_state]
+    dropped = drop_nonfinite(params, optimizers, states)
     decision = decide(params, config, contribution, count=count(len(params["means"])))
-    _keep(params, optimizers, state, strategy_state, decision.mask)
+    keep(params, optimizers, states, decision.mask)
     if decision.values is not None:
         rewrite(params, optimizers, decision.values)
     state["pruned_at"] = step
     state["num_prunes"] += 1
     return replace(decision, dropped_nonfinite=dropped)
-
-
-def _keep(
-    params: MutableMapping[str, Parameter],
-    optimizers: Mapping[str, Optimizer],
-    state: MutableMapping[str, Any],
-    strategy_state: MutableMapping[str, Any] | None,
-    mask: Tensor,
-) -> None:
-    keep(params, optimizers, state, mask)
-    if strategy_state is not None:
-        keep_state(strategy_state, mask)

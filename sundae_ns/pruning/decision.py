@@ -81,14 +81,14 @@ def decide(
         return Decision(finite, n_finite, n - n_finite)
 
     field = as_field(params)
-    usable = field if n_finite == n else field.detached().rows(finite)
+    usable = field if n_finite == n else field.rows(finite)
     weights = _once(contribution, finite)
     if not config.uses_graph:
         graph = None
     elif graph is None:
         graph = field_graph(for_graph(usable, config), config)
-    found = response(usable, config, graph) if config.uses_response else None
-    values = score(usable, config, found, weights)
+    magnitude = response(usable, config, graph) if config.uses_response else None
+    values = score(usable, config, magnitude, weights)
     selected = _select(values, config, count, usable["means"])
     mask = finite.clone()
     mask[finite] = selected.to(mask.device)

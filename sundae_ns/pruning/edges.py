@@ -34,7 +34,6 @@ def field_graph(params: Mapping[str, Tensor], config: PruningConfig) -> Neighbor
     Args:
         params: the field, all finite, N primitives, colours as harmonics (:func:`sundae_ns.pruning.scores.for_graph`). The
             graph is built on its device.
-        config: gives number of neighbours, bandwidth and kind of edges.
 
     Raises:
         DataError: only one primitive, or positions that are not finite.

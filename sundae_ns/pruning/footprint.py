@@ -15,9 +15,6 @@ def footprint(params: Mapping[str, Tensor]) -> Tensor:
 
     It ignores distance and occlusion: with cameras, summed blending weights are the better estimate.
 
-    Args:
-        params: a field, all finite.
-
     Returns:
         Footprints, float64 ``[N]``, squared scene units, on the field's device.
     """

@@ -28,7 +28,6 @@ def heirs(graph: NeighborGraph, mask: Tensor) -> Tensor:
     directions: a thousand clones share the same few neighbours, and all of these may be dropped.
 
     Args:
-        graph: graph of N nodes.
         mask: True for primitives to keep, bool, any device ``[N]``.
 
     Returns:
@@ -89,7 +88,6 @@ def merged(params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, wei
 
     Args:
         params: the field, all finite, N primitives.
-        graph: graph of the field.
         mask: True for primitives to keep, bool ``[N]``.
         weight: weight of each primitive in the merge, its summed blending weight over the training views ``[N]``.
 

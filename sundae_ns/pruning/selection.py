@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.errors import DataError
 
 
 def kept_count(keep_ratio: float, n: int) -> int:
@@ -21,7 +21,7 @@ def kept_count(keep_ratio: float, n: int) -> int:
 
 def select_top(score: Tensor, count: int) -> Tensor:
     """Select the ``count`` highest scores: ``[N]`` to bool ``[N]``."""
-    values = _prepared(score, count)
+    values = as_scores(score, count)
     return _mask(_ranked(values)[:count], score)
 
 
@@ -32,17 +32,13 @@ def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
     isolated primitives, belong to neither end.
 
     Args:
-        magnitude: response magnitudes ``[N]``.
         count: number of primitives to keep, 1 to N.
         gamma: share of the high end, in [0, 1].
 
     Raises:
-        ConfigError: ``gamma`` is out of range.
         DataError: ``count`` is not in 1 to N.
     """
-    if not 0 <= gamma <= 1:
-        raise ConfigError(f"gamma is {gamma}: use a share in [0, 1]")
-    values = _prepared(magnitude, count)
+    values = as_scores(magnitude, count)
     high = _ranked(values)[: round(gamma * count)]
     rest = torch.ones_like(values, dtype=torch.bool)
     rest[high] = False
@@ -59,14 +55,13 @@ def select_sampled(score: Tensor, count: int, seed: int) -> Tensor:
     uniformly, after all positive ones.
 
     Args:
-        score: scores ``[N]``; need not sum to 1.
         count: number of primitives to keep, 1 to N.
         seed: seed of the draw, independent of the global generator.
 
     Raises:
         DataError: ``count`` is not in 1 to N.
     """
-    values = _prepared(score, count)
+    values = as_scores(score, count)
     generator = torch.Generator().manual_seed(seed)
     uniform = torch.rand(len(values), generator=generator, dtype=torch.float64)
     gumbel = -torch.log((-torch.log1p(-uniform)).clamp_min(torch.finfo(torch.float64).tiny))
@@ -83,7 +78,12 @@ def select_random(n: int, count: int, seed: int, device: torch.device | str = "c
     return select_sampled(torch.ones(n, device=device), count, seed)
 
 
-def _prepared(score: Tensor, count: int) -> Tensor:
+def as_scores(score: Tensor, count: int) -> Tensor:
+    """Scores as float64 on the CPU ``[N]``.
+
+    Raises:
+        DataError: they have another shape, or ``count`` is not in 1 to N.
+    """
     if score.ndim != 1:
         raise DataError(f"scores have shape {list(score.shape)}: pass one number per primitive, [N]")
     if not 1 <= count <= len(score):

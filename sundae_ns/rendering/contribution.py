@@ -10,7 +10,7 @@ from rich.progress import track
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.pruning import pixel_detail
+from sundae_ns.pruning.detail import pixel_detail
 from sundae_ns.rasterization import blending_weights
 from sundae_ns.rendering.render import RenderSettings, draw, pass_options
 from sundae_ns.rendering.source import FieldSource, Primitives, TrainingView, ViewBatch

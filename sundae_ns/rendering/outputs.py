@@ -49,7 +49,7 @@ class ShownResponse:
         of, values = self._last
         if of != key:
             try:
-                values = display.response_values(response(field, config).magnitude)
+                values = display.response_values(response(field, config))
             except DataError:
                 values = None
             self._last = (key, values)

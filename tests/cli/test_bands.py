@@ -54,7 +54,7 @@ def test_files_and_statistics_agree(ply: Path, tmp_path: Path, capsys: pytest.Ca
 
     params = {name: value[torch.isfinite(x_of(ply))] for name, value in read_ply(ply).items()}
     config = PruningConfig(signal="positions", num_neighbors=9)
-    magnitude = response(params, band_rule(config, 0.1, 0.3)).magnitude
+    magnitude = response(params, band_rule(config, 0.1, 0.3))
     known = magnitude[magnitude.isfinite()]
     assert result["response"]["known"] == len(known)
     assert result["isolated"] == len(magnitude) - len(known)

@@ -11,8 +11,8 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.cli import main
-from sundae_ns.gaussians import SPLAT_NAMES, from_points
-from sundae_ns.gaussians.parameters import SH_C0
+from sundae_ns.gaussians import from_points
+from sundae_ns.gaussians.parameters import SH_C0, SPLAT_NAMES
 from sundae_ns.storage import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
 from sundae_ns.storage.packing import Scene, read_scene, write_scene
 from sundae_ns.storage.viewers import write_for_viewers

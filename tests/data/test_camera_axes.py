@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.data import Camera, look_at, project
 from sundae_ns.data.camera_axes import world_to_camera, world_to_camera_floats
+from sundae_ns.data.cameras import Camera, look_at, project
 
 
 def random_pose(seed: int) -> Tensor:

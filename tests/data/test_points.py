@@ -1,6 +1,9 @@
 import numpy as np
 
-from sundae_ns.data import first_hits, in_frame, orbit, project, render, sparse_points, still_life
+from sundae_ns.data.cameras import in_frame, orbit, project
+from sundae_ns.data.points import sparse_points
+from sundae_ns.data.still_life import still_life
+from sundae_ns.data.tracer import first_hits, render
 
 
 def test_every_point_is_seen_by_two_cameras():

@@ -7,7 +7,11 @@ import torch
 from PIL import Image
 from plyfile import PlyData
 
-from sundae_ns.data import Camera, first_hits, held_out_indices, in_frame, project, still_life, write_embedded_capture
+from sundae_ns.data.cameras import Camera, in_frame, orbit, project
+from sundae_ns.data.points import sparse_points
+from sundae_ns.data.scene_folder import held_out_indices, write_embedded_capture
+from sundae_ns.data.still_life import still_life
+from sundae_ns.data.tracer import first_hits, render
 from sundae_ns.errors import ConfigError, DataError
 
 SIZE = {"train_views": 12, "test_views": 2, "width": 128, "height": 96, "points": 400}
@@ -130,19 +134,27 @@ def _on_a_surface(points):
     return np.abs(distance - 0.01) < 2e-3
 
 
-def test_outliers_are_the_given_fraction(tmp_path):
-    size = {"train_views": 4, "test_views": 1, "width": 32, "height": 32, "points": 400, "point_noise": 0.0}
-    clean, _ = _points(write_embedded_capture(tmp_path / "clean", outliers=0.0, **size))
+def _scene_and_views(count):
+    scene = still_life(0)
+    cameras = orbit(count, width=32, height=32, rng=np.random.default_rng(2))
+    return scene, cameras, [render(scene, camera) for camera in cameras]
+
+
+def test_outliers_are_the_given_fraction():
+    views = _scene_and_views(4)
+    clean, dirty = (
+        sparse_points(*views, 400, noise=0, outliers=share, rng=np.random.default_rng(3))[0] for share in (0, 0.25)
+    )
     assert _on_a_surface(clean).mean() > 0.97
-    dirty, _ = _points(write_embedded_capture(tmp_path / "dirty", outliers=0.25, **size))
     assert _on_a_surface(dirty[:300]).mean() > 0.97
     assert _on_a_surface(dirty[300:]).mean() < 0.05
 
 
-def test_noise_grows_with_the_distance(tmp_path):
-    size = {"train_views": 14, "test_views": 1, "width": 32, "height": 32, "points": 400, "outliers": 0.0}
-    exact, _ = _points(write_embedded_capture(tmp_path / "exact", point_noise=0.0, **size))
-    noisy, _ = _points(write_embedded_capture(tmp_path / "noisy", point_noise=0.01, **size))
+def test_noise_grows_with_the_distance():
+    views = _scene_and_views(14)
+    exact, noisy = (
+        sparse_points(*views, 400, noise=noise, outliers=0, rng=np.random.default_rng(3))[0] for noise in (0, 0.01)
+    )
     error = np.abs(noisy - exact)
     far = np.linalg.norm(exact, axis=1) > 15
     assert 10 < far.sum() < 390
@@ -188,38 +200,9 @@ def test_marker_cannot_delete_outside(tmp_path):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"train_views": 2}, {"test_views": 0}, {"width": 8}, {"points": 0}, {"outliers": 1.5}, {"test_views": 60}],
+    [{"train_views": 2}, {"test_views": 0}, {"width": 8}, {"points": 0}, {"test_views": 60}],
 )
 def test_impossible_options(tmp_path, wrong):
     with pytest.raises(ConfigError):
         write_embedded_capture(tmp_path / "scene", **wrong)
     assert not (tmp_path / "scene").exists()
-
-
-def test_a_wall_fills_every_image_and_is_smooth(tmp_path):
-    wall = write_embedded_capture(tmp_path / "wall", kind="wall", **SIZE)
-    still = write_embedded_capture(tmp_path / "still", **SIZE)
-
-    def detail(folder):
-        images = [_image(path) for path in sorted((folder / "images").glob("*.png"))]
-        return np.mean([np.abs(np.diff(image, axis=1)).mean() for image in images])
-
-    assert detail(wall) < detail(still) / 5
-    xyz, _ = _points(wall)
-    assert np.median(np.abs(xyz[:, 1])) < 0.02
-    for path in (wall / "images").glob("*.png"):
-        assert 0.25 < _image(path).min()
-        assert _image(path).std(axis=(0, 1)).max() > 0.01, "no texture"
-    with pytest.raises(ConfigError, match="kind is 'attic'; use one of still-life, wall"):
-        write_embedded_capture(tmp_path / "attic", kind="attic", **SIZE)
-
-
-def test_sensor_noise_is_independent_in_each_pixel(tmp_path):
-    clean, noisy = (
-        write_embedded_capture(tmp_path / str(noise), kind="wall", sensor_noise=noise, **SIZE) for noise in (0.0, 0.03)
-    )
-    names = [f"images/frame_{i:05d}.png" for i in (1, 2)]
-    errors = np.stack([_image(noisy / name) - _image(clean / name) for name in names])
-    assert 0.029 < errors.std() < 0.031
-    assert np.abs(errors.mean()) < 0.001
-    assert np.abs(np.corrcoef(errors[0].ravel(), errors[1].ravel())[0, 1]) < 0.03

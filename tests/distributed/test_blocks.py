@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn import Parameter
 
-from sundae_ns.distributed import bounds, checkpoints, moves, pruning
+from sundae_ns.distributed import checkpoints, pruning
+from sundae_ns.distributed.shards import bounds, moves
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.surgery import per_primitive

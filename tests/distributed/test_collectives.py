@@ -20,11 +20,13 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.distributed import ShardedField, Shards, bounds, take_shard
+from sundae_ns.distributed import ShardedField, Shards
 from sundae_ns.distributed.batches import average_gradients
 from sundae_ns.distributed.densification import ShardedDensification
 from sundae_ns.distributed.pruning import GlobalPruning
+from sundae_ns.distributed.shards import bounds
 from sundae_ns.distributed.source import ReceivedPrimitives, statistics_of
+from sundae_ns.distributed.team import take_shard
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning import PruningConfig
@@ -447,7 +449,7 @@ def check_pruning(shards: Shards, **options: Any) -> None:
     params = shard_of(whole, start, end)
     optimizers, counts = adams(params, start), {"grad2d": torch.arange(start, end)}
     shards.recount(params)
-    schedule = GlobalPruning(make_schedule(config), shards)
+    schedule = GlobalPruning(config, make_schedule(config), shards)
     state = schedule.initialize_state()
     assert schedule.config is config
     assert schedule.due(state, 2, 200)
@@ -490,7 +492,8 @@ def check_refusal(shards: Shards) -> None:
     """All ranks raise the error that rank 0 finds."""
     params = own_half(shards)
     shards.recount(params)
-    schedule = GlobalPruning(make_schedule(PruningConfig(prune_at=1, keep_ratio=0.3)), shards)
+    config = PruningConfig(prune_at=1, keep_ratio=0.3)
+    schedule = GlobalPruning(config, make_schedule(config), shards)
     with pytest.raises(ConfigError, match="pass over the training views"):
         schedule.step_post_backward(params, {}, schedule.initialize_state(), 2)
 

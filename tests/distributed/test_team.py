@@ -9,9 +9,10 @@ from typing import Any
 import pytest
 import torch
 
-from sundae_ns.distributed import OneProcess, Ranks, team_of
+from sundae_ns.distributed import team_of
 from sundae_ns.distributed.densification import ShardedDensification
 from sundae_ns.distributed.pruning import GlobalPruning
+from sundae_ns.distributed.team import OneProcess, Ranks
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.method_configs import sundae_tiny

@@ -23,15 +23,17 @@ import pytest
 import torch
 import torch.distributed as dist
 from PIL import Image
+from torch.multiprocessing.spawn import ProcessExitedException
 
 from sundae_ns import distributed
 from sundae_ns.data import write_embedded_capture
 from sundae_ns.distributed import ShardedField, Shards
 from sundae_ns.distributed.batches import shorten
 from sundae_ns.distributed.checkpoints import state_of_rank
+from sundae_ns.distributed.shards import DRIFT
 from sundae_ns.distributed.source import Exchange
 from sundae_ns.distributed.start import without_viewer
-from sundae_ns.errors import ConfigError, RankError, rank_ended
+from sundae_ns.errors import ConfigError, rank_ended
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.rendering import StepResolution, View
 from sundae_ns.storage.runs import checkpoint
@@ -127,7 +129,7 @@ def check_training(shards: Shards, folder: Path) -> None:
     team: Any = trainer.team
     assert team.shards.numbers(model.num_points) == [[count] for count in team.shards.counts]
     assert model.source.total == sum(team.shards.counts)
-    assert max(team.shards.counts) <= distributed.DRIFT * model.source.total / RANKS
+    assert max(team.shards.counts) <= DRIFT * model.source.total / RANKS
     group = trainer.optimizers.optimizers["opacities"].param_groups[0]
     assert group["lr"] == pytest.approx(0.05 * RANKS**0.5)
     assert group["betas"] == pytest.approx((0.9**RANKS, 0.999**RANKS))
@@ -180,6 +182,15 @@ class DyingTrainer(SundaeTrainer):
         return super().train_iteration(step)
 
 
+def train_rank(rank: int, meeting: Path, config: Any) -> None:
+    dist.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=RANKS)
+    torch.manual_seed(config.machine.seed + rank)
+    trainer = config.setup(local_rank=rank, world_size=RANKS)
+    trainer.setup()
+    trainer.train()
+    dist.destroy_process_group()
+
+
 def main(folder: Path) -> None:
     """Two ranks resume from a checkpoint, and one is killed."""
     torch.set_num_threads(1)
@@ -187,9 +198,9 @@ def main(folder: Path) -> None:
     config = DyingTrainerConfig(**{k: v for k, v in vars(plain).items() if k != "_target"})
     config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
     try:
-        distributed.launch(config, RANKS)
-    except RankError as error:
-        (folder / "died.txt").write_text(str(error))
+        torch.multiprocessing.spawn(train_rank, (folder / "meeting-of-the-dead", config), nprocs=RANKS)
+    except ProcessExitedException as error:
+        (folder / "died.txt").write_text(str(rank_ended(error)))
 
 
 if __name__ == "__main__":

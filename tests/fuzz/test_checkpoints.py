@@ -19,7 +19,7 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch.amp import GradScaler
 
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.distributed import OneProcess
+from sundae_ns.distributed.team import OneProcess
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.trainer import SundaeTrainer

@@ -7,8 +7,8 @@ from torch import nn
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from sundae_ns.gaussians import keep
 from sundae_ns.gaussians.snapshot import module_snapshot, narrow, restore, restore_module, snapshot
+from sundae_ns.gaussians.surgery import keep
 
 
 def field(n: int = 20) -> tuple[dict[str, Parameter], dict[str, Adam]]:
@@ -33,7 +33,7 @@ def test_training_continues_from_a_snapshot_bit_for_bit() -> None:
     train(params, optimizers, 4)
     expected = {name: value.detach().clone() for name, value in params.items()}
 
-    keep(params, optimizers, {}, torch.arange(20) < 7)
+    keep(params, optimizers, [], torch.arange(20) < 7)
     narrow(params, optimizers, "features_rest", 3)
     train(params, optimizers, 5)
     for _ in range(2):  # a snapshot can be restored more than once

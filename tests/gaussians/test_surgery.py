@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.surgery import check_wiring, keep, keep_state
+from sundae_ns.gaussians.surgery import check_wiring, keep
 
 SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "features_rest": (8, 3), "opacities": (1,), "features": (13,)}
 
@@ -47,11 +47,11 @@ def some(n: int = 20) -> Tensor:
 def test_training_continues_as_if_only_the_kept_primitives_had_existed() -> None:
     params, optimizers = field()
     expected, expected_optimizers = field()
-    keep(expected, expected_optimizers, {}, some())
+    keep(expected, expected_optimizers, [], some())
     for _ in range(3):
         train(params, optimizers)
         train(expected, expected_optimizers)
-    keep(params, optimizers, {}, some())
+    keep(params, optimizers, [], some())
     for _ in range(3):
         train(params, optimizers)
         train(expected, expected_optimizers)
@@ -65,7 +65,7 @@ def test_optimizers_hold_the_new_parameters_and_sliced_moments() -> None:
     train(params, optimizers)
     old = dict(params)
     moments = {name: optimizers[name].state[params[name]]["exp_avg"].clone() for name in SHAPES if name != "quats"}
-    keep(params, optimizers, {}, some())
+    keep(params, optimizers, [], some())
     for name, value in params.items():
         torch.testing.assert_close(value.data, old[name].data[some()])
         assert isinstance(value, Parameter)
@@ -85,7 +85,7 @@ def test_a_live_graph_of_the_previous_step_does_not_break_training() -> None:
     params, optimizers = field()
     still_alive = params["means"].exp().sum()
     train(params, optimizers)
-    keep(params, optimizers, {}, some())
+    keep(params, optimizers, [], some())
     before = train(params, optimizers)
     assert train(params, optimizers) < before
     assert still_alive.grad_fn is not None
@@ -102,8 +102,9 @@ def test_per_primitive_state_is_sliced_and_other_state_is_unchanged() -> None:
         "no": None,
     }
     scalar = state["scalar"] = torch.tensor(20)
+    alone = {"grad2d": torch.arange(20, 0, -1), "other": other}
     network = [p.detach().clone() for p in optimizers["compensation"].param_groups[0]["params"]]
-    keep(params, optimizers, state, some())
+    keep(params, optimizers, [state, alone], some())
     assert state["grad2d"].tolist() == [0, 3, 6, 9, 12, 15, 18]
     assert state["pair"].shape == (7, 2)
     assert state["other"] is other
@@ -111,9 +112,7 @@ def test_per_primitive_state_is_sliced_and_other_state_is_unchanged() -> None:
     assert (state["step"], state["no"]) == (20, None)
     for value, before in zip(optimizers["compensation"].param_groups[0]["params"], network, strict=True):
         assert torch.equal(value, before)
-    alone = {"grad2d": torch.arange(4), "other": other}
-    keep_state(alone, torch.tensor([True, False, False, True]))
-    assert alone["grad2d"].tolist() == [0, 3]
+    assert alone["grad2d"].tolist() == [20, 17, 14, 11, 8, 5, 2]
     assert alone["other"] is other
 
 
@@ -121,7 +120,7 @@ def test_a_one_element_step_of_one_primitive_is_not_sliced() -> None:
     params, optimizers = field(1)
     train(params, optimizers)
     step = optimizers["means"].state[params["means"]]["step"] = torch.ones(1)
-    keep(params, optimizers, {}, torch.tensor([True]))
+    keep(params, optimizers, [], torch.tensor([True]))
     assert optimizers["means"].state[params["means"]]["step"] is step
 
 
@@ -137,7 +136,7 @@ def test_a_one_element_step_of_one_primitive_is_not_sliced() -> None:
 def test_wrong_masks_are_refused(mask: Tensor, message: str) -> None:
     params, optimizers = field()
     with pytest.raises(DataError, match=message):
-        keep(params, optimizers, {}, mask)
+        keep(params, optimizers, [], mask)
 
 
 @pytest.mark.parametrize("fault", ["length", "stale", "two groups"])
@@ -154,7 +153,7 @@ def test_nothing_changes_on_error(fault: str) -> None:
     objects = dict(params)
     state: dict[str, Any] = {"grad2d": torch.arange(20)}
     with pytest.raises(DataError, match="'features'"):
-        keep(params, optimizers, state, some())
+        keep(params, optimizers, [state], some())
     with pytest.raises(DataError, match="'features'"):
         check_wiring(params, optimizers)
     assert all(params[name] is objects[name] for name in objects)
@@ -166,7 +165,7 @@ def test_nothing_changes_on_error(fault: str) -> None:
 def test_works_on_a_parameter_dict() -> None:
     params, optimizers = field()
     container = torch.nn.ParameterDict(params)
-    keep(container, optimizers, {}, some())
+    keep(container, optimizers, [], some())
     assert {name: tuple(value.shape) for name, value in container.items()} == {n: (7, *s) for n, s in SHAPES.items()}
     assert len(list(container.parameters())) == len(SHAPES)
 
@@ -176,7 +175,7 @@ def test_a_mask_on_the_cpu_prunes_a_field_on_the_gpu() -> None:
     params = {name: Parameter(value.detach().cuda()) for name, value in field()[0].items()}
     optimizers: dict[str, torch.optim.Optimizer] = {name: torch.optim.Adam([value]) for name, value in params.items()}
     train(params, optimizers)
-    keep(params, optimizers, {}, some())
+    keep(params, optimizers, [], some())
     train(params, optimizers)
     assert params["means"].is_cuda
     assert len(params["means"]) == 7

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from sundae_ns.gaussians import SPLAT_NAMES
+from sundae_ns.gaussians.parameters import SPLAT_NAMES
 from sundae_ns.storage import is_nerfstudio_ply, read_ply
 
 

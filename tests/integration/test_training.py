@@ -15,7 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, MemoryExhaustedError
-from sundae_ns.gaussians import SPLAT_NAMES
+from sundae_ns.gaussians.parameters import SPLAT_NAMES
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage import MODEL_FRAME, write_ply
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.pruning import inclusion_probabilities, neighbor_order, select_systematic
+from sundae_ns.pruning.coverage import inclusion_probabilities, neighbor_order, select_systematic
 
 
 def scores(n: int = 500) -> Tensor:
@@ -126,9 +126,7 @@ def test_the_order_walks_through_small_clusters_too() -> None:
 
 def test_invalid_input_is_refused() -> None:
     with pytest.raises(DataError, match="cannot keep 5 of 3"):
-        inclusion_probabilities(torch.ones(3), 5)
-    with pytest.raises(DataError, match="positive finite"):
-        inclusion_probabilities(torch.tensor([1.0, 0.0]), 1)
+        select_systematic(torch.ones(3), 5, torch.arange(3), 0)
     with pytest.raises(DataError, match="cannot keep 0 of 3"):
         select_systematic(torch.ones(3), 0, torch.arange(3), 0)
     with pytest.raises(DataError, match=r"\[3\] and their order \[2\]"):

@@ -24,7 +24,7 @@ def field() -> dict[str, Parameter]:
 def test_primitives_that_are_not_finite_are_removed_and_counted(bad: list[int], removed: int) -> None:
     params, statistics = field(), {"count": torch.arange(N)}
     params["opacities"].data[bad] = torch.nan
-    assert drop_nonfinite(params, {}, {}, statistics) == removed
+    assert drop_nonfinite(params, {}, [statistics]) == removed
     kept = [row for row in range(N) if row not in bad]
     assert statistics["count"].tolist() == kept
     assert all(len(value) == len(kept) for value in params.values())
@@ -33,7 +33,7 @@ def test_primitives_that_are_not_finite_are_removed_and_counted(bad: list[int], 
 def test_a_field_without_a_finite_primitive_stays() -> None:
     params = field()
     params["means"].data[:, 1] = torch.inf
-    assert drop_nonfinite(params, {}, {}) == 0
+    assert drop_nonfinite(params, {}, []) == 0
     assert len(params["means"]) == N
 
 

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians.parameters import rgb_to_sh
-from sundae_ns.pruning import PruningConfig, attribute_signal, decide, position_signal, response, score
-from sundae_ns.pruning.scores import Response
+from sundae_ns.pruning import PruningConfig, decide, response
+from sundae_ns.pruning.scores import score
+from sundae_ns.pruning.signals import attribute_signal, position_signal
 
 PLAIN = PruningConfig(selection="sampled", score="response-contribution", edges="centres", redistribution="none")
 """Response times contribution and independent draws, without the additions of the default rule."""
@@ -55,9 +56,9 @@ def test_the_papers_rule_is_the_band_of_the_position_response() -> None:
     params = field()
     decision = decide_share(params, replace(PAPER, keep_ratio=0.2))
     found = response(params, PAPER)
-    ranked = found.magnitude[~found.magnitude.isnan()].sort().values
-    assert sorted(found.magnitude[decision.mask].tolist()) == torch.cat([ranked[:6], ranked[-6:]]).tolist()
-    assert found.isolated == decision.isolated == int(found.magnitude.isnan().sum())
+    ranked = found[~found.isnan()].sort().values
+    assert sorted(found[decision.mask].tolist()) == torch.cat([ranked[:6], ranked[-6:]]).tolist()
+    assert decision.isolated == int(found.isnan().sum())
 
 
 def test_isolated_floaters_are_judged_by_contribution_or_not_kept() -> None:
@@ -89,7 +90,7 @@ def test_attribute_response_finds_the_colour_edge() -> None:
     params["features_dc"] = rgb_to_sh(torch.where(left, 0.2, 0.8)[:, None].expand(-1, 3)).clone()
     params["scales"] = torch.zeros(n, 3)
     params["opacities"] = torch.zeros(n, 1)
-    magnitude = response(params, replace(PLAIN, num_neighbors=8)).magnitude
+    magnitude = response(params, replace(PLAIN, num_neighbors=8))
     edge = (params["means"][:, 0] - 9.5).abs() < 1
     assert magnitude[edge].min() > 10 * magnitude[~edge].max()
 
@@ -155,12 +156,6 @@ def test_invalid_input_raises_one_line() -> None:
         (DataError, "none of 60", lambda: decide_share({k: v * torch.nan for k, v in field().items()}, PAPER)),
         (ConfigError, "training views", lambda: decide_share(field(), PruningConfig())),
         (DataError, r"shape \[59\] for 60", lambda: decide_share(field(), PruningConfig(), lambda: ones(59))),
-        (
-            DataError,
-            r"shape \[9\] for 60",
-            lambda: score(field(), PruningConfig(score="contribution"), None, lambda: ones(9)),
-        ),
-        (ConfigError, "graph response", lambda: score(field(), PAPER, None, None)),
         (ConfigError, "keep_ratio", lambda: decide_share(field(), PruningConfig(keep_ratio=0.0))),
     ]
     for error, message, call in cases:
@@ -188,7 +183,7 @@ def test_a_contribution_of_nan_counts_as_0() -> None:
 
 def test_scores_by_hand() -> None:
     params, weights = field(3), torch.tensor([2.0, 0.5, torch.nan])
-    found = Response(torch.tensor([4.0, torch.nan, 9.0]), 1.0, 1.0, 1)
+    found = torch.tensor([4.0, torch.nan, 9.0])
     expected = {
         "contribution": [2.0, 0.5, 0.0],
         "detail-contribution": [2.0, 0.5, 0.0],
@@ -202,7 +197,5 @@ def test_scores_by_hand() -> None:
     assert score(params, replace(PLAIN, score="response"), found, None)[[0, 2]].tolist() == [2, 3]
     opacities = score(params, replace(PLAIN, score="opacity"), None, None)
     assert torch.equal(opacities, params["opacities"].double().sigmoid().flatten())
-    with pytest.raises(ConfigError, match="needs a graph response"):
-        score(params, replace(PLAIN, score="response"), None, None)
-    nothing = Response(torch.full((3,), torch.nan), 1.0, 1.0, 3)
+    nothing = torch.full((3,), torch.nan)
     assert score(params, replace(PLAIN, score="response-contribution"), nothing, lambda: weights)[0] == 2

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sundae_ns.errors import DataError
-from sundae_ns.pruning import pixel_detail
+from sundae_ns.pruning.detail import pixel_detail
 
 
 def test_edges_weigh_more_than_flat_areas_and_flat_areas_more_than_0() -> None:

@@ -20,7 +20,8 @@ from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.parameters import rgb_to_sh, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.pruning import PruningConfig, field_graph, heirs
+from sundae_ns.pruning import PruningConfig, field_graph
+from sundae_ns.pruning.redistribution import heirs
 from sundae_ns.training.schedulers import Decay, notify_pruned
 
 

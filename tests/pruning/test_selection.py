@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.pruning import kept_count, select_band, select_random, select_sampled, select_top
+from sundae_ns.pruning import PruningConfig, kept_count, select_random
+from sundae_ns.pruning.selection import select_band, select_sampled, select_top
 
 VALUES = st.one_of(st.floats(0, 1e30), st.sampled_from([0.0, 1.0, math.nan, math.inf, -math.inf, 1e-300]))
 SCORES = st.lists(VALUES, min_size=1, max_size=40).map(lambda v: torch.tensor(v, dtype=torch.float64))
@@ -137,7 +138,7 @@ def test_impossible_counts_are_refused(count: int) -> None:
 
 def test_bad_options_are_refused() -> None:
     with pytest.raises(ConfigError, match="gamma"):
-        select_band(torch.ones(3), 1, 1.5)
+        PruningConfig(gamma=1.5).validate()
     with pytest.raises(DataError, match="one number per primitive"):
         select_top(torch.ones(3, 2), 1)
 

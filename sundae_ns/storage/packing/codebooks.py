@@ -6,13 +6,15 @@ takes one byte per book.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
+
+from sundae_ns.storage.packing.container import Encoded, Floats
 
 MAX_ENTRIES = 256
 """Maximum number of entries of a book: one byte indexes them."""
@@ -25,24 +27,9 @@ _ROUNDS = 8  # Lloyd iterations
 _CHUNK = 1 << 14  # rows compared with all centres at once
 
 
-class Codebooks(NamedTuple):
-    """Vectors ``[N, D]`` coded by S books of K entries; the error of each element is at most ``bound``."""
-
-    indices: NDArray[np.uint8]
-    """Entry of each book for each row ``[S, N]``."""
-    entries: NDArray[np.int8]
-    """Entries of the books, in steps ``[S, K, D]``."""
-    steps: NDArray[np.float32]
-    """Step of each book ``[S]``."""
-    rows: NDArray[np.uint32]
-    """Indices of the rows stored exactly, ascending ``[E]``."""
-    exact: NDArray[np.float32]
-    """These rows ``[E, D]``."""
-    bound: float
-
-
-class Books(NamedTuple):
-    """Books without the indices of the vectors."""
+@dataclass(frozen=True, eq=False)
+class Books:
+    """Codec of vectors ``[N, D]`` by S books of K entries; see :func:`fit`."""
 
     entries: Tensor
     """In steps, int8 ``[S, K, D]``."""
@@ -51,20 +38,42 @@ class Books(NamedTuple):
     rows: Tensor
     """Indices of the rows stored exactly, ascending ``[E]``."""
 
+    def encode(self, values: Floats) -> Encoded:
+        """Code vectors; ``bound`` is the largest error of an element."""
+        indices = self.assign(torch.from_numpy(np.ascontiguousarray(values)))
+        rows = self.rows.numpy()
+        found = self.sums(indices).numpy()
+        found[rows] = values[rows]
+        bound = float(np.abs(values.astype(np.float64) - found).max(initial=0.0))
+        return {"codec": "codebooks", "width": values.shape[1], "bound": bound}, {
+            "indices": indices.numpy(),
+            "entries": self.entries.numpy().reshape(len(self.entries), -1),
+            "steps": self.steps.numpy(),
+            "rows": rows.astype(np.uint32),
+            "exact": values[rows],
+        }
 
-def books_of(packed: Codebooks) -> Books:
-    """The books of packed vectors."""
-    return Books(*(torch.from_numpy(x) for x in (packed.entries, packed.steps, packed.rows.astype(np.int64))))
+    def rounded(self, values: Tensor) -> Tensor:
+        """Return the vectors that a reader decodes; bit for bit on a CPU, up to rounding elsewhere."""
+        return self.sums(self.assign(values)).index_copy(0, self.rows, values[self.rows])
+
+    def assign(self, vectors: Tensor) -> Tensor:
+        """Index of an entry of each book for each vector, uint8 ``[S, N]``, chosen greedily."""
+        residual = vectors.double().clone()
+        tables = self.entries.float() * self.steps[:, None, None]
+        return torch.stack([_subtract_nearest(residual, table) for table in tables]).to(torch.uint8)
+
+    def sums(self, indices: Tensor) -> Tensor:
+        """Vectors ``[N, D]`` of entry indices ``[S, N]``."""
+        count, entries, width = self.entries.shape
+        table = (self.entries.float() * self.steps[:, None, None]).reshape(-1, width)
+        rows = indices.T.int() + torch.arange(0, count * entries, entries, dtype=torch.int32, device=indices.device)
+        # embedding_bag sums table rows in one pass, on several threads.
+        return F.embedding_bag(rows, table, mode="sum")
 
 
-def fit(vectors: NDArray[np.float32], books: int, *, seed: int = 0) -> Codebooks:
-    """Fit books to vectors, and code the vectors.
-
-    Args:
-        vectors: ``[N, D]``, finite, N and D at least 1.
-        books: number of books, at least 1.
-        seed: seed of the samples and the initial centres.
-    """
+def fit(vectors: Floats, books: int, *, seed: int = 0) -> Books:
+    """Fit books to finite vectors ``[N, D]``, N and D at least 1; ``seed`` is that of samples and initial centres."""
     n, width = vectors.shape
     entries = min(MAX_ENTRIES, max(1, n // ROWS_PER_ENTRY))
     generator = torch.Generator().manual_seed(seed)
@@ -82,27 +91,19 @@ def fit(vectors: NDArray[np.float32], books: int, *, seed: int = 0) -> Codebooks
         # Subtract the entries as stored, so that the next book also corrects their rounding.
         indices[book] = _subtract_nearest(residual, kept[book].float() * step).to(torch.uint8)
     fitted = Books(kept, steps, torch.zeros(0, dtype=torch.int64))
-    error = (target - _sums(indices, fitted)).abs().amax(dim=1)
-    worst = error.topk(int(n * EXACT)).indices.sort().values
-    return _packed(vectors, indices, fitted._replace(rows=worst))
+    error = (target - fitted.sums(indices)).abs().amax(dim=1)
+    return replace(fitted, rows=error.topk(int(n * EXACT)).indices.sort().values)
 
 
-def encode(vectors: NDArray[np.float32], books: Books) -> Codebooks:
-    """Code vectors ``[N, D]`` with given books; ``books.rows`` are stored exactly."""
-    return _packed(vectors, _assign(torch.from_numpy(np.ascontiguousarray(vectors)), books), books)
-
-
-def rounded(vectors: Tensor, books: Books) -> Tensor:
-    """The result ``[N, D]`` of :func:`encode` and :func:`restore`; bit for bit on a CPU, up to rounding elsewhere."""
-    return _sums(_assign(vectors, books), books).index_copy(0, books.rows, vectors[books.rows])
-
-
-def _packed(vectors: NDArray[np.float32], indices: Tensor, books: Books) -> Codebooks:
-    rows = books.rows.numpy()
-    packed = Codebooks(
-        indices.numpy(), books.entries.numpy(), books.steps.numpy(), rows.astype(np.uint32), vectors[rows], 0.0
-    )
-    return packed._replace(bound=float(np.abs(vectors.astype(np.float64) - restore(packed)).max(initial=0.0)))
+def restore(
+    indices: NDArray[np.uint8], entries: NDArray[np.int8], steps: Floats, rows: NDArray[np.uint32], exact: Floats
+) -> Floats:
+    """Vectors ``[N, D]`` from the arrays of :meth:`Books.encode`, with entries ``[S, K, D]``."""
+    places = rows.astype(np.int64)
+    books = Books(torch.from_numpy(entries.copy()), torch.from_numpy(steps.copy()), torch.from_numpy(places))
+    out: Floats = books.sums(torch.from_numpy(indices.copy())).numpy()
+    out[places] = exact
+    return out
 
 
 def _subtract_nearest(residual: Tensor, entries: Tensor) -> Tensor:
@@ -110,30 +111,6 @@ def _subtract_nearest(residual: Tensor, entries: Tensor) -> Tensor:
     nearest = nearest_centre(residual, entries.double())
     residual -= entries.double()[nearest]
     return nearest
-
-
-def _assign(vectors: Tensor, books: Books) -> Tensor:
-    """Index of an entry of each book for each vector ``[S, N]``, chosen greedily."""
-    residual = vectors.double().clone()
-    tables = books.entries.float() * books.steps[:, None, None]
-    return torch.stack([_subtract_nearest(residual, table) for table in tables]).to(torch.uint8)
-
-
-def _sums(indices: Tensor, books: Books) -> Tensor:
-    """Vectors ``[N, D]`` of entry indices ``[S, N]``."""
-    count, entries, width = books.entries.shape
-    table = (books.entries.float() * books.steps[:, None, None]).reshape(-1, width)
-    rows = indices.T.int() + torch.arange(0, count * entries, entries, dtype=torch.int32, device=indices.device)
-    # embedding_bag sums table rows in one pass, on several threads.
-    return F.embedding_bag(rows, table, mode="sum")
-
-
-def restore(packed: Codebooks) -> NDArray[np.float32]:
-    """Vectors ``[N, D]`` of the result of :func:`encode`."""
-    indices, entries, steps = (torch.from_numpy(x.copy()) for x in (packed.indices, packed.entries, packed.steps))
-    out: NDArray[np.float32] = _sums(indices, Books(entries, steps, torch.zeros(0, dtype=torch.int64))).numpy()
-    out[packed.rows] = packed.exact
-    return out
 
 
 def kmeans(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -1,21 +1,8 @@
 """A file of named arrays behind a JSON header: all bytes are under checksums, and none can be executed.
 
-    offset  bytes
-    0       8      magic, ``89 53 55 4E 44 41 45 0A`` (``\\x89SUNDAE\\n``)
-    8       4      version of the format, unsigned, little-endian
-    12      4      length H of the header, unsigned, little-endian, at most 4 MiB
-    16      32     SHA-256 of the header
-    48      H      header: a JSON object in UTF-8; its key ``sections`` lists the sections in order
-    48 + H  ...    the sections, contiguous, to the end of the file
-
-A section is one little-endian array, split into planes of equal length. An array of two or more dimensions is split
-along the first one; then each piece is split into the bytes of its numbers, lowest byte first. A plane is stored as one
-zstandard frame that states its size, or uncompressed if that is not longer. The header lists for each section ``name``,
-``dtype`` (numpy's, such as ``<u2``), ``shape``, ``parts`` (stored length of each plane) and ``sha256`` of the stored
-bytes.
-
-Readers check sizes before they allocate: all sections together may unpack to at most ``SPARE`` bytes plus ``MAX_RATIO``
-bytes per byte of the file. If they unpack to more, the writer adds a section ``padding``.
+``docs/formats.md`` gives the layout. Readers check sizes before they allocate: all sections together may unpack to at
+most ``SPARE`` bytes plus ``MAX_RATIO`` bytes per byte of the file. If they unpack to more, the writer adds a section
+``padding``.
 """
 
 from __future__ import annotations
@@ -46,6 +33,9 @@ _DTYPES = ("|u1", "<u2", "<u4", "<u8", "|i1", "<i2", "<f2", "<f4", "<f8")
 _THREADS = 2
 
 Array = NDArray[Any]
+Floats = NDArray[np.float32]
+Encoded = tuple[dict[str, Any], dict[str, Array]]
+"""The stored form of an attribute: its entry in the header, and its sections by name."""
 
 
 class Section(NamedTuple):
@@ -133,11 +123,9 @@ def write(
     """Write a file, atomically.
 
     Args:
-        path: the file; its folder must exist.
         meta: JSON values for the header, without the key ``sections``.
         arrays: arrays of the dtypes in ``_DTYPES``.
         unpacked: bytes that a reader decodes from the arrays, if more than their own size.
-        level: compression level of zstandard, 1 to 22.
 
     Returns:
         Bytes of the file.

@@ -40,13 +40,10 @@ def separate(codes: NDArray[np.uint64], axis: int) -> NDArray[np.uint64]:
 
 
 def scene_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Permutation ``[N]`` that sorts primitives along a space-filling curve.
+    """Permutation ``[N]`` that sorts finite centres ``[N, 3]`` along a space-filling curve.
 
     Coordinates are centred on their medians and compressed by an inverse hyperbolic sine, so that a few far primitives
     do not push all others into one cell.
-
-    Args:
-        means: centres ``[N, 3]``, all finite.
     """
     centred = means.astype(np.float64) - np.median(means, axis=0)
     spread = np.median(np.abs(centred))

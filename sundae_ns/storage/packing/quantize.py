@@ -1,12 +1,12 @@
 """Quantisation: ranges robust to outliers, positions in blocks, rotations by three components, weights of the head.
 
-Each pair of functions states its error bound, without the rounding of the result to float32 (half a unit in the last
-place). Rounding is implemented once, in torch: files store ``levels``, and training with rounding uses ``rounded`` of
-the same.
+Error bounds do not count the rounding of the result to float32 (half a unit in the last place). Rounding is implemented
+once, in torch: files store levels, and training with rounding uses the values of the same levels.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,14 +14,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sundae_ns.storage.packing.container import Array, Encoded, Floats
 from sundae_ns.storage.packing.morton import interleave, separate
-
-Floats = NDArray[np.float32]
-Codes = NDArray[Any]
 
 TAIL = 0.001
 """Fraction of the values of a channel at either end that may lie outside of its range; they are stored exactly."""
 _ROOT_HALF = 0.5**0.5
+_FOUR_PAIRS = np.array([0, 2, 4, 6], np.uint8)
 
 
 def code_type(bits: int) -> type[np.unsignedinteger[Any]]:
@@ -29,8 +28,9 @@ def code_type(bits: int) -> type[np.unsignedinteger[Any]]:
     return np.uint8 if bits <= 8 else np.uint16
 
 
-class Grid(NamedTuple):
-    """Even levels of each channel; see :func:`fit_grid`."""
+@dataclass(frozen=True, eq=False)
+class Uniform:
+    """Codec of values ``[N, C]`` by even levels of each channel; see :func:`fit_uniform`."""
 
     low: Tensor
     """Value of code 0, float64 ``[C]``."""
@@ -39,81 +39,73 @@ class Grid(NamedTuple):
     step: Tensor
     """Distance between neighbouring levels, 0 for a constant channel, float64 ``[C]``."""
     bits: int
+    differences: bool
+    """Store the codes of channels 0 and 2 as differences from those of channel 1."""
+
+    def encode(self, values: Floats) -> Encoded:
+        """Round finite values; ``places`` index the exceptions in the flattened ``[C, N]``."""
+        nearest, outside = self.levels(torch.from_numpy(values))
+        codes = nearest.T.numpy().astype(code_type(self.bits), order="C")
+        places = np.flatnonzero(outside.T.numpy()).astype(np.uint32)
+        low, step = self.low.tolist(), self.step.numpy()
+        about = {"codec": "uniform", "bits": self.bits, "low": low, "step": step.tolist(), "bound": (step / 2).tolist()}
+        if self.differences:
+            about["differences"] = True
+            codes = np.stack([codes[0] - codes[1], codes[1], codes[2] - codes[1]])
+        exceptions = np.ascontiguousarray(values.T).reshape(-1)[places]
+        return about, {"codes": codes, "places": places, "exceptions": exceptions}
+
+    def rounded(self, values: Tensor) -> Tensor:
+        """Return the values that a reader decodes, float32; bit for bit on a CPU."""
+        nearest, outside = self.levels(values)
+        return torch.where(outside, values, _at_levels(nearest, self.low, self.step))
+
+    def levels(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Nearest levels, float64 ``[N, C]``, and a mask ``[N, C]`` of values outside of the range."""
+        exact = values.double()
+        safe = torch.where(self.step > 0, self.step, 1.0)
+        outside = (exact < self.low) | (exact > self.high)
+        return ((exact - self.low) / safe).round().clamp(0, 2**self.bits - 1), outside
 
 
-def fit_grid(values: Floats, bits: int, *, shared: bool = False) -> Grid:
+def fit_uniform(values: Floats, bits: int, *, color: bool = False) -> Uniform:
     """Fit levels to values; the outermost :data:`TAIL` at either end is excluded if it is far from the others.
 
     Args:
         values: ``[N, C]``, finite, N at least 1.
-        bits: 1 to 16.
-        shared: use one range for all channels.
+        color: the values are colours ``[N, 3]``, which correlate: use one range for all channels, and store differences.
     """
     columns = values.T.astype(np.float64)
-    rows = columns.reshape(1, -1) if shared else columns
+    rows = columns.reshape(1, -1) if color else columns
     smallest, largest = rows.min(axis=1), rows.max(axis=1)
     low, high = np.quantile(rows, [TAIL, 1 - TAIL], axis=1, method="nearest")
     # Exclude the tails only if that makes the step a quarter finer; else the exceptions cost more than they save.
     excluded = 1.25 * (high - low) < largest - smallest
     ends = (np.where(excluded, low, smallest), np.where(excluded, high, largest))
     low, high = (torch.from_numpy(np.broadcast_to(end, len(columns)).copy()) for end in ends)
-    return Grid(low, high, (high - low) / (2**bits - 1), bits)
+    return Uniform(low, high, (high - low) / (2**bits - 1), bits, color)
 
 
-def levels(values: Tensor, grid: Grid) -> tuple[Tensor, Tensor]:
-    """Nearest levels of values ``[N, C]``, float64 ``[N, C]``, and a mask ``[N, C]`` of values outside of the range."""
-    exact = values.double()
-    safe = torch.where(grid.step > 0, grid.step, 1.0)
-    outside = (exact < grid.low) | (exact > grid.high)
-    return ((exact - grid.low) / safe).round().clamp(0, 2**grid.bits - 1), outside
+def dequantize(
+    codes: Array, low: NDArray[np.float64], step: NDArray[np.float64], places: NDArray[np.uint32], exceptions: Floats
+) -> Floats:
+    """Values ``[N, C]`` from the arrays of :meth:`Uniform.encode`, with codes that are not differences ``[C, N]``.
 
-
-def at_levels(levels: Tensor, low: Tensor, step: Tensor) -> Tensor:
-    """Values of levels as float32; all arguments are float64 and broadcast."""
-    return (low + levels * step).float()
-
-
-def rounded(values: Tensor, grid: Grid) -> Tensor:
-    """The result ``[N, C]`` float32 of :func:`quantize` and :func:`dequantize`; bit for bit on a CPU."""
-    nearest, outside = levels(values, grid)
-    return torch.where(outside, values, at_levels(nearest, grid.low, grid.step))
-
-
-class Uniform(NamedTuple):
-    """Values ``[N, C]`` on a grid; the error is at most half of the channel's ``step``."""
-
-    codes: Codes
-    """``[C, N]`` unsigned."""
-    low: NDArray[np.float64]
-    """Value of code 0 ``[C]``."""
-    step: NDArray[np.float64]
-    """Distance between neighbouring levels ``[C]``."""
-    places: NDArray[np.uint32]
-    """Indices of the exceptions in the flattened ``[C, N]``, ascending ``[E]``."""
-    exceptions: Floats
-    """Exact values of the exceptions ``[E]``."""
-
-
-def quantize(values: Floats, grid: Grid) -> Uniform:
-    """Round finite values ``[N, C]`` to the levels of a grid; values outside of its range are stored exactly."""
-    nearest, outside = levels(torch.from_numpy(values), grid)
-    codes = nearest.T.numpy().astype(code_type(grid.bits), order="C")
-    places = np.flatnonzero(outside.T.numpy()).astype(np.uint32)
-    exceptions = np.ascontiguousarray(values.T).reshape(-1)[places]
-    return Uniform(codes, grid.low.numpy(), grid.step.numpy(), places, exceptions)
-
-
-def dequantize(packed: Uniform) -> Floats:
-    """Values ``[N, C]`` of the result of :func:`quantize`."""
-    channels, n = packed.codes.shape
-    every = torch.arange(int(np.iinfo(packed.codes.dtype).max) + 1, dtype=torch.float64)
-    tables = at_levels(every, *(torch.from_numpy(ends)[:, None] for ends in (packed.low, packed.step))).numpy()
+    The error is at most half of the channel's step.
+    """
+    channels, n = codes.shape
+    every = torch.arange(int(np.iinfo(codes.dtype).max) + 1, dtype=torch.float64)
+    tables = _at_levels(every, *(torch.from_numpy(ends)[:, None] for ends in (low, step))).numpy()
     out = np.empty((n, channels), np.float32)
     for c in range(channels):
-        out[:, c] = tables[c][packed.codes[c]]
-    column, row = np.divmod(packed.places.astype(np.int64), max(n, 1))
-    out[row, column] = packed.exceptions
+        out[:, c] = tables[c][codes[c]]
+    column, row = np.divmod(places.astype(np.int64), max(n, 1))
+    out[row, column] = exceptions
     return out
+
+
+def _at_levels(levels: Tensor, low: Tensor, step: Tensor) -> Tensor:
+    return (low + levels * step).float()
 
 
 class Blocks(NamedTuple):
@@ -132,7 +124,6 @@ def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDA
 
     Args:
         means: ``[N, 3]``, finite, in the order of ``morton.scene_order``.
-        bits: bits per coordinate, 1 to 21.
         size: primitives per block.
 
     Returns:
@@ -171,13 +162,46 @@ def dequantize_positions(packed: Blocks, bits: int, size: int) -> Floats:
     return out
 
 
-class Rotations(NamedTuple):
-    """Unit quaternions by their three smallest components; see :func:`rotation_bound`."""
+@dataclass(frozen=True, eq=False)
+class Rotations:
+    """Codec of quaternions ``[N, 4]`` wxyz by their three smallest components; see :func:`rotation_bound`."""
 
-    codes: Codes
-    """Levels of the three smallest components, in the order wxyz, unsigned ``[3, N]``."""
-    largest: NDArray[np.uint8]
-    """Index in wxyz of the largest component, which is not stored ``[N]``."""
+    bits: int
+    """Bits per component, 4 to 16."""
+
+    def encode(self, values: Floats) -> Encoded:
+        """Quantise finite quaternions of any length; zero ones are the identity, as in the rasterisers."""
+        nearest, largest = _rotation_levels(torch.from_numpy(values), self.bits)
+        codes = nearest.numpy().astype(code_type(self.bits))
+        about = {"codec": "smallest-three", "bits": self.bits, "bound": rotation_bound(self.bits)}
+        return about, {"codes": codes, "largest": _pack_pairs_of_bits(largest.numpy().astype(np.uint8))}
+
+    def rounded(self, values: Tensor) -> Tensor:
+        """Return the unit quaternions that a reader decodes; bit for bit on a CPU."""
+        nearest, largest = _rotation_levels(values, self.bits)
+        return _unit(_component(nearest, self.bits), largest)
+
+
+def dequantize_rotations(codes: Array, largest: NDArray[np.uint8], bits: int) -> Floats:
+    """Unit quaternions wxyz ``[N, 4]`` from the arrays of :meth:`Rotations.encode`; the largest component is positive.
+
+    Args:
+        codes: levels of the three smallest components, in the order wxyz ``[3, N]``.
+        largest: index in wxyz of the component that is not stored, two bits each ``[ceil(N / 4)]``.
+        bits: bits per component.
+    """
+    every = torch.arange(int(np.iinfo(codes.dtype).max) + 1, dtype=torch.float64)
+    three = _component(every, bits).numpy()[codes]
+    pairs = (largest[:, None] >> _FOUR_PAIRS & np.uint8(3)).reshape(-1)[: codes.shape[1]]
+    out: Floats = _unit(torch.from_numpy(three), torch.from_numpy(pairs)).numpy()
+    return out
+
+
+def _pack_pairs_of_bits(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pack two-bit numbers ``[N]`` four to a byte, the first in the lowest bits."""
+    four = np.pad(values, (0, -len(values) % 4)).reshape(-1, 4)
+    joined: NDArray[np.uint8] = np.bitwise_or.reduce(four << _FOUR_PAIRS, axis=1)
+    return joined
 
 
 def rotation_bound(bits: int) -> float:
@@ -192,13 +216,8 @@ def rotation_bound(bits: int) -> float:
     return 2 * off / (1 - (3**0.5 / 2 + off) ** 2) ** 0.5
 
 
-def rotation_levels(quats: Tensor, bits: int) -> tuple[Tensor, Tensor]:
-    """Nearest levels of the three smallest components, float64 ``[3, N]``, and the index of the largest ``[N]``.
-
-    Args:
-        quats: wxyz ``[N, 4]``, finite, any length; zero quaternions are the identity, as in the rasterisers.
-        bits: bits per component, 4 to 16.
-    """
+def _rotation_levels(quats: Tensor, bits: int) -> tuple[Tensor, Tensor]:
+    """Nearest levels of the three smallest components, float64 ``[3, N]``, and the index of the largest ``[N]``."""
     q = quats.double()
     scale = q.abs().amax(dim=1, keepdim=True)
     q = torch.where(scale > 0, q / torch.where(scale > 0, scale, 1.0), q.new_tensor([1.0, 0.0, 0.0, 0.0]))
@@ -233,26 +252,6 @@ def _unit(three: Tensor, largest: Tensor) -> Tensor:
     return torch.stack([place / length for place in places], dim=1)
 
 
-def rounded_rotations(quats: Tensor, bits: int) -> Tensor:
-    """The result ``[N, 4]`` of :func:`quantize_rotations` and :func:`dequantize_rotations`; bit for bit on a CPU."""
-    nearest, largest = rotation_levels(quats, bits)
-    return _unit(_component(nearest, bits), largest)
-
-
-def quantize_rotations(quats: Floats, bits: int) -> Rotations:
-    """Quantise the three smallest components of each quaternion; arguments as in :func:`rotation_levels`."""
-    nearest, largest = rotation_levels(torch.from_numpy(quats), bits)
-    return Rotations(nearest.numpy().astype(code_type(bits)), largest.numpy().astype(np.uint8))
-
-
-def dequantize_rotations(packed: Rotations, bits: int) -> Floats:
-    """Unit quaternions wxyz ``[N, 4]`` of a result of :func:`quantize_rotations`; the largest component is positive."""
-    every = torch.arange(int(np.iinfo(packed.codes.dtype).max) + 1, dtype=torch.float64)
-    three = _component(every, bits).numpy()[packed.codes]
-    out: Floats = _unit(torch.from_numpy(three), torch.from_numpy(packed.largest)).numpy()
-    return out
-
-
 def weight_steps(weight: Tensor, bits: int) -> Tensor:
     """Step of each output channel, float32 ``[O]``: the largest weight of ``[O, ...]`` is at level 2^(bits - 1) - 1."""
     step = weight.reshape(len(weight), -1).double().abs().amax(dim=1) / (2 ** (bits - 1) - 1)
@@ -262,40 +261,12 @@ def weight_steps(weight: Tensor, bits: int) -> Tensor:
 
 
 def weight_levels(weight: Tensor, step: Tensor, bits: int) -> Tensor:
-    """Nearest levels of weights ``[O, ...]``, float64."""
+    """Nearest levels of weights ``[O, ...]``, float64; the error is at most half of the channel's step."""
     wide = step.reshape(-1, *([1] * (weight.ndim - 1))).double()
     last = 2 ** (bits - 1) - 1
     return (weight.double() / torch.where(wide > 0, wide, 1.0)).round().clamp(-last, last)
 
 
 def weights_at(levels: Tensor, step: Tensor) -> Tensor:
-    """Weights, float32, of levels ``[O, ...]``."""
+    """Weights ``[O, ...]``, float32, of levels of any dtype and steps ``[O]``."""
     return levels.float() * step.reshape(-1, *([1] * (levels.ndim - 1)))
-
-
-def rounded_weights(weight: Tensor, step: Tensor, bits: int) -> Tensor:
-    """The result ``[O, ...]`` of :func:`quantize_weights` and :func:`dequantize_weights`; bit for bit on a CPU."""
-    return weights_at(weight_levels(weight, step, bits), step)
-
-
-def quantize_weights(weight: Floats, step: Floats, bits: int = 8) -> NDArray[np.int8]:
-    """Round weights; with steps of :func:`weight_steps`, the error is at most half of the channel's step.
-
-    Args:
-        weight: ``[O, ...]``, finite.
-        step: step of each output channel ``[O]``.
-        bits: 2 to 8.
-
-    Returns:
-        Codes ``[O, ...]``.
-    """
-    codes: NDArray[np.int8] = (
-        weight_levels(torch.from_numpy(weight), torch.from_numpy(step), bits).to(torch.int8).numpy()
-    )
-    return codes
-
-
-def dequantize_weights(codes: NDArray[np.int8], step: Floats) -> Floats:
-    """Weights ``[O, ...]`` of the result of :func:`quantize_weights`."""
-    out: Floats = weights_at(torch.from_numpy(codes.astype(np.float32)), torch.from_numpy(step.copy())).numpy()
-    return out

@@ -21,12 +21,10 @@ from torch import Tensor
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, odd_shapes, sh_degree_of
 from sundae_ns.storage.packing import codebooks, container, quantize, transform
-from sundae_ns.storage.packing.codebooks import Codebooks
-from sundae_ns.storage.packing.codecs import Codecs, as_matrix, fit, unpack_pairs_of_bits
+from sundae_ns.storage.packing.codecs import Codecs, as_matrix, fit
 from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array
-from sundae_ns.storage.packing.quantize import Blocks, Rotations, Uniform
-from sundae_ns.storage.packing.transform import Transformed
+from sundae_ns.storage.packing.quantize import Blocks
 
 CAMERAS = {"poses": ("<f4", (3, 4)), "intrinsics": ("<f8", (4,)), "sizes": ("<u4", (2,))}
 """dtype and shape, after ``[M, ...]``, of the arrays of M cameras: camera-to-world with OpenGL axes in the model's
@@ -93,10 +91,6 @@ def _check(params: Mapping[str, Tensor]) -> None:
 def fit_scene(scene: Scene, config: PackConfig | None = None) -> tuple[Scene, Codecs]:
     """Fit codecs to a scene.
 
-    Args:
-        scene: at least one primitive, all finite.
-        config: bits and codec of each attribute.
-
     Returns:
         The scene with its primitives in the stored order and with rounded positions, and the codecs.
 
@@ -112,28 +106,15 @@ def fit_scene(scene: Scene, config: PackConfig | None = None) -> tuple[Scene, Co
 
 
 def write_scene(path: Path, scene: Scene, config: PackConfig | None = None) -> PackReport:
-    """Pack a scene into one file, atomically.
-
-    Args:
-        path: the file; its folder must exist.
-        scene: at least one primitive, all finite. The file stores its primitives in another order.
-        config: bits and codec of each attribute.
-
-    Raises:
-        ConfigError: an option is invalid.
-        PackError: the field has no primitives, wrong shapes or values that are not finite.
-        StorageError: the disk is full or not writable.
-    """
+    """Pack a scene into one file: :func:`fit_scene`, then :func:`write_fitted`."""
     return write_fitted(path, *fit_scene(scene, config))
 
 
 def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
-    """Pack a scene with codecs that were fitted to it, before or after training with rounding.
+    """Pack a scene, atomically, with codecs that were fitted to it before or after training with rounding.
 
     Args:
-        path: the file; its folder must exist.
         scene: primitives in the order of :func:`fit_scene`. Its positions are ignored; the codecs hold them.
-        codecs: from :func:`fit_scene`.
 
     Raises:
         PackError: values are not finite, or the codecs do not fit the scene.
@@ -239,8 +220,7 @@ def _decode_quats(reader: _Reader, n: int) -> NDArray[np.float32]:
     about = reader.about("quats", ("smallest-three",))
     bits = reader.number(about, "bits", 4, 16)
     codes = reader.section("quats/codes", (_code(bits),), (3, n))
-    largest = unpack_pairs_of_bits(reader.section("quats/largest", ("|u1",), (-(-n // 4),)), n)
-    return quantize.dequantize_rotations(Rotations(codes, largest), bits)
+    return quantize.dequantize_rotations(codes, reader.section("quats/largest", ("|u1",), (-(-n // 4),)), bits)
 
 
 def _code(bits: int) -> str:
@@ -258,7 +238,7 @@ def _decode_uniform(reader: _Reader, name: str, n: int, width: int) -> NDArray[n
     places = reader.places(f"{name}/places", width * n)
     exceptions = reader.section(f"{name}/exceptions", ("<f4",), (len(places),))
     low, step = reader.numbers(about, "low", width), reader.numbers(about, "step", width)
-    return quantize.dequantize(Uniform(codes, low, step, places, exceptions))
+    return quantize.dequantize(codes, low, step, places, exceptions)
 
 
 def _decode_transform(reader: _Reader, name: str, n: int, width: int) -> NDArray[np.float32]:
@@ -268,7 +248,7 @@ def _decode_transform(reader: _Reader, name: str, n: int, width: int) -> NDArray
     basis = reader.section(f"{name}/basis", ("|i1",), (width * width,)).reshape(width, width)
     rows = reader.places(f"{name}/rows", n)
     exact = reader.section(f"{name}/exact", ("<f4",), (len(rows), width))
-    return transform.backward(Transformed(codes, basis, float(step), rows, exact))
+    return transform.restore(codes, basis, float(step), rows, exact)
 
 
 def _decode_books(reader: _Reader, name: str, n: int, width: int) -> NDArray[np.float32]:
@@ -286,7 +266,7 @@ def _decode_books(reader: _Reader, name: str, n: int, width: int) -> NDArray[np.
         raise reader.refuse(f"{name} has values beyond float32")
     rows = reader.places(f"{name}/rows", n)
     exact = reader.section(f"{name}/exact", ("<f4",), (len(rows), width))
-    return codebooks.restore(Codebooks(indices, entries, steps, rows, exact, 0.0))
+    return codebooks.restore(indices, entries, steps, rows, exact)
 
 
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:
@@ -310,13 +290,12 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
     for name, shape in _tensors(reader, about.get("tensors")):
         count = int(np.prod(shape, dtype=object))
         if len(shape) <= 1:
-            value = take("plain", plain, count).copy()
-        elif coded:
-            codes, step = take("weights", weights, count), take("steps", steps, shape[0])
-            value = quantize.dequantize_weights(codes.reshape(shape), step)
+            value = take("plain", plain, count)
         else:
-            value = take("weights", weights, count).astype(np.float32)
-        head[name] = torch.from_numpy(value.reshape(shape))
+            value = take("weights", weights, count)
+        head[name] = torch.from_numpy(value.astype(np.float32).reshape(shape))
+        if coded and len(shape) > 1:
+            head[name] = quantize.weights_at(head[name], torch.from_numpy(take("steps", steps, shape[0]).copy()))
     return head
 
 

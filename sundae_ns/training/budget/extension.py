@@ -18,7 +18,7 @@ from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.storage import accounting, megabytes
 from sundae_ns.training.budget import heads, sizes
-from sundae_ns.training.budget.record import budget_of, point_of, write
+from sundae_ns.training.budget.record import budget_of, write
 from sundae_ns.training.budget.search import NO_IMAGE, Point, Search
 from sundae_ns.training.budget.searched_field import SearchedField
 from sundae_ns.training.budget.sh_degree import flatten, lower_degree
@@ -424,7 +424,16 @@ class BudgetSearch(Extension):
         self.search.degree = searched.field.sh_degree
 
     def _point(self, searched: SearchedField, psnr: float, phase: str, verdict: str) -> Point:
-        return point_of(searched, self.search, self._largest, psnr, phase=phase, verdict=verdict)
+        head, state = self.search.head, searched.state
+        return Point(
+            step=state.step,
+            phase=phase,
+            primitives=searched.count,
+            bytes=sizes.bytes_of(searched.field if head else searched.bare, self.head_config if head else None),
+            psnr=psnr,
+            verdict=verdict,
+            since_cut=state.schedule_step - self.search.cut_at,
+        )
 
 
 def _search_of(saved: Mapping[str, Any]) -> Search:

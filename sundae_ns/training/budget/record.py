@@ -6,13 +6,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict
 
-from sundae_ns.compensation import HeadConfig
 from sundae_ns.evaluation import without_nan
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.training.budget.search import Point, Search
 from sundae_ns.training.budget.searched_field import SearchedField
-from sundae_ns.training.budget.sizes import bytes_of, chosen_head
 
 
 def budget_of(config: PruningConfig) -> tuple[str, float]:
@@ -22,31 +20,6 @@ def budget_of(config: PruningConfig) -> tuple[str, float]:
         if value is not None:
             return name, value
     return "max_psnr_drop", config.tolerated_drop
-
-
-def point_of(
-    searched: SearchedField, search: Search, largest: HeadConfig | None, psnr: float, *, phase: str, verdict: str
-) -> Point:
-    """One evaluation on the held-out views, for the curve.
-
-    Args:
-        searched: the field.
-        search: state of the search.
-        largest: the largest head that the search may choose.
-        psnr: mean over the views, dB.
-        phase, verdict: see :class:`sundae_ns.training.budget.search.Point`.
-    """
-    head = chosen_head(search, largest) if search.head else None
-    state = searched.state
-    return Point(
-        step=state.step,
-        phase=phase,
-        primitives=searched.count,
-        bytes=bytes_of(searched.field if search.head else searched.bare, head),
-        psnr=psnr,
-        verdict=verdict,
-        since_cut=state.schedule_step - search.cut_at,
-    )
 
 
 def write(searched: SearchedField, search: Search) -> None:

@@ -154,12 +154,7 @@ class Search:
         return self.aim + self.margin
 
     def next_degree(self, top: int, tolerated: float) -> int | None:
-        """The SH degree to try next by bisection, the highest first; None once the lowest sufficient degree is known.
-
-        Args:
-            top: SH degree of the warm-up field.
-            tolerated: tolerated drop against that degree, dB.
-        """
+        """The SH degree to try next by bisection from ``top``; None once the lowest sufficient degree is known."""
         if str(top) not in self.degrees:
             return top
         best, worst = self.lowest_degree(top, tolerated), -1

@@ -36,12 +36,7 @@ MAX_VIEWS = 64
 
 
 class SearchedField:
-    """What a step of the search does to the field of a run.
-
-    Args:
-        run: the training.
-        config: options of pruning.
-    """
+    """What a step of the search does to the field of a run."""
 
     def __init__(self, run: TrainingRun, config: PruningConfig) -> None:
         self.run = run
@@ -130,7 +125,7 @@ class SearchedField:
 
     def drop_nonfinite(self) -> int:
         """Remove primitives with a NaN or infinite parameter; returns their number."""
-        return drop_nonfinite(self.field, self.state.optimizers, self.state.pruning)
+        return drop_nonfinite(self.field, self.state.optimizers, [self.state.pruning])
 
     def cut_to(self, count: int) -> int:
         """Keep ``count`` primitives by the configured rule, or all that are finite if there are fewer.

@@ -30,7 +30,6 @@ def flatten(searched: SearchedField, least: float) -> Tensor:
     """Give view-independent colours to as many primitives as held-out views allow, the least view-dependent first.
 
     Args:
-        searched: a field with coefficients above the constant one.
         least: mean PSNR over the held-out views to keep, dB.
 
     Returns:

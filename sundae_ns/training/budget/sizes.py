@@ -20,12 +20,7 @@ WIDTHS = (1, 5, 13, 29)
 
 
 def bytes_of(field: Mapping[str, Tensor], head: HeadConfig | None) -> int:
-    """Bytes of a stored field and its head. The one place where a budget counts bytes.
-
-    Args:
-        field: the parameters, in the shapes in which they are stored.
-        head: configuration of the head; None, or mode off, for none.
-    """
+    """Bytes of a stored field and its head. The one place where a budget counts bytes."""
     return accounting.bytes_of(field) + head_bytes(head)
 
 
@@ -38,13 +33,7 @@ def head_bytes(head: HeadConfig | None) -> int:
 
 
 def head_for(stored: int, primitives: int, largest: HeadConfig) -> HeadConfig | None:
-    """The largest head, at most the one given, that is small beside a field; None if none is.
-
-    Args:
-        stored: bytes of the field without features.
-        primitives: number of primitives.
-        largest: the head for a field of any size.
-    """
+    """The largest head, at most ``largest``, that is small beside ``stored`` bytes without features; None if none is."""
     narrower = [width for width in WIDTHS if width < largest.num_features]
     floats = HEAD_SHARE * stored / primitives / accounting.BYTES_PER_FLOAT
     widths = [width for width in (*narrower, largest.num_features) if width <= floats]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import pytest
 from budget_runs import tidy
 from nerfstudio.scripts.train import _set_random_seed
+from walls import add_noise, write_wall
 
 from sundae_ns.data import write_embedded_capture
 from sundae_ns.method_configs import sundae_auto, sundae_tiny
@@ -44,19 +46,10 @@ def config_for(scene: Path, out: Path) -> Any:
     return config
 
 
-def searched(kind: str, folder: Path) -> dict[str, Any]:
-    """Train on a scene of a kind; the search's own record."""
-    scene = write_embedded_capture(
-        folder / kind,
-        kind=kind,
-        seed=0,
-        train_views=96,
-        test_views=6,
-        width=64,
-        height=64,
-        points=1000,
-        sensor_noise=0.03,
-    )
+def searched(write: Callable[..., Path], folder: Path) -> dict[str, Any]:
+    """Train on a scene; the search's own record."""
+    scene = write(folder / write.__name__, seed=0, train_views=96, test_views=6, width=64, height=64, points=1000)
+    add_noise(scene, 0.03)
     config = config_for(scene, folder / "runs")
     _set_random_seed(config.machine.seed)
     try:
@@ -72,7 +65,7 @@ def searched(kind: str, folder: Path) -> dict[str, Any]:
 @pytest.mark.long
 def test_a_plain_wall_comes_out_tiny(tmp_path: Path) -> None:
     """At the same allowed drop, a painted wall keeps a tenth of the still life's primitives, and a lower SH degree."""
-    still, wall = searched("still-life", tmp_path), searched("wall", tmp_path)
+    still, wall = searched(write_embedded_capture, tmp_path), searched(write_wall, tmp_path)
     assert 10 * wall["primitives"] <= still["primitives"]
     assert wall["degree"] < still["degree"]
     for found in (still, wall):

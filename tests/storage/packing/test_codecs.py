@@ -10,7 +10,6 @@ import torch
 from hard_values import hard_values
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import PackError
@@ -25,8 +24,9 @@ from sundae_ns.storage.packing import (
     write_fitted,
     write_scene,
 )
+from sundae_ns.storage.packing.codecs import HeadCodec
+from sundae_ns.storage.packing.container import Floats
 
-Floats = NDArray[np.float32]
 hard = given(
     st.sampled_from(["normal", "constant", "huge", "tiny", "outliers"]), st.integers(1, 500), st.integers(0, 2**16)
 )
@@ -43,11 +43,16 @@ def drifted(x: Floats, seed: int) -> Floats:
 @hard
 def test_uniform(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 3, seed)
-    grid = quantize.fit_grid(x, 4 + seed % 13, shared=seed % 2 == 0)
+    color = seed % 2 == 0
+    codec = quantize.fit_uniform(x, 4 + seed % 13, color=color)
     for y in (x, drifted(x, seed)):
-        packed = quantize.quantize(y, grid)
-        assert np.array_equal(quantize.rounded(torch.from_numpy(y), grid).numpy(), quantize.dequantize(packed))
-        assert packed.codes.max() < 2**grid.bits
+        _, arrays = codec.encode(y)
+        codes = arrays["codes"]
+        if color:
+            codes = arrays["codes"] = np.stack([codes[0] + codes[1], codes[1], codes[2] + codes[1]])
+        found = quantize.dequantize(low=codec.low.numpy(), step=codec.step.numpy(), **arrays)
+        assert np.array_equal(codec.rounded(torch.from_numpy(y)).numpy(), found)
+        assert codes.max() < 2**codec.bits
 
 
 @given(st.integers(1, 500), st.integers(0, 2**16), st.integers(4, 16))
@@ -55,40 +60,45 @@ def test_rotations(n: int, seed: int, bits: int) -> None:
     q = hard_values("normal", n, 4, seed)
     q[::7] = [0.5, -0.5, 0.5, 0.5]
     q[::11] = 0
-    found = quantize.dequantize_rotations(quantize.quantize_rotations(q, bits), bits)
-    assert np.array_equal(quantize.rounded_rotations(torch.from_numpy(q), bits).numpy(), found)
+    codec = quantize.Rotations(bits)
+    found = quantize.dequantize_rotations(**codec.encode(q)[1], bits=bits)
+    assert np.array_equal(codec.rounded(torch.from_numpy(q)).numpy(), found)
 
 
 @hard
 def test_weights(kind: str, n: int, seed: int) -> None:
     x, bits = hard_values(kind, n, 18, seed).reshape(n, 2, 3, 3), 3 + seed % 6
-    step = quantize.weight_steps(torch.from_numpy(x), bits)
+    codec = HeadCodec(bits, {"w": quantize.weight_steps(torch.from_numpy(x), bits)})
     for y in (x, drifted(x, seed)):
-        codes = quantize.quantize_weights(y, step.numpy(), bits)
-        found = quantize.rounded_weights(torch.from_numpy(y), step, bits).numpy()
-        assert np.array_equal(found, quantize.dequantize_weights(codes, step.numpy()))
-        assert np.abs(codes.astype(int)).max() < 2 ** (bits - 1)
+        _, arrays = codec.encode({"w": torch.from_numpy(y)})
+        codes = torch.from_numpy(arrays["weights"].reshape(x.shape))
+        found = quantize.weights_at(codes, torch.from_numpy(arrays["steps"]))
+        assert torch.equal(codec.rounded("w", torch.from_numpy(y)), found)
+        assert codes.int().abs().max() < 2 ** (bits - 1)
 
 
 @hard
 def test_transform(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 9, seed)
-    basis = transform.fit_basis(x, 0.03)
+    codec = transform.fit(x, 0.03)
     for y in (x, drifted(x, seed)):
-        packed = transform.forward(y, basis)
-        assert np.array_equal(transform.rounded(torch.from_numpy(y), basis).numpy(), transform.backward(packed))
-        assert np.abs(packed.codes.astype(int)).max(initial=0) <= basis.limit
+        _, arrays = codec.encode(y)
+        arrays["basis"] = arrays["basis"].reshape(9, 9)
+        found = transform.restore(step=codec.step, **arrays)
+        assert np.array_equal(codec.rounded(torch.from_numpy(y)).numpy(), found)
+        assert np.abs(arrays["codes"].astype(int)).max(initial=0) <= codec.limit
 
 
 @hard
 def test_codebooks(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 9, seed)
-    books = codebooks.books_of(codebooks.fit(x, 1 + seed % 3))
+    books = codebooks.fit(x, 1 + seed % 3)
     for y in (x, drifted(x, seed)):
-        packed = codebooks.encode(y, books)
-        found = codebooks.restore(packed)
-        assert np.array_equal(codebooks.rounded(torch.from_numpy(y), books).numpy(), found)
-        assert np.abs(found.astype(np.float64) - y).max() <= packed.bound
+        about, arrays = books.encode(y)
+        arrays["entries"] = arrays["entries"].reshape(books.entries.shape)
+        found = codebooks.restore(**arrays)
+        assert np.array_equal(books.rounded(torch.from_numpy(y)).numpy(), found)
+        assert np.abs(found.astype(np.float64) - y).max() <= about["bound"]
 
 
 def scene(n: int = 700) -> Scene:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,9 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sundae_ns.storage.packing import codebooks, morton, quantize, transform
-
-Floats = NDArray[np.float32]
-
+from sundae_ns.storage.packing.container import Floats
 
 hard = given(st.sampled_from(KINDS), st.integers(1, 700), st.integers(0, 2**16))
 
@@ -42,24 +42,31 @@ def test_scene_order_keeps_neighbours_together_despite_a_far_primitive() -> None
     assert steps[2] < 1.5 * steps[1]
 
 
+def through_uniform(x: Floats, codec: quantize.Uniform) -> tuple[Floats, Floats]:
+    """Values after a round trip, and the exceptions."""
+    _, arrays = replace(codec, differences=False).encode(x)
+    return quantize.dequantize(low=codec.low.numpy(), step=codec.step.numpy(), **arrays), arrays["exceptions"]
+
+
 @hard
 def test_uniform(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 3, seed)
     bits = 4 + seed % 13
-    for shared in (False, True):
-        packed = quantize.quantize(x, quantize.fit_grid(x, bits, shared=shared))
-        error = np.abs(quantize.dequantize(packed).astype(np.float64) - x)
-        assert (error <= packed.step / 2 * (1 + 1e-9) + ulp(x)).all()
-        assert len(packed.exceptions) <= 2 * quantize.TAIL * x.size + 6
+    for color in (False, True):
+        codec = quantize.fit_uniform(x, bits, color=color)
+        found, exact = through_uniform(x, codec)
+        error = np.abs(found.astype(np.float64) - x)
+        assert (error <= codec.step.numpy() / 2 * (1 + 1e-9) + ulp(x)).all()
+        assert len(exact) <= 2 * quantize.TAIL * x.size + 6
 
 
 def test_outliers_do_not_widen_the_range() -> None:
     x = np.random.default_rng(0).normal(size=(10_000, 1)).astype(np.float32)
-    clean = quantize.fit_grid(x, 8).step.numpy()
+    clean = quantize.fit_uniform(x, 8).step
     x[17], x[18] = 1e6, -1e9
-    packed = quantize.quantize(x, quantize.fit_grid(x, 8))
-    assert packed.step <= clean
-    assert np.array_equal(quantize.dequantize(packed)[17:19], x[17:19])
+    codec = quantize.fit_uniform(x, 8)
+    assert codec.step <= clean
+    assert np.array_equal(through_uniform(x, codec)[0][17:19], x[17:19])
 
 
 @hard
@@ -94,6 +101,11 @@ def angles(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64
     return 4 * np.arcsin(np.minimum(near / 2, 1))
 
 
+def through_rotations(q: Floats, bits: int) -> Floats:
+    _, arrays = quantize.Rotations(bits).encode(q)
+    return quantize.dequantize_rotations(arrays["codes"], arrays["largest"], bits)
+
+
 @given(st.integers(1, 500), st.integers(0, 2**16), st.integers(4, 16), st.sampled_from([1e-30, 1.0, 1e30]))
 def test_rotations(n: int, seed: int, bits: int, length: float) -> None:
     rng = np.random.default_rng(seed)
@@ -101,7 +113,7 @@ def test_rotations(n: int, seed: int, bits: int, length: float) -> None:
     q[rng.random(n) < 0.2] = rng.choice([-0.5, 0.5], size=4)  # corners, where all four are the largest
     q[rng.random(n) < 0.1] = [0, 0, -1, 0]
     q = (q * length).astype(np.float32)
-    found = quantize.dequantize_rotations(quantize.quantize_rotations(q, bits), bits)
+    found = through_rotations(q, bits)
     assert np.allclose(np.linalg.norm(found, axis=1), 1, atol=1e-6)
     assert angles(q.astype(np.float64), found.astype(np.float64)).max() <= quantize.rotation_bound(bits) + 2e-6
 
@@ -110,40 +122,47 @@ def test_the_bound_of_rotations_is_nearly_reached() -> None:
     rng = np.random.default_rng(0)
     corner = np.full((100_000, 4), 0.5) + rng.normal(size=(100_000, 4)) * 0.01
     for bits in (8, 10):  # 0.94 and 0.95 of the bound
-        found = quantize.dequantize_rotations(quantize.quantize_rotations(corner.astype(np.float32), bits), bits)
+        found = through_rotations(corner.astype(np.float32), bits)
         worst = angles(corner, found.astype(np.float64)).max()
         assert 0.9 * quantize.rotation_bound(bits) < worst <= quantize.rotation_bound(bits)
 
 
 def test_a_quaternion_of_length_zero_is_the_identity() -> None:
-    found = quantize.dequantize_rotations(quantize.quantize_rotations(np.zeros((2, 4), np.float32), 8), 8)
+    found = through_rotations(np.zeros((2, 4), np.float32), 8)
     assert np.allclose(found, [1, 0, 0, 0], atol=quantize.rotation_bound(8))
 
 
 @hard
 def test_weights(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 18, seed).reshape(n, 2, 3, 3)
-    step = quantize.weight_steps(torch.from_numpy(x), 8).numpy()
-    codes = quantize.quantize_weights(x, step)
-    error = np.abs(quantize.dequantize_weights(codes, step).astype(np.float64) - x).reshape(n, -1)
+    steps = quantize.weight_steps(torch.from_numpy(x), 8)
+    found = quantize.weights_at(quantize.weight_levels(torch.from_numpy(x), steps, 8), steps)
+    error, step = np.abs(found.double().numpy() - x).reshape(n, -1), steps.numpy()
     assert (error <= step[:, None] / 2 * (1 + 1e-6) + ulp(x.reshape(n, -1))).all()
     assert (step <= np.abs(x.reshape(n, -1)).max(axis=1) / 127 * (1 + 1e-6) + 1e-44).all()
+
+
+def through_books(x: Floats, books: codebooks.Books) -> tuple[NDArray[np.float64], float]:
+    """Vectors after a round trip, and the stated bound of their error."""
+    about, arrays = books.encode(x)
+    arrays["entries"] = arrays["entries"].reshape(books.entries.shape)
+    return codebooks.restore(**arrays).astype(np.float64), about["bound"]
 
 
 @hard
 def test_codebooks(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 9, seed)
-    packed = codebooks.fit(x, 1 + seed % 3)
-    found = codebooks.restore(packed).astype(np.float64)
-    others = np.delete(np.arange(n), packed.rows)
-    assert np.array_equal(found[packed.rows].astype(np.float32), x[packed.rows])
-    assert (np.abs(found - x)[others] <= packed.bound).all()
-    assert len(packed.rows) <= codebooks.EXACT * n
+    books = codebooks.fit(x, 1 + seed % 3)
+    found, bound = through_books(x, books)
+    others = np.delete(np.arange(n), books.rows)
+    assert np.array_equal(found[books.rows].astype(np.float32), x[books.rows])
+    assert (np.abs(found - x)[others] <= bound).all()
+    assert len(books.rows) <= codebooks.EXACT * n
 
 
 def test_each_codebook_reduces_the_error() -> None:
     x = hard_values("normal", 3000, 9, 0)
-    errors = [np.square(codebooks.restore(codebooks.fit(x, books)) - x).mean() for books in (1, 2, 4)]
+    errors = [np.square(through_books(x, codebooks.fit(x, books))[0] - x).mean() for books in (1, 2, 4)]
     assert errors[0] < 0.7
     assert errors[1] < 0.6 * errors[0]
     assert errors[2] < 0.4 * errors[1]
@@ -152,13 +171,15 @@ def test_each_codebook_reduces_the_error() -> None:
 @hard
 def test_transform(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 9, seed)
-    packed = transform.forward(x, transform.fit_basis(x, 0.03))
-    found = transform.backward(packed).astype(np.float64)
-    assert np.array_equal(found[packed.rows].astype(np.float32), x[packed.rows])
+    codec = transform.fit(x, 0.03)
+    _, arrays = codec.encode(x)
+    arrays["basis"] = arrays["basis"].reshape(9, 9)
+    found, rows = transform.restore(step=codec.step, **arrays).astype(np.float64), arrays["rows"]
+    assert np.array_equal(found[rows].astype(np.float32), x[rows])
     # Sums of nine products in float32.
     slack = 20 * ulp(np.linalg.norm(x.astype(np.float64), axis=1, keepdims=True))
-    assert (np.abs(found - x) <= transform.bound(packed) + slack).all()
-    assert transform.bound(packed) < 0.03 / 2 * 3.2
+    assert (np.abs(found - x) <= codec.bound + slack).all()
+    assert codec.bound < 0.03 / 2 * 3.2
 
 
 @pytest.mark.parametrize("kind", ["normal", "outliers"])
@@ -166,7 +187,7 @@ def test_a_transform_decorrelates_columns(kind: str) -> None:
     rng = np.random.default_rng(0)
     x = np.repeat(hard_values(kind, 2000, 3, 0), 3, axis=1) + 0.001 * rng.normal(size=(2000, 9)).astype(np.float32)
     x = x.astype(np.float32)
-    packed = transform.forward(x, transform.fit_basis(x, 0.03))
-    zeros = (packed.codes == 0).mean(axis=1)
+    _, arrays = transform.fit(x, 0.03).encode(x)
+    zeros = (arrays["codes"] == 0).mean(axis=1)
     assert (zeros[3:] > 0.98).all()
     assert (zeros[:3] < 0.2).all()

@@ -13,8 +13,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from torch import Tensor
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.gaussians import SPLAT_NAMES
-from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, sh_to_rgb
 from sundae_ns.storage import MODEL_FRAME, write_ply
 from sundae_ns.storage.runs import checkpoint
 
