@@ -30,7 +30,7 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering import LocalField, render
 from sundae_ns.scenes.opening import Opened, load_run
 from sundae_ns.scenes.packed import scene_of_run
-from sundae_ns.storage import read_ply, write_sog, write_spz
+from sundae_ns.storage import read_ply
 from sundae_ns.storage.viewers import ANTIALIASED, write_for_viewers
 
 
@@ -71,7 +71,6 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--downscale", type=int, default=1)
     parser.add_argument("--splat-transform", default=shutil.which("splat-transform"))
-    parser.add_argument("--sweep", action="store_true", help="other roundings of harmonics too")
     options = parser.parse_args()
     if options.splat_transform is None:
         parser.error(
@@ -98,14 +97,6 @@ def main() -> None:
             export(folder / f"ours.{kind}")
         files = [folder / f"ours.{kind}" for kind in ("ply", "spz", "sog")]
         files += [transform(options.splat_transform, files[0], folder / f"theirs.{kind}") for kind in ("spz", "sog")]
-        if options.sweep:
-            field = read_ply(files[0])
-            for step in (128, 32, 16, 8):
-                files.append(folder / f"step-{step}.spz")
-                write_spz(files[-1], field, antialiased=antialiased, harmonics_step=1 / step)
-            for share in (2, 4, 8):
-                files.append(folder / f"palette-{share}.sog")
-                write_sog(files[-1], field, antialiased=antialiased, max_palette=len(field["means"]) // share)
         for file in files:
             back = transform(options.splat_transform, file, folder / "back.ply")
             field = {key: value.to(model.device) for key, value in read_ply(back).items()}

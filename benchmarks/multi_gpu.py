@@ -28,7 +28,6 @@ from nerfstudio.scripts.train import _set_random_seed
 from sundae_ns.cli.bench.job import configure
 from sundae_ns.cli.bench.plan import Job, parser_of
 from sundae_ns.evaluation import psnr
-from sundae_ns.scenes.measure import revision
 from sundae_ns.storage.runs import checkpoint
 
 WARM = 100
@@ -151,7 +150,6 @@ def measure(rank: int, ranks: int, meeting: str, options: argparse.Namespace, ex
             "images_per_s": round(clock.images / clock.seconds, 1),
             "psnr_after_images": clock.curve,
             "peak_mib": [round(peak) for peak in memory],
-            "commit": revision(),
             "command": f"python benchmarks/multi_gpu.py {shlex.join(sys.argv[1:])} ({command})",
         }
         print(json.dumps(line), flush=True)

@@ -47,17 +47,17 @@ def plot_runs() -> Any:
     """PSNR of methods against their bytes, for the captures on which all of them were trained."""
     by_scene: dict[str, list[Any]] = {}
     for row in runs():
-        if row.variant in SHORT:
-            by_scene.setdefault(row.scene, []).append(row)
+        if row["variant"] in SHORT:
+            by_scene.setdefault(row["scene"], []).append(row)
     scenes = [scene for scene, rows in by_scene.items() if len(rows) > 3]
     figure, panels = plt.subplots(1, len(scenes), figsize=(5.5 * len(scenes), 4), layout="constrained")
     for panel, scene in zip(panels, scenes, strict=True):
         for row in by_scene[scene]:
-            place, full = (row.bytes_total / MB, row.psnr), row.bytes_total > 30 * MB
-            ours = row.variant == "sundae"
+            place, full = (row["bytes_total"] / MB, row["psnr"]), row["bytes_total"] > 30 * MB
+            ours = row["variant"] == "sundae"
             panel.plot(*place, "o", color="tab:red" if ours else "gray" if full else "tab:blue")
             to_left = {"ha": "right", "xytext": (-7, -3)} if full else {"xytext": (7, -3)}
-            panel.annotate(SHORT[row.variant], place, textcoords="offset points", fontsize=9, **to_left)
+            panel.annotate(SHORT[row["variant"]], place, textcoords="offset points", fontsize=9, **to_left)
         panel.margins(y=0.1)
         panel.set_xscale("log")
         panel.set_xlim(3, 300)

@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sundae_ns.evaluation import RunRow, read_rows
 from sundae_ns.evaluation.document import number, table
 
 ROOT = Path(__file__).parents[1]
@@ -48,10 +47,15 @@ def lines_of(name: str) -> list[dict[str, Any]]:
     return list(csv.DictReader(text.splitlines()))
 
 
-def runs() -> list[RunRow]:
-    """Rows of runs.csv by capture, in the order of :data:`METHODS`."""
-    rows = [row for row in read_rows(RESULTS / "runs.csv") if row.variant in METHODS]
-    return sorted(rows, key=lambda row: (row.scene, list(METHODS).index(row.variant)))
+def runs() -> list[dict[str, Any]]:
+    """Rows of runs.csv by capture, in the order of :data:`METHODS`; numbers are numbers, and None is an empty cell."""
+    words = ("scene", "method", "variant", "resolution", "gpu", "command", "lpips_net")
+    rows = [
+        {name: cell if name in words else float(cell) if cell else None for name, cell in row.items()}
+        for row in lines_of("runs.csv")
+        if row["variant"] in METHODS
+    ]
+    return sorted(rows, key=lambda row: (row["scene"], list(METHODS).index(row["variant"])))
 
 
 def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
@@ -64,38 +68,33 @@ def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
     return shown
 
 
-def scene(row: RunRow) -> str:
-    return f"{row.scene}, {row.resolution.replace('x', ' x ')}"
-
-
 def headline() -> list[str]:
     """README's table: today's default beside stock splatfacto."""
     heads = ["capture", "method", "primitives", "PSNR", "SSIM", "PSNR head off", "MB", "ms a frame"]
-    rows = [
-        [
-            *(scene(row), METHODS[row.variant], number(row.primitives, 0), number(row.psnr, 2), number(row.ssim, 4)),
-            number(row.psnr_base, 2) if row.bytes_head else "",
-            *(number(row.bytes_total / MB, 1), number(row.ms_frame, 2)),
-        ]
-        for row in runs()
-        if row.variant in HEADLINE
-    ]
+    rows = [cells_of(row) for row in runs() if row["variant"] in HEADLINE]
     return table(heads, first_of_each(rows))
 
 
 def quality() -> list[str]:
     """All methods on the captures: quality, size and time of the same rendering."""
     heads = ["capture", "method", "keep", "primitives", "PSNR, dB", "SSIM", "PSNR, head off", "MB", "ms a frame"]
-    rows = [
-        [
-            *(scene(row), METHODS[row.variant], "" if row.keep_ratio is None else f"{row.keep_ratio:.0%}"),
-            *(number(row.primitives, 0), number(row.psnr, 2), number(row.ssim, 4)),
-            number(row.psnr_base, 2) if row.bytes_head else "",
-            *(number(row.bytes_total / MB, 1), number(row.ms_frame, 2)),
-        ]
-        for row in runs()
-    ]
+    rows = []
+    for row in runs():
+        capture, method, *others = cells_of(row)
+        keep = "" if row["keep_ratio"] is None else f"{row['keep_ratio']:.0%}"
+        rows.append([capture, method, keep, *others])
     return table(heads, first_of_each(rows))
+
+
+def cells_of(row: dict[str, Any]) -> list[str]:
+    """Capture, method, number of primitives, metrics, size and time of a row of runs.csv."""
+    return [
+        f"{row['scene']}, {row['resolution'].replace('x', ' x ')}",
+        METHODS[row["variant"]],
+        *(number(row["primitives"], 0), number(row["psnr"], 2), number(row["ssim"], 4)),
+        number(row["psnr_base"], 2) if row["bytes_head"] else "",
+        *(number(row["bytes_total"] / MB, 1), number(row["ms_frame"], 2)),
+    ]
 
 
 def speed() -> list[str]:
@@ -109,17 +108,6 @@ def speed() -> list[str]:
             *(number(line["psnr"], 2), number(line["ssim"], 4), gpu(line["device"])),
         ]
         for line in lines_of("frames.jsonl")
-    ]
-    return table(heads, first_of_each(rows))
-
-
-def sizes() -> list[str]:
-    """The head at other image sizes than the training images'."""
-    heads = ["capture", "factor", "size", "PSNR, dB", "head off", "SSIM", "head off"]
-    rows = [
-        [line["scene"], line["factor"], f"{line['width']} x {line['height']}"]
-        + [line[name] for name in ("psnr", "psnr_base", "ssim", "ssim_base")]
-        for line in lines_of("sizes.csv")
     ]
     return table(heads, first_of_each(rows))
 
@@ -139,58 +127,6 @@ def packing() -> list[str]:
                 ]
             )
     return table(heads, first_of_each(rows))
-
-
-def exports() -> list[str]:
-    """Files for viewers, read back by splat-transform: bytes, and PSNR without the head."""
-    heads = ["run", "file", "primitives", "MB", "PSNR of the run, head off", "of the file"]
-    rows = [
-        [
-            *(line["run"] + ", antialiased" * line["antialiased"], line["file"], number(line["primitives"], 0)),
-            *(number(line["bytes"] / MB, 3), number(line["psnr_model"], 2), number(line["psnr"], 2)),
-        ]
-        for line in lines_of("exports.jsonl")
-    ]
-    return table(heads, first_of_each(rows))
-
-
-def graph() -> list[str]:
-    """The neighbour graph with the high-pass response, beside scipy's cKDTree."""
-    heads = ["device", "points", "distribution", "graph and response, s", "cKDTree, s", "error", "peak, MiB"]
-    rows = [
-        [
-            *(gpu(line["device_name"]), number(line["points"], 0), line["distribution"]),
-            *(f"{line['seconds']:g}", f"{line['reference_seconds']:g}" if line["reference_seconds"] else "-"),
-            *(f"{line['response_rel_error']:.0e}", number(line["peak_mib"], 0)),
-        ]
-        for line in lines_of("graph.jsonl")
-    ]
-    return table(heads, first_of_each(rows), words=1)
-
-
-def rasterizer() -> list[str]:
-    """Rasterisers on random views, with their errors against the reference in float64."""
-    heads = [
-        "rasterizer",
-        "device",
-        "primitives",
-        "size",
-        "forward, ms",
-        "and backward, ms",
-        "max. error",
-        "gradient's",
-    ]
-    rows = [
-        [
-            *(line["rasterizer"], gpu(line["device_name"]), number(line["primitives"], 0)),
-            f"{line['width']} x {line['height']}",
-            *(f"{line['forward_ms']:g}", f"{line['forward_backward_ms']:g}"),
-            *(f"{line['max_error']:.0e}", f"{line['gradient_error']:.0e}"),
-        ]
-        for line in lines_of("rasterizer.jsonl")
-        if "max_error" in line
-    ]
-    return table(heads, rows)
 
 
 def multi_gpu() -> list[str]:
@@ -255,20 +191,6 @@ def heads() -> list[str]:
     return table(columns, first_of_each(rows))
 
 
-def budgets() -> list[str]:
-    """Primitives that ``sundae-auto`` keeps for a drop of 0.1 dB, and other ways to as many."""
-    columns = ["scene", "method", "seed", "primitives before", "kept", "peak", "SH degree", "head", "MB", "PSNR, dB"]
-    rows = [
-        [
-            *(line["scene"], line["method"], line["seed"], number(int(line["before"]), 0) if line["before"] else "-"),
-            *(number(int(line[name]), 0) for name in ("primitives", "peak")),
-            *(line["degree"], line["head"], number(int(line["bytes"]) / MB, 3), number(float(line["psnr"]), 2)),
-        ]
-        for line in lines_of("budgets.csv")
-    ]
-    return table(columns, first_of_each(rows))
-
-
 def gpu(name: str) -> str:
     """Name of a device as tables show it."""
     return name.replace("NVIDIA ", "").replace(" 80GB HBM3", "")
@@ -278,15 +200,10 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "headline": headline,
     "quality": quality,
     "speed": speed,
-    "sizes": sizes,
     "packing": packing,
-    "exports": exports,
-    "graph": graph,
-    "rasterizer": rasterizer,
     "multi-gpu": multi_gpu,
     "rules": rules,
     "heads": heads,
-    "budgets": budgets,
 }
 
 

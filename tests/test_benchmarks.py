@@ -11,9 +11,8 @@ from typing import Any
 
 import pytest
 import tyro
+from csv_rows import read_rows
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
-
-from sundae_ns.evaluation import read_rows
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "benchmarks"
@@ -104,6 +103,23 @@ def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(sys, "argv", ["plot.py", "-o", str(tmp_path)])
     plots["main"]()
     assert {path.stem for path in tmp_path.iterdir()} == set(plots["PLOTS"])
+
+
+# ------------------------------------------------------------------------------------------------------------------ parts
+
+
+def test_parts_are_timed_beside_their_errors(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for part, errors in (("graph", ["response_rel_error"]), ("rasterizers", ["max_error", "gradient_error"])):
+        words = [part, "--primitives", "300", "--size", "24", "--repeats", "1"]
+        monkeypatch.setattr(sys, "argv", ["bench_step.py", *words])
+        loaded(monkeypatch, "bench_step.py")["main"]()
+        lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        assert [line.get("rasterizer") for line in lines] == ([None] if part == "graph" else ["cpu", "reference"])
+        for line in lines:
+            assert all(0 < line[error] < 1e-3 for error in errors), line
+            assert all(value > 0 for name, value in line.items() if name.startswith("ms_"))
 
 
 # ---------------------------------------------------------------------------------------------------------------- mutants

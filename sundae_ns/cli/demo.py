@@ -16,7 +16,7 @@ from rich.progress import Progress
 from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import ConfigError
-from sundae_ns.evaluation import ComparisonRow, Quality, RunFigures, report_text, save_comparison
+from sundae_ns.evaluation import ComparisonRow, report_text, save_comparison
 
 METHOD = "sundae-tiny"
 SHOWN = 3
@@ -44,10 +44,6 @@ def _comparison(renders: Path, out: Path) -> None:
         base = _read_image(path.with_name(path.name.replace("img", "base")))
         rows.append(ComparisonRow(truth, base, compensated, title=f"test view {int(path.stem[-4:])}"))
     save_comparison(out, rows)
-
-
-def _quality(results: dict[str, float], suffix: str = "") -> Quality:
-    return Quality(results["psnr" + suffix], results["ssim" + suffix], results.get("lpips" + suffix))
 
 
 def _check_steps(steps: int) -> None:
@@ -116,20 +112,16 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
     results = json.loads((out / "eval.json").read_text())["results"]
     prunes = json.loads((run / "prune.json").read_text()) if (run / "prune.json").exists() else []
     prune = prunes[-1] if prunes else {"before": model.num_points, "after": model.num_points}
-    figures = RunFigures(
-        title=f"sundae demo, {cameras[0].width.item()} x {cameras[0].height.item()} px, {device}",
-        primitives_before=prune["before"],
-        primitives_after=prune["after"],
-        warm_up=_quality(prune["warm_up"]) if prune.get("warm_up") else None,
-        after_prune=_quality(prune["pruned"]) if prune.get("pruned") else None,
-        base=_quality(results, "_base"),
-        compensated=_quality(results),
-        bytes_primitives=stored.primitives,
-        bytes_head=stored.head,
-        ms_frame=times.frame,
-        ms_splat=times.splat,
-        ms_head=times.head,
+    base = {name.removesuffix("_base"): value for name, value in results.items() if name.endswith("_base")}
+    stages = (
+        ("warm-up", prune["before"], prune.get("warm_up")),
+        ("after the prune", prune["after"], prune.get("pruned")),
+        ("final, base colours", prune["after"], base),
+        ("final, compensated", prune["after"], results),
     )
-    console.print(report_text(figures), highlight=False)
+    title = f"sundae demo, {cameras[0].width.item()} x {cameras[0].height.item()} px, {device}"
+    sizes_of_parts = (stored.primitives, stored.head)
+    text = report_text(title, stages, sizes_of_parts, (times.splat, times.head, times.frame))
+    console.print(text, highlight=False)
     console.print(f"Images: {out / 'comparison.png'}   View: ns-viewer --load-config {run / 'config.yml'}")
     return 0

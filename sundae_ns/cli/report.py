@@ -24,13 +24,9 @@ from sundae_ns.evaluation.plots import (
     Cost,
     colors_of,
     plot_curves,
-    plot_gain,
     plot_quality,
     plot_views,
-    points_of,
-    printed_point,
 )
-from sundae_ns.evaluation.published import Printed, printed_of
 from sundae_ns.scenes.measure import comparison_of, measure_scene
 from sundae_ns.scenes.opening import Opened, open_scene
 from sundae_ns.storage.atomic import write_text, writing
@@ -121,13 +117,12 @@ def run_report(
             raise failures[0]
         progress.add_task("Plotting", total=None)
         scenes = {scene: [run for run in runs if run.scene == scene] for scene in dict.fromkeys(r.scene for r in runs)}
-        printed = {scene: printed_of(scene, own[0].resolution) for scene, own in scenes.items()}
-        plots = _plot(out, scenes, printed, curves)
+        plots = _plot(out, scenes, curves)
         notes += _differences(scenes)
     images = {scene: [*plots[scene], *comparisons[scene]] for scene in scenes}
     write_text(out / "report.json", json.dumps([run.as_json() for run in runs], indent=1) + "\n")
-    write_text(out / "report.csv", csv_text([run.row() for run in runs]))
-    write_text(out / "report.md", document(scenes, printed, images, notes, command))
+    write_text(out / "report.csv", csv_text([run.as_json() for run in runs]))
+    write_text(out / "report.md", document(scenes, images, notes, command))
     for note in notes:
         console.print(f"[yellow]Left out: {note}", highlight=False)
     console.print(f"wrote {out / 'report.md'}, with report.csv, report.json and images beside it", highlight=False)
@@ -181,7 +176,7 @@ def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
 
 
 def _plot(
-    out: Path, scenes: Mapping[str, list[Measured]], printed: Mapping[str, list[Printed]], curves: Mapping[str, Curves]
+    out: Path, scenes: Mapping[str, list[Measured]], curves: Mapping[str, Curves]
 ) -> dict[str, list[tuple[str, str]]]:
     """Write all plots; returns (title, file name) by scene."""
     written: dict[str, list[tuple[str, str]]] = {}
@@ -189,13 +184,9 @@ def _plot(
         end = "" if len(scenes) == 1 else f"-{number}"
         colors = colors_of([run.label for run in runs])
         plots = written.setdefault(scene, [])
-        points = [point for run in runs for point in points_of(run)] + [printed_point(row) for row in printed[scene]]
         for cost, cost_name in COSTS.items():
-            title = f"{scene}: quality against {cost_name}, means over the test views"
-            if plot_quality(out / f"quality-{cost}{end}.png", points, cost, colors, title=title):
+            if plot_quality(out / f"quality-{cost}{end}.png", runs, cost, colors):
                 plots.append((f"Quality against {cost_name}", f"quality-{cost}{end}.png"))
-        if plot_gain(out / f"gain{end}.png", runs, colors):
-            plots.append(("Quality gained by the head against the time that it adds", f"gain{end}.png"))
         # One figure for every few runs, so that colours tell their lines apart.
         for first in range(0, len(runs), MOST_SERIES):
             group = runs[first : first + MOST_SERIES]

@@ -1,8 +1,7 @@
-"""Image metrics in named variants, synchronised timing, comparison images, plots, tables, and records of runs. Floor 2."""
+"""Image metrics in named variants, synchronised timing, comparison images, plots and tables."""
 
 from sundae_ns.evaluation import display
 from sundae_ns.evaluation.comparison_image import ComparisonRow, comparison_sheet, save_comparison
-from sundae_ns.evaluation.flicker import Change, Frame, change
 from sundae_ns.evaluation.flip import flip, flip_available
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
 from sundae_ns.evaluation.measured import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality, without_nan
@@ -16,28 +15,20 @@ from sundae_ns.evaluation.points import (
     project_through_camera,
     response_histogram,
 )
-from sundae_ns.evaluation.records import COLUMNS, RunRow, append_row, csv_text, read_rows
-from sundae_ns.evaluation.report import Quality, RunFigures, report_text
-from sundae_ns.evaluation.timing import Timing, median_ms
+from sundae_ns.evaluation.records import COLUMNS, csv_text
+from sundae_ns.evaluation.report import report_text
+from sundae_ns.evaluation.timing import median_ms
 
 __all__ = [
     "COLUMNS",
     "HEAD_OFF",
     "HEAD_ON",
-    "Change",
     "ComparisonRow",
     "Configuration",
-    "Frame",
     "Lpips",
     "Measured",
     "Projection",
-    "Quality",
-    "RunFigures",
-    "RunRow",
-    "Timing",
     "ViewQuality",
-    "append_row",
-    "change",
     "comparison_sheet",
     "csv_text",
     "display",
@@ -53,7 +44,6 @@ __all__ = [
     "project_along_axes",
     "project_through_camera",
     "psnr",
-    "read_rows",
     "report_text",
     "response_histogram",
     "save_comparison",

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 from sundae_ns.evaluation.flip import VARIANT
 from sundae_ns.evaluation.measured import MEGABYTE, Configuration, Measured
-from sundae_ns.evaluation.published import NOTE, Printed
 
 METRICS = (("psnr", 2), ("ssim", 4), ("flip", 4), ("lpips", 4))
 """Metrics in the order of a table's columns, with their number of decimals."""
@@ -35,17 +34,8 @@ def _row(run: Measured, configuration: Configuration) -> list[str]:
     ]
 
 
-def _printed_row(row: Printed) -> list[str]:
-    return [
-        f"{row.keep_ratio:.0%}",
-        *(number(value, digits) for value, digits in ((row.psnr, 2), (row.ssim, 3), (row.lpips, 3))),
-        *(number(value, digits) for value, digits in ((row.psnr_base, 2), (row.megabytes, 1), (row.primitives, 0))),
-    ]
-
-
 def document(
     scenes: Mapping[str, Sequence[Measured]],
-    printed: Mapping[str, Sequence[Printed]],
     images: Mapping[str, Sequence[tuple[str, str]]],
     notes: Sequence[str],
     command: str,
@@ -54,7 +44,6 @@ def document(
 
     Args:
         scenes: measured fields by scene.
-        printed: the paper's rows by scene; scenes without rows may be missing.
         images: (title, file name beside the page) by scene, in order.
         notes: what was left out and why, one sentence each.
         command: the command that made the page.
@@ -62,9 +51,8 @@ def document(
     lines = ["# Quality, speed and size", "", f"    {command}", ""]
     runs = [run for own in scenes.values() for run in own]
     devices = sorted({run.gpu or "CPU" for run in runs})
-    commits = sorted({run.commit for run in runs} - {""})
     lines += [
-        f"Rendered on {', '.join(devices)}" + (f", commit {', '.join(commits)}." if commits else "."),
+        f"Rendered on {', '.join(devices)}.",
         "",
         "- Each row is one configuration of rendering a field. Its time and its metrics come from the same calls.",
         "- Metrics are means over the test views. PSNR is over all pixels and channels, SSIM is pytorch_msssim's",
@@ -83,11 +71,6 @@ def document(
         sizes = sorted({run.resolution for run in own})
         lines += [f"## {scene}", "", f"{' or '.join(map(str, views))} test views, {' or '.join(sizes)} px.", ""]
         lines += table(heads, [_row(run, configuration) for run in own for configuration in run.configurations])
-        if printed.get(scene):
-            printed_heads = ["keep ratio", "PSNR, dB", "SSIM", "LPIPS, net not named", "PSNR without head, dB"]
-            printed_heads += ["MB", "primitives"]
-            lines += ["", f"SUNDAE on {scene}, {NOTE}:", ""]
-            lines += table(printed_heads, [_printed_row(row) for row in printed[scene]], words=1)
         for title, name in images.get(scene, ()):
             lines += ["", f"![{title}]({name})", "", f"*{title}.*"]
         lines.append("")

@@ -7,8 +7,6 @@ from dataclasses import asdict, dataclass
 from statistics import fmean
 from typing import Any
 
-from sundae_ns.evaluation.records import RunRow
-
 HEAD_ON, HEAD_OFF = "head on", "head off"
 MEGABYTE = 1e6
 """Bytes in the MB of tables and plots."""
@@ -78,7 +76,6 @@ class Measured:
     peak_vram_mib: float | None = None
     gpu: str = ""
     """Name of the GPU that rendered; empty for a CPU."""
-    commit: str = ""
     command: str = ""
 
     @property
@@ -100,39 +97,6 @@ class Measured:
     def has_head(self) -> bool:
         """Whether the field has an enabled head."""
         return len(self.configurations) > 1
-
-    def row(self) -> RunRow:
-        """The measurements as a row of ``runs.csv``: ``psnr`` belongs to ``ms_frame``, ``psnr_base`` to ``ms_splat``."""
-        lpips = self.full.mean("lpips")
-        return RunRow(
-            scene=self.scene,
-            method=self.method,
-            variant=self.variant,
-            keep_ratio=self.keep_ratio,
-            seed=self.seed,
-            steps=self.steps,
-            primitives=self.primitives,
-            psnr=self.full.mean("psnr"),
-            ssim=self.full.mean("ssim"),
-            psnr_base=self.base.mean("psnr"),
-            ssim_base=self.base.mean("ssim"),
-            lpips=lpips,
-            lpips_net=self.lpips_net if lpips is not None else "",
-            bytes_primitives=self.bytes_primitives,
-            bytes_head=self.bytes_head,
-            bytes_total=self.bytes_total,
-            ms_frame=self.full.ms,
-            ms_splat=self.base.ms,
-            ms_head=self.ms_head,
-            train_s=self.train_s,
-            prune_s=self.prune_s,
-            peak_primitives=self.peak_primitives,
-            peak_vram_mib=self.peak_vram_mib,
-            gpu=self.gpu,
-            resolution=self.resolution,
-            commit=self.commit,
-            command=self.command,
-        )
 
     def as_json(self) -> dict[str, Any]:
         """All measurements, including those of each view, as plain values for JSON; numbers that are not finite become None."""

@@ -4,21 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from statistics import median
 
-import numpy as np
 import torch
 
 from sundae_ns.errors import ConfigError
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Wall-clock times of repeated calls, milliseconds."""
-
-    median_ms: float
-    p90_ms: float
-    """90th percentile."""
 
 
 def now(device: torch.device | str) -> float:
@@ -31,8 +21,8 @@ def now(device: torch.device | str) -> float:
     return time.perf_counter()
 
 
-def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: int = 5, repeats: int = 20) -> Timing:
-    """Time a function from its call until the device is idle again.
+def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: int = 5, repeats: int = 20) -> float:
+    """Median milliseconds of a function, from its call until the device is idle again.
 
     The host's clock is read after a synchronisation on both sides of the call, so the time includes launching the work.
 
@@ -54,4 +44,4 @@ def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: i
         start = now(device)
         fn()
         times.append(1e3 * (now(device) - start))
-    return Timing(float(np.median(times)), float(np.quantile(times, 0.9, method="higher")))
+    return median(times)

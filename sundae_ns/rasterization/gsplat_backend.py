@@ -13,7 +13,7 @@ from sundae_ns.rasterization.constants import constant
 from sundae_ns.rasterization.gsplat_harmonics import harmonics
 from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, tile_lists
 from sundae_ns.rasterization.reference import ReferenceBackend, largest_axis, strategy_info
-from sundae_ns.rasterization.types import Rasterization
+from sundae_ns.rasterization.types import Inputs, Rasterization
 
 _CHANNELS_PER_PASS = 32
 
@@ -31,66 +31,30 @@ class GsplatBackend:
     def __init__(self, capacity: Capacity | None = None) -> None:
         self._capacity = capacity
 
-    def rasterize(
-        self,
-        means: Tensor,  # [N, 3]
-        quats: Tensor,  # [N, 4]
-        scales: Tensor,  # [N, 3]
-        opacities: Tensor,  # [N]
-        colors: Tensor,  # [N, C]
-        viewmat: Tensor,  # [4, 4]
-        K: Tensor,  # [3, 3]
-        width: int,
-        height: int,
-        *,
-        near_plane: float,
-        far_plane: float,
-        antialiased: bool,
-        absgrad: bool,
-        render_depth: bool,
-    ) -> Rasterization:
-        """Render one view; see :func:`sundae_ns.rasterization.rasterize`.
+    def rasterize(self, inputs: Inputs) -> Rasterization:
+        """Render one view.
 
         Raises:
             BackendError: The tensors are not float32 on a CUDA device.
         """
         from gsplat import rasterize_to_pixels
 
-        _check_kernels_take(means)
-        if means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
-            return ReferenceBackend().rasterize(
-                means,
-                quats,
-                scales,
-                opacities,
-                colors,
-                viewmat,
-                K,
-                width,
-                height,
-                near_plane=near_plane,
-                far_plane=far_plane,
-                antialiased=antialiased,
-                absgrad=absgrad,
-                render_depth=render_depth,
-            )
+        _check_kernels_take(inputs.means)
+        if inputs.means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
+            return ReferenceBackend().rasterize(inputs)
+        width, height = inputs.width, inputs.height
         radii, means2d, depths, conics, seen_opacities = project(
-            means,
-            quats,
-            scales,
-            opacities,
-            viewmat,
-            K,
-            width,
-            height,
-            near_plane=near_plane,
-            far_plane=far_plane,
-            antialiased=antialiased,
+            *(inputs.means, inputs.quats, inputs.scales, inputs.opacities, inputs.viewmat, inputs.K, width, height),
+            near_plane=inputs.near_plane,
+            far_plane=inputs.far_plane,
+            antialiased=inputs.antialiased,
         )
         starts, primitives = self._lists(means2d, conics, seen_opacities, depths, radii, width, height)
-        channels = torch.cat([colors, depths[0, :, None]], dim=1) if render_depth else colors
+        channels = inputs.colors
+        if inputs.render_depth:
+            channels = torch.cat([channels, depths[0, :, None]], dim=1)
         # Each pass overwrites absgrad with that of its own channels, so absgrad allows one pass only.
-        passes = [channels] if absgrad else channels.split(_CHANNELS_PER_PASS, dim=1)
+        passes = [channels] if inputs.absgrad else channels.split(_CHANNELS_PER_PASS, dim=1)
         blended = [
             rasterize_to_pixels(
                 means2d,
@@ -102,14 +66,14 @@ class GsplatBackend:
                 TILE,
                 starts,
                 primitives,
-                absgrad=absgrad,
+                absgrad=inputs.absgrad,
             )
             for part in passes
         ]
         alpha = blended[0][1][0]
         image = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
         depth = None
-        if render_depth:
+        if inputs.render_depth:
             image, depth = image[..., :-1], image[..., -1:] / alpha.clamp(min=1e-10)
         return Rasterization(
             colors=image,

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.rasterization.constants import constant
-from sundae_ns.rasterization.types import Backend, Rasterization
+from sundae_ns.rasterization.types import Backend, Inputs, Rasterization
 
 MAX_SH_DEGREE = 4
 
@@ -66,20 +66,12 @@ def rasterize(
         raise DataError(f"colors has shape {list(colors.shape)}; pass [{n}, C] with at least one channel")
     _check_alike("means", means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmat=viewmat, K=K)
     return backend.rasterize(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        viewmat,
-        K,
-        width,
-        height,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        antialiased=antialiased,
-        absgrad=absgrad,
-        render_depth=render_depth,
+        Inputs(
+            *(means, quats, scales, opacities, colors, viewmat, K, width, height, near_plane, far_plane),
+            antialiased=antialiased,
+            absgrad=absgrad,
+            render_depth=render_depth,
+        )
     )
 
 

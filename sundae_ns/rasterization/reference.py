@@ -14,7 +14,7 @@ from sundae_ns.rasterization.compositing import composite
 from sundae_ns.rasterization.harmonics import evaluate_harmonics
 from sundae_ns.rasterization.projection import Projection, project
 from sundae_ns.rasterization.tiles import build_tile_lists
-from sundae_ns.rasterization.types import Rasterization
+from sundae_ns.rasterization.types import Inputs, Rasterization
 
 _SMALLEST_ALPHA = 1e-10  # lower bound of the divisor of depths; the alpha of any blended pixel is larger
 
@@ -27,35 +27,25 @@ class ReferenceBackend:
     _build_lists: ClassVar[Callable[..., Any]] = staticmethod(build_tile_lists)
     _composite: ClassVar[Callable[..., tuple[Tensor, Tensor]]] = staticmethod(composite)
 
-    def rasterize(
-        self,
-        means: Tensor,  # [N, 3]
-        quats: Tensor,  # [N, 4]
-        scales: Tensor,  # [N, 3]
-        opacities: Tensor,  # [N]
-        colors: Tensor,  # [N, C]
-        viewmat: Tensor,  # [4, 4]
-        K: Tensor,  # [3, 3]
-        width: int,
-        height: int,
-        *,
-        near_plane: float,
-        far_plane: float,
-        antialiased: bool,
-        absgrad: bool,
-        render_depth: bool,
-    ) -> Rasterization:
-        """Render one view; see :func:`sundae_ns.rasterization.rasterize`."""
-        projection = self._project(means, quats, scales, viewmat, K, width, height, near_plane, far_plane)
-        if antialiased:
+    def rasterize(self, inputs: Inputs) -> Rasterization:
+        """Render one view."""
+        width, height = inputs.width, inputs.height
+        opacities, colors = inputs.opacities, inputs.colors
+        projection = self._project(
+            *(inputs.means, inputs.quats, inputs.scales, inputs.viewmat, inputs.K, width, height),
+            *(inputs.near_plane, inputs.far_plane),
+        )
+        if inputs.antialiased:
             opacities = opacities * projection.compensations
-        if render_depth:
+        if inputs.render_depth:
             colors = torch.cat([colors, projection.depths[:, None]], dim=-1)
         means2d = projection.means2d[None]
         lists = self._build_lists(projection, opacities, width, height)
-        image, alpha = self._composite(means2d, projection.conics, opacities, colors, lists, width, height, absgrad)
+        image, alpha = self._composite(
+            means2d, projection.conics, opacities, colors, lists, width, height, inputs.absgrad
+        )
         depth = None
-        if render_depth:
+        if inputs.render_depth:
             image, depth = image[..., :-1], image[..., -1:] / alpha.clamp(min=_SMALLEST_ALPHA)
         radii = projection.radii
         return Rasterization(

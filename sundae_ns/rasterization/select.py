@@ -9,6 +9,7 @@ import torch
 
 from sundae_ns.errors import BackendError, ConfigError
 from sundae_ns.rasterization.gsplat_backend import GsplatBackend
+from sundae_ns.rasterization.interface import rasterize
 from sundae_ns.rasterization.reference import ReferenceBackend
 from sundae_ns.rasterization.types import Backend
 
@@ -57,22 +58,8 @@ def numba_problem() -> str | None:
     """
     try:
         ones = torch.ones(1, 4)
-        _cpu_backend().rasterize(
-            ones[:, :3],
-            ones,
-            ones[:, :3],
-            ones[:, 0],
-            ones[:, :1],
-            torch.eye(4),
-            torch.eye(3),
-            1,
-            1,
-            near_plane=0.01,
-            far_plane=1e10,
-            antialiased=False,
-            absgrad=False,
-            render_depth=False,
-        )
+        camera = (torch.eye(4), torch.eye(3), 1, 1)
+        rasterize(ones[:, :3], ones, ones[:, :3], ones[:, 0], ones[:, :1], *camera, backend=_cpu_backend())
     except ImportError as error:
         return f"numba does not import ({_first_line(error)}); pip install numba"
     except Exception as error:  # versions, processors and settings that numba refuses raise errors of many kinds

@@ -1,4 +1,4 @@
-"""The result of a rasterisation, and the protocol of a backend."""
+"""Arguments and result of a rasterisation, and the protocol of a backend."""
 
 from __future__ import annotations
 
@@ -6,6 +6,26 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Arguments of :func:`sundae_ns.rasterization.rasterize`, checked."""
+
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4]
+    scales: Tensor  # [N, 3]
+    opacities: Tensor  # [N]
+    colors: Tensor  # [N, C]
+    viewmat: Tensor  # [4, 4]
+    K: Tensor  # [3, 3]
+    width: int
+    height: int
+    near_plane: float
+    far_plane: float
+    antialiased: bool
+    absgrad: bool
+    render_depth: bool
 
 
 @dataclass(frozen=True)
@@ -40,25 +60,8 @@ class Backend(Protocol):
     def name(self) -> str:
         """``"gsplat"``, ``"cpu"`` or ``"reference"``."""
 
-    def rasterize(
-        self,
-        means: Tensor,  # [N, 3]
-        quats: Tensor,  # [N, 4]
-        scales: Tensor,  # [N, 3]
-        opacities: Tensor,  # [N]
-        colors: Tensor,  # [N, C]
-        viewmat: Tensor,  # [4, 4]
-        K: Tensor,  # [3, 3]
-        width: int,
-        height: int,
-        *,
-        near_plane: float,
-        far_plane: float,
-        antialiased: bool,
-        absgrad: bool,
-        render_depth: bool,
-    ) -> Rasterization:
-        """Render one view; see :func:`sundae_ns.rasterization.rasterize`."""
+    def rasterize(self, inputs: Inputs) -> Rasterization:
+        """Render one view."""
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""

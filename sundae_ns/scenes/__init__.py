@@ -1,1 +1,1 @@
-"""Finished scenes: opening, packing, fine-tuning and measuring them. Floor 8."""
+"""Finished scenes: opening, packing, fine-tuning and measuring them."""

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -77,7 +74,7 @@ def frame_times(model: SundaeModel, cameras: Sequence[Cameras], *, warmup: int =
     background = model._get_background_color()
 
     def milliseconds(fn: Callable[[], object]) -> float:
-        return median_ms(fn, device=model.device, warmup=warmup, repeats=repeats).median_ms
+        return median_ms(fn, device=model.device, warmup=warmup, repeats=repeats)
 
     def show(camera: Cameras) -> Tensor:
         return model.get_outputs_for_camera(camera)["rgb"]
@@ -108,95 +105,44 @@ def sizes(model: SundaeModel) -> Sizes:
     return Sizes(bytes_of(dict(model.gauss_params)), 0 if model.head is None else bytes_of_module(model.head))
 
 
-@dataclass(frozen=True)
-class FrameFigures:
-    """Speed of a configuration beside its error; means over the test views."""
-
-    width: int
-    height: int
-    """Size of the first image, pixels."""
-    precision: str
-    """Arithmetic of the head."""
-    phases: int
-    """Runs of the head for a frame."""
-    views: int
-    ms_frame: float
-    ms_splat: float
-    ms_head: float
-    psnr: float
-    ssim: float
-    psnr_base: float
-    ssim_base: float
-
-
-@torch.no_grad()
-def frame_figures(
-    run: Opened,
-    *,
-    factor: float = 1.0,
-    precision: str | None = None,
-    phases: int | None = None,
-    warmup: int = 3,
-    repeats: int = 5,
-) -> FrameFigures:
-    """Time the frames of a run at a size, and compare the same frames with the resized truth.
+@contextmanager
+def rendered_as(
+    run: Opened, *, factor: float = 1.0, precision: str | None = None, phases: int | None = None
+) -> Iterator[Opened]:
+    """The run with images of another size, and inside the block with another arithmetic of its head.
 
     Args:
         run: a finished run.
-        factor: factor on the sides of the images.
+        factor: factor on the sides of the images; the truths are resized alike.
         precision: of the head, one of ``PRECISIONS``; by default the run's own, and fp32 on a CPU.
         phases: runs of the head for a frame, one of ``PHASES``; by default the run's own.
-        warmup, repeats: as for :func:`frame_times`.
 
     Raises:
-        ConfigError: the factor is not above zero or too large, or phases are not of :data:`PHASES`.
+        ConfigError: the factor is not above zero or too large, or phases are not of ``PHASES``.
         BackendError: half precision is asked for on a CPU.
     """
-    model = run.model
+    head, on_cpu = run.model.head, run.model.device.type == "cpu"
     if not 0 < factor < MOST_ZOOM:
         raise ConfigError(f"images cannot be {factor} times as large; give a factor above 0 and below {MOST_ZOOM}")
-    on_cpu = model.device.type == "cpu"
-    precision = precision or ("fp32" if on_cpu or model.head is None else model.head.config.precision)
-    if on_cpu and precision != "fp32":
+    if on_cpu and precision not in (None, "fp32"):
         raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
-    phases = phases or (1 if model.head is None else model.head.config.phases)
-    cameras = [zoomed(camera, factor) for camera in run.cameras]
-    with _head_as(model, precision=precision, phases=phases):
-        times = frame_times(model, cameras, warmup=warmup, repeats=repeats)
-        errors = dict.fromkeys(("psnr", "ssim", "psnr_base", "ssim_base"), 0.0)
-        for camera, truth in zip(cameras, run.truths, strict=True):
-            outputs = model.get_outputs_for_camera(camera)
-            height, width = outputs["rgb"].shape[:2]
-            target = truth if truth.shape[:2] == (height, width) else resize(truth, height, width)
-            for suffix, image in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
-                errors["psnr" + suffix] += float(psnr(image, target)) / len(cameras)
-                errors["ssim" + suffix] += float(ssim(image, target)) / len(cameras)
-    return FrameFigures(
-        width=int(cameras[0].width),
-        height=int(cameras[0].height),
-        precision=precision,
-        phases=phases,
-        views=len(cameras),
-        ms_frame=times.frame,
-        ms_splat=times.splat,
-        ms_head=times.head,
-        **errors,
-    )
-
-
-@contextmanager
-def _head_as(model: SundaeModel, **changes: Any) -> Iterator[None]:
-    if model.head is None:
-        yield
+    cameras, truths = [zoomed(camera, factor) for camera in run.cameras], []
+    for camera, truth in zip(cameras, run.truths, strict=True):
+        size = int(camera.height), int(camera.width)
+        truths.append(truth if truth.shape[:2] == size else resize(truth, *size))
+    resized = replace(run, cameras=cameras, truths=truths)
+    if head is None:
+        yield resized
         return
-    before = model.head.config
-    changed = replace(before, **changes)
+    before: Any = head.config
+    precision = precision or ("fp32" if on_cpu else before.precision)
+    changed = replace(before, precision=precision, phases=phases or before.phases)
     changed.validate()
-    model.head.config = changed
+    head.config = changed
     try:
-        yield
+        yield resized
     finally:
-        model.head.config = before
+        head.config = before
 
 
 @torch.no_grad()
@@ -205,6 +151,7 @@ def measure_scene(
     *,
     label: str,
     lpips: Lpips | None = None,
+    with_flip: bool = True,
     warmup: int = 3,
     repeats: int = 5,
     progress: Callable[[], object] | None = None,
@@ -218,6 +165,7 @@ def measure_scene(
         opened: the scene.
         label: its name in tables.
         lpips: LPIPS; None leaves it out.
+        with_flip: whether to compute FLIP, which takes about a second per image, if its package is installed.
         warmup: untimed renders of each view.
         repeats: timed renders of each view; 0 leaves times out.
         progress: called after each view.
@@ -232,7 +180,7 @@ def measure_scene(
         for name, on in ways.items():
             with compensation(model, on):
                 image = model.get_outputs_for_camera(camera)["rgb"]
-            views[name].append(quality(image, truth, lpips))
+            views[name].append(quality(image, truth, lpips, with_flip=with_flip))
         if repeats:
             found = frame_times(model, [camera], warmup=warmup, repeats=repeats)
             for name, on in ways.items():
@@ -268,14 +216,13 @@ def measure_scene(
         prune_s=opened.prune_s,
         peak_primitives=model.state.pruning["peak"] or None,
         gpu=torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "",
-        commit=revision(),
         command=command,
     )
 
 
-def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None) -> ViewQuality:
+def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None, *, with_flip: bool = True) -> ViewQuality:
     """Every metric of one image ``[H, W, 3]`` against its truth."""
-    errors = (flip(image, truth), None if lpips is None else lpips(image, truth))
+    errors = (flip(image, truth) if with_flip else None, None if lpips is None else lpips(image, truth))
     return ViewQuality(
         float(psnr(image, truth)), float(ssim(image, truth)), *(None if e is None else float(e) for e in errors)
     )
@@ -286,22 +233,6 @@ def comparison_of(opened: Opened, index: int) -> ComparisonRow:
     """Ground truth, base colours and complete rendering of one test view."""
     outputs = opened.model.get_outputs_for_camera(opened.cameras[index])
     return ComparisonRow(opened.truths[index], outputs["base_rgb"], outputs["rgb"])
-
-
-def revision() -> str:
-    """Commit of the running checkout, or ``BENCHMARK_COMMIT`` for a tree that was copied without git; empty if unknown."""
-    told = os.environ.get("BENCHMARK_COMMIT")
-    if told:
-        return told
-    folder = Path(__file__).parent
-    # An installed package may lie inside another repository.
-    if not (folder.parent / ".git").exists():
-        return ""
-    command = ["git", "-C", str(folder), "rev-parse", "--short", "HEAD"]
-    try:
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return ""
 
 
 def _resolution(cameras: Sequence[Cameras]) -> str:

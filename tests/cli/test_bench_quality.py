@@ -13,17 +13,17 @@ from typing import Any
 
 import pytest
 import tyro
+from csv_rows import read_rows
 from rich.console import Console
 
-from sundae_ns.cli.bench.arms import Lengths, choose_arms
+from sundae_ns.cli.bench.arms import choose_arms
 from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
-from sundae_ns.cli.bench.paper import PAPER_SCENES, find_scene
+from sundae_ns.cli.bench.paper import DATASETS, PRINTED, find_scene
 from sundae_ns.cli.bench.plan import Arm, Job, done_file, jobs_of_shard, parser_of, plan_scene
 from sundae_ns.cli.bench.quality import run_paper, run_quality
 from sundae_ns.cli.bench.results import read_results, spread
 from sundae_ns.errors import ConfigError, DataError, SundaeError
-from sundae_ns.evaluation import COLUMNS, HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality, read_rows
-from sundae_ns.evaluation.published import RESOLUTIONS
+from sundae_ns.evaluation import COLUMNS, HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality
 
 PSNR = {"sundae-warm-up": 24.0, "sundae": 27.0, "random": 25.0, "mcmc": 26.0, "splatfacto": 28.0}
 
@@ -83,7 +83,7 @@ def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[i
     text = StringIO()
     options: dict[str, Any] = {"arms": ("sundae", "random-no-head", "mcmc", "splatfacto"), **changed}
     console = Console(file=text, width=200, force_terminal=False)
-    code = run_quality(QualityOptions(capture, out, **options), runner=runner, console=console)
+    code = run_quality(QualityOptions(scene=capture, out=out, **options), runner=runner, console=console)
     return code, text.getvalue()
 
 
@@ -93,12 +93,10 @@ def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[i
 @pytest.mark.parametrize(
     "options",
     [
-        QualityOptions(Path("a b"), Path("out")),
-        QualityOptions(
-            Path("a"), Path("o"), arms=("random", "my arms.yaml"), warmup_steps=7, steps_scale=0.5, downscale=4
-        ),
-        PaperOptions(Path("a b"), Path("out")),
-        PaperOptions(Path("a"), Path("o"), scenes=("garden", "room"), seed=1, finetune_steps=9, method="sundae-tiny"),
+        QualityOptions(scene=Path("a b"), out=Path("out")),
+        QualityOptions(scene=Path("a"), out=Path("o"), arms=("random", "my arms.yaml"), steps_scale=0.5, downscale=4),
+        PaperOptions(root=Path("a b"), out=Path("out")),
+        PaperOptions(root=Path("a"), out=Path("o"), scenes=("garden", "room"), seed=1, method="sundae-tiny"),
     ],
 )
 def test_a_page_names_the_command_of_the_whole(options: QualityOptions | PaperOptions) -> None:
@@ -115,7 +113,7 @@ def test_a_page_names_the_command_of_the_whole(options: QualityOptions | PaperOp
 @pytest.fixture(scope="module")
 def arms() -> list[Arm]:
     """All default arms."""
-    return choose_arms([], "sundae", Lengths())
+    return choose_arms([], "sundae")
 
 
 def plan(arms: list[Arm], **changed: Any) -> list[Job]:
@@ -160,13 +158,19 @@ def test_arms_differ_in_their_rule_alone(arms: list[Arm]) -> None:
 @pytest.mark.parametrize("parts", [1, 2, 5, 40])
 def test_shards_divide_the_jobs_and_bring_the_warm_ups_they_need(parts: int, arms: list[Arm]) -> None:
     jobs = plan(arms)
-    shards = [jobs_of_shard(jobs, index, parts) for index in range(parts)]
+    shards = [jobs_of_shard(jobs, f"{index}/{parts}") for index in range(1, parts + 1)]
     dealt = sorted(job.key for shard in shards for job in shard if job.kind != "warm-up")
     assert dealt == sorted(job.key for job in jobs if job.kind != "warm-up")
     for shard in shards:
         keys = [job.key for job in shard]
         assert all(job.needs is None or keys.index(job.needs) < keys.index(job.key) for job in shard)
         assert all(any(other.needs == job.key for other in shard) for job in shard if job.kind == "warm-up")
+
+
+@pytest.mark.parametrize("shard", ["0/2", "3/2", "1", "a/b", "1/2/3", ""])
+def test_shards_that_cannot_be(shard: str) -> None:
+    with pytest.raises(ConfigError, match="i/n"):
+        jobs_of_shard([], shard)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +215,7 @@ def test_stopped_and_continued(capture: Path, tmp_path: Path) -> None:
 def test_the_page_has_mean_and_spread_beside_each_ways_own_time(capture: Path, tmp_path: Path) -> None:
     quality(capture, tmp_path / "out", Runner())
     page = (tmp_path / "out" / "table.md").read_text()
-    assert "--keep-ratios 0.01 0.1 --seeds 42 43 44 --repeat-at 0.1 --method sundae" in page
+    assert "--keep-ratios 0.01 0.1 --seeds 42 43 44 --repeat-at 0.1" in page
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| sun")]
     by_way = {(line[1], line[2]): line for line in lines}
     on, off = by_way["head on", "10%"], by_way["head off", "10%"]
@@ -263,7 +267,7 @@ def test_a_job_that_fails_stops_only_what_needs_it(capture: Path, tmp_path: Path
 def test_another_plan_does_not_pass_for_this_one(capture: Path, tmp_path: Path) -> None:
     quality(capture, tmp_path / "out", Runner())
     with pytest.raises(ConfigError, match="steps"):
-        quality(capture, tmp_path / "out", Runner(), finetune_steps=100)
+        quality(capture, tmp_path / "out", Runner(), steps_scale=0.5)
 
 
 def test_damaged_results_are_refused(capture: Path, tmp_path: Path) -> None:
@@ -292,11 +296,10 @@ def scene_folder(folder: Path, *pictures: str) -> None:
 @pytest.fixture
 def archives(tmp_path: Path) -> Path:
     """Empty folders, laid out as the archives unpack."""
-    for paper_scene in PAPER_SCENES:
-        parent = {"Mip-NeRF 360": "360_v2", "Tanks and Temples": "tandt_db/tandt", "Deep Blending": "tandt_db/db"}
-        scene_folder(
-            tmp_path / "data" / parent[paper_scene.dataset] / paper_scene.scene, "images", "images_2", "images_4"
-        )
+    parents = {"Mip-NeRF 360": "360_v2", "Tanks and Temples": "tandt_db/tandt", "Deep Blending": "tandt_db/db"}
+    for dataset, scenes in DATASETS.items():
+        for scene in scenes:
+            scene_folder(tmp_path / "data" / parents[dataset] / scene, "images", "images_2", "images_4")
     return tmp_path / "data"
 
 
@@ -304,7 +307,7 @@ def paper(root: Path, out: Path, runner: Runner, **changed: Any) -> tuple[int, s
     text = StringIO()
     options: dict[str, Any] = {"arms": ("sundae", "splatfacto"), **changed}
     console = Console(file=text, width=200, force_terminal=False)
-    return run_paper(PaperOptions(root, out, **options), runner=runner, console=console), text.getvalue()
+    return run_paper(PaperOptions(root=root, out=out, **options), runner=runner, console=console), text.getvalue()
 
 
 def cells_of(page: str, first: str) -> list[str]:
@@ -315,10 +318,10 @@ def cells_of(page: str, first: str) -> list[str]:
 
 
 def test_scenes_are_the_papers_eleven_at_its_resolutions() -> None:
-    assert len(PAPER_SCENES) == 11
-    factors = {paper_scene.scene: paper_scene.downscale for paper_scene in PAPER_SCENES}
+    factors = {scene: factor for members in DATASETS.values() for scene, factor in members.items()}
+    assert len(factors) == 11
     assert (factors["bicycle"], factors["counter"], factors["truck"], factors["playroom"]) == (4, 2, 1, 1)
-    assert set(RESOLUTIONS) <= set(factors)
+    assert set(PRINTED) <= {*factors, *DATASETS}
 
 
 def test_all_scenes_into_one_table_beside_the_papers(archives: Path, tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 from sundae_ns.evaluation import Measured
 from sundae_ns.evaluation.document import document, number
-from sundae_ns.evaluation.published import NOTE, printed_of
 
 
 def lines_of(text: str, start: str) -> list[list[str]]:
@@ -16,7 +15,7 @@ def lines_of(text: str, start: str) -> list[list[str]]:
 
 def test_each_configuration_has_a_row(measured: Callable[..., Measured]) -> None:
     own = [measured("ours"), measured("theirs", head=False)]
-    text = document({"bicycle": own}, {}, {"bicycle": [("A plot", "a.png")]}, ["this and that"], "sundae report x")
+    text = document({"bicycle": own}, {"bicycle": [("A plot", "a.png")]}, ["this and that"], "sundae report x")
     assert lines_of(text, "| ours")[0] == ["ours", "head on", "4,000", "3.00", "3.50", "25.50", "0.8500", "0.2000", "-"]
     assert lines_of(text, "| ours")[1] == [
         "ours",
@@ -33,21 +32,13 @@ def test_each_configuration_has_a_row(measured: Callable[..., Measured]) -> None
     assert "![A plot](a.png)" in text
     assert "- this and that" in text
     assert "    sundae report x" in text
-    assert NOTE not in text
-
-
-def test_printed_rows_are_marked(measured: Callable[..., Measured]) -> None:
-    printed = {"bicycle": printed_of("bicycle", "1237x822")}
-    text = document({"bicycle": [measured()]}, printed, {}, [], "")
-    assert NOTE in text
-    assert lines_of(text, "| 10%")[0] == ["10%", "24.36", "0.692", "0.321", "23.93", "141.0", "-"]
 
 
 def test_lpips_names_its_net(measured: Callable[..., Measured]) -> None:
     run = measured(head=False)
     views = tuple(replace(view, lpips=0.25) for view in run.full.views)
     run = replace(run, lpips_net="vgg", configurations=(replace(run.full, views=views),))
-    text = document({"a": [run]}, {}, {}, [], "")
+    text = document({"a": [run]}, {}, [], "")
     assert "LPIPS (vgg)" in text
     assert "0.2500" in text
 

@@ -1,28 +1,38 @@
 from __future__ import annotations
 
+import csv
 import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from io import StringIO
 
 import pytest
 
-from sundae_ns.evaluation import Configuration, Measured, ViewQuality
+from sundae_ns.evaluation import COLUMNS, Configuration, Measured, ViewQuality, csv_text
+
+
+def row_of(run: Measured) -> dict[str, str]:
+    header, row = csv.reader(StringIO(csv_text([run.as_json()])))
+    assert tuple(header) == COLUMNS
+    return dict(zip(header, row, strict=True))
 
 
 def test_a_row_pairs_each_time_with_the_quality_of_its_configuration(measured: Callable[..., Measured]) -> None:
-    row = measured().row()
-    assert (row.ms_frame, row.psnr) == (3.5, pytest.approx(25.5))
-    assert (row.ms_splat, row.psnr_base) == (2.0, pytest.approx(25.0))
-    assert (row.ssim, row.ssim_base) == (pytest.approx(0.85), pytest.approx(0.8))
-    assert (row.bytes_primitives, row.bytes_head, row.bytes_total) == (2_000_000, 1_000_000, 3_000_000)
+    row = row_of(replace(measured(), command='sundae report "a, b"', seed=None))
+    assert (row["ms_frame"], float(row["psnr"])) == ("3.5", pytest.approx(25.5))
+    assert (row["ms_splat"], float(row["psnr_base"])) == ("2.0", pytest.approx(25.0))
+    assert (float(row["ssim"]), float(row["ssim_base"])) == (pytest.approx(0.85), pytest.approx(0.8))
+    assert (row["bytes_primitives"], row["bytes_head"], row["bytes_total"]) == ("2000000", "1000000", "3000000")
+    assert (row["scene"], row["keep_ratio"], row["seed"]) == ("bicycle", "0.1", "")
+    assert row["command"] == 'sundae report "a, b"'
 
 
 def test_without_a_head_full_and_base_are_the_same(measured: Callable[..., Measured]) -> None:
     run = measured(head=False)
     assert not run.has_head
-    row = run.row()
-    assert (row.psnr, row.ms_frame) == (row.psnr_base, row.ms_splat) == (pytest.approx(25.0), 2.0)
+    row = row_of(run)
+    assert (row["psnr"], row["ms_frame"]) == (row["psnr_base"], row["ms_splat"]) == ("25.0", "2.0")
 
 
 def test_a_mean_needs_all_views() -> None:
@@ -36,10 +46,11 @@ def test_a_mean_needs_all_views() -> None:
 
 def test_the_net_is_named_only_if_lpips_was_measured(measured: Callable[..., Measured]) -> None:
     run = replace(measured(head=False), lpips_net="alex")
-    assert run.row().lpips_net == ""
+    assert row_of(run)["lpips_net"] == ""
     views = tuple(replace(view, lpips=0.3) for view in run.full.views)
     run = replace(run, configurations=(replace(run.full, views=views),))
-    assert (run.row().lpips, run.row().lpips_net) == (pytest.approx(0.3), "alex")
+    row = row_of(run)
+    assert (float(row["lpips"]), row["lpips_net"]) == (pytest.approx(0.3), "alex")
 
 
 def test_json_has_no_nan(measured: Callable[..., Measured]) -> None:

@@ -1,20 +1,12 @@
-from dataclasses import replace
+from sundae_ns.evaluation import report_text
 
-from sundae_ns.evaluation import Quality, RunFigures, report_text
-
-FIGURES = RunFigures(
-    primitives_before=20_000,
-    primitives_after=2_000,
-    warm_up=Quality(27.126, 0.91234, 0.1),
-    after_prune=Quality(12.3, 0.4),
-    base=Quality(25.0, 0.85),
-    compensated=Quality(26.0, float("nan")),
-    bytes_primitives=472_000,
-    bytes_head=123_456,
-    ms_frame=12.5,
-    ms_splat=10.0,
-    ms_head=2.5,
+STAGES = (
+    ("warm-up", 20_000, {"psnr": 27.126, "ssim": 0.91234, "lpips": 0.1, "other": 7.0}),
+    ("after the prune", 2_000, {"psnr": 12.3, "ssim": 0.4}),
+    ("final, base colours", 2_000, {"psnr": 25.0, "ssim": 0.85}),
+    ("final, compensated", 2_000, {"psnr": 26.0, "ssim": float("nan")}),
 )
+SIZES, TIMES = (472_000, 123_456), (10.0, 2.5, 12.5)
 
 
 def _cells(text, row):
@@ -23,7 +15,7 @@ def _cells(text, row):
 
 
 def test_each_number_is_in_its_cell():
-    text = report_text(FIGURES)
+    text = report_text("A run", STAGES, SIZES, TIMES)
     assert _cells(text, "warm-up") == ["20,000", "27.13", "0.9123", "0.1000"]
     assert _cells(text, "after the prune") == ["2,000", "12.30", "0.4000", "-"]
     assert _cells(text, "base colours") == ["2,000", "25.00", "0.8500", "-"]
@@ -34,10 +26,9 @@ def test_each_number_is_in_its_cell():
 
 
 def test_skipped_stages_are_left_out():
-    text = report_text(replace(FIGURES, compensated=None, ms_frame=None, ms_splat=None, ms_head=None))
-    assert "compensated" not in text
-    assert "time" not in text
+    stages = (*STAGES[:1], ("after the prune", 2_000, None), *STAGES[2:])
+    assert "after the prune" not in report_text("A run", stages, SIZES, TIMES)
 
 
 def test_width_is_kept():
-    assert all(len(line) <= 60 for line in report_text(FIGURES, width=60).splitlines())
+    assert all(len(line) <= 60 for line in report_text("A run", STAGES, SIZES, TIMES, width=60).splitlines())

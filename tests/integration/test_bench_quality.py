@@ -11,19 +11,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from csv_rows import read_rows
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sundae_ns.cli import main
-from sundae_ns.cli.bench.arms import Lengths, choose_arms
+from sundae_ns.cli.bench.arms import choose_arms
 from sundae_ns.cli.bench.job import perform
 from sundae_ns.cli.bench.options import PaperOptions
 from sundae_ns.cli.bench.plan import Job, parser_of, plan_scene
 from sundae_ns.cli.bench.quality import run_paper
-from sundae_ns.evaluation import read_rows
 from sundae_ns.scenes.opening import open_scene
 
-WARMUP, FINETUNE = 12, 8
+SCALE, WARMUP = 0.02, 12
 WARM_UP = "sundae-tiny-warm-up"
 
 
@@ -38,7 +38,7 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, capsys: pytest.Capture
         tiny.scene.name,
         tiny.scene.resolve(),
         parser_of(tiny.scene),
-        choose_arms(arms, "sundae-tiny", Lengths(WARMUP, FINETUNE)),
+        choose_arms(arms, "sundae-tiny", SCALE),
         keep_ratios=[0.5],
         seeds=[42],
         repeat_at=[0.5],
@@ -54,7 +54,7 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, capsys: pytest.Capture
     stamps = {path: path.stat().st_mtime_ns for path in (out / "done").iterdir()}
     assert len(stamps) == 3
 
-    options = ["--method", "sundae-tiny", "--warmup-steps", WARMUP, "--finetune-steps", FINETUNE, "--seeds", 42]
+    options = ["--method", "sundae-tiny", "--steps-scale", SCALE, "--seeds", 42]
     options += ["--keep-ratios", 0.5, "--repeat-at", 0.5, "--arms", *arms]
     with pytest.raises(SystemExit) as caught:
         main([str(word) for word in ("bench", "quality", tiny.scene, "-o", out, *options)])
@@ -108,13 +108,12 @@ def test_a_scene_as_it_is_published(tiny: Any, tmp_path: Path) -> None:
     published(tiny.scene, tmp_path / "360_v2" / "bicycle", factor=4)
     published(tiny.scene, tmp_path / "360_v2" / "counter", factor=2)
     options = PaperOptions(
-        tmp_path,
-        tmp_path / "out",
+        root=tmp_path,
+        out=tmp_path / "out",
         arms=("sundae",),
         keep_ratios=(0.5,),
         method="sundae-tiny",
-        warmup_steps=WARMUP,
-        finetune_steps=FINETUNE,
+        steps_scale=SCALE,
     )
     code = run_paper(options, runner=in_process)
     assert code == 0

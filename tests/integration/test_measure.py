@@ -18,10 +18,15 @@ from nerfstudio.configs.method_configs import method_configs
 from sundae_ns.cli import main
 from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
-from sundae_ns.evaluation import psnr
+from sundae_ns.evaluation import Measured, psnr
 from sundae_ns.rendering import render, zoomed
-from sundae_ns.scenes.measure import compensation, frame_figures, frame_times, sizes
-from sundae_ns.scenes.opening import load_run
+from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, rendered_as, sizes
+from sundae_ns.scenes.opening import Opened, load_run
+
+
+def figures_of(run: Opened, factor: float = 1.0) -> Measured:
+    with rendered_as(run, factor=factor) as shown:
+        return measure_scene(shown, label="", warmup=0, repeats=1)
 
 
 def test_figures_of_a_run(tiny: Any) -> None:
@@ -42,19 +47,19 @@ def test_figures_of_a_run(tiny: Any) -> None:
 def test_the_timed_frames_are_those_compared_with_the_truth(tiny: Any) -> None:
     run = load_run(tiny.config)
     run = replace(run, cameras=run.cameras[:2], truths=run.truths[:2])
-    whole = frame_figures(run, warmup=0, repeats=1)
-    assert (whole.width, whole.height) == run.truths[0].shape[1::-1]
-    assert (whole.precision, whole.views) == ("fp32", 2)
-    assert min(whole.ms_frame, whole.ms_splat, whole.ms_head) > 0
+    whole = figures_of(run)
+    height, width = run.truths[0].shape[:2]
+    assert whole.resolution == f"{width}x{height}"
+    assert len(whole.full.views) == 2
+    assert min(whole.full.ms, whole.base.ms, whole.ms_head) > 0
     with torch.no_grad():
         shown = [run.model.get_outputs_for_camera(camera) for camera in run.cameras]
-    for name, found in (("rgb", whole.psnr), ("base_rgb", whole.psnr_base)):
+    for name, found in (("rgb", whole.full.mean("psnr")), ("base_rgb", whole.base.mean("psnr"))):
         expected = [float(psnr(image[name], truth)) for image, truth in zip(shown, run.truths, strict=True)]
         assert found == pytest.approx(sum(expected) / 2, abs=1e-4)
-    half = frame_figures(run, factor=0.5, warmup=0, repeats=1)
-    assert (half.width, half.height) == (whole.width // 2, whole.height // 2)
+    assert figures_of(run, 0.5).resolution == f"{width // 2}x{height // 2}"
     # The cameras of the run do not change.
-    assert int(run.cameras[0].width) == whole.width
+    assert int(run.cameras[0].width) == width
 
 
 @pytest.mark.parametrize("factor", [0.4, 1.3])
@@ -62,9 +67,9 @@ def test_the_timed_frames_are_those_compared_with_the_truth(tiny: Any) -> None:
 def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> None:
     run = load_run(tiny.config)
     model = run.model
-    found = frame_figures(run, factor=factor, warmup=0, repeats=1)
+    found = figures_of(run, factor)
     height, width = (round(factor * side) for side in run.truths[0].shape[:2])
-    assert (found.width, found.height) == (width, height)
+    assert found.resolution == f"{width}x{height}"
     assert width != pytest.approx(factor * run.truths[0].shape[1], abs=0.1)  # else nothing is rounded
     background, expected = model._get_background_color(), []
     settings = model.render_settings(training=False).without_head()
@@ -75,7 +80,7 @@ def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> N
         view = view._replace(K=K, width=width, height=height)
         shown, _ = render(model.source, view, background, settings, depth=False)
         expected.append(float(psnr(shown["base_rgb"], resize(truth, height, width))))
-    assert found.psnr_base == pytest.approx(sum(expected) / len(expected), abs=1e-3)
+    assert found.base.mean("psnr") == pytest.approx(sum(expected) / len(expected), abs=1e-3)
 
 
 @torch.no_grad()
@@ -136,8 +141,16 @@ def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path
     ],
 )
 def test_frames_that_cannot_be_measured(tiny: Any, options: dict[str, Any], error: type, match: str) -> None:
-    with pytest.raises(error, match=match):
-        frame_figures(load_run(tiny.config), **options)
+    with pytest.raises(error, match=match), rendered_as(load_run(tiny.config), **options):
+        pass
+
+
+def test_the_head_runs_as_asked_for_inside_a_block(tiny: Any) -> None:
+    run = load_run(tiny.config)
+    before = run.model.head.config
+    with rendered_as(run, phases=2):
+        assert run.model.head.config == replace(before, precision="fp32", phases=2)
+    assert run.model.head.config is before
 
 
 def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from csv_rows import read_rows
 from nerfstudio.configs.method_configs import method_configs
 
 from sundae_ns.cli import main
-from sundae_ns.evaluation import COLUMNS, flip_available, read_rows
+from sundae_ns.evaluation import COLUMNS, flip_available
 from sundae_ns.rendering import render
 from sundae_ns.scenes.measure import quality
 from sundae_ns.scenes.opening import open_scene
@@ -55,7 +56,7 @@ def report(tiny: Any, stock: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def test_files(report: Path, stock: Path) -> None:
     names = {path.name for path in report.iterdir()}
-    images = {"gain.png", "views.png", "curves.png", "errors-1.png", "errors-2.png"}
+    images = {"views.png", "curves.png", "errors-1.png", "errors-2.png"}
     images |= {f"quality-{cost}.png" for cost in ("size", "time", "primitives")}
     assert names == {"report.json", "report.csv", "report.md"} | images
     text = (report / "report.md").read_text()

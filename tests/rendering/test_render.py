@@ -61,19 +61,19 @@ def test_depth_is_splatted_when_it_is_looked_at(
     box = OrientedBox(torch.eye(3), torch.tensor([0.0, 0.0, 0.0]), torch.tensor([1.0, 1.0, 1.0]))
     view, background = model.view_of(camera()), model._get_background_color()
     rasterise, passes = model.backend.rasterize, []
-    monkeypatch.setattr(model.backend, "rasterize", lambda *a, **k: passes.append(k) or rasterise(*a, **k))
+    monkeypatch.setattr(model.backend, "rasterize", lambda inputs: passes.append(inputs) or rasterise(inputs))
     found = []
     for crop in (None, box):
         outputs = model.get_outputs_for_camera(camera(), crop)
         assert outputs["rgb"].shape[-1] == 3
-        assert [p["render_depth"] for p in passes] == [False]
+        assert [p.render_depth for p in passes] == [False]
         inside = slice(None) if crop is None else crop.within(model.means).squeeze(-1)
         part = LocalField(Field({k: v[inside] for k, v in model.state.field.items()}))
         images, _ = render(part, view, background, model.render_settings(training=False))
         seen = images["accumulation"] > 0
         passes.clear()
         found.append(outputs["depth"])
-        assert [p["render_depth"] for p in passes] == [True]
+        assert [p.render_depth for p in passes] == [True]
         torch.testing.assert_close(found[-1][seen], images["depth"][seen])
         passes.clear()
     assert not torch.equal(*found)

@@ -15,46 +15,6 @@ INLINE = tyro.conf.arg(name="")
 
 
 @app.command
-def graph(
-    points: int = 1_000_000,
-    neighbors: int = 16,
-    device: Literal["cpu", "cuda"] = "cpu",
-    distribution: Literal["field", "clusters", "duplicates", "uniform"] = "field",
-    field: Path | None = None,
-    reference: Literal["true", "false"] = "true",
-    repeats: int = 3,
-    seed: int = 0,
-    json: bool = False,
-) -> int:
-    """Time the neighbour graph and the high-pass response of positions; compare with scipy's cKDTree.
-
-    Args:
-        points: number of points to draw.
-        neighbors: neighbours of each point.
-        device: where to measure; the reference always runs on all cores of the CPU.
-        distribution: of the points; field is like a trained one, clusters and duplicates are hard for a search.
-        field: use the positions of this checkpoint or .ply instead of drawing points.
-        reference: false leaves cKDTree out, which is slow for many millions of points.
-        repeats: timed runs; their median counts.
-        seed: of the points.
-        json: print one line of JSON.
-    """
-    from sundae_ns.cli.bench.graph import run_graph
-
-    return run_graph(
-        points=points,
-        neighbors=neighbors,
-        device=device,
-        distribution=distribution,
-        field=field,
-        reference=reference == "true",
-        repeats=repeats,
-        seed=seed,
-        json=json,
-    )
-
-
-@app.command
 def quality(options: Annotated[QualityOptions, INLINE]) -> int:
     """Compare methods and options on one capture: train and evaluate each arm. Stopped, the same command resumes.
 
@@ -116,52 +76,6 @@ def frame(
 
     return run_frame(
         load_config, factors=factors, precisions=precisions, phases=phases, views=views, repeats=repeats, json=json
-    )
-
-
-@app.command
-def rasterizer(
-    counts: tuple[int, ...] = (100, 1000, 10_000, 100_000, 1_000_000),
-    rasterizers: tuple[Literal["auto", "gsplat", "cpu", "reference"], ...] = (),
-    dtypes: tuple[Literal["float32", "float64"], ...] = ("float32", "float64"),
-    size: tuple[int, int] = (640, 480),
-    channels: int = 16,
-    pixels: float = 2.0,
-    repeats: int = 20,
-    seed: int = 0,
-    shard: str = "1/1",
-    output: Path | None = None,
-    json: bool = False,
-) -> int:
-    """Time the rasterisers on random views, with their errors against the reference in float64.
-
-    Args:
-        counts: numbers of primitives.
-        rasterizers: to measure; by default all that run here. gsplat runs on CUDA, cpu on a CPU.
-        dtypes: precisions; gsplat has float32 only.
-        size: width and height of the image.
-        channels: number of blended values, without alpha.
-        pixels: standard deviation of a primitive on the screen.
-        repeats: timed runs; their median counts. Fewer if together they take longer than 20 s.
-        seed: of the views.
-        shard: i/n measures the i-th of n parts; their outputs are merged by concatenation.
-        output: append a line of JSON for every row to this file; rows in it are not measured again.
-        json: print one line of JSON for every row, instead of a table.
-    """
-    from sundae_ns.cli.bench.rasterizer import run_rasterizer
-
-    return run_rasterizer(
-        counts=counts,
-        rasterizers=rasterizers,
-        dtypes=dtypes,
-        size=size,
-        channels=channels,
-        pixels=pixels,
-        repeats=repeats,
-        seed=seed,
-        shard=shard,
-        output=output,
-        json=json,
     )
 
 

@@ -6,9 +6,8 @@ import contextlib
 import difflib
 import io
 import re
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,33 +39,19 @@ class Entry:
     options: Mapping[str, Words]
 
 
-@dataclass(frozen=True)
-class Lengths:
-    """Lengths of training that the command sets, in steps; None: the method's own."""
-
-    warmup: int | None = None
-    finetune: int | None = None
-    scale: float = 1.0
-    """Factor on all lengths."""
-
-    def scaled(self, steps: int) -> int:
-        """A length times the factor, at least 1."""
-        return max(round(steps * self.scale), 1)
-
-
-def choose_arms(words: Sequence[str], method: str, lengths: Lengths) -> list[Arm]:
+def choose_arms(words: Sequence[str], method: str, scale: float = 1.0) -> list[Arm]:
     """The arms that a command names, checked, with their lengths.
 
     Args:
         words: names of default arms and files of arms (``.yaml``); none for all default arms.
         method: method of this package that prunes once, for arms without a method.
-        lengths: lengths that the command sets.
+        scale: factor on all lengths of training.
 
     Raises:
         ConfigError: a file, an arm, a method, an option or a length that cannot work.
     """
-    if not lengths.scale > 0:
-        raise ConfigError(f"steps-scale is {lengths.scale}; give a positive factor, 0.01 for a trial")
+    if not scale > 0:
+        raise ConfigError(f"steps-scale is {scale}; give a positive factor, 0.01 for a trial")
     defaults = {entry.name: entry for entry in read_entries(DEFAULT_FILE)}
     entries: list[Entry] = []
     for word in words or defaults:
@@ -77,7 +62,7 @@ def choose_arms(words: Sequence[str], method: str, lengths: Lengths) -> list[Arm
         else:
             raise ConfigError(f"{word} is no arm; use some of {', '.join(defaults)}, or a file of arms (.yaml)")
     _refuse_duplicates((entry.name for entry in entries), "--arms")
-    return [_checked(entry, method, lengths) for entry in entries]
+    return [_checked(entry, method, scale) for entry in entries]
 
 
 # ----------------------------------------------------------------------------------------------------------------- files
@@ -119,27 +104,19 @@ def _entry(item: Any, where: str) -> Entry:
 
 
 def _read_options(given: Any, where: str) -> dict[str, Words]:
-    """Options by name, without the dashes: from a mapping, or from a list of ``name value``."""
-    pairs: list[tuple[str, Words]]
-    if isinstance(given, dict):
-        pairs = [(name, tuple(value) if isinstance(value, list) else (value,)) for name, value in given.items()]
-    elif isinstance(given, list) and all(isinstance(item, str) for item in given):
-        try:
-            split = [shlex.split(item) for item in given]
-        except ValueError as error:
-            raise ConfigError(f"{where} has an option with an open quote ({error}); close it") from error
-        pairs = [(words[0], tuple(words[1:])) for words in split if words]
-    else:
-        raise ConfigError(f"{where} has options that are neither a mapping nor a list of texts; write `name: value`")
-    for name, words in pairs:
+    """Options by name, without the dashes."""
+    if not isinstance(given, dict):
+        raise ConfigError(f"{where} has options that are no mapping; write `name: value`")
+    options: dict[str, Words] = {}
+    for written, value in given.items():
+        name = written.lstrip("-").replace("_", "-")
+        words = tuple(value) if isinstance(value, list) else (value,)
         if not words or not all(isinstance(word, str) for word in words):
             raise ConfigError(f"{where} has option {name} without a plain value; write `{name}: value`")
-    named = [(name.lstrip("-").replace("_", "-"), words) for name, words in pairs]
-    _refuse_duplicates((name for name, _ in named), f"{where}, options")
-    for name, _ in named:
         if name in _SET_BY_BENCH:
             raise ConfigError(f"{where} sets {name}, which the command sets itself; remove it")
-    return {name: tuple(_FLAGS.get(word, word) for word in words) for name, words in named}
+        options[name] = tuple(_FLAGS.get(word, word) for word in words)
+    return options
 
 
 def _refuse_duplicates(names: Iterable[str], where: str) -> None:
@@ -153,7 +130,7 @@ def _refuse_duplicates(names: Iterable[str], where: str) -> None:
 # ---------------------------------------------------------------------------------------------------------------- checks
 
 
-def _checked(entry: Entry, default: str, lengths: Lengths) -> Arm:
+def _checked(entry: Entry, default: str, scale: float) -> Arm:
     """The arm of an entry, its options parsed by its method, its lengths resolved.
 
     Raises:
@@ -176,10 +153,12 @@ def _checked(entry: Entry, default: str, lengths: Lengths) -> Arm:
     elif mode is not None and config.pipeline.model.pruning.mode == "one-shot":
         kind = "branch"
     options, ratio = dict(entry.options), None
-    own_steps = lengths.scaled(config.max_num_iterations)
+    own_steps = _scaled(config.max_num_iterations, scale)
     warmup, total, steps = 0, 0, own_steps
     if kind != "whole":
-        warmup, finetune = _parts(method, lengths)
+        whole = _methods()[method]
+        prune_at = whole.pipeline.model.pruning.prune_at
+        warmup, finetune = _scaled(prune_at, scale), _scaled(whole.max_num_iterations - prune_at, scale)
         total = warmup + finetune
         steps = finetune if kind == "branch" else total
         if options.pop(_KEEP_RATIO, None) is not None:
@@ -192,15 +171,9 @@ def _checked(entry: Entry, default: str, lengths: Lengths) -> Arm:
     return Arm(entry.name, kind, method, options, steps, warmup, total, ratio)
 
 
-def _parts(method: str, lengths: Lengths) -> tuple[int, int]:
-    """Steps of the warm-up and of the fine-tuning of a method that prunes once."""
-    config = _methods()[method]
-    prune_at = config.pipeline.model.pruning.prune_at
-    warmup = prune_at if lengths.warmup is None else lengths.warmup
-    finetune = config.max_num_iterations - prune_at if lengths.finetune is None else lengths.finetune
-    if warmup < 1 or finetune < 1:
-        raise ConfigError(f"{warmup} steps of warm-up and {finetune} of fine-tuning; give at least 1 of each")
-    return lengths.scaled(warmup), lengths.scaled(finetune)
+def _scaled(steps: int, scale: float) -> int:
+    """A length times a factor, at least 1."""
+    return max(round(steps * scale), 1)
 
 
 def _methods() -> dict[str, Any]:
@@ -221,11 +194,6 @@ def _config_of(entry: Entry, method: str) -> Any:
     if method not in methods:
         near = difflib.get_close_matches(method, methods) or ["sundae", "splatfacto"]
         raise ConfigError(f"arm {entry.name}: ns-train has no method {method!r}; use {' or '.join(near)}")
-    for name in entry.options:
-        if not _has_option(methods[method], name):
-            near = difflib.get_close_matches(name, _option_names(methods[method]), n=1)
-            mend = f"did you mean {near[0]}?" if near else f"`ns-train {method} --help` lists its options"
-            raise ConfigError(f"arm {entry.name}: {method} has no option {name}; {mend}")
     words = [word for name, value in entry.options.items() for word in (f"--{name}", *value)]
     said = io.StringIO()
     try:
@@ -236,7 +204,9 @@ def _config_of(entry: Entry, method: str) -> Any:
             if validate is not None:
                 validate()
     except SystemExit as error:
-        raise ConfigError(f"arm {entry.name}: {_message_of(said.getvalue())}") from error
+        meant = re.search(r"Perhaps you meant:\s+--(\S+)", said.getvalue())
+        mend = f"did you mean {meant[1]}?" if meant else f"`ns-train {method} --help` lists its options"
+        raise ConfigError(f"arm {entry.name}: {_message_of(said.getvalue())}; {mend}") from error
     except (ConfigError, ValueError) as error:
         raise ConfigError(f"arm {entry.name}: {error}") from error
     return config
@@ -245,31 +215,6 @@ def _config_of(entry: Entry, method: str) -> Any:
 def _parse(default: Any, words: Sequence[str]) -> Any:
     """A configuration with options of the command line, as ``ns-train`` parses them."""
     return tyro.cli(tyro.conf.FlagConversionOff[type(default)], default=default, args=words)  # type: ignore[misc]
-
-
-def _has_option(config: Any, name: str) -> bool:
-    """Whether a configuration has an option of this dotted name."""
-    *parts, last = name.replace("-", "_").split(".")
-    for part in parts:
-        config = _options_in(config).get(part)
-    options = _options_in(config)
-    return last in options and not _options_in(options[last])
-
-
-def _option_names(config: Any, prefix: str = "") -> list[str]:
-    """Dotted names of all options below a configuration."""
-    names = []
-    for option, value in _options_in(config).items():
-        name = prefix + option.replace("_", "-")
-        names += _option_names(value, f"{name}.") or [name]
-    return names
-
-
-def _options_in(config: Any) -> dict[str, Any]:
-    """Options that a configuration holds itself, by their Python names."""
-    if is_dataclass(config) and not isinstance(config, type):
-        config = {field.name: getattr(config, field.name) for field in fields(config)}
-    return {name: value for name, value in config.items() if name[0] != "_"} if isinstance(config, dict) else {}
 
 
 def _message_of(box: str) -> str:
@@ -281,4 +226,4 @@ def _message_of(box: str) -> str:
         if rule and words:
             break
         words += [] if rule else line.split()
-    return " ".join(words) or "ns-train refuses its options; try them there first"
+    return " ".join(words).rstrip(".") or "ns-train refuses its options"

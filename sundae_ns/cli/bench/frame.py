@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json as jsonlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from rich.console import Console
@@ -17,8 +18,8 @@ from rich.table import Table
 from sundae_ns.errors import ConfigError
 from sundae_ns.evaluation import without_nan
 from sundae_ns.evaluation.document import number
-from sundae_ns.scenes.measure import FrameFigures, frame_figures
-from sundae_ns.scenes.opening import load_run
+from sundae_ns.scenes.measure import measure_scene, rendered_as
+from sundae_ns.scenes.opening import Opened, load_run
 
 
 def run_frame(
@@ -48,26 +49,44 @@ def run_frame(
     every = ("fp32", "bf16", "fp16") if device != "cpu" and run.model.head is not None else (None,)
     wanted: Sequence[str | None] = precisions or every
     jobs = [(factor, precision, count) for factor in factors for precision in wanted for count in phases or (None,)]
-    found: list[FrameFigures] = []
+    found: list[dict[str, Any]] = []
     for factor, precision, count in track(jobs, description="Frames", transient=True, console=Console(stderr=True)):
-        found.append(frame_figures(run, factor=factor, precision=precision, phases=count, repeats=repeats))
+        line = {"config": str(load_config), "device": device, "primitives": run.model.num_points, "factor": factor}
+        with rendered_as(run, factor=factor, precision=precision, phases=count) as shown:
+            line |= {"repeats": repeats, **_figures(shown, repeats)}
+        found.append(line)
         if json:
-            line = {"config": str(load_config), "device": device, "primitives": run.model.num_points}
-            rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(found[-1]).items()}
-            line |= {"factor": factor, "repeats": repeats, **rounded}
-            # Images smaller than its window have no SSIM.
-            print(jsonlib.dumps(without_nan(line), allow_nan=False), flush=True)
+            rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in line.items()}
+            print(jsonlib.dumps(without_nan(rounded), allow_nan=False), flush=True)
     if not json:
         Console().print(_table(found, f"{run.model.num_points:,} primitives, {device}, {len(run.cameras)} test views"))
     return 0
 
 
-def _table(figures: Sequence[FrameFigures], title: str) -> Table:
+@torch.no_grad()
+def _figures(run: Opened, repeats: int) -> dict[str, Any]:
+    """Speed of a configuration beside its error: means over the test views."""
+    measured, head = measure_scene(run, label="", repeats=repeats, with_flip=False), run.model.head
+    full, base = measured.full, measured.base
+    return {
+        "width": int(run.cameras[0].width),
+        "height": int(run.cameras[0].height),
+        "precision": "fp32" if head is None else head.config.precision,
+        "phases": 1 if head is None else head.config.phases,
+        "views": len(run.cameras),
+        **{"ms_frame": full.ms, "ms_splat": base.ms, "ms_head": measured.ms_head},
+        # Images smaller than its window have no SSIM.
+        **{metric: full.mean(metric) for metric in ("psnr", "ssim")},
+        **{f"{metric}_base": base.mean(metric) for metric in ("psnr", "ssim")},
+    }
+
+
+def _table(lines: Sequence[Mapping[str, Any]], title: str) -> Table:
     table = Table(title=title, caption="frame, splat and head in ms; off: without the head")
     for column in ("size", "head in", "runs", "frame", "splat", "head", "PSNR", "SSIM", "PSNR off", "SSIM off"):
         table.add_column(column, justify="right", no_wrap=True)
-    for f in figures:
-        times = (number(value, 2) for value in (f.ms_frame, f.ms_splat, f.ms_head))
-        errors = (number(f.psnr, 2), number(f.ssim, 4), number(f.psnr_base, 2), number(f.ssim_base, 4))
-        table.add_row(f"{f.width}x{f.height}", f.precision, str(f.phases), *times, *errors)
+    digits = {"ms_frame": 2, "ms_splat": 2, "ms_head": 2, "psnr": 2, "ssim": 4, "psnr_base": 2, "ssim_base": 4}
+    for line in lines:
+        figures = (number(line[name], places) for name, places in digits.items())
+        table.add_row(f"{line['width']}x{line['height']}", line["precision"], str(line["phases"]), *figures)
     return table

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import json
+import os
 import shutil
 import sys
 import time
@@ -26,7 +27,6 @@ from nerfstudio.utils import profiler, writer
 from sundae_ns.cli.bench.plan import Job, done_file, job_folder
 from sundae_ns.errors import BackendError, CheckpointError, SundaeError
 from sundae_ns.evaluation import Lpips, lpips_weights_available
-from sundae_ns.evaluation.records import wait_for_lock
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import open_scene
@@ -66,9 +66,12 @@ def perform(job: Job, out: Path) -> None:
 
 @contextlib.contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Hold a file's lock; the system releases it when the process ends."""
+    """Hold a file's lock, which the system releases when the process ends; no lock on Windows."""
     with path.open("a") as file:
-        wait_for_lock(file.fileno())
+        if os.name == "posix":
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
@@ -97,7 +100,6 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
         if cuda:
             torch.cuda.reset_peak_memory_stats()
             torch.cuda.synchronize()
-        primitives = _Peak(trainer)
         started = time.perf_counter()
         trainer.train()
         if cuda:
@@ -117,7 +119,6 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
         variant=job.arm,
         seed=job.seed,
         train_s=seconds,
-        peak_primitives=max(measured.peak_primitives or 0, primitives.peak),
         peak_vram_mib=peak,
     )
     if job.keep_ratio is not None:
@@ -163,19 +164,6 @@ def _run_folder(out: Path, key: str | None) -> Path:
         raise CheckpointError(f"the warm-up {key} is not done; run the whole plan")
     # Not the folder in the result: the comparison may have moved since.
     return job_folder(out, str(key)) / result["job"]["arm"] / result["job"]["method"] / "run"
-
-
-class _Peak:
-    """Largest number of primitives before any step of a training; sundae's model counts within a step too."""
-
-    def __init__(self, trainer: Trainer) -> None:
-        self.peak = 0
-        self._trainer, self._step = trainer, trainer.train_iteration
-        trainer.train_iteration = self  # type: ignore[method-assign,assignment]
-
-    def __call__(self, step: int) -> Any:
-        self.peak = max(self.peak, self._trainer.pipeline.model.num_points)
-        return self._step(step)
 
 
 class _Nothing(torch.nn.Module):

@@ -1,7 +1,4 @@
-"""Options of the comparisons, as the command line is parsed into them.
-
-The two classes share no base: its fields would come first in ``--help`` and in the command that a page names.
-"""
+"""Options of the comparisons, as the command line is parsed into them."""
 
 from __future__ import annotations
 
@@ -14,14 +11,40 @@ from typing import Annotated
 import tyro
 
 
-@dataclass(frozen=True)
-class QualityOptions:
+@dataclass(frozen=True, kw_only=True)
+class ComparisonOptions:
+    """Options of both comparisons."""
+
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """folder for jobs, results and tables; its finished jobs are not run again."""
+    method: str = "sundae"
+    """method of arms that name none; one of this package that prunes once."""
+    steps_scale: float = 1.0
+    """factor on all lengths, for a trial."""
+    shard: str = "1/1"
+    """i/n runs the i-th of n parts."""
+    jobs: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """only list the jobs, and which are done."""
+
+    def _command(self, name: str, folder: Path) -> str:
+        """The command of the whole comparison, without the shard."""
+        words = ["sundae", "bench", name, str(folder), "-o", str(self.out)]
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name in ("out", "shard", "jobs") or value is folder:
+                continue
+            values = [value] if isinstance(value, str) or not isinstance(value, Sequence) else list(value)
+            if values:
+                words += [f"--{field.name.replace('_', '-')}", *map(str, values)]
+        return shlex.join(words)
+
+
+@dataclass(frozen=True, kw_only=True)
+class QualityOptions(ComparisonOptions):
     """Options of ``sundae bench quality``."""
 
     scene: Annotated[Path, tyro.conf.Positional]
     """folder of a capture: COLMAP layout (sparse/0, images), or with a transforms.json."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """folder for jobs, results and tables; its finished jobs are not run again."""
     arms: tuple[str, ...] = ()
     """files of arms (.yaml), and names of default arms: sundae, band, contribution, random, each also with -no-head;
     mcmc, splatfacto, splatfacto-7k. All default arms if none is given."""
@@ -31,34 +54,20 @@ class QualityOptions:
     """the first for every job, the others for the shares of --repeat-at."""
     repeat_at: tuple[float, ...] = (0.1,)
     """shares that run with all seeds."""
-    method: str = "sundae"
-    """method of arms that name none; one of this package that prunes once."""
-    warmup_steps: int | None = None
-    """steps of the warm-up, instead of the method's own."""
-    finetune_steps: int | None = None
-    """steps of the fine-tuning, instead of the method's own."""
-    steps_scale: float = 1.0
-    """factor on all lengths, for a trial."""
     downscale: int = 1
     """use the images of images_2, images_4 ... (COLMAP layout)."""
-    shard: str = "1/1"
-    """i/n runs the i-th of n parts."""
-    jobs: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """only list the jobs, and which are done."""
 
     def command(self) -> str:
         """The command that a page names."""
-        return _command("quality", self)
+        return self._command("quality", self.scene)
 
 
-@dataclass(frozen=True)
-class PaperOptions:
+@dataclass(frozen=True, kw_only=True)
+class PaperOptions(ComparisonOptions):
     """Options of ``sundae bench paper``."""
 
     root: Annotated[Path, tyro.conf.Positional]
     """folder with the unpacked archives (360_v2, tandt, db), or with the scenes themselves."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """folder for jobs, results and tables; its finished jobs are not run again."""
     scenes: tuple[str, ...] = ()
     """some of the eleven; by default all that the folder has."""
     arms: tuple[str, ...] = ("sundae", "sundae-no-head", "splatfacto")
@@ -67,33 +76,7 @@ class PaperOptions:
     """shares of the warm-up's primitives to keep."""
     seed: int = 42
     """of every job."""
-    method: str = "sundae"
-    """method of arms that name none; one of this package that prunes once."""
-    warmup_steps: int | None = None
-    """steps of the warm-up, instead of the method's own."""
-    finetune_steps: int | None = None
-    """steps of the fine-tuning, instead of the method's own."""
-    steps_scale: float = 1.0
-    """factor on all lengths, for a trial."""
-    shard: str = "1/1"
-    """i/n runs the i-th of n parts."""
-    jobs: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """only list the jobs, and which are done."""
 
     def command(self) -> str:
         """The command that a page names."""
-        return _command("paper", self)
-
-
-def _command(name: str, options: QualityOptions | PaperOptions) -> str:
-    """The command of the whole comparison, without the shard."""
-    positional, *others = (field.name for field in fields(options))
-    words = ["sundae", "bench", name, str(getattr(options, positional)), "-o", str(options.out)]
-    for other in others:
-        if other in ("out", "shard", "jobs"):
-            continue
-        value = getattr(options, other)
-        values = [value] if isinstance(value, str) or not isinstance(value, Sequence) else list(value)
-        if values and values != [None]:
-            words += [f"--{other.replace('_', '-')}", *map(str, values)]
-    return shlex.join(words)
+        return self._command("paper", self.root)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -129,22 +129,9 @@ def plan_scene(
         wholes: list[Job] = []
         for arm in arms:
             if arm.kind == "whole":
-                key = f"{scene}-{arm.name}-s{seed}"
-                words = _command(arm.options)
-                wholes.append(
-                    Job(
-                        key,
-                        "whole",
-                        scene,
-                        arm.name,
-                        str(data),
-                        arm.method,
-                        arm.steps,
-                        seed,
-                        options=words,
-                        parser=parser,
-                    )
-                )
+                key, words = f"{scene}-{arm.name}-s{seed}", _command(arm.options)
+                names = (scene, arm.name, str(data), arm.method)
+                wholes.append(Job(key, "whole", *names, arm.steps, seed, options=words, parser=parser))
                 continue
             for ratio in keep_ratios if arm.keep_ratio is None else (arm.keep_ratio,):
                 if number == 0 or ratio in repeat_at:
@@ -199,19 +186,15 @@ def _branch(warmup: Job, arm: Arm, ratio: float) -> Job:
             "optimizers.compensation.scheduler.max-steps": (steps,),
             "pipeline.model.evaluate-prune": ("False",),
         }
-    return Job(
+    return replace(
+        warmup,
         key=f"{warmup.scene}-{arm.name}-{100 * ratio:g}pct-s{warmup.seed}",
         kind="mcmc" if arm.kind == "mcmc" else "branch",
-        scene=warmup.scene,
         arm=arm.name,
-        data=warmup.data,
-        method=arm.method,
         steps=arm.steps,
-        seed=warmup.seed,
         keep_ratio=ratio,
         needs=warmup.key,
         options=_command({**options, **arm.options}),
-        parser=warmup.parser,
     )
 
 
@@ -235,12 +218,22 @@ def _check(
         raise ConfigError(f"no keep ratio is repeated with other seeds; let --repeat-at name one of {ratios}")
 
 
-def jobs_of_shard(jobs: Sequence[Job], index: int, parts: int) -> list[Job]:
-    """The jobs of part ``index``, counted from 0, with the warm-ups that they need; parts share only those.
+def jobs_of_shard(jobs: Sequence[Job], shard: str) -> list[Job]:
+    """The jobs of a part, with the warm-ups that they need; parts share only those.
 
     Warm-ups are not dealt out: a part makes the ones that are missing, and finds the others finished.
+
+    Args:
+        jobs: of the whole plan.
+        shard: ``"2/5"`` for the second of five parts.
+
+    Raises:
+        ConfigError: the shard has another form.
     """
-    own = [job for job in jobs if job.kind != "warm-up"][index::parts]
+    part, _, parts = shard.partition("/")
+    if not (part.isdecimal() and parts.isdecimal() and 1 <= int(part) <= int(parts)):
+        raise ConfigError(f"{shard!r} is no shard: use i/n with i from 1 to n")
+    own = [job for job in jobs if job.kind != "warm-up"][int(part) - 1 :: int(parts)]
     keys = {job.key for job in own} | {job.needs for job in own}
     return [job for job in jobs if job.key in keys]
 

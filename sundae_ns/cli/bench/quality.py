@@ -12,12 +12,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
-from sundae_ns.cli.bench.arms import Lengths, choose_arms
-from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
+from sundae_ns.cli.bench.arms import choose_arms
+from sundae_ns.cli.bench.options import ComparisonOptions, PaperOptions, QualityOptions
 from sundae_ns.cli.bench.paper import plan_paper
-from sundae_ns.cli.bench.plan import Arm, Job, done_file, job_folder, jobs_of_shard, parser_of, plan_scene
+from sundae_ns.cli.bench.plan import Job, done_file, job_folder, jobs_of_shard, parser_of, plan_scene
 from sundae_ns.cli.bench.results import Result, paper_page, quality_page, read_results, write_results
-from sundae_ns.cli.bench.shards import parse_shard
 from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.evaluation.document import table
@@ -47,7 +46,7 @@ def run_quality(options: QualityOptions, *, runner: Runner | None = None, consol
         DataError: the folder is no capture.
         StorageError: the folder cannot be written to.
     """
-    console, part, arms = console or Console(), parse_shard(options.shard), _arms(options)
+    console, arms = console or Console(), choose_arms(options.arms, options.method, options.steps_scale)
     data = options.scene.resolve()
     plan = plan_scene(
         data.name,
@@ -62,7 +61,7 @@ def run_quality(options: QualityOptions, *, runner: Runner | None = None, consol
     def page(results: Sequence[Result]) -> str:
         return quality_page(results, arms, options.command())
 
-    return _list_or_run(jobs_of_shard(plan, *part), options, page, runner, console)
+    return _list_or_run(jobs_of_shard(plan, options.shard), options, page, runner, console)
 
 
 def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: Console | None = None) -> int:
@@ -71,7 +70,7 @@ def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: C
     Raises:
         ConfigError, DataError, StorageError: as in :func:`run_quality`.
     """
-    console, part, arms = console or Console(), parse_shard(options.shard), _arms(options)
+    console, arms = console or Console(), choose_arms(options.arms, options.method, options.steps_scale)
     plan, missing = plan_paper(
         options.root.resolve(), arms, scenes=options.scenes, keep_ratios=options.keep_ratios, seed=options.seed
     )
@@ -81,12 +80,7 @@ def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: C
     def page(results: Sequence[Result]) -> str:
         return paper_page(results, arms, missing, options.command())
 
-    return _list_or_run(jobs_of_shard(plan, *part), options, page, runner, console)
-
-
-def _arms(options: QualityOptions | PaperOptions) -> list[Arm]:
-    lengths = Lengths(options.warmup_steps, options.finetune_steps, options.steps_scale)
-    return choose_arms(options.arms, options.method, lengths)
+    return _list_or_run(jobs_of_shard(plan, options.shard), options, page, runner, console)
 
 
 def show_jobs(jobs: Sequence[Job], out: Path, console: Console) -> None:
@@ -178,7 +172,7 @@ def _check_same(job: Job, result: Result, out: Path) -> None:
 
 def _list_or_run(
     jobs: Sequence[Job],
-    options: QualityOptions | PaperOptions,
+    options: ComparisonOptions,
     page: Callable[[Sequence[Result]], str],
     runner: Runner | None,
     console: Console,

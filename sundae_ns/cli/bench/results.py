@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import statistics
 from collections.abc import Mapping, Sequence
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
+from sundae_ns.cli.bench.paper import DATASETS, PRINTED
 from sundae_ns.cli.bench.plan import Arm
 from sundae_ns.errors import DataError
-from sundae_ns.evaluation import COLUMNS
+from sundae_ns.evaluation import csv_text
 from sundae_ns.evaluation.document import METRICS, number, table
-from sundae_ns.evaluation.measured import HEAD_OFF, MEGABYTE
-from sundae_ns.evaluation.published import DATASETS, MEMBERS, NOTE, SCENES
+from sundae_ns.evaluation.measured import MEGABYTE
 from sundae_ns.storage.atomic import write_text
 
 Result = Mapping[str, Any]
@@ -46,27 +44,9 @@ def write_results(out: Path, results: Sequence[Result], page: str) -> None:
     Raises:
         StorageError: the folder cannot be written to.
     """
-    buffer = StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows([_cells(result) for result in results])
     write_text(out / "results.jsonl", "".join(json.dumps(result) + "\n" for result in results))
-    write_text(out / "results.csv", buffer.getvalue())
+    write_text(out / "results.csv", csv_text([result["measured"] for result in results]))
     write_text(out / "table.md", page)
-
-
-def _cells(result: Result) -> list[Any]:
-    """A row of runs.csv, as ``Measured.row`` makes it, from a result that was read."""
-    measured = result["measured"]
-    full, bare = measured["configurations"][0], measured["configurations"][-1]
-    renamed = {
-        **{name: full["mean"][name] for name in ("psnr", "ssim", "lpips")},
-        **{f"{name}_base": bare["mean"][name] for name in ("psnr", "ssim")},
-        "ms_frame": full["ms"],
-        "ms_splat": bare["ms"],
-        "lpips_net": measured["lpips_net"] if full["mean"]["lpips"] is not None else "",
-    }
-    return [renamed.get(name, measured.get(name)) for name in COLUMNS]
 
 
 def _group(results: Sequence[Result], arms: Sequence[Arm]) -> dict[tuple[str, str, float | None], list[Result]]:
@@ -153,21 +133,26 @@ def _described(arms: Sequence[Arm]) -> list[str]:
 
 
 def paper_page(results: Sequence[Result], arms: Sequence[Arm], missing: Sequence[str], command: str) -> str:
-    """The paper's scenes at its keep ratios: measured figures beside printed ones; see :func:`quality_page`."""
+    """The paper's scenes at its keep ratios: measured figures beside printed ones, then :func:`quality_page`."""
     groups = _group([r for r in results if r["job"]["kind"] != "warm-up"], arms)
     columns = list(dict.fromkeys((arm, ratio) for _, arm, ratio in groups))
-    lines = ["# The paper's scenes", "", f"    {command}", ""]
+    lines = ["# The paper's scenes", ""]
     lines += [
-        f"Figures in italics are {NOTE}: it may resize images otherwise, and use other variants of SSIM and LPIPS.",
-        "Measured: means over the test views, head enabled. A data set has a mean only if all its scenes are measured; the",
-        "paper's 3DGS rows of Mip-NeRF 360 are means over nine scenes, not seven.",
+        "Figures in italics are printed in the paper, not measured by us: it may resize images otherwise, and use another",
+        "variant of SSIM. Measured: means over the test views, head enabled. A data set has a mean only if all its scenes are",
+        "measured; the paper's 3DGS rows of Mip-NeRF 360 are means over nine scenes, not seven.",
     ]
     shares = [0.01, 0.1, 0.3, 0.5]
-    for metric, name, digits in (("psnr", "PSNR, dB", 2), ("ssim", "SSIM", 4)):
+    for place, (metric, name, digits) in enumerate((("psnr", "PSNR, dB", 2), ("ssim", "SSIM", 4))):
+
+        def printed(where: str, place: int = place, digits: int = digits) -> list[str]:
+            own = PRINTED.get(where, {})
+            return [f"*{number(own[s][place], min(digits, 3))}*" if s in own else "-" for s in shares]
+
         heads = ["scene", *(f"{arm} {_percent(ratio)}".rstrip() for arm, ratio in columns)]
         heads += [f"*paper {share:.0%}*" for share in shares]
         rows = []
-        for dataset, members in MEMBERS.items():
+        for dataset, members in DATASETS.items():
             by_arm: dict[tuple[str, float | None], list[float | None]] = {arm: [] for arm in columns}
             for scene in members:
                 cells = []
@@ -176,36 +161,10 @@ def paper_page(results: Sequence[Result], arms: Sequence[Arm], missing: Sequence
                     values = [r["measured"]["configurations"][0]["mean"][metric] for r in own]
                     by_arm[arm].append(_mean(values))
                     cells.append(spread(values, digits))
-                rows.append([scene, *cells, *_printed(SCENES, scene, shares, metric)])
+                rows.append([scene, *cells, *printed(scene)])
             means = [spread([_mean(values)], digits) for values in by_arm.values()]
-            rows.append([f"**{dataset}**", *means, *_printed(DATASETS, dataset, shares, metric)])
+            rows.append([f"**{dataset}**", *means, *printed(dataset)])
         lines += ["", f"## {name}", "", *table(heads, rows, words=1)]
     if missing:
         lines += ["", f"Missing: {', '.join(missing)}."]
-    return "\n".join([*lines, "", *_sizes(groups), ""])
-
-
-def _printed(rows: Sequence[Any], where: str, shares: Sequence[float], metric: str) -> list[str]:
-    own = {row.keep_ratio: getattr(row, metric) for row in rows if row.where == where}
-    return [f"*{number(own[share], 2 if metric == 'psnr' else 3)}*" if share in own else "-" for share in shares]
-
-
-def _sizes(groups: Mapping[tuple[str, str, float | None], Sequence[Result]]) -> list[str]:
-    """Size and time of each arm, beside the PSNR of the same rendering."""
-    heads = ["scene", "arm", "keep", "primitives", "MB", "ms a frame", "PSNR of that rendering", "head off: ms", "PSNR"]
-    rows = []
-    for (scene, arm, ratio), own in groups.items():
-        full = [r["measured"]["configurations"][0] for r in own]
-        bare = [r["measured"]["configurations"][-1] for r in own]
-        with_head = full[0]["name"] != HEAD_OFF
-        rows.append(
-            [
-                *(scene, arm, _percent(ratio)),
-                spread([r["measured"]["primitives"] for r in own], 0),
-                spread([way["bytes"] / MEGABYTE for way in full], 1),
-                *(spread([way["ms"] for way in full], 2), spread([way["mean"]["psnr"] for way in full], 2)),
-                spread([way["ms"] for way in bare], 2) if with_head else "",
-                spread([way["mean"]["psnr"] for way in bare], 2) if with_head else "",
-            ]
-        )
-    return ["## Cost", "", *table(heads, rows)]
+    return "\n".join([*lines, "", quality_page(results, arms, command)])
