@@ -127,7 +127,7 @@ def _keep(percent: int) -> MethodSpecification:
     description = (
         f"SUNDAE: spectrally pruned Gaussian field with neural compensation, keeps {percent}% of the primitives."
     )
-    return method(name, description, pruning=PruningConfig(keep_ratio=percent / 100))
+    return method(name, description, pruning=PruningConfig(keep_ratio=percent / 100), head=HeadConfig(mode="auto"))
 
 
 sundae = _keep(10)
@@ -141,6 +141,7 @@ sundae_continuous = method(
     "sundae-continuous",
     "SUNDAE with continuous pruning during densification: a lower peak of memory, with an optional cap and final number.",
     pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
+    head=HeadConfig(mode="auto"),
 )
 
 sundae_auto = method(

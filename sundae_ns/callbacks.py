@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -107,6 +107,14 @@ class NerfstudioRun:
     def training_views(self) -> list[TrainingView]:
         """The training views that are not held out."""
         return training_views(self.model, self._datamanager)
+
+    def view_indices(self) -> list[int]:
+        """Indices of the training views."""
+        return self._datamanager.train_indices
+
+    def hold_out(self, indices: Iterable[int]) -> None:
+        """Hold out these training views from the next step on."""
+        self._datamanager.hold_back(indices)
 
     def heldout_views(self) -> Iterator[HeldOutView]:
         """The held-out training views, loaded one at a time."""

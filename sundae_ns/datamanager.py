@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -155,6 +155,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise DataError(f"{data} cannot be parsed ({reason}); check the capture") from error
         self._order: tuple[int, list[int]] = (-1, [])
+        self._held_back: frozenset[int] = frozenset()
+        self._served = self.train_indices
         self._cameras: dict[int, Cameras] = {}
         self.place: tuple[int, int] = (0, 1)
         """Rank of this process and number of ranks; each rank gets another view at a step."""
@@ -178,27 +180,36 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     @property
     def holdout_indices(self) -> list[int]:
-        """Indices of the held-out training views."""
+        """Indices of the training views that are held out now."""
+        return sorted({*self._always_held_out, *self._held_back})
+
+    @property
+    def _always_held_out(self) -> range:
         every = self.config.holdout_every
-        return list(range(every - 1, len(self.train_dataset), every)) if every else []
+        return range(every - 1, len(self.train_dataset), every) if every else range(0)
 
     @property
     def train_indices(self) -> list[int]:
-        """Indices of the other training views."""
-        held_out = set(self.holdout_indices)
-        return [i for i in range(len(self.train_dataset)) if i not in held_out]
+        """Indices of the training views that are not held out for the whole training."""
+        return [i for i in range(len(self.train_dataset)) if i not in self._always_held_out]
+
+    def hold_back(self, indices: Iterable[int]) -> None:
+        """Hold out these of :attr:`train_indices` too, from the next step on, until the next call."""
+        self._held_back = frozenset(indices)
+        self._served = [index for index in self.train_indices if index not in self._held_back]
+        self._order = (-1, [])
 
     def view_of_step(self, step: int) -> int:
         """Index of the training view of ``step``: each pass over the views is a new permutation."""
-        indices = self.train_indices
-        epoch, position = divmod(step, len(indices))
+        epoch, position = divmod(step, len(self._served))
         if self._order[0] != epoch:
+            indices = list(self._served)
             random.Random(f"{self.config.train_cameras_sampling_seed}-{epoch}").shuffle(indices)
             self._order = (epoch, indices)
         return self._order[1][position]
 
     def training_views(self) -> Iterator[tuple[Cameras, torch.Tensor | None]]:
-        """Training views that are not held out: camera of shape ``(1,)`` on the CPU, and mask.
+        """Training views that are not held out for the whole training: camera of shape ``(1,)`` on the CPU, and mask.
 
         The mask is bool ``[H, W, 1]``, True for pixels to train on; None for all pixels.
         """

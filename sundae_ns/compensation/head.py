@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -40,9 +40,10 @@ PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float
 class HeadConfig:
     """Architecture and arithmetic of the compensation head."""
 
-    mode: Literal["residual", "features", "off"] = "residual"
-    """residual: the head adds a correction to the spherical-harmonics image, which remains usable alone.
-    features: the paper's, the head alone makes the image from splatted features, over the background. off: no head."""
+    mode: Literal["auto", "residual", "features", "off"] = "residual"
+    """auto: residual, if held-out training views show after a short trial that it pays, else off. residual: the head adds a
+    correction to the spherical-harmonics image, which remains usable alone. features: the paper's, the head alone makes the
+    image from splatted features, over the background. off: no head."""
     size: Literal["tiny", "compact", "wide", "small", "regular", "large"] = "wide"
     """Width of the U-Net: 0.5, 2, 2.5, 7.8, 31 or 124 MB in fp32. The last three are the paper's, whose default is
     regular; compact is small with at most 64 channels per level, wide has 64 on each."""
@@ -67,6 +68,11 @@ class HeadConfig:
     """On CUDA, in bf16 and fp16: use our own kernels between the convolutions, recorded as one CUDA graph per image
     size, in training and inference. Otherwise run layer by layer."""
 
+    @property
+    def resolved(self) -> HeadConfig:
+        """The configuration of the head while it is undecided: residual in place of auto."""
+        return replace(self, mode="residual") if self.mode == "auto" else self
+
     def validate(self) -> None:
         """Check the values.
 
@@ -89,7 +95,7 @@ class CompensationHead(nn.Module):
     """Computes the compensated image (``I_hat = Phi(F)`` of the paper, and our residual variant).
 
     Args:
-        config: mode, size and arithmetic; ``mode="off"`` is refused.
+        config: mode, size and arithmetic; modes off and auto are refused.
 
     Raises:
         ConfigError: the configuration is invalid.
@@ -101,8 +107,8 @@ class CompensationHead(nn.Module):
 
     def _build(self, config: HeadConfig) -> None:
         config.validate()
-        if config.mode == "off":
-            raise ConfigError("head.mode is off, which has no compensation head; choose residual or features")
+        if config.mode in ("off", "auto"):
+            raise ConfigError(f"head.mode is {config.mode}, which is no compensation head; choose residual or features")
         self.config = config
         # The residual head sees the colours and the accumulation beside the features.
         in_channels = config.num_features + (4 if config.mode == "residual" else 0)

@@ -16,6 +16,7 @@ from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.densification import Densification, GrowthOptions, make_strategy
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.head_trial import HeadTrial
 from sundae_ns.training.initial_field import Frame, PointOptions, Points, Start, initial_field
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.schedules import make_schedule
@@ -44,7 +45,7 @@ class Parts:
     state: FieldState
     """On these parameters and networks."""
     extensions: list[Extension]
-    """Densification, scheduled pruning and, in mode auto, the budget search, in the order in which they act."""
+    """Densification, scheduled pruning and, where asked for, budget search or head trial, in the order in which they act."""
     start: Start
     """To announce when training starts."""
 
@@ -81,7 +82,7 @@ def build(options: BuildOptions, *, num_images: int, points: Points | None, fram
         ConfigError: an option cannot work.
     """
     check(options)
-    pruning, head, warm = options.pruning, options.head, options.warm_start is not None
+    pruning, head, warm = options.pruning, options.head.resolved, options.warm_start is not None
     mcmc_cap = options.mcmc_cap if options.warmup == "mcmc" else None
     strategy = make_strategy(options, pruning, mcmc_cap=mcmc_cap, num_images=num_images)
     params, start = initial_field(
@@ -109,4 +110,7 @@ def build(options: BuildOptions, *, num_images: int, points: Points | None, fram
     extensions: list[Extension] = [densification, ScheduledPruning(schedule, evaluate=options.evaluate_prune)]
     if pruning.mode == "auto":
         extensions.append(BudgetSearch(pruning, head, densification, state))
+    elif options.head.mode == "auto":
+        begins_at = max(state.head_starts_at, pruning.settled_at, state.densify_until)
+        extensions.append(HeadTrial(int(begins_at), state))
     return Parts(gauss_params, networks, state, extensions, start)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -64,7 +64,13 @@ class TrainingRun(Protocol):
         """Number of held-out training views."""
 
     def training_views(self) -> list[TrainingView]:
-        """The training views that are not held out."""
+        """The training views that are not held out for the whole training."""
+
+    def view_indices(self) -> list[int]:
+        """Indices of these views."""
+
+    def hold_out(self, indices: Iterable[int]) -> None:
+        """Hold out these training views too, from the next step on, until the next call."""
 
     def heldout_views(self) -> Iterator[HeldOutView]:
         """The held-out training views, loaded one at a time."""

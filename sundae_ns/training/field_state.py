@@ -14,6 +14,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from sundae_ns.compensation import CompensationHead
+from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization import Backend
 from sundae_ns.rendering.render import RenderSettings
@@ -88,9 +89,15 @@ class FieldState:
         return self.head is not None and self.schedule_step > self.head_starts_at
 
     def remove_head(self) -> None:
-        """Do without a head from now on."""
+        """Do without head and features from now on. Parameters stay the same objects, as optimizers need them."""
         if _HEAD in self.networks:
             del self.networks[_HEAD]
+        if FEATURES in self.field:
+            features = self.field[FEATURES]
+            features.data, features.grad = features.data[:, :0], None
+        for name in ("compensation", FEATURES):
+            if name in self.optimizers:
+                self.optimizers[name].state.clear()
 
     def remember_focal(self, focal: float) -> None:
         """Note the focal length of an image that the head is trained on, pixels."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, MutableMapping
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -154,7 +155,8 @@ def _shortage(run: TrainingRun, pruning: PruningConfig, last_step: int) -> _Shor
     warm = state.offset > 0
     first, target = pruning.first_prune, pruning.target_primitives
     begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
-    scheduled = state.head is not None and pruning.mode != "auto"
+    # A head whose start is not known yet is decided upon elsewhere.
+    scheduled = state.head is not None and math.isfinite(state.head_starts_at)
     idle = scheduled and last_step + state.offset <= state.head_starts_at
     and_head = ", and the head stays disabled" if idle else ""
     # A warm start is pruned at once.

@@ -112,3 +112,11 @@ def notify_pruned(schedulers: Mapping[str, LRScheduler], step: int, *, last: boo
                 continue
             if last or not multiplier.hold_until_prune:
                 multiplier.pruned_at = step
+
+
+def postpone(schedulers: Mapping[str, LRScheduler], steps: int) -> None:
+    """Let every :class:`Decay` that has restarted begin this many steps later, as for a trial that starts again."""
+    for scheduler in schedulers.values():
+        for multiplier in getattr(scheduler, "lr_lambdas", []):
+            if isinstance(multiplier, Decay) and multiplier.pruned_at is not None:
+                multiplier.pruned_at += steps

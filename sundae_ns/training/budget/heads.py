@@ -44,10 +44,7 @@ def enable(searched: SearchedField, search: Search, largest: HeadConfig | None, 
 
 def remove(searched: SearchedField, search: Search) -> None:
     """Remove the head and the features for good."""
-    state = searched.state
-    state.remove_head()
-    state.optimizers["compensation"].state.clear()
-    narrow(state.field, state.optimizers, FEATURES, 0)
+    searched.state.remove_head()
     search.head_dropped, search.head_size, search.num_features = True, "", 0
 
 

@@ -1,0 +1,237 @@
+"""Whole runs that decide about their head, on a scene of a few pixels."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from budget_runs import same, tidy
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils.eval_utils import eval_setup
+
+from sundae_ns.data import write_embedded_capture
+from sundae_ns.errors import CheckpointError
+from sundae_ns.method_configs import sundae
+from sundae_ns.scenes.packed import scene_of_run
+from sundae_ns.training import head_trial
+from sundae_ns.training.heldout import HeldOutQuality
+
+STEPS, PRUNE_AT = 100, 40
+LENGTH = 5
+"""Steps of a trial: a twentieth of the run. Views are held out from step 30 on."""
+Make = Callable[..., Trainer]
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
+    folder, made = tmp_path_factory.mktemp("scenes"), {}
+
+    def scene(views: int) -> Path:
+        if views not in made:
+            made[views] = write_embedded_capture(
+                folder / str(views), train_views=views, test_views=2, width=24, height=24, points=200, samples=1
+            )
+        return made[views]
+
+    return scene
+
+
+@pytest.fixture
+def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
+    def trainer(views: int = 16, *, name: str = "run", save_every: int = 1000, **options: Any) -> Trainer:
+        config = deepcopy(sundae.config)
+        config.data = config.pipeline.datamanager.data = scenes(views)
+        config.output_dir, config.experiment_name, config.timestamp = tmp_path, name, "now"
+        config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = STEPS, save_every, False
+        config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
+        config.vis, config.viewer.quit_on_train_completion = "tensorboard", True
+        model = config.pipeline.model
+        model.num_downscales, model.sh_degree, model.sh_degree_interval, model.warmup_length = 0, 1, 5, 10**9
+        model.pruning.prune_at, model.evaluate_prune = PRUNE_AT, False
+        model.head.size, model.head.pixel_unshuffle, model.head.num_features = "tiny", 1, 5
+        for option, value in options.items():
+            setattr(config, option, value)
+        torch.manual_seed(7)
+        config.save_config()
+        made: Trainer = config.setup(local_rank=0, world_size=1)
+        made.setup()
+        # The decision must not use test views.
+        made.pipeline.get_average_eval_image_metrics = None
+        return made
+
+    yield trainer
+    tidy()
+
+
+@pytest.fixture
+def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[[float, float], None]:
+    """Fixes what the head gains on every held-out view: PSNR in dB, SSIM."""
+
+    def fix(decibels: float, similarity: float) -> None:
+        real = head_trial.measure_heldout
+
+        def measured(run: Any, *, mend: str) -> list[HeldOutQuality]:
+            head = run.state.head_enabled
+            views = [view.pixels for view in real(run, mend=mend)]
+            return [HeldOutQuality(n, 20 + head * decibels, 0.5 + head * similarity) for n in views]
+
+        monkeypatch.setattr(head_trial, "measure_heldout", measured)
+
+    return fix
+
+
+def _record(trainer: Trainer) -> dict[str, Any]:
+    return dict(json.loads((trainer.base_dir / "head.json").read_text()))
+
+
+def _served(trainer: Trainer) -> list[int]:
+    """Collects the training views that are served, by step."""
+    manager, views = trainer.pipeline.datamanager, []
+    real = manager.view_of_step
+
+    def view_of_step(step: int) -> int:
+        views.append(real(step))
+        return views[-1]
+
+    manager.view_of_step = view_of_step
+    return views
+
+
+def test_a_head_that_pays_stays_and_all_views_are_trained_on_again(make: Make, judge: Any) -> None:
+    judge(0.5, 0.01)
+    trainer = make()
+    served = _served(trainer)
+    trainer.train()
+    model: Any = trainer.pipeline.model
+    record = _record(trainer)
+    held = set(record["held_out_views"])
+    assert record["decision"] == "head"
+    assert record["step"] == PRUNE_AT + 2 * LENGTH
+    assert record["with_head"]["psnr"] == pytest.approx(20.5)
+    assert model.head is not None
+    assert model.state.head_enabled
+    assert len(held) == 2
+    assert not held & set(served[31 : PRUNE_AT + 2 * LENGTH + 1])
+    assert held & set(served[:30])
+    assert held & set(served[PRUNE_AT + 2 * LENGTH + 1 :])
+    moved = model.head.net.out.weight.abs().max()
+    assert moved > 0
+
+
+@pytest.mark.parametrize("gains", [(0.05, 0.01), (0.5, -0.001), (math.nan, 0.01)])
+def test_a_head_that_does_not_pay_costs_nothing(make: Make, judge: Any, gains: tuple[float, float]) -> None:
+    judge(*gains)
+    trainer = make()
+    trainer.train()
+    model: Any = trainer.pipeline.model
+    assert _record(trainer)["decision"] == "none"
+    assert model.head is None
+    assert model.gauss_params["features"].numel() == 0
+    saved = torch.load(next(trainer.checkpoint_dir.glob("*.ckpt")), map_location="cpu", weights_only=True)
+    assert not [name for name in saved["pipeline"] if "head" in name]
+    opened = eval_setup(trainer.base_dir / "config.yml", test_mode="test")[1].model
+    assert opened.head is None
+    camera = trainer.pipeline.datamanager.train_dataset.cameras[0:1]
+    with torch.no_grad():
+        images = [one.eval().get_outputs_for_camera(camera) for one in (model, opened)]
+    assert torch.equal(images[0]["rgb"], images[1]["rgb"])
+    assert torch.equal(images[0]["rgb"], images[0]["base_rgb"])
+    scene = scene_of_run(trainer.base_dir)
+    assert not scene.head
+    assert not any(value.numel() for name, value in scene.field.items() if name == "features")
+
+
+def test_the_trials_start_alike_and_the_field_without_a_head_continues(make: Make, judge: Any) -> None:
+    judge(-1.0, -0.1)
+    trainer = make()
+    model: Any = trainer.pipeline.model
+    (trial,) = (extension for extension in model.extensions if extension.name == "head_trial")
+    seen: dict[int, tuple[torch.Tensor, float]] = {}
+    real = trial.after_step
+
+    def after_step(run: Any) -> None:
+        real(run)
+        rate = run.state.schedulers["means"].lr_lambdas[0](run.state.step)
+        seen[run.state.step] = (model.gauss_params["means"].detach().clone(), rate)
+
+    trial.after_step = after_step
+    trainer.train()
+    start, bare, decided = PRUNE_AT, PRUNE_AT + LENGTH - 1, PRUNE_AT + 2 * LENGTH
+    # Both trials start from the field and the rate right after the prune.
+    assert torch.equal(seen[start][0], seen[PRUNE_AT + LENGTH][0])
+    assert seen[start][1] == pytest.approx(seen[PRUNE_AT + LENGTH][1])
+    assert not torch.equal(seen[bare][0], seen[start][0])
+    # The field at the end of the first trial is the one that goes on.
+    assert (seen[decided][0] - seen[bare][0]).abs().max() < (seen[decided][0] - seen[start][0]).abs().max()
+
+
+@pytest.mark.parametrize("stop", [35, PRUNE_AT + 2, PRUNE_AT + LENGTH + 2, PRUNE_AT + 2 * LENGTH + 3])
+@pytest.mark.parametrize("gain", [0.5, -0.5])
+def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, judge: Any, stop: int, gain: float) -> None:
+    judge(gain, gain / 10)
+    whole = make(name="whole", save_every=stop)
+    whole.train()
+    resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
+    resumed.train()
+    last = f"step-{STEPS - 1:09d}.ckpt"
+    a, b = (torch.load(one.checkpoint_dir / last, map_location="cpu", weights_only=True) for one in (whole, resumed))
+    same(a["pipeline"], b["pipeline"])
+    same(a["optimizers"], b["optimizers"])
+    same(a["schedulers"], b["schedulers"])
+    assert _record(whole) == (_record(resumed) if stop < PRUNE_AT + 2 * LENGTH else _record(whole))
+
+
+def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None:
+    judge(0.5, 0.01)
+    trainer = make(8)
+    served = _served(trainer)
+    trainer.train()
+    first, second = _record(trainer)["held_out_views"]
+    length = round(LENGTH / 2)
+    folds = [served[PRUNE_AT + 1 + 2 * i * length : PRUNE_AT + 1 + 2 * (i + 1) * length] for i in range(2)]
+    assert _record(trainer)["decision"] == "head"
+    assert _record(trainer)["steps_per_trial"] == length
+    assert first not in folds[0]
+    assert second not in folds[1]
+
+
+def test_with_too_few_views_the_head_stays_off(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    trainer = make(5)
+    trainer.train()
+    assert trainer.pipeline.model.head is None
+    assert _record(trainer) == {
+        "decision": "none",
+        "reason": "5 training views are too few to tell whether it helps",
+        "step": 0,
+    }
+    assert "the head is removed without a trial: 5 training views are too few" in " ".join(
+        capsys.readouterr().out.split()
+    )
+
+
+def test_a_run_that_is_too_short_for_trials_says_so(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
+    trainer = make(max_num_iterations=PRUNE_AT + 5)
+    trainer.train()
+    assert not (trainer.base_dir / "head.json").exists()
+    assert not trainer.pipeline.model.state.head_enabled
+    assert "before the head could be tried" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_checkpoint_that_lacks_the_field_to_return_to_is_refused(make: Make, judge: Any) -> None:
+    judge(0.5, 0.01)
+    stop = PRUNE_AT + LENGTH + 2
+    whole = make(name="whole", save_every=stop)
+    whole.train()
+    path = whole.checkpoint_dir / f"step-{stop:09d}.ckpt"
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    state["pipeline"]["_model._extra_state"]["extensions"]["head_trial"]["bare"] = None
+    model: Any = make(name="other").pipeline.model
+    inner = {name.removeprefix("_model."): value for name, value in state["pipeline"].items() if "_model." in name}
+    with pytest.raises(CheckpointError, match="lacks the field"):
+        model.load_state_dict(inner)

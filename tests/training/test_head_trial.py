@@ -1,0 +1,94 @@
+"""The plan of the trials that decide about a head, and the removal of a head."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from models import Training
+
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.errors import CheckpointError, ConfigError
+from sundae_ns.model import SundaeModel
+from sundae_ns.training.head_trial import MOST_HELD_OUT, HeadTrial, plan_trials
+
+Build = Callable[..., SundaeModel]
+
+
+@pytest.mark.parametrize(("views", "held_out"), [(12, 2), (16, 2), (43, 5), (73, 9), (105, 13), (255, 16), (2000, 16)])
+def test_an_eighth_of_the_views_is_held_out_within_limits(views: int, held_out: int) -> None:
+    trials = plan_trials(range(views), 30000)
+    assert trials.length == 1500
+    assert trials.number == 2
+    (fold,) = trials.folds
+    assert len(set(fold)) == held_out <= MOST_HELD_OUT
+    # Even gaps: no stretch of the capture goes unjudged.
+    gaps = [b - a for a, b in zip(fold, fold[1:])]
+    assert max(gaps) - min(gaps) <= 1
+    assert fold[0] >= 1
+    assert fold[-1] < views - 1
+
+
+@pytest.mark.parametrize("views", [6, 9, 11])
+def test_with_few_views_two_are_held_out_in_turn(views: int) -> None:
+    trials = plan_trials([10 * i for i in range(views)], 30000)
+    assert trials.number == 4
+    assert trials.length == 750
+    assert [len(fold) for fold in trials.folds] == [1, 1]
+    assert len(set(trials.views)) == 2
+    assert all(index % 10 == 0 for index in trials.views)
+
+
+@pytest.mark.parametrize("views", [6, 12, 255])
+def test_deciding_costs_at_most_a_tenth_of_the_steps(views: int) -> None:
+    trials = plan_trials(range(views), 30000)
+    # The last trial of the two arms goes on.
+    assert (trials.number - 1) * trials.length <= 0.1 * 30000
+
+
+def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
+    assert "head_trial" in {extension.name for extension in build(head={"mode": "auto"}).extensions}
+    for mode in ("residual", "features", "off"):
+        assert "head_trial" not in {extension.name for extension in build(head={"mode": mode}).extensions}
+    searching = build(head={"mode": "auto"}, pruning={"mode": "auto", "stop": 10})
+    assert [extension.name for extension in searching.extensions][-1] == "budget"
+
+
+def test_an_undecided_head_is_residual_and_disabled(build: Build) -> None:
+    model = build(head={"mode": "auto"})
+    model.step = 10**6
+    assert model.head is not None
+    assert model.head.config.mode == "residual"
+    assert not model.state.head_enabled
+
+
+def test_a_network_is_not_built_in_mode_auto() -> None:
+    with pytest.raises(ConfigError, match=r"head.mode is auto.*residual or features"):
+        CompensationHead(HeadConfig(mode="auto"))
+
+
+def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:
+    model = build(head={"mode": "residual"})
+    training = Training(model)
+    for step in range(3, 6):
+        training.step(step)
+    training.step(6)
+    assert model.state.head_enabled
+    assert training.optimizers.optimizers["compensation"].state
+    features = model.gauss_params["features"]
+    model.state.remove_head()
+    assert model.head is None
+    assert model.gauss_params["features"] is features
+    assert features.numel() == 0
+    assert not training.optimizers.optimizers["compensation"].state
+    assert not training.optimizers.optimizers["features"].state
+    before = model.gauss_params["means"].detach().clone()
+    training.step(7)
+    assert not model.gauss_params["means"].detach().equal(before)
+
+
+def test_a_checkpoint_without_a_decision_names_the_option(build: Build) -> None:
+    model = build(head={"mode": "auto"})
+    (trial,) = (extension for extension in model.extensions if isinstance(extension, HeadTrial))
+    with pytest.raises(CheckpointError, match=r"--pipeline.model.head.mode"):
+        trial.prepare_loading(model.state, {})
