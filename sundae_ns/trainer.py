@@ -5,6 +5,9 @@ Module path and class names are written into every run's ``config.yml``, so movi
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,13 +17,17 @@ from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
+from rich.table import Table
 
 from sundae_ns import distributed
-from sundae_ns.errors import CheckpointError, StorageError, SundaeError
+from sundae_ns.errors import CheckpointError, ConfigError, StorageError, SundaeError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.runs.folder import find_config
+from sundae_ns.training.run_length import fit_to_length, given_options, schedule_table, take_schedule
 
 
 @dataclass
@@ -28,6 +35,62 @@ class SundaeTrainerConfig(TrainerConfig):
     """Configuration of a run."""
 
     _target: type = field(default_factory=lambda: SundaeTrainer)
+    schedule_length: int | None = None
+    """Steps over which prune, densification, resolution and learning rates are spread, unless you set their options: by
+    default max_num_iterations, and the length of the run that is resumed. A larger number trains the first part only."""
+
+    def print_to_terminal(self) -> None:
+        """Make the schedule and log it. ``ns-train`` calls this before it saves the configuration and starts the ranks."""
+        self.make_schedule(sys.argv[1:])
+        scaled = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
+        table = Table(
+            "part of training", "steps", title=f"{self.max_num_iterations:,}{scaled} steps", title_justify="left"
+        )
+        for row in schedule_table(self):
+            table.add_row(*row)
+        CONSOLE.print(table)
+
+    def make_schedule(self, words: Iterable[str]) -> None:
+        """Fit all options that count steps to the length of the run, or take those of the run that is resumed.
+
+        Args:
+            words: the command line; options in it keep their value.
+
+        Raises:
+            ConfigError: the length is no number of steps.
+        """
+        from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
+
+        usual, given = deepcopy(all_methods.get(str(self.method_name))), given_options(words)
+        if self.load_dir is not None or self.load_checkpoint is not None:
+            run = self._resumed_run()
+            if run is not None and usual is not None:
+                take_schedule(self, run, usual, given)
+                self.schedule_length = self.schedule_length or run.schedule_length or run.max_num_iterations
+            # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
+            self.schedule_length = self.schedule_length or self.max_num_iterations
+            return
+        if self.schedule_length is None:
+            self.schedule_length = self.max_num_iterations
+        if self.schedule_length < 1:
+            raise ConfigError(
+                f"the length of the run is {self.schedule_length}; give --max-num-iterations 30000, or fewer"
+            )
+        if usual is not None:
+            fit_to_length(self, usual, given)
+
+    def _resumed_run(self) -> SundaeTrainerConfig | None:
+        """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
+        place = self.load_dir or self.load_checkpoint
+        path = None if place is None else find_config(place)
+        try:
+            run = None if path is None else load_config(path)
+        except CheckpointError as error:
+            CONSOLE.print(
+                f"[yellow]Warning: {error}; the run is resumed with the options of this command", soft_wrap=True
+            )
+            return None
+        return run if isinstance(run, SundaeTrainerConfig) else None
 
     def save_config(self) -> None:
         """Write ``config.yml`` into the run's folder atomically.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import subprocess
 import sys
 import zipfile
@@ -13,11 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import Trainer
 
-from sundae_ns.errors import CheckpointError, DataError, StorageError
+from sundae_ns.errors import CheckpointError, ConfigError, DataError, StorageError
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 
 
@@ -210,3 +214,55 @@ def test_one_line_in_nerfstudios_commands_only(
         assert "Traceback" in result.stderr
     else:
         assert result.stderr.splitlines() == lines
+
+
+def configured(tmp_path: Path, *words: str) -> Any:
+    """The configuration of ``ns-train sundae`` with these options, and its schedule."""
+    arguments = ["sundae", "--output-dir", str(tmp_path), "--experiment-name", "e", *words]
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)  # type: ignore[call-overload]
+    config.timestamp = "t"
+    config.make_schedule(arguments)
+    return config
+
+
+def test_the_number_of_steps_alone_sets_the_schedule(tmp_path: Path) -> None:
+    words = ("--max-num-iterations", "3000", "--pipeline.model.stop-split-at", "15000")
+    config = configured(tmp_path, *words)
+    model = config.pipeline.model
+    assert (config.schedule_length, model.pruning.prune_at, model.stop_split_at) == (3000, 1500, 15000)
+    first_part = configured(tmp_path, *words, "--schedule-length=30000")
+    assert (first_part.schedule_length, first_part.pipeline.model.pruning.prune_at) == (30000, 15000)
+    for option in ("--max-num-iterations", "--schedule-length"):
+        with pytest.raises(ConfigError, match="length of the run is 0; give"):
+            configured(tmp_path, option, "0")
+
+
+def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path: Path) -> None:
+    run = configured(tmp_path, "--max-num-iterations", "3000", "--pipeline.model.pruning.prune-at", "1000")
+    run.save_config()
+    folder = run.get_base_dir()
+    (folder / "nerfstudio_models").mkdir()
+    for place in (folder, folder / "nerfstudio_models"):
+        words = ("--load-dir", str(place), "--max-num-iterations", "700", "--pipeline.model.sh-degree-interval", "5")
+        again = configured(tmp_path, *words)
+        assert (again.schedule_length, again.max_num_iterations) == (3000, 700)
+        model = again.pipeline.model
+        assert (model.pruning.prune_at, model.resolution_schedule, model.sh_degree_interval) == (1000, 300, 5)
+        assert again.optimizers == run.optimizers
+    (folder / "config.yml").write_text("damaged: [")
+    alone = configured(tmp_path, "--load-dir", str(folder), "--max-num-iterations", "700")
+    assert alone.pipeline.model.pruning.prune_at == 15000, "nothing says how long the run was meant to be"
+
+
+def test_the_schedule_is_logged_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=["sundae", "--max-num-iterations", "3000"])  # type: ignore[call-overload]
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path, "e", "t"
+    monkeypatch.setattr(sys, "argv", ["ns-train", "sundae", "--max-num-iterations", "3000"])
+    config.print_to_terminal()
+    config.save_config()
+    shown = capsys.readouterr().out
+    assert len(shown.splitlines()) <= 13
+    assert re.search(r"3,000 steps", shown)
+    assert re.search(r"prune .* after 1,500", shown)
+    saved = load_config(tmp_path / "e" / "sundae" / "t" / "config.yml")
+    assert (saved.pipeline.model.pruning.prune_at, saved.schedule_length) == (1500, 3000)

@@ -46,28 +46,20 @@ def _comparison(renders: Path, out: Path) -> None:
     save_comparison(out, rows)
 
 
-def _check_steps(steps: int) -> None:
-    from sundae_ns.method_configs import sundae_tiny  # slow to import
-
-    prune_at = sundae_tiny.config.pipeline.model.pruning.prune_at
-    if steps <= prune_at:
-        raise ConfigError(f"steps is {steps}: the demo prunes after step {prune_at}; give more, or omit it")
-
-
 def run_demo(out: Path, steps: int | None = None, console: Console | None = None) -> int:
     """Write the scene, train, evaluate, and print the results.
 
     Args:
         out: folder for scene, run, logs and images; an earlier demo in it is replaced.
-        steps: number of training steps; None takes the method's default.
+        steps: number of training steps, to which the schedule is scaled; None takes the method's default.
         console: where to print.
 
     Raises:
-        ConfigError: training ends before the prune.
+        ConfigError: there is no step.
         SundaeError: a command failed; the message ends with the last lines of its output.
     """
-    if steps is not None:
-        _check_steps(steps)
+    if steps is not None and steps < 1:
+        raise ConfigError(f"steps is {steps}; give at least 1")
     console = console or Console()
     out.mkdir(parents=True, exist_ok=True)
     scene, run = out / "scene", out / "runs" / "demo" / METHOD / "run"

@@ -130,8 +130,7 @@ class Ranks(OneProcess):
         if isinstance(extension, Densification):
             strategy = extension.strategy
             if isinstance(strategy, CappedStrategy):
-                # After a reset of the opacities each image is seen once before the field grows again.
-                strategy.pause_refine_after_reset = -(-num_images // self.count) + strategy.refine_every
+                strategy.see_each_image_after_resets(-(-num_images // self.count))
             return ShardedDensification(strategy, self.shards)
         if isinstance(extension, ScheduledPruning):
             schedule = extension.schedule

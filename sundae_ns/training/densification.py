@@ -67,6 +67,19 @@ class CappedStrategy(DefaultStrategy):
     cap: int | None = None
     """Highest number of primitives; None for no cap."""
 
+    def see_each_image_after_resets(self, steps: int) -> None:
+        """Let the field grow again only once opacities have recovered from a reset.
+
+        Args:
+            steps: steps in which each image is seen once. If resets are closer together, growth waits for half of the time.
+        """
+        pause = steps + self.refine_every
+        if self.reset_every >= self.refine_stop_iter:
+            pause = 0  # gsplat also waits at the start of a run that never resets
+        elif pause >= self.reset_every:
+            pause = self.reset_every // 2
+        self.pause_refine_after_reset = pause
+
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State of gsplat's strategy, and the peak."""
         return {**super().initialize_state(scene_scale), "peak": 0}
@@ -243,7 +256,7 @@ def make_strategy(
             refine_stop_iter=stop,
             refine_every=options.refine_every,
         )
-    return CappedStrategy(
+    strategy = CappedStrategy(
         cap=cap,
         prune_opa=options.cull_alpha_thresh,
         grow_grad2d=options.densify_grad_thresh,
@@ -256,7 +269,8 @@ def make_strategy(
         refine_stop_iter=stop,
         reset_every=options.reset_alpha_every * options.refine_every,
         refine_every=options.refine_every,
-        pause_refine_after_reset=num_images + options.refine_every,
         absgrad=options.use_absgrad,
         verbose=False,
     )
+    strategy.see_each_image_after_resets(num_images)
+    return strategy

@@ -131,7 +131,7 @@ def tiny(call: Call, once: Once) -> TinyRun:
             "pipeline.model.pruning.prune-at": prune_at,
             "pipeline.model.pruning.keep-ratio": keep_ratio,
             # One round of densification, at step 30.
-            "pipeline.model.warmup-length": 5,
+            "pipeline.model.warmup-length": 20,
             "pipeline.model.refine-every": 15,
             "pipeline.model.densify-grad-thresh": 0.0004,
             "pipeline.model.sh-degree-interval": 20,

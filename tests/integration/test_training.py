@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import gc
 import json
+import re
 import tracemalloc
 from typing import Any
 
 import pytest
 import torch
+import yaml
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, MemoryExhaustedError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
+from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage import MODEL_FRAME, write_ply
 
@@ -52,6 +55,18 @@ def test_prune_keeps_exactly_the_share(tiny: Any) -> None:
     counts = {step: len(field(load(tiny.checkpoint(step)))["means"]) for step in (30, 60, 90, 119)}
     assert counts == {30: found["before"], 60: found["after"], 90: found["after"], 119: found["after"]}
     assert f"kept {found['after']:,} of {found['before']:,} primitives" in " ".join(tiny.output.split())
+
+
+def test_the_schedule_follows_the_number_of_steps(tiny: Any) -> None:
+    """A tenth of the method's own steps; what the command sets stays."""
+    config = yaml.load(tiny.config.read_text(), Loader=yaml.Loader)
+    model, rates = config.pipeline.model, config.optimizers["compensation"]["scheduler"]
+    assert config.schedule_length == tiny.steps == sundae_tiny.config.max_num_iterations // 10
+    assert model.stop_split_at == sundae_tiny.config.pipeline.model.stop_split_at // 10
+    assert (rates.max_steps, rates.warmup_steps) == (tiny.steps, tiny.steps // 12)
+    assert (model.pruning.prune_at, model.refine_every) == (tiny.prune_at, 15)
+    assert f"{tiny.steps} steps" in tiny.output
+    assert re.search(rf"prune .* after {tiny.prune_at}", tiny.output)
 
 
 def test_prune_costs_quality_and_training_brings_it_back(tiny: Any) -> None:

@@ -96,3 +96,17 @@ def test_a_chain_grows_to_its_cap_and_no_further() -> None:
     assert counts == sorted(counts)
     assert counts[-1] == max(counts) == state["peak"] == 60
     assert not any(math.isnan(value) for value in params["means"].flatten().tolist())
+
+
+@pytest.mark.parametrize(
+    ("reset_every", "images", "pause"),
+    [
+        (300, 50, 60),  # each image once, and one round
+        (300, 290, 150),  # more images than steps between resets: gsplat alone would never grow
+        (1000, 290, 0),  # never reset: gsplat alone would grow from step 300 on
+    ],
+)
+def test_a_field_grows_however_many_images_there_are(reset_every: int, images: int, pause: int) -> None:
+    strategy = CappedStrategy(refine_every=10, refine_start_iter=0, refine_stop_iter=1000, reset_every=reset_every)
+    strategy.see_each_image_after_resets(images)
+    assert strategy.pause_refine_after_reset == pause

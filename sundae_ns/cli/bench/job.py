@@ -31,6 +31,7 @@ from sundae_ns.model import SundaeModelConfig
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.storage.atomic import write_text
+from sundae_ns.trainer import SundaeTrainerConfig
 
 NEVER = 10**9
 """A step that no training reaches."""
@@ -145,6 +146,8 @@ def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
     config.output_dir = job_folder(out, job.key)
     config.experiment_name, config.timestamp = job.arm, "run"
     config.vis = "tensorboard"
+    if isinstance(config, SundaeTrainerConfig):
+        config.make_schedule(arguments)
     config.steps_per_save = config.steps_per_eval_batch = NEVER
     config.steps_per_eval_image = config.steps_per_eval_all_images = NEVER
     return config, "ns-train " + " ".join(job.scene if word == job.data else word for word in arguments)

@@ -149,6 +149,7 @@ def _warmup(scene: str, data: Path, parser: Words, arm: Arm, seed: int) -> Job:
         "pipeline.model.head.mode": ("off",),
         "pipeline.model.stop-split-at": (str(arm.warmup),),
         "optimizers.means.scheduler.max-steps": (str(arm.total),),
+        "schedule-length": (str(arm.total),),  # the first part of a whole run
     }
     return Job(
         key=f"{scene}-{name}-s{seed}",
