@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
-from nerfstudio.configs.base_config import MachineConfig, ViewerConfig
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -17,6 +17,7 @@ from sundae_ns.model import SundaeModelConfig
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.trainer import SundaeTrainerConfig
 from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
+from sundae_ns.training.progress import ProgressWriter
 from sundae_ns.training.schedulers import PruneAwareDecayConfig
 
 
@@ -113,6 +114,7 @@ def method(
                 **model,
             ),
         ),
+        logging=LoggingConfig(local_writer=LocalWriterConfig(_target=ProgressWriter, enable=True)),
         optimizers=optimizers(steps, means_restart=means_restart),
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",

@@ -15,6 +15,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sundae_ns.data.capture import check_image, check_transforms, no_transforms, undecodable
@@ -27,6 +28,12 @@ DATASET_FRAME = "sundae_dataset_frame"
 
 NO_IMAGES = "sundae_no_images"
 """Key of a dataset's metadata and of a batch: cameras without images, which are grey."""
+
+
+LEAST_FOCAL, MOST_FOCAL = 0.01, 1000.0
+"""Shortest and longest focal length in widths of the image: views of 178 and of 0.06 degrees."""
+FARTHEST = 10_000
+"""Distance of a camera, in median distances, above which its pose is doubted."""
 
 
 def no_images_error(run: object = "this run") -> DataError:
@@ -76,6 +83,67 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
         if not path.is_file():
             raise no_transforms(data)
         check_transforms(path, splits=splits, camera_models=CAMERA_MODEL_TO_TYPE)
+
+
+def capture_of(config: FullImageDatamanagerConfig) -> Path:
+    """Where the capture of a datamanager lies."""
+    return Path(config.dataparser.data if config.data is None else config.data)
+
+
+def check_before_training(config: Any) -> None:
+    """Check a capture before anything else of a training happens.
+
+    Args:
+        config: of a datamanager; only ours is checked.
+
+    Raises:
+        DataError: see :func:`check_capture`.
+    """
+    if isinstance(config, SundaeDatamanagerConfig):
+        check_capture(config.dataparser, capture_of(config), ("train", "val"), images=config.images)
+
+
+def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
+    """Check the poses and focal lengths of training images, in any units.
+
+    Args:
+        cameras: ``N`` cameras.
+        names: their images.
+
+    Returns:
+        A warning on poses that are possible, but make no good scene; None without one.
+
+    Raises:
+        DataError: an axis is mirrored, or a focal length belongs to no lens.
+    """
+    mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
+    if mirrored.any():
+        first = names[int(mirrored.nonzero()[0])].name
+        raise DataError(
+            f"the pose of {first} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses do); negate one column of "
+            "its rotation"
+        )
+    shares = cameras.fx / cameras.width.clamp_min(1)
+    wrong = ((shares < LEAST_FOCAL) | (shares > MOST_FOCAL)).flatten()
+    if wrong.any():
+        at = int(wrong.nonzero()[0])
+        raise DataError(
+            f"the focal length of {names[at].name} is {float(cameras.fx[at]):.3g} px and the image is "
+            f"{int(cameras.width[at])} px wide, which no lens has; give the focal length in pixels"
+        )
+    centres = cameras.camera_to_worlds[:, :, 3]
+    distances = (centres - centres.median(dim=0).values).norm(dim=1)
+    if len(names) > 1 and distances.max() == 0:
+        return "all cameras stand at one place, so nothing says how far things are; check the poses"
+    usual = distances.median()
+    far = distances > FARTHEST * usual.clamp_min(torch.finfo(usual.dtype).tiny)
+    if usual > 0 and far.any():
+        first = names[int(far.nonzero()[0])].name
+        return (
+            f"the camera of {first} is more than {FARTHEST:,} times as far away as most ({int(far.sum())} of {len(names)} "
+            "are); check the poses"
+        )
+    return None
 
 
 class CheckedDataset(InputDataset):
@@ -135,7 +203,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise ConfigError(f"holdout-every is {config.holdout_every}; give 0 (none) or at least 2")
         if config.dataparser._target is Nerfstudio:
             config.dataparser._target = LightNerfstudioParser
-        data = config.dataparser.data if config.data is None else Path(config.data)
+        data = capture_of(config)
         check_capture(
             config.dataparser,
             data,
@@ -148,8 +216,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise
         except EOFError as error:
             raise DataError(
-                "nerfstudio asks a question about this capture, but there is no terminal to answer it; start the command in a "
-                "terminal, or give --downscale-factor 1 to its parser if it asks about downscaled images"
+                "nerfstudio asks whether to make the smaller images of --downscale-factor with ffmpeg, but there is no "
+                "terminal to answer it; start the command once in a terminal and answer y, or train on images of full "
+                "size with --downscale-factor 1"
             ) from error
         except Exception as error:  # parsers raise many kinds, assertions too, with one meaning for the user
             reason = " ".join(str(error).split())[:200] or type(error).__name__
@@ -166,6 +235,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         outputs = self.train_dataparser_outputs
         if len(outputs.image_filenames) == 0:
             raise DataError(f"no training images in {self.config.dataparser.data}; check the path and the split")
+        warning = check_cameras(outputs.cameras, outputs.image_filenames)
+        if warning is not None:
+            CONSOLE.print(f"[yellow]Warning: {warning}", soft_wrap=True)
         outputs.metadata[DATASET_FRAME] = (outputs.dataparser_transform, float(outputs.dataparser_scale))
         return self._marked(super().create_train_dataset())
 
@@ -259,7 +331,15 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         if cache_images_device == "cpu" and not torch.cuda.is_available():
             # The stock "cpu" cache pins memory, which needs a driver; "gpu" means the model's device.
             cache_images_device = "gpu"
-        return super()._load_images(split, cache_images_device)
+        loaded = super()._load_images(split, cache_images_device)
+        transparent = sum(batch["image"].shape[-1] == 4 for batch in loaded)
+        if split == "train" and transparent:
+            CONSOLE.print(
+                f"{transparent} of {len(loaded)} training images have an alpha channel: what is transparent is trained to be "
+                "empty space. To leave pixels out instead, give masks (mask_path in transforms.json)",
+                soft_wrap=True,
+            )
+        return loaded
 
     def _check_images(self, dataset: InputDataset) -> None:
         scale = dataset.scale_factor

@@ -12,6 +12,9 @@ import sys
 from pathlib import Path
 from types import TracebackType
 
+STOPPED = (130, 143)
+"""Exit codes of a training that SIGINT or SIGTERM stopped, and that has saved itself."""
+
 
 class SundaeError(Exception):
     """Base class of all errors that ``sundae_ns`` raises on purpose."""
@@ -90,7 +93,7 @@ def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError
 
 
 def show_in_one_line() -> None:
-    """In a nerfstudio command (``ns-*``), end an uncaught :class:`SundaeError` with one line on stderr.
+    """In a nerfstudio command (``ns-*``), end an uncaught :class:`SundaeError` with one line on stderr, and Ctrl-C with 130.
 
     Other errors, other programs, and all errors when ``SUNDAE_TRACEBACK`` is set are shown as before.
     """
@@ -99,6 +102,12 @@ def show_in_one_line() -> None:
     before = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        if issubclass(kind, KeyboardInterrupt):
+            print("\nStopped.", file=sys.stderr)
+            raise SystemExit(130)
+        code = getattr(error, "exit_code", None)  # of the rank that ended first; it has said the rest
+        if code in STOPPED:
+            raise SystemExit(code)
         if kind.__name__ in ("ProcessExitedException", "ProcessRaisedException"):
             error = rank_ended(error)
         if isinstance(error, SundaeError):

@@ -5,21 +5,25 @@ Module path and class names are written into every run's ``config.yml``, so movi
 
 from __future__ import annotations
 
+import contextlib
 import sys
+import time
 from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.utils import profiler, writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
 from sundae_ns import distributed
+from sundae_ns.datamanager import check_before_training
 from sundae_ns.errors import CheckpointError, ConfigError, StorageError, SundaeError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
@@ -27,7 +31,9 @@ from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import find_config
-from sundae_ns.training.run_length import fit_to_length, given_options, schedule_table, take_schedule
+from sundae_ns.training.interruption import Interruption, resume_command
+from sundae_ns.training.progress import long_on_cpu
+from sundae_ns.training.run_length import fit_to_length, given_options, schedule_table, take_options
 
 
 @dataclass
@@ -40,7 +46,18 @@ class SundaeTrainerConfig(TrainerConfig):
     default max_num_iterations, and the length of the run that is resumed. A larger number trains the first part only."""
 
     def print_to_terminal(self) -> None:
-        """Make the schedule and log it. ``ns-train`` calls this before it saves the configuration and starts the ranks."""
+        """Check the capture, make the schedule and log it; the other options are in ``config.yml``.
+
+        ``ns-train`` calls this before it saves the configuration and starts the ranks.
+
+        Raises:
+            DataError: the capture cannot be used.
+            ConfigError: the length of the run is no number of steps.
+        """
+        if self.machine.num_devices > 1:
+            distributed.forward_signals()
+        self.make_paths_absolute()
+        check_before_training(self.pipeline.datamanager)
         self.make_schedule(sys.argv[1:])
         scaled = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
         table = Table(
@@ -49,6 +66,19 @@ class SundaeTrainerConfig(TrainerConfig):
         for row in schedule_table(self):
             table.add_row(*row)
         CONSOLE.print(table)
+
+    def make_paths_absolute(self) -> None:
+        """Make the paths absolute that a finished run is opened with, because it may be opened from another folder."""
+        datamanager: Any = self.pipeline.datamanager
+        model = self.pipeline.model
+        for owner, name in ((self, "data"), (self, "output_dir"), (datamanager, "data"), (model, "warm_start")):
+            value = getattr(owner, name, None)
+            if isinstance(value, Path):
+                setattr(owner, name, value.absolute())
+        parser = datamanager.dataparser
+        # An unset path is nerfstudio's example.
+        if datamanager.data is None and isinstance(getattr(parser, "data", None), Path):
+            parser.data = parser.data.absolute()
 
     def make_schedule(self, words: Iterable[str]) -> None:
         """Fit all options that count steps to the length of the run, or take those of the run that is resumed.
@@ -61,12 +91,17 @@ class SundaeTrainerConfig(TrainerConfig):
         """
         from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
 
-        usual, given = deepcopy(all_methods.get(str(self.method_name))), given_options(words)
+        usual: Any = deepcopy(all_methods.get(str(self.method_name)))
+        given = given_options(words)
         if self.load_dir is not None or self.load_checkpoint is not None:
             run = self._resumed_run()
             if run is not None and usual is not None:
-                take_schedule(self, run, usual, given)
+                for line in take_options(self, run, usual, given):
+                    late = "; a prune that is done is not repeated" if ".pruning." in line else ""
+                    CONSOLE.print(f"[yellow]Warning: {line}{late}", soft_wrap=True)
                 self.schedule_length = self.schedule_length or run.schedule_length or run.max_num_iterations
+                if "max_num_iterations" not in given and self.max_num_iterations == usual.max_num_iterations:
+                    self.max_num_iterations = self._steps_left()
             # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
             self.schedule_length = self.schedule_length or self.max_num_iterations
             return
@@ -78,6 +113,24 @@ class SundaeTrainerConfig(TrainerConfig):
             )
         if usual is not None:
             fit_to_length(self, usual, given)
+
+    def _steps_left(self) -> int:
+        """Steps from the checkpoint to resume to the end of the schedule.
+
+        Raises:
+            ConfigError: there are none.
+        """
+        place = self.load_dir or self.load_checkpoint
+        assert self.schedule_length is not None
+        assert place is not None
+        step = checkpoint.newest_step(place) if self.load_step is None else self.load_step
+        left = self.schedule_length if step is None else self.schedule_length - step - 1
+        if left < 1:
+            raise ConfigError(
+                f"the run has trained all of its {self.schedule_length:,} steps; give the number of further ones with "
+                "--max-num-iterations"
+            )
+        return left
 
     def _resumed_run(self) -> SundaeTrainerConfig | None:
         """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
@@ -121,6 +174,20 @@ class SundaeTrainer(Trainer):
         # nerfstudio sees one process. For more it would wrap the model in DDP, which breaks when the field changes its size.
         super().__init__(self.team.configured(config), local_rank, world_size=1)
         self.team.make_folder(self.base_dir)
+        self._trained: int | None = None
+        """The last step that is trained."""
+        self._stopped_by = 0
+        """The signal that ends this training after the step; 0 for none."""
+        self._interruption = Interruption(self._stop, quiet=local_rank != 0)
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Load the capture and, if a run is resumed, its checkpoint."""
+        try:
+            super().setup(test_mode)
+        except KeyboardInterrupt:
+            CONSOLE.print("Stopped before the first step: nothing to save.")
+            raise SystemExit(130) from None
+        writer.GLOBAL_BUFFER["max_iter"] = self.last_step + 1  # nerfstudio forgets the steps before a resume
 
     @property
     def model(self) -> SundaeModel:
@@ -159,8 +226,68 @@ class SundaeTrainer(Trainer):
         with (
             naming_full_memory(lambda: self.model.num_points),
             writing(f"cannot write to the run's folder {self.base_dir}"),
+            self._interruption,
         ):
             super().train()
+
+    def train_iteration(self, step: int) -> Any:
+        """Train one step; several ranks agree on whether to stop after it."""
+        result = super().train_iteration(step)
+        self._trained = step
+        self._foretell(step - self._start_step)
+        self._stopped_by = self.team.agreed(self._interruption.number, step)
+        if self._stopped_by:
+            self.stop_training = True
+        return result
+
+    def _foretell(self, number: int) -> None:
+        """On a CPU, warn of a training of hours once ten steps are measured; the first compiles, and the second warms up."""
+        if self.config.machine.device_type != "cpu" or self.team.collective:
+            return
+        if number == 1:
+            self._measured_from = time.perf_counter()
+        elif number == 11:
+            warning = long_on_cpu(
+                (time.perf_counter() - self._measured_from) / 10, self.last_step - self._start_step - 11
+            )
+            if warning is not None:
+                CONSOLE.print(f"[yellow]Warning: {warning}", soft_wrap=True)
+
+    def _stop(self) -> None:
+        if not self.team.collective:  # ranks stop together
+            self._stopped_by = self._interruption.number
+            self.stop_training = True
+
+    def _after_train(self) -> None:
+        """Save and report; a run that was stopped says how to resume, and exits with 130 (SIGINT) or 143 (SIGTERM).
+
+        Raises:
+            SystemExit: a signal stopped the run before its last step.
+        """
+        if self._trained is not None:
+            self.step = self._trained  # nerfstudio has counted a step that it does not train
+        if not self._stopped_by or self._trained == self.last_step:
+            super()._after_train()
+            return
+        if self._trained is not None:
+            self.save_checkpoint(self.step)
+            self.team.meet()  # a rank that leaves ends the others
+            data = self.config.pipeline.datamanager.data
+            command = resume_command(sys.argv, self.checkpoint_dir, str(self.config.method_name), data)
+            CONSOLE.print("Stopped and saved. To train the remaining steps:")
+            CONSOLE.print(f"    {command}", markup=False, highlight=False, soft_wrap=True)
+        else:
+            CONSOLE.print("Stopped before the first step: nothing to save.")
+        profiler.PROFILER.clear()  # else nerfstudio's table would hide the command
+        raise SystemExit(128 + self._stopped_by)
+
+    def _train_complete_viewer(self) -> None:
+        """Show the finished scene until Ctrl-C."""
+        if self._interruption.number:
+            return
+        self._interruption.restore()
+        with contextlib.suppress(KeyboardInterrupt):
+            super()._train_complete_viewer()
 
     def save_checkpoint(self, step: int) -> None:
         """Save model, optimizers, schedules and random state; older checkpoints are removed afterwards.

@@ -10,11 +10,13 @@ from typing import Any
 
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from PIL import Image
 
 from sundae_ns.data import write_embedded_capture
-from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager, SundaeDatamanagerConfig, check_cameras
 from sundae_ns.errors import ConfigError, DataError
 
 VIEWS = 7
@@ -249,3 +251,83 @@ def test_a_file_that_is_no_capture(tmp_path: Path) -> None:
     (tmp_path / "walk.mp4").touch()
     with pytest.raises(DataError, match="is a file, not a capture; ns-process-data video"):
         manager(tmp_path / "walk.mp4")
+
+
+def cameras(*, focal: float = 20.0, mirrored: bool = False, spread: float = 1.0, outlier: float = 0.0) -> Cameras:
+    poses = torch.eye(4)[None, :3].repeat(6, 1, 1)
+    poses[:, :, 3] = spread * torch.randn(6, 3, generator=torch.Generator().manual_seed(0))
+    poses[4, 0, 0] = -1.0 if mirrored else 1.0
+    poses[4, 0, 3] += outlier
+    return Cameras(poses, fx=focal, fy=focal, cx=10.0, cy=8.0, width=20, height=16)
+
+
+NAMES = [Path(f"{index}.png") for index in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("options", "cause"),
+    [
+        ({"mirrored": True}, r"pose of 4\.png mirrors an axis \(1 of 6"),
+        ({"focal": 1e-5}, r"focal length of 0\.png is 1e-05 px and the image is 20 px wide"),
+        ({"focal": 1e9}, r"no lens has; give the focal length in pixels"),
+    ],
+)
+def test_cameras_that_cannot_be(options: dict[str, Any], cause: str) -> None:
+    with pytest.raises(DataError, match=cause) as caught:
+        check_cameras(cameras(**options), NAMES)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "cause"),
+    [
+        ({}, None),
+        ({"outlier": 100.0}, None),
+        ({"spread": 0.0}, "all cameras stand at one place"),
+        ({"outlier": 1e11}, r"camera of 4.png is more than 10,000 times as far away as most (1 of 6"),
+    ],
+)
+def test_cameras_that_make_no_good_scene(options: dict[str, Any], cause: str | None) -> None:
+    warning = check_cameras(cameras(**options), NAMES)
+    assert (cause in warning) if cause and warning else warning is cause
+
+
+def test_cameras_are_checked_before_training(own_copy: Path, capsys: Any) -> None:
+    meta = json.loads((own_copy / "transforms.json").read_text())
+    for frame in meta["frames"]:
+        frame["transform_matrix"] = meta["frames"][0]["transform_matrix"]
+    edit(own_copy, frames=meta["frames"])
+    manager(own_copy)
+    assert "all cameras stand at one place" in " ".join(capsys.readouterr().out.split())
+    edit(own_copy, fl_x=1e-5, fl_y=1e-5)
+    with pytest.raises(DataError, match="focal length"):
+        manager(own_copy)
+
+
+def test_alpha_is_named(own_copy: Path, capsys: Any) -> None:
+    manager(own_copy).next_train(0)
+    assert "alpha" not in capsys.readouterr().out
+    for path in sorted((own_copy / "images").iterdir())[:3]:
+        with Image.open(path) as image:
+            image.convert("RGBA").save(path)
+    made = manager(own_copy)
+    made.next_train(0)
+    kept = sum(batch["image"].shape[-1] == 4 for batch in made.cached_train)
+    assert 0 < kept < VIEWS
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"{kept} of {VIEWS} training images have an alpha channel" in shown
+    assert "empty space" in shown
+
+
+def test_a_question_without_a_terminal(own_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What nerfstudio's COLMAP parser asks if images_2 is missing."""
+    monkeypatch.setattr("sundae_ns.datamanager.check_capture", lambda *_, **__: None)
+
+    def ask(*_: Any, **__: Any) -> None:
+        raise EOFError
+
+    monkeypatch.setattr(ColmapDataParserConfig().__class__, "setup", ask)
+    config = SundaeDatamanagerConfig(data=own_copy, dataparser=ColmapDataParserConfig(downscale_factor=2))
+    with pytest.raises(DataError, match="start the command once in a terminal and answer y") as caught:
+        config.setup(device="cpu", test_mode="val")
+    assert "\n" not in str(caught.value)

@@ -18,11 +18,13 @@ import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import Trainer
 
+from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, StorageError
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
+from sundae_ns.training.interruption import Interruption
 
 
 def state(step: int, n: int = 50) -> dict[str, Any]:
@@ -179,7 +181,7 @@ def test_faults_while_training(
 
     monkeypatch.setattr(Trainer, "train", fail)
     made = SundaeTrainer.__new__(SundaeTrainer)
-    made.base_dir = tmp_path
+    made.base_dir, made._interruption = tmp_path, Interruption(lambda: None)
     with pytest.raises(kind, match=cause):
         made.train()
 
@@ -216,6 +218,22 @@ def test_one_line_in_nerfstudios_commands_only(
         assert result.stderr.splitlines() == lines
 
 
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        ("KeyboardInterrupt()", 130),
+        ("ProcessExitedException('rank', error_index=1, error_pid=2, exit_code=143)", 143),
+    ],
+)
+def test_a_stopped_command_ends_without_a_traceback(error: str, code: int) -> None:
+    text = HOOK[: HOOK.index("raise")].format(program="/usr/bin/ns-viewer", error="DataError")
+    text += f"from torch.multiprocessing.spawn import ProcessExitedException\nraise {error}"
+    result = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
+    assert result.returncode == code
+    assert "Traceback" not in result.stderr
+    assert len(result.stderr.splitlines()) <= 2
+
+
 def configured(tmp_path: Path, *words: str) -> Any:
     """The configuration of ``ns-train sundae`` with these options, and its schedule."""
     arguments = ["sundae", "--output-dir", str(tmp_path), "--experiment-name", "e", *words]
@@ -249,6 +267,15 @@ def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path: Path) -> None:
         model = again.pipeline.model
         assert (model.pruning.prune_at, model.resolution_schedule, model.sh_degree_interval) == (1000, 300, 5)
         assert again.optimizers == run.optimizers
+    checkpoints = folder / "nerfstudio_models"
+    for step in (999, 1999):
+        (checkpoints / name(step)).write_text("")
+    for words, left in (((), 1000), (("--load-step", "999"), 2000)):
+        for place in (folder, checkpoints):
+            assert configured(tmp_path, "--load-dir", str(place), *words).max_num_iterations == left
+    (checkpoints / name(2999)).write_text("")
+    with pytest.raises(ConfigError, match="has trained all of its 3,000 steps; give .*--max-num-iterations"):
+        configured(tmp_path, "--load-dir", str(folder))
     (folder / "config.yml").write_text("damaged: [")
     alone = configured(tmp_path, "--load-dir", str(folder), "--max-num-iterations", "700")
     assert alone.pipeline.model.pruning.prune_at == 15000, "nothing says how long the run was meant to be"
@@ -256,13 +283,21 @@ def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path: Path) -> None:
 
 def test_the_schedule_is_logged_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     config = tyro.cli(AnnotatedBaseConfigUnion, args=["sundae", "--max-num-iterations", "3000"])  # type: ignore[call-overload]
-    config.output_dir, config.experiment_name, config.timestamp = tmp_path, "e", "t"
+    config.output_dir, config.experiment_name, config.timestamp = Path("outputs"), "e", "t"
+    config.pipeline.datamanager.data = Path("capture")
     monkeypatch.setattr(sys, "argv", ["ns-train", "sundae", "--max-num-iterations", "3000"])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DataError, match="capture does not exist"):
+        config.print_to_terminal()
+    assert list(tmp_path.iterdir()) == []
+    write_embedded_capture(tmp_path / "capture", train_views=3, test_views=1, width=16, height=16, points=9, samples=1)
     config.print_to_terminal()
     config.save_config()
     shown = capsys.readouterr().out
     assert len(shown.splitlines()) <= 13
     assert re.search(r"3,000 steps", shown)
     assert re.search(r"prune .* after 1,500", shown)
-    saved = load_config(tmp_path / "e" / "sundae" / "t" / "config.yml")
+    saved = load_config(tmp_path / "outputs" / "e" / "sundae" / "t" / "config.yml")
+    assert saved.pipeline.datamanager.data == tmp_path / "capture"
+    assert saved.get_base_dir() == tmp_path / "outputs" / "e" / "sundae" / "t"
     assert (saved.pipeline.model.pruning.prune_at, saved.schedule_length) == (1500, 3000)

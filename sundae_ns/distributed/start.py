@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
+import os
+import signal
+from types import FrameType
 from typing import Any
 
 import torch
@@ -55,3 +60,16 @@ def check_machine(ranks: int, device_type: str) -> None:
 def without_viewer(vis: str) -> str:
     """The loggers without the viewer, which could show the primitives of one rank only."""
     return "tensorboard" if vis in ("viewer", "viewer_legacy") else vis.removeprefix("viewer+")
+
+
+def forward_signals() -> None:
+    """Pass SIGINT and SIGTERM on to the ranks, which save and leave together, and wait for them."""
+
+    def forward(number: int, frame: FrameType | None) -> None:
+        for process in multiprocessing.active_children():
+            with contextlib.suppress(OSError):
+                # A terminal has sent SIGINT to all of them, and the second would make a rank leave at once.
+                os.kill(process.pid or 0, signal.SIGTERM)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, forward)

@@ -34,9 +34,22 @@ from sundae_ns.training.pruning import ScheduledPruning
 
 State = dict[str, Any]
 
+AGREED_EVERY = 16
+"""Steps after which ranks ask each other whether to stop, which waits for the GPU."""
+
 
 class OneProcess:
     """One process that holds the whole field."""
+
+    collective = False
+    """Whether there are several processes."""
+
+    def agreed(self, number: int, step: int) -> int:
+        """The signal after which all processes stop with this step; 0 for none."""
+        return number
+
+    def meet(self) -> None:
+        """Nobody to wait for."""
 
     def configured(self, config: Any) -> Any:
         """The configuration, unchanged."""
@@ -78,6 +91,18 @@ class Ranks(OneProcess):
 
     def __init__(self, rank: int, count: int) -> None:
         self.rank, self.count = rank, count
+
+    collective = True
+
+    def agreed(self, number: int, step: int) -> int:
+        """The signal that a rank got, 0 for none; asked for at every :data:`AGREED_EVERY`-th step."""
+        if step % AGREED_EVERY:
+            return 0
+        return min((got for (got,) in self.shards.numbers(number) if got), default=0)
+
+    def meet(self) -> None:
+        """Wait for all ranks."""
+        dist.barrier()
 
     def configured(self, config: Any) -> Any:
         """A copy with as many images in fewer, larger steps, without a viewer, and with images in host memory.

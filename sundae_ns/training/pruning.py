@@ -85,6 +85,8 @@ class ScheduledPruning(Extension):
         state.pruning["peak"] = max(state.pruning["peak"], state.densification.get("peak", 0))
         total = run.source.total
         due = self.schedule.due(state.pruning, state.schedule_step, total)
+        if due:
+            CONSOLE.log(f"step {state.step}: pruning {total:,} primitives, with passes over the training views")
         evaluate = due and self.evaluate and config.ends_growth_at is not None
         before = _evaluated(run, "warm-up") if evaluate else {}
         try:

@@ -6,6 +6,7 @@ that nobody set by hand to another length; nothing else in the package knows a f
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Collection, Iterable, Sequence
 from copy import deepcopy
@@ -79,18 +80,29 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
         model.reset_alpha_every = max(round(period / model.refine_every), 1) if period >= LEAST_RECOVERY else never
 
 
-def take_schedule(config: Any, run: Any, usual: Any, given: Collection[str]) -> None:
-    """Give a configuration the schedule of the run that it resumes, but for options that were set by hand.
+def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> list[str]:
+    """Give a configuration the schedule and the model of the run that it resumes, but for options that were set by hand.
 
     Args:
-        config: ``SundaeTrainerConfig``; its schedule changes.
+        config: ``SundaeTrainerConfig``; its schedule and its model change.
         run: the configuration of that run.
         usual: the method's own configuration.
         given: see :func:`fit_to_length`.
+
+    Returns:
+        A line for each option that the run has otherwise.
     """
     config.optimizers = deepcopy(config.optimizers)
-    for name in _free(config, usual, given):
-        _set(config, name, _get(run, name))
+    names = [*step_options(usual), *_leaves(usual.pipeline.model, "pipeline.model")]
+    free = set(_free(config, usual, given, names))
+    differing = []
+    for name in dict.fromkeys(names):
+        theirs = _get(run, name)
+        if name in free:
+            _set(config, name, deepcopy(theirs))
+        elif _get(config, name) != theirs:
+            differing.append(f"--{name.replace('_', '-')} is {_get(config, name)}; the run to resume has {theirs}")
+    return differing
 
 
 def schedule_table(config: Any) -> list[tuple[str, str]]:
@@ -153,9 +165,22 @@ def _rates(config: Any) -> str:
     return f"decay until {', '.join(f'{end:,}' for end in sorted(ends))}" if ends else ""
 
 
-def _free(config: Any, usual: Any, given: Collection[str]) -> Sequence[str]:
-    """Step options that nobody set by hand."""
-    return [name for name in step_options(usual) if name not in given and _get(config, name) == _get(usual, name)]
+def _free(config: Any, usual: Any, given: Collection[str], names: Sequence[str] | None = None) -> Sequence[str]:
+    """Those of ``names``, by default the step options, that nobody set by hand."""
+    names = step_options(usual) if names is None else names
+    return [name for name in names if name not in given and _get(config, name) == _get(usual, name)]
+
+
+def _leaves(config: Any, prefix: str) -> list[str]:
+    """Dotted names of all options in a configuration and in those that it holds."""
+    names = []
+    for field in dataclasses.fields(config):
+        name, value = f"{prefix}.{field.name}", getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            names += _leaves(value, name)
+        elif field.name != "_target":
+            names.append(name)
+    return names
 
 
 def _get(config: Any, name: str) -> Any:

@@ -33,7 +33,7 @@ from sundae_ns.distributed.checkpoints import state_of_rank
 from sundae_ns.distributed.shards import DRIFT
 from sundae_ns.distributed.source import Exchange
 from sundae_ns.distributed.start import without_viewer
-from sundae_ns.errors import ConfigError, rank_ended
+from sundae_ns.errors import ConfigError, rank_ended, show_in_one_line
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.rendering import StepResolution, View
 from sundae_ns.storage.runs import checkpoint
@@ -191,10 +191,32 @@ def train_rank(rank: int, meeting: Path, config: Any) -> None:
     dist.destroy_process_group()
 
 
-def main(folder: Path) -> None:
-    """Two ranks resume from a checkpoint, and one is killed."""
+@dataclass
+class StoppedTrainerConfig(SundaeTrainerConfig):
+    """A run whose rank 1 gets SIGINT."""
+
+    _target: type = field(default_factory=lambda: StoppedTrainer)
+
+
+class StoppedTrainer(SundaeTrainer):
+    """Stopped at its second step."""
+
+    def train_iteration(self, step: int) -> Any:
+        if step == 1 and dist.get_rank() == 1:
+            os.kill(os.getpid(), signal.SIGINT)
+        return super().train_iteration(step)
+
+
+def main(folder: Path, name: str) -> None:
+    """Two ranks resume from a checkpoint, and one is killed; or one gets SIGINT, which ends this program."""
     torch.set_num_threads(1)
-    plain = configured(folder, "dies")
+    plain = configured(folder, name)
+    if name == "stops":
+        sys.argv = ["ns-train"]
+        show_in_one_line()
+        stopped = StoppedTrainerConfig(**{k: v for k, v in vars(plain).items() if k != "_target"})
+        torch.multiprocessing.spawn(train_rank, (folder / "meeting-of-the-stopped", stopped), nprocs=RANKS)
+        return
     config = DyingTrainerConfig(**{k: v for k, v in vars(plain).items() if k != "_target"})
     config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"
     try:
@@ -204,7 +226,7 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), sys.argv[2])
 
 
 # -------------------------------------------------------------------------------------------------------------- tests
@@ -311,10 +333,20 @@ def test_one_process_resumes_a_run_of_two(folder: Path) -> None:
 
 def test_a_killed_rank_ends_all_with_one_line(folder: Path) -> None:
     """It resumes on two ranks first, from a checkpoint of two."""
-    subprocess.run([sys.executable, __file__, str(folder)], timeout=LIMIT, check=True)
+    subprocess.run([sys.executable, __file__, str(folder), "dies"], timeout=LIMIT, check=True)
     line = (folder / "died.txt").read_text()
     assert re.fullmatch(r"rank 1 ended \(killed by SIGKILL\).*--load-dir.*--machine\.num-devices", line)
     assert not (models(folder, "dies") / f"step-{SAVED_AT + STEPS:09d}.ckpt").exists()
+
+
+def test_ranks_stop_together_and_save_when_one_gets_a_signal(folder: Path) -> None:
+    command = [sys.executable, __file__, str(folder), "stops"]
+    result = subprocess.run(command, timeout=LIMIT, check=False, capture_output=True, text=True)
+    assert result.returncode == 130, result.stderr
+    assert result.stdout.count("--load-dir") == 1, "the first rank says how to resume"
+    # They agree after the seventeenth batch.
+    saved = checkpoint.load(models(folder, "stops") / f"step-{17 * RANKS - 1:09d}.ckpt")
+    assert checkpoint.checkpoints(models(folder, "stops"))[-1].name == f"step-{saved['step']:09d}.ckpt"
 
 
 @pytest.mark.gpu

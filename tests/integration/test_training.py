@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gc
 import json
+import os
 import re
+import signal
 import tracemalloc
 from typing import Any
 
@@ -12,10 +14,12 @@ import pytest
 import torch
 import yaml
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.utils import writer
 from nerfstudio.utils.eval_utils import eval_setup
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
 
+from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.errors import CheckpointError, MemoryExhaustedError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
 from sundae_ns.method_configs import sundae_tiny
@@ -179,6 +183,51 @@ def test_a_run_stopped_right_at_the_prune_ends_like_one_that_never_stopped(tiny:
     again.train()
     assert again.pipeline.model.state.pruning["num_prunes"] == 1
     assert_same(load(tiny.checkpoint(60)), load(again.checkpoint_dir / "step-000000060.ckpt"))
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(
+    tiny: Any, trainer_of: Any, capsys: Any, number: int, code: int
+) -> None:
+    def to_step_60(config: Any) -> None:
+        config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 30, 30
+
+    trainer = trainer_of(to_step_60)
+    serve = trainer.pipeline.datamanager.next_train
+
+    def interrupted(step: int) -> Any:
+        if step == 50:
+            os.kill(os.getpid(), number)
+        return serve(step)
+
+    trainer.pipeline.datamanager.next_train = interrupted
+    handler = signal.getsignal(number)
+    with pytest.raises(SystemExit) as end:
+        trainer.train()
+    assert end.value.code == code
+    assert signal.getsignal(number) is handler
+    assert [path.name for path in trainer.checkpoint_dir.iterdir()] == ["step-000000050.ckpt"]
+    last = capsys.readouterr().out.splitlines()[-1].split()
+    assert last[:2] == ["ns-train", "sundae-tiny"]
+    assert last[last.index("--load-dir") + 1] == str(trainer.checkpoint_dir)
+
+    def onwards(config: Any) -> None:
+        config.load_dir, config.max_num_iterations = trainer.checkpoint_dir, 10
+
+    again = trainer_of(onwards)
+    assert writer.GLOBAL_BUFFER["max_iter"] == 61, "progress counts the steps before"
+    again.train()
+    assert_same(load(tiny.checkpoint(60)), load(again.checkpoint_dir / "step-000000060.ckpt"))
+
+
+def test_a_signal_before_the_first_step_saves_nothing(tiny: Any, trainer_of: Any, monkeypatch: Any) -> None:
+    def stop(*_: Any, **__: Any) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(SundaeDatamanager, "create_train_dataset", stop)
+    with pytest.raises(SystemExit) as end:
+        trainer_of(lambda config: None)
+    assert end.value.code == 130
 
 
 def assert_same(whole: dict[str, Any], resumed: dict[str, Any]) -> None:

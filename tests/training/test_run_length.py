@@ -15,7 +15,7 @@ from sundae_ns.training.run_length import (
     given_options,
     schedule_table,
     step_options,
-    take_schedule,
+    take_options,
 )
 from sundae_ns.training.schedules import make_schedule
 
@@ -135,7 +135,15 @@ def test_a_resumed_run_keeps_its_schedule() -> None:
     config = deepcopy(usual)
     config.max_num_iterations = 2000
     config.pipeline.model.sh_degree_interval = 9
-    take_schedule(config, run, usual, given_options(["--pipeline.model.pruning.prune-at", "4000"]))
+    run.pipeline.model.head.size, run.pipeline.model.pruning.keep_ratio = "tiny", 0.3
+    config.pipeline.model.pruning.keep_ratio = 0.2
+    lines = take_options(config, run, usual, given_options(["--pipeline.model.pruning.prune-at", "4000"]))
+    assert config.pipeline.model.head.size == "tiny"
+    assert lines == [
+        "--pipeline.model.sh-degree-interval is 9; the run to resume has 200",
+        "--pipeline.model.pruning.prune-at is 15000; the run to resume has 3000",
+        "--pipeline.model.pruning.keep-ratio is 0.2; the run to resume has 0.3",
+    ]
     assert config.pipeline.model.resolution_schedule == run.pipeline.model.resolution_schedule == 600
     assert config.optimizers["means"]["scheduler"].max_steps == 6000
     assert (config.pipeline.model.pruning.prune_at, config.pipeline.model.sh_degree_interval) == (15000, 9)

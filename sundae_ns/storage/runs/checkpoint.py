@@ -62,6 +62,17 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: int(found[path][1]))
 
 
+def newest_step(place: Path) -> int | None:
+    """Step of the newest checkpoint by its name; None if there is none.
+
+    Args:
+        place: a checkpoint, the folder of checkpoints, or the folder of a run.
+    """
+    found = [place] if place.is_file() else checkpoints(place) or checkpoints(place / "nerfstudio_models")
+    match = _NAME.fullmatch(found[-1].name) if found else None
+    return None if match is None else int(match[1])
+
+
 def save(state: Mapping[str, Any], path: Path) -> None:
     """Write a checkpoint atomically: an older file of that name stays until the new one is on the disk.
 

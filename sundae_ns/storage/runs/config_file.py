@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import os
 from collections.abc import Iterator
 from enum import Enum
 from functools import cache
@@ -88,6 +89,24 @@ _ConfigLoader.add_multi_constructor(_PYTHON + "object:", _make_object)
 _ConfigLoader.add_multi_constructor(_PYTHON + "object/apply:", _make_value)
 
 
+def _find_capture(config: Any, folder: Path) -> None:
+    """If the capture of a run is not where it was, look for it where it was as seen from the run, which may have moved too.
+
+    Args:
+        config: of the run.
+        folder: of the run.
+    """
+    datamanager: Any = getattr(getattr(config, "pipeline", None), "datamanager", None)
+    data = getattr(datamanager, "data", None)
+    if not isinstance(data, Path) or data.exists():
+        return
+    names = ("output_dir", "experiment_name", "method_name", "timestamp")
+    before = Path(*(str(getattr(config, name, "")) for name in names))
+    moved = Path(os.path.normpath(folder / os.path.relpath(data, before)))
+    if moved.exists():
+        datamanager.data = moved
+
+
 def load_config(path: Path) -> Any:
     """What a run's ``config.yml`` describes, as objects of nerfstudio, without running anything that it asks for.
 
@@ -98,7 +117,9 @@ def load_config(path: Path) -> Any:
         CheckpointError: it cannot be read, is no configuration, or asks for something else.
     """
     try:
-        return yaml.load(path.read_text(encoding="utf-8"), Loader=_ConfigLoader)
+        config = yaml.load(path.read_text(encoding="utf-8"), Loader=_ConfigLoader)
+        _find_capture(config, path.absolute().parent)
+        return config
     except OSError as error:
         raise CheckpointError(
             f"{path} cannot be read ({error.strerror}); give the folder of a finished run, or its config.yml"

@@ -11,6 +11,7 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 
 from sundae_ns.errors import CheckpointError, DataError
+from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.scenes.cameras import training_cameras
 from sundae_ns.scenes.opening import load_run, open_scene
 from sundae_ns.scenes.packed import scene_of_run
@@ -108,3 +109,17 @@ def test_a_file_that_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
         load_config(path)
     with pytest.raises(CheckpointError, match="cannot be read"):
         load_config(tmp_path)
+
+
+def test_a_capture_that_has_moved_with_its_run_is_found(tmp_path: Path) -> None:
+    config = copy.deepcopy(sundae_tiny.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path / "here" / "outputs", "e", "t"
+    config.pipeline.datamanager.data = tmp_path / "here" / "capture"
+    config.pipeline.datamanager.data.mkdir(parents=True)
+    config.save_config()
+    assert load_config(config.get_base_dir() / "config.yml").pipeline.datamanager.data == tmp_path / "here" / "capture"
+    (tmp_path / "here").rename(tmp_path / "there")
+    moved = tmp_path / "there" / "outputs" / "e" / "sundae-tiny" / "t" / "config.yml"
+    assert load_config(moved).pipeline.datamanager.data == tmp_path / "there" / "capture"
+    (tmp_path / "there" / "capture").rmdir()
+    assert load_config(moved).pipeline.datamanager.data == tmp_path / "here" / "capture", "the error names this one"
