@@ -157,7 +157,8 @@ def _head(model: Any, warm: bool) -> str:
         return "when the search enables it"
     at = model.pruning.settled_at if model.head.start_at is None else model.head.start_at
     at = max(at - (model.pruning.prune_at if warm else 0), 0)
-    return f"after {at:,}" if at else "from the start"
+    when = f"after {at:,}" if at else "from the start"
+    return f"{when}, if two trials favour it" if model.head.mode == "auto" else when
 
 
 def _rates(config: Any) -> str:
