@@ -51,7 +51,7 @@ from sundae_ns.training.build import build
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.initial_field import Start
-from sundae_ns.training.losses import chain_losses, image_losses
+from sundae_ns.training.losses import image_losses, regularisers
 from sundae_ns.training.step import training_image
 from sundae_ns.viewer import ViewerControls
 
@@ -379,8 +379,8 @@ class SundaeModel(SplatfactoModel):
             losses["base_loss"] = self.config.base_loss_weight * base_loss
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
-            if self.config.warmup == "mcmc" and self.state.densifying:
-                losses.update(chain_losses(self.state.field))
+            if self.state.regularised or (self.config.warmup == "mcmc" and self.state.densifying):
+                losses.update(regularisers(self.state.field))
         return losses
 
     def get_image_metrics_and_images(

@@ -16,10 +16,10 @@ from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.densification import Densification, GrowthOptions, make_strategy
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.head_trial import HeadTrial
 from sundae_ns.training.initial_field import Frame, PointOptions, Points, Start, initial_field
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.schedules import make_schedule
+from sundae_ns.training.trials import Trials
 
 
 class BuildOptions(GrowthOptions, PointOptions, Protocol):
@@ -45,7 +45,7 @@ class Parts:
     state: FieldState
     """On these parameters and networks."""
     extensions: list[Extension]
-    """Densification, scheduled pruning and, where asked for, budget search or head trial, in the order in which they act."""
+    """Densification, scheduled pruning and, where asked for, budget search or trials, in the order in which they act."""
     start: Start
     """To announce when training starts."""
 
@@ -112,5 +112,5 @@ def build(options: BuildOptions, *, num_images: int, points: Points | None, fram
         extensions.append(BudgetSearch(pruning, head, densification, state))
     elif options.head.mode == "auto":
         begins_at = max(state.head_starts_at, pruning.settled_at, state.densify_until)
-        extensions.append(HeadTrial(int(begins_at), state))
+        extensions.append(Trials(int(begins_at), state))
     return Parts(gauss_params, networks, state, extensions, start)

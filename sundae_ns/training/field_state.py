@@ -54,6 +54,8 @@ class FieldState:
     """Step of the schedule at which densification ends."""
     head_starts_at: float = math.inf
     """Step of the schedule after which the head is enabled."""
+    regularised: bool = False
+    """Whether the loss keeps opacities and scales down, which pays where views are few."""
     sh_degree_interval: int | None = None
     """Steps after which the next SH degree is enabled; None enables all at once, as after a warm start."""
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.fused_loss import WINDOW, compiled, fused_loss
 
-MCMC_REGULARISER = 0.01
-"""Weights of opacities and scales in the loss while the field grows by MCMC (lambda_o and lambda_Sigma of the paper)."""
+REGULARISER = 0.01
+"""Weights of opacities and scales in the loss (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
 
 _log = logging.getLogger(__name__)
 
@@ -66,9 +66,12 @@ def _kernel_runs(device: torch.device) -> bool:
     return True
 
 
-def chain_losses(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Regularisers that make unused primitives transparent and small, so that MCMC moves them (equation 10 of 3DGS-MCMC)."""
+def regularisers(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Losses that make unused primitives transparent and small (equation 10 of 3DGS-MCMC).
+
+    MCMC moves such primitives; where views are few, they would fit the differences between views.
+    """
     return {
-        "opacity_loss": MCMC_REGULARISER * params["opacities"].sigmoid().mean(),
-        "scale_loss": MCMC_REGULARISER * params["scales"].exp().mean(),
+        "opacity_loss": REGULARISER * params["opacities"].sigmoid().mean(),
+        "scale_loss": REGULARISER * params["scales"].exp().mean(),
     }

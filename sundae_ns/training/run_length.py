@@ -158,7 +158,7 @@ def _head(model: Any, warm: bool) -> str:
     at = model.pruning.settled_at if model.head.start_at is None else model.head.start_at
     at = max(at - (model.pruning.prune_at if warm else 0), 0)
     when = f"after {at:,}" if at else "from the start"
-    return f"{when}, if two trials favour it" if model.head.mode == "auto" else when
+    return f"{when}, if trials favour it" if model.head.mode == "auto" else when
 
 
 def _rates(config: Any) -> str:

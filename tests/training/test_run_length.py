@@ -81,7 +81,7 @@ def test_a_twentieth_of_the_steps() -> None:
         "densification": "25 to 750, every 50; opacities never reset",
         "SH degree": "+1 every 50 steps",
         "prune": "after 750",
-        "head": "after 750, if two trials favour it",
+        "head": "after 750, if trials favour it",
         "learning rates": "decay until 1,500",
     }
 
@@ -160,7 +160,7 @@ def test_tables_of_other_kinds() -> None:
     late.pipeline.model.head.start_at, late.pipeline.model.warm_start = 25000, "field.ply"
     rows = dict(schedule_table(late))
     assert (rows["prune"], rows["densification"]) == ("at once", "none: warm start")
-    assert rows["head"] == "after 10,000, if two trials favour it"
+    assert rows["head"] == "after 10,000, if trials favour it"
     assert dict(schedule_table(all_methods["sundae-tiny"]))["head"] == "after 600"
     assert dict(schedule_table(all_methods["sundae-continuous"]))["prune"] == "2,000 to 15,000, every 2,000"
     assert dict(schedule_table(all_methods["sundae-auto"]))["head"] == "when the search enables it"

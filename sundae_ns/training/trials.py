@@ -1,9 +1,9 @@
-"""The decision whether a field gets a head (``head.mode auto``).
+"""The decision how a field is finished (``head.mode auto``): with a head, regularised, or plain.
 
-A head gains where views are many and agree; where they are few or differ, it fits their differences. So some training
-views are held out from shortly before the prune. From the pruned field two trials of one length follow, without and with
-the head. The held-out views choose one, and it continues on all views; the steps of the other are the cost. Test views are
-never used.
+A head gains where views are many and agree; where they are few or differ, it fits their differences, and regularisers may
+help instead. So some training views are held out from shortly before the prune. From the pruned field, trials of one length
+follow in turn. The held-out views choose one, and it continues on all views; the steps of the others are the cost. Test
+views are never used.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, mean_quality, measure_heldout
 from sundae_ns.training.schedulers import postpone
 
-TRIAL_SHARE = 0.05
+ARMS = ("plain", "regularised", "head")
+"""What is tried, in this order. The head comes last, so that it continues without a break where it wins."""
+TRIAL_SHARE = 0.04
 """Length of a trial as a share of the schedule."""
 HOLD_SHARE = 0.1
 """Share of the schedule for which views are held out before the first trial, so that the field forgets them."""
@@ -34,15 +36,15 @@ HELD_OUT_EVERY = 8
 MOST_HELD_OUT = 16
 """Most held-out views."""
 FEWEST_VIEWS = 6
-"""Fewer training views cannot tell whether a head helps; the field then gets none."""
+"""Fewer training views cannot judge a trial; the field is then finished plain."""
 FEW_VIEWS = 12
 """With fewer training views, two are held out in turn, for trials of half the length."""
 LEAST_GAIN = 0.1
-"""PSNR that a head must gain, dB. Two runs of one seed differ by as much."""
+"""PSNR that an arm must gain over the plain one, dB. Two runs of one seed differ by as much."""
 
 
-class Trials(NamedTuple):
-    """The trials of a run. Each fold of held-out views has two: without the head, then with it."""
+class Plan(NamedTuple):
+    """The trials of a run: each fold of held-out views tries every arm."""
 
     folds: list[list[int]]
     """Held-out training views, by index."""
@@ -50,9 +52,9 @@ class Trials(NamedTuple):
     """Training steps of a trial."""
 
     @property
-    def number(self) -> int:
+    def num_trials(self) -> int:
         """Number of trials."""
-        return 2 * len(self.folds)
+        return len(ARMS) * len(self.folds)
 
     @property
     def views(self) -> list[int]:
@@ -60,8 +62,8 @@ class Trials(NamedTuple):
         return [index for fold in self.folds for index in fold]
 
 
-def plan_trials(indices: Sequence[int], steps: int) -> Trials:
-    """Trials of a run.
+def plan_trials(indices: Sequence[int], steps: int) -> Plan:
+    """Plan the trials of a run.
 
     Args:
         indices: of the training views, at least two.
@@ -72,7 +74,7 @@ def plan_trials(indices: Sequence[int], steps: int) -> Trials:
     # Evenly over the capture, because neighbours in a path look alike.
     chosen = [indices[(2 * i + 1) * len(indices) // (2 * count)] for i in range(count)]
     length = max(round(TRIAL_SHARE * steps / (2 if few else 1)), 1)
-    return Trials([[index] for index in chosen] if few else [chosen], length)
+    return Plan([[index] for index in chosen] if few else [chosen], length)
 
 
 @dataclass
@@ -82,46 +84,63 @@ class Progress:
     phase: str = "before"
     """before, holding (views are held out), trials, or done."""
     decision: str = ""
-    """head or none, once taken."""
+    """The chosen arm."""
     reason: str = ""
-    """Why it was taken without trials."""
+    """Why it was chosen without trials."""
     steps: int = 0
     """Length of the schedule, noted when training starts: a resumed run may be longer or shorter, its trials may not."""
     trial: int = 0
-    """Number of the current trial; those with the head are odd."""
+    """Number of the current trial."""
     began: int = 0
     """Step of the schedule at which the current trial began."""
     measured: list[list[list[float]]] = field(default_factory=list)
     """For each finished trial and held-out view: pixels, PSNR (dB), SSIM."""
 
-    def qualities(self, *, head: bool) -> list[HeldOutQuality]:
-        """Quality of all held-out views after the trials with the head, or after those without."""
-        return [HeldOutQuality(*view) for trial in self.measured[int(head) :: 2] for view in trial]  # type: ignore[arg-type]
+    @property
+    def arm(self) -> str:
+        """Arm of the current trial; the chosen one after the trials, and plain before them."""
+        return ARMS[self.trial % len(ARMS)] if self.phase == "trials" else self.decision or "plain"
+
+    def qualities(self, arm: str) -> list[HeldOutQuality]:
+        """Quality of the held-out views after the trials of an arm, over all folds."""
+        trials = self.measured[ARMS.index(arm) :: len(ARMS)]
+        return [HeldOutQuality(int(pixels), *figures) for trial in trials for pixels, *figures in trial]
+
+    def best(self) -> str:
+        """The arm with the highest PSNR among the plain one and those that gain enough over it and lose no SSIM."""
+        plain = mean_quality(self.qualities("plain"))
+        best, highest = "plain", LEAST_GAIN
+        for arm in ARMS[1:]:
+            decibels, similarity = (b - a for a, b in zip(plain, mean_quality(self.qualities(arm)), strict=True))
+            # Comparisons with figures that are not finite fail.
+            if math.inf > decibels >= highest and similarity >= 0:
+                best, highest = arm, decibels
+        return best
 
 
-class HeadTrial(Extension):
-    """Decides whether the field gets its head, and removes the head if not.
+class Trials(Extension):
+    """Decides how the field is finished, and removes the head if it does not pay.
 
     Args:
-        begins_at: step of the schedule after which the first trial begins: field and number of primitives are settled.
+        begins_at: step of the schedule after which the first trial begins: the number of primitives is settled.
         state: the field, whose head stays disabled until its trial.
     """
 
-    name = "head_trial"
+    name = "trials"
 
     def __init__(self, begins_at: int, state: FieldState) -> None:
         self.begins_at = begins_at
         self.progress = Progress()
-        self._plan: Trials | None = None
+        self._plan: Plan | None = None
         self._start: dict[str, Snapshot] | None = None
-        self._bare: dict[str, Snapshot] | None = None
-        state.head_starts_at = math.inf
+        self._ends: dict[str, Snapshot] = {}
+        self._set_arm(state)
 
     # ------------------------------------------------------------------------------------------------- checkpoints
 
     def state_dict(self) -> dict[str, Any]:
         """Numbers and, during trials, copies of the fields to which they may return."""
-        return {"numbers": asdict(self.progress), "start": self._start, "bare": self._bare}
+        return {"numbers": asdict(self.progress), "start": self._start, "ends": self._ends}
 
     def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Remove the head if the checkpoint has none.
@@ -129,22 +148,21 @@ class HeadTrial(Extension):
         Raises:
             CheckpointError: the checkpoint carries no decision.
         """
-        if _progress_of(saved).decision == "none":
+        if _progress_of(saved).decision in ("plain", "regularised"):
             state.remove_head()
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`.
 
         Raises:
-            CheckpointError: the checkpoint carries no decision, or lacks the fields of its trials.
+            CheckpointError: the checkpoint carries no decision, or lacks a field to which its trials may return.
         """
         progress = _progress_of(saved)
-        needed = {"start": progress.phase == "trials", "bare": progress.phase == "trials" and progress.trial % 2 == 1}
-        if any(due and not isinstance(saved.get(name), Mapping) for name, due in needed.items()):
-            raise CheckpointError("the checkpoint lacks the field that its head trial would return to; give another")
-        self.progress, self._start, self._bare = progress, saved.get("start"), saved.get("bare")
-        enabled = progress.decision == "head" or (progress.phase == "trials" and progress.trial % 2 == 1)
-        state.head_starts_at = progress.began if enabled else math.inf
+        start, ends = saved.get("start"), saved.get("ends")
+        if progress.phase == "trials" and not (isinstance(start, Mapping) and isinstance(ends, Mapping)):
+            raise CheckpointError("the checkpoint lacks the fields that its trials would return to; give another")
+        self.progress, self._start, self._ends = progress, start, dict(ends or {})
+        self._set_arm(state)
 
     # ---------------------------------------------------------------------------------------------------- training
 
@@ -157,28 +175,26 @@ class HeadTrial(Extension):
             if run.images_per_step > 1:
                 self._settle(run, "head", "trials need a single GPU")
             elif views < FEWEST_VIEWS:
-                self._settle(run, "none", f"{views} training views are too few to tell whether it helps")
+                self._settle(run, "plain", f"{views} training views are too few to tell whether a head helps")
         elif progress.phase != "done":
             self._hold_out(run)
 
     def after_step(self, run: TrainingRun) -> None:
         """Hold out views, begin and end trials, decide."""
         progress, step = self.progress, run.state.schedule_step
-        if progress.phase == "before" and step >= self.begins_at - HOLD_SHARE * progress.steps:
-            if not self._fits(run):
-                return
+        if progress.phase == "before" and step >= self.begins_at - HOLD_SHARE * progress.steps and self._fits(run):
             progress.phase = "holding"
             self._hold_out(run)
         if progress.phase == "holding" and step >= self.begins_at:
-            progress.phase = "trials"
-            trials = self._trials(run)
+            plan = self._planned(run)
             CONSOLE.log(
-                f"step {run.state.step}: is the head worth it? {trials.number} trials of {trials.length:,} steps, without "
-                f"and with it; {len(trials.views)} of {len(run.view_indices())} training views are held out"
+                f"step {run.state.step}: is the head worth it? {plan.num_trials} trials of {plan.length:,} steps "
+                f"({', '.join(ARMS)}); {len(plan.views)} of {len(run.view_indices())} training views are held out"
             )
+            progress.phase = "trials"
             self._start = _copies(run.state)
             self._begin(run)
-        elif progress.phase == "trials" and step - progress.began >= self._trials(run).length:
+        elif progress.phase == "trials" and step - progress.began >= self._planned(run).length:
             self._end(run)
 
     def finish(self, run: TrainingRun) -> None:
@@ -192,7 +208,7 @@ class HeadTrial(Extension):
 
     # ------------------------------------------------------------------------------------------------------- trials
 
-    def _trials(self, run: TrainingRun) -> Trials:
+    def _planned(self, run: TrainingRun) -> Plan:
         if self._plan is None:
             self._plan = plan_trials(run.view_indices(), self.progress.steps)
         return self._plan
@@ -201,100 +217,96 @@ class HeadTrial(Extension):
         """Whether as many steps as the trials take are left after them."""
         if run.last_step is None:
             return False
-        trials = self._trials(run)
-        return run.last_step + run.state.offset >= self.begins_at + 2 * trials.number * trials.length
+        plan = self._planned(run)
+        return run.last_step + run.state.offset >= self.begins_at + 2 * plan.num_trials * plan.length
 
     def _hold_out(self, run: TrainingRun) -> None:
         """Serve training views without the held-out ones of this phase."""
-        trials, progress = self._trials(run), self.progress
-        run.hold_out(trials.folds[progress.trial // 2] if progress.phase == "trials" else trials.views)
+        plan, progress = self._planned(run), self.progress
+        run.hold_out(plan.folds[progress.trial // len(ARMS)] if progress.phase == "trials" else plan.views)
 
     def _begin(self, run: TrainingRun) -> None:
         """Begin the current trial from the field as it is."""
         self._hold_out(run)
-        state = run.state
-        self.progress.began = state.schedule_step
-        state.head_starts_at = state.schedule_step if self.progress.trial % 2 else math.inf
+        self.progress.began = run.state.schedule_step
+        self._set_arm(run.state)
+
+    def _set_arm(self, state: FieldState) -> None:
+        """Let the next steps train the arm of this phase."""
+        arm = self.progress.arm
+        state.regularised = arm == "regularised"
+        state.head_starts_at = self.progress.began if arm == "head" else math.inf
 
     def _end(self, run: TrainingRun) -> None:
+        """End the current trial; begin the next one from the same field, or decide."""
         progress, state = self.progress, run.state
         mend = "decide by hand with --pipeline.model.head.mode residual or off"
         progress.measured.append([list(view) for view in measure_heldout(run, mend=mend)])
-        if progress.trial % 2 == 0:
-            self._bare = _copies(state)
-        progress.trial += 1
-        if progress.trial == self._trials(run).number:
+        if progress.arm != "head":  # it is the last, so a chosen head needs no copy
+            self._ends[progress.arm] = snapshot(state.field, state.optimizers)
+        if progress.trial + 1 == self._planned(run).num_trials:
             self._decide(run)
             return
         assert self._start is not None
-        _restore(state, self._start)
+        restore(state.field, state.optimizers, self._start["field"])
+        restore_module(_head(state), state.optimizers["compensation"], self._start["head"])
         postpone(state.schedulers, state.schedule_step - progress.began)
+        progress.trial += 1
         self._begin(run)
 
     def _decide(self, run: TrainingRun) -> None:
-        progress = self.progress
-        without, with_head = (mean_quality(progress.qualities(head=head)) for head in (False, True))
-        gain = [b - a for a, b in zip(without, with_head, strict=True)]
-        # A gain that is not finite does not pay.
-        pays = gain[0] >= LEAST_GAIN and gain[1] >= 0
-        CONSOLE.log(
-            f"step {run.state.step}: the head gains {gain[0]:+.2f} dB and {gain[1]:+.4f} SSIM on held-out training views "
-            f"({without[0]:.2f} dB, {without[1]:.4f} without it): it is {'enabled' if pays else 'removed'}"
-        )
-        run.log_scalars("Head", {"gain_psnr": gain[0], "gain_ssim": gain[1], "enabled": int(pays)})
-        if not pays:
-            assert self._bare is not None
-            _restore(run.state, self._bare)
-        self._settle(run, "head" if pays else "none", "")
+        progress, state = self.progress, run.state
+        decision = progress.best()
+        figures = {arm: mean_quality(progress.qualities(arm)) for arm in ARMS}
+        texts = [f"{arm} {decibels:.2f} dB, SSIM {similarity:.4f}" for arm, (decibels, similarity) in figures.items()]
+        CONSOLE.log(f"step {state.step}: held-out training views: {'; '.join(texts)}. Continuing with: {decision}")
+        run.log_scalars("Trials", {f"psnr_{arm}": decibels for arm, (decibels, _) in figures.items()})
+        if decision != "head":
+            restore(state.field, state.optimizers, self._ends[decision])
+        self._settle(run, decision, "")
 
     def _settle(self, run: TrainingRun, decision: str, reason: str) -> None:
         """Take a decision, and serve all training views from now on."""
-        progress, state = self.progress, run.state
+        progress = self.progress
         if reason:
             CONSOLE.log(f"the head is {'enabled' if decision == 'head' else 'removed'} without a trial: {reason}")
             progress.began = self.begins_at
         progress.phase, progress.decision, progress.reason = "done", decision, reason
-        self._start = self._bare = None
+        self._start, self._ends = None, {}
         run.hold_out([])
-        if decision == "none":
-            state.remove_head()
-        else:
-            state.head_starts_at = progress.began
-        self._record(run)
+        self._set_arm(run.state)
+        if decision != "head":
+            run.state.remove_head()
+        if run.folder is not None:
+            run.folder.mkdir(parents=True, exist_ok=True)
+            write_text(run.folder / "trials.json", json.dumps(without_nan(self._record(run)), indent=2) + "\n")
 
-    def _record(self, run: TrainingRun) -> None:
-        """Write the decision and its figures to ``head.json`` in the run's folder."""
-        if run.folder is None:
-            return
+    def _record(self, run: TrainingRun) -> dict[str, Any]:
+        """The decision and its figures."""
         progress = self.progress
         record: dict[str, Any] = {"decision": progress.decision, "reason": progress.reason, "step": run.state.step}
-        if progress.measured:
-            trials = self._trials(run)
-            record |= {"held_out_views": trials.views, "steps_per_trial": trials.length}
-            for name, head in (("without_head", False), ("with_head", True)):
-                views = progress.qualities(head=head)
-                record[name] = {
-                    **dict(zip(("psnr", "ssim"), mean_quality(views))),
-                    "views": [v._asdict() for v in views],
-                }
-        run.folder.mkdir(parents=True, exist_ok=True)
-        write_text(run.folder / "head.json", json.dumps(without_nan(record), indent=2) + "\n")
+        if not progress.measured:
+            return record
+        record |= {"held_out_views": self._planned(run).views, "steps_per_trial": self._planned(run).length, "arms": {}}
+        for arm in ARMS:
+            views = progress.qualities(arm)
+            decibels, similarity = mean_quality(views)
+            record["arms"][arm] = {"psnr": decibels, "ssim": similarity, "views": [view._asdict() for view in views]}
+        return record
+
+
+def _head(state: FieldState) -> list[Any]:
+    """The parameters of the head."""
+    assert state.head is not None
+    return list(state.head.parameters())
 
 
 def _copies(state: FieldState) -> dict[str, Snapshot]:
     """Copies of field and head with the states of their optimizers."""
-    assert state.head is not None
     return {
         "field": snapshot(state.field, state.optimizers),
-        "head": module_snapshot(state.head.parameters(), state.optimizers["compensation"]),
+        "head": module_snapshot(_head(state), state.optimizers["compensation"]),
     }
-
-
-def _restore(state: FieldState, saved: Mapping[str, Snapshot]) -> None:
-    """Return to :func:`_copies`."""
-    assert state.head is not None
-    restore(state.field, state.optimizers, saved["field"])
-    restore_module(state.head.parameters(), state.optimizers["compensation"], saved["head"])
 
 
 def _progress_of(saved: Mapping[str, Any]) -> Progress:

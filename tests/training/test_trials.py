@@ -1,4 +1,4 @@
-"""The plan of the trials that decide about a head, and the removal of a head."""
+"""The plan of the trials that decide how a field is finished, their verdict, and the removal of a head."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from models import Training
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.model import SundaeModel
-from sundae_ns.training.head_trial import MOST_HELD_OUT, HeadTrial, plan_trials
+from sundae_ns.training.trials import MOST_HELD_OUT, Progress, Trials, plan_trials
 
 Build = Callable[..., SundaeModel]
 
@@ -18,8 +18,8 @@ Build = Callable[..., SundaeModel]
 @pytest.mark.parametrize(("views", "held_out"), [(12, 2), (16, 2), (43, 5), (73, 9), (105, 13), (255, 16), (2000, 16)])
 def test_an_eighth_of_the_views_is_held_out_within_limits(views: int, held_out: int) -> None:
     trials = plan_trials(range(views), 30000)
-    assert trials.length == 1500
-    assert trials.number == 2
+    assert trials.length == 1200
+    assert trials.num_trials == 3
     (fold,) = trials.folds
     assert len(set(fold)) == held_out <= MOST_HELD_OUT
     # Even gaps: no stretch of the capture goes unjudged.
@@ -32,8 +32,8 @@ def test_an_eighth_of_the_views_is_held_out_within_limits(views: int, held_out: 
 @pytest.mark.parametrize("views", [6, 9, 11])
 def test_with_few_views_two_are_held_out_in_turn(views: int) -> None:
     trials = plan_trials([10 * i for i in range(views)], 30000)
-    assert trials.number == 4
-    assert trials.length == 750
+    assert trials.num_trials == 6
+    assert trials.length == 600
     assert [len(fold) for fold in trials.folds] == [1, 1]
     assert len(set(trials.views)) == 2
     assert all(index % 10 == 0 for index in trials.views)
@@ -42,14 +42,14 @@ def test_with_few_views_two_are_held_out_in_turn(views: int) -> None:
 @pytest.mark.parametrize("views", [6, 12, 255])
 def test_deciding_costs_at_most_a_tenth_of_the_steps(views: int) -> None:
     trials = plan_trials(range(views), 30000)
-    # The last trial of the two arms goes on.
-    assert (trials.number - 1) * trials.length <= 0.1 * 30000
+    # The trial of one arm continues.
+    assert (trials.num_trials - 1) * trials.length <= 0.1 * 30000
 
 
 def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
-    assert "head_trial" in {extension.name for extension in build(head={"mode": "auto"}).extensions}
+    assert "trials" in {extension.name for extension in build(head={"mode": "auto"}).extensions}
     for mode in ("residual", "features", "off"):
-        assert "head_trial" not in {extension.name for extension in build(head={"mode": mode}).extensions}
+        assert "trials" not in {extension.name for extension in build(head={"mode": mode}).extensions}
     searching = build(head={"mode": "auto"}, pruning={"mode": "auto", "stop": 10})
     assert [extension.name for extension in searching.extensions][-1] == "budget"
 
@@ -89,6 +89,36 @@ def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:
 
 def test_a_checkpoint_without_a_decision_names_the_option(build: Build) -> None:
     model = build(head={"mode": "auto"})
-    (trial,) = (extension for extension in model.extensions if isinstance(extension, HeadTrial))
+    (trial,) = (extension for extension in model.extensions if isinstance(extension, Trials))
     with pytest.raises(CheckpointError, match=r"--pipeline.model.head.mode"):
         trial.prepare_loading(model.state, {})
+
+
+@pytest.mark.parametrize(
+    ("regularised", "head", "best"),
+    [
+        ((0.05, 0.01), (0.09, 0.01), "plain"),
+        ((0.3, 0.01), (0.2, 0.01), "regularised"),
+        ((0.2, 0.01), (0.3, 0.01), "head"),
+        ((0.2, 0.01), (0.9, -0.001), "regularised"),
+        ((-1.0, -0.1), (0.5, 0.0), "head"),
+        ((float("nan"), 0.01), (float("inf"), 0.01), "plain"),
+        ((0.5, 0.01), (0.5, float("nan")), "regularised"),
+    ],
+)
+def test_an_arm_must_gain_and_must_not_lose_ssim(
+    regularised: tuple[float, float], head: tuple[float, float], best: str
+) -> None:
+    # Two folds; the second view has more pixels and is harder.
+    measured = [
+        [[float(pixels), decibels + gain[0], 0.7 + gain[1]]]
+        for pixels, decibels in ((100, 25.0), (300, 20.0))
+        for gain in ((0.0, 0.0), regularised, head)
+    ]
+    assert Progress(measured=measured).best() == best
+
+
+def test_views_count_by_their_pixels() -> None:
+    # A gain of 1 dB on few pixels does not outweigh a loss on many.
+    plain, head = [[10.0, 20.0, 0.5], [990.0, 20.0, 0.5]], [[10.0, 21.0, 0.6], [990.0, 19.99, 0.6]]
+    assert Progress(measured=[plain, plain, head]).best() == "plain"

@@ -1,4 +1,4 @@
-"""Whole runs that decide about their head, on a scene of a few pixels."""
+"""Whole runs that decide how they are finished, on a scene of a few pixels."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import CheckpointError
 from sundae_ns.method_configs import sundae
 from sundae_ns.scenes.packed import scene_of_run
-from sundae_ns.training import head_trial
+from sundae_ns.training import trials
 from sundae_ns.training.heldout import HeldOutQuality
 
 STEPS, PRUNE_AT = 100, 40
-LENGTH = 5
-"""Steps of a trial: a twentieth of the run. Views are held out from step 30 on."""
+LENGTH = 4
+"""Steps of a trial: a twenty-fifth of the run. Views are held out from step 30 on."""
+DECIDED = PRUNE_AT + 3 * LENGTH
+"""Step of the decision."""
+NONE = (0.0, 0.0)
 Make = Callable[..., Trainer]
 
 
@@ -70,24 +73,25 @@ def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
 
 
 @pytest.fixture
-def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[[float, float], None]:
-    """Fixes what the head gains on every held-out view: PSNR in dB, SSIM."""
+def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Fixes what the arms gain on every held-out view: PSNR in dB, SSIM."""
 
-    def fix(decibels: float, similarity: float) -> None:
-        real = head_trial.measure_heldout
+    def fix(head: tuple[float, float] = NONE, regularised: tuple[float, float] = NONE) -> None:
+        real = trials.measure_heldout
 
         def measured(run: Any, *, mend: str) -> list[HeldOutQuality]:
-            head = run.state.head_enabled
+            state = run.state
+            decibels, similarity = head if state.head_enabled else regularised if state.regularised else NONE
             views = [view.pixels for view in real(run, mend=mend)]
-            return [HeldOutQuality(n, 20 + head * decibels, 0.5 + head * similarity) for n in views]
+            return [HeldOutQuality(n, 20 + decibels, 0.5 + similarity) for n in views]
 
-        monkeypatch.setattr(head_trial, "measure_heldout", measured)
+        monkeypatch.setattr(trials, "measure_heldout", measured)
 
     return fix
 
 
 def _record(trainer: Trainer) -> dict[str, Any]:
-    return dict(json.loads((trainer.base_dir / "head.json").read_text()))
+    return dict(json.loads((trainer.base_dir / "trials.json").read_text()))
 
 
 def _served(trainer: Trainer) -> list[int]:
@@ -104,7 +108,7 @@ def _served(trainer: Trainer) -> list[int]:
 
 
 def test_a_head_that_pays_stays_and_all_views_are_trained_on_again(make: Make, judge: Any) -> None:
-    judge(0.5, 0.01)
+    judge(head=(0.5, 0.01))
     trainer = make()
     served = _served(trainer)
     trainer.train()
@@ -112,25 +116,25 @@ def test_a_head_that_pays_stays_and_all_views_are_trained_on_again(make: Make, j
     record = _record(trainer)
     held = set(record["held_out_views"])
     assert record["decision"] == "head"
-    assert record["step"] == PRUNE_AT + 2 * LENGTH
-    assert record["with_head"]["psnr"] == pytest.approx(20.5)
+    assert record["step"] == DECIDED
+    assert record["arms"]["head"]["psnr"] == pytest.approx(20.5)
     assert model.head is not None
     assert model.state.head_enabled
     assert len(held) == 2
-    assert not held & set(served[31 : PRUNE_AT + 2 * LENGTH + 1])
+    assert not held & set(served[31 : DECIDED + 1])
     assert held & set(served[:30])
-    assert held & set(served[PRUNE_AT + 2 * LENGTH + 1 :])
+    assert held & set(served[DECIDED + 1 :])
     moved = model.head.net.out.weight.abs().max()
     assert moved > 0
 
 
 @pytest.mark.parametrize("gains", [(0.05, 0.01), (0.5, -0.001), (math.nan, 0.01)])
 def test_a_head_that_does_not_pay_costs_nothing(make: Make, judge: Any, gains: tuple[float, float]) -> None:
-    judge(*gains)
+    judge(head=gains)
     trainer = make()
     trainer.train()
     model: Any = trainer.pipeline.model
-    assert _record(trainer)["decision"] == "none"
+    assert _record(trainer)["decision"] == "plain"
     assert model.head is None
     assert model.gauss_params["features"].numel() == 0
     saved = torch.load(next(trainer.checkpoint_dir.glob("*.ckpt")), map_location="cpu", weights_only=True)
@@ -147,11 +151,12 @@ def test_a_head_that_does_not_pay_costs_nothing(make: Make, judge: Any, gains: t
     assert not any(value.numel() for name, value in scene.field.items() if name == "features")
 
 
-def test_the_trials_start_alike_and_the_field_without_a_head_continues(make: Make, judge: Any) -> None:
-    judge(-1.0, -0.1)
+@pytest.mark.parametrize(("chosen", "place"), [("plain", 1), ("regularised", 2)])
+def test_the_trials_start_alike_and_the_chosen_field_continues(make: Make, judge: Any, chosen: str, place: int) -> None:
+    judge(head=(-1.0, -0.1), regularised=(0.3 if chosen == "regularised" else 0.0, 0.0))
     trainer = make()
     model: Any = trainer.pipeline.model
-    (trial,) = (extension for extension in model.extensions if extension.name == "head_trial")
+    (trial,) = (extension for extension in model.extensions if extension.name == "trials")
     seen: dict[int, tuple[torch.Tensor, float]] = {}
     real = trial.after_step
 
@@ -162,19 +167,24 @@ def test_the_trials_start_alike_and_the_field_without_a_head_continues(make: Mak
 
     trial.after_step = after_step
     trainer.train()
-    start, bare, decided = PRUNE_AT, PRUNE_AT + LENGTH - 1, PRUNE_AT + 2 * LENGTH
-    # Both trials start from the field and the rate right after the prune.
-    assert torch.equal(seen[start][0], seen[PRUNE_AT + LENGTH][0])
-    assert seen[start][1] == pytest.approx(seen[PRUNE_AT + LENGTH][1])
-    assert not torch.equal(seen[bare][0], seen[start][0])
-    # The field at the end of the first trial is the one that goes on.
-    assert (seen[decided][0] - seen[bare][0]).abs().max() < (seen[decided][0] - seen[start][0]).abs().max()
+    starts = [PRUNE_AT + i * LENGTH for i in range(3)]
+    # All trials start from the field and the rate right after the prune.
+    for step in starts[1:]:
+        assert torch.equal(seen[starts[0]][0], seen[step][0])
+        assert seen[starts[0]][1] == pytest.approx(seen[step][1])
+    end = seen[PRUNE_AT + place * LENGTH - 1][0]
+    assert not torch.equal(end, seen[PRUNE_AT][0])
+    # The field at the end of the chosen trial is one step away from the last that was seen of it.
+    distances = [(seen[DECIDED][0] - seen[PRUNE_AT + i * LENGTH - 1][0]).abs().max() for i in (1, 2, 3)]
+    assert min(distances) == distances[place - 1]
+    assert model.state.regularised == (chosen == "regularised")
+    assert _record(trainer)["decision"] == chosen
 
 
-@pytest.mark.parametrize("stop", [35, PRUNE_AT + 2, PRUNE_AT + LENGTH + 2, PRUNE_AT + 2 * LENGTH + 3])
+@pytest.mark.parametrize("stop", [35, PRUNE_AT + 2, PRUNE_AT + LENGTH + 2, PRUNE_AT + 2 * LENGTH + 2, DECIDED + 3])
 @pytest.mark.parametrize("gain", [0.5, -0.5])
 def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, judge: Any, stop: int, gain: float) -> None:
-    judge(gain, gain / 10)
+    judge(head=(gain, gain / 10), regularised=(0.2, 0.0))
     whole = make(name="whole", save_every=stop)
     whole.train()
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
@@ -184,17 +194,17 @@ def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, judge: An
     same(a["pipeline"], b["pipeline"])
     same(a["optimizers"], b["optimizers"])
     same(a["schedulers"], b["schedulers"])
-    assert _record(whole) == (_record(resumed) if stop < PRUNE_AT + 2 * LENGTH else _record(whole))
+    assert _record(whole) == (_record(resumed) if stop < DECIDED else _record(whole))
 
 
 def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None:
-    judge(0.5, 0.01)
+    judge(head=(0.5, 0.01))
     trainer = make(8)
     served = _served(trainer)
     trainer.train()
     first, second = _record(trainer)["held_out_views"]
-    length = round(LENGTH / 2)
-    folds = [served[PRUNE_AT + 1 + 2 * i * length : PRUNE_AT + 1 + 2 * (i + 1) * length] for i in range(2)]
+    length = LENGTH // 2
+    folds = [served[PRUNE_AT + 1 + 3 * i * length : PRUNE_AT + 1 + 3 * (i + 1) * length] for i in range(2)]
     assert _record(trainer)["decision"] == "head"
     assert _record(trainer)["steps_per_trial"] == length
     assert first not in folds[0]
@@ -206,8 +216,8 @@ def test_with_too_few_views_the_head_stays_off(make: Make, capsys: pytest.Captur
     trainer.train()
     assert trainer.pipeline.model.head is None
     assert _record(trainer) == {
-        "decision": "none",
-        "reason": "5 training views are too few to tell whether it helps",
+        "decision": "plain",
+        "reason": "5 training views are too few to tell whether a head helps",
         "step": 0,
     }
     assert "the head is removed without a trial: 5 training views are too few" in " ".join(
@@ -218,20 +228,20 @@ def test_with_too_few_views_the_head_stays_off(make: Make, capsys: pytest.Captur
 def test_a_run_that_is_too_short_for_trials_says_so(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
     trainer = make(max_num_iterations=PRUNE_AT + 5)
     trainer.train()
-    assert not (trainer.base_dir / "head.json").exists()
+    assert not (trainer.base_dir / "trials.json").exists()
     assert not trainer.pipeline.model.state.head_enabled
     assert "before the head could be tried" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_checkpoint_that_lacks_the_field_to_return_to_is_refused(make: Make, judge: Any) -> None:
-    judge(0.5, 0.01)
+    judge(head=(0.5, 0.01))
     stop = PRUNE_AT + LENGTH + 2
     whole = make(name="whole", save_every=stop)
     whole.train()
     path = whole.checkpoint_dir / f"step-{stop:09d}.ckpt"
     state = torch.load(path, map_location="cpu", weights_only=True)
-    state["pipeline"]["_model._extra_state"]["extensions"]["head_trial"]["bare"] = None
+    state["pipeline"]["_model._extra_state"]["extensions"]["trials"]["ends"] = None
     model: Any = make(name="other").pipeline.model
     inner = {name.removeprefix("_model."): value for name, value in state["pipeline"].items() if "_model." in name}
-    with pytest.raises(CheckpointError, match="lacks the field"):
+    with pytest.raises(CheckpointError, match="lacks the fields"):
         model.load_state_dict(inner)
