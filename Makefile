@@ -26,7 +26,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	touch $@
 
 demo: $(INSTALLED)
-	$(BIN)/sundae demo .demo
+	$(BIN)/sundae demo .demo --overwrite
 
 # mypy runs beside pytest; make waits for both and fails if one does.
 test: lint

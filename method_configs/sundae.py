@@ -116,7 +116,8 @@ def method(
         ),
         logging=LoggingConfig(local_writer=LocalWriterConfig(_target=ProgressWriter, enable=True)),
         optimizers=optimizers(steps, means_restart=means_restart),
-        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        # A training ends by itself, so that the next command runs; ns-viewer shows the run afterwards.
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15, quit_on_train_completion=True),
         vis="viewer",
     )
     for option, value in (trainer or {}).items():

@@ -84,6 +84,11 @@ class NerfstudioRun:
         return None if self._trainer is None else self._trainer.config.max_num_iterations
 
     @property
+    def schedule_length(self) -> int | None:
+        """Number of steps for which the schedule is made."""
+        return None if self._trainer is None else self._trainer.config.schedule_length or self.num_steps
+
+    @property
     def images_per_step(self) -> int:
         """Number of images in the batch of a step."""
         return self._datamanager.place[1]

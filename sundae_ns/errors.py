@@ -1,19 +1,37 @@
 """Errors shown to users: one line each, the cause first and then the remedy.
 
 All derive from :class:`SundaeError`, so the command line can print them without a traceback. Each also derives from the
-built-in exception that a caller would expect. This module imports nothing of the package.
+built-in exception that a caller would expect. Here, too, is what every reader and writer of files shares. This module
+imports nothing of the package.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
 STOPPED = (130, 143)
 """Exit codes of a training that SIGINT or SIGTERM stopped, and that has saved itself."""
+_REASONS = {
+    errno.ENOSPC: "the disk is full; make room",
+    errno.EDQUOT: "the disk quota is used up; make room",
+    errno.EFBIG: "the file is larger than this process may write; raise the limit (ulimit -f)",
+    errno.EROFS: "the file system is read-only; choose another folder",
+    errno.EACCES: "permission denied; choose another folder, or change its permissions",
+    errno.EPERM: "not permitted; choose another folder",
+    errno.ENOTDIR: "a file stands where a folder should be; choose another folder",
+    errno.EEXIST: "a file stands where a folder should be; choose another folder",
+    errno.EIO: "the disk reports an error; check it, or choose another disk",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+    errno.EISDIR: "it is a folder; name a file",
+}
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class SundaeError(Exception):
@@ -53,6 +71,51 @@ class CheckpointError(SundaeError, ValueError):
 
 class RankError(SundaeError, RuntimeError):
     """One of the processes that train a scene together ended early."""
+
+
+@contextmanager
+def writing(failure: str) -> Iterator[None]:
+    """Turn file-system errors that a user can correct into ``StorageError``; others pass.
+
+    Args:
+        failure: start of the message, without a full stop: ``"cannot make runs/a"``.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    try:
+        yield
+    except SundaeError:
+        raise
+    except Exception as error:
+        reason = _reason(error)
+        if reason is None:
+            raise
+        raise StorageError(f"{failure}: {reason}") from error
+
+
+def _reason(error: Exception) -> str | None:
+    """Cause and remedy of a file-system error; None for other errors."""
+    if isinstance(error, OSError):
+        return _REASONS.get(error.errno or 0)
+    # torch and zipfile replace a failed write by an error of their own when they close the file.
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in _NO_SPACE:
+            return _REASONS[cause.errno]
+        cause = cause.__cause__ or cause.__context__
+    return None
+
+
+def regular(path: Path) -> Path:
+    """The path, unless reading it may never end.
+
+    Raises:
+        OSError: it is a pipe, a socket or a device.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", str(path))
+    return path
 
 
 def rank_ended(error: BaseException) -> RankError:

@@ -28,7 +28,7 @@ from sundae_ns.errors import CheckpointError, ConfigError, StorageError, SundaeE
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage.atomic import write_text, writing
-from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage.runs import checkpoint, folder
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import find_config
 from sundae_ns.training.interruption import Interruption, resume_command
@@ -145,6 +145,11 @@ class SundaeTrainerConfig(TrainerConfig):
             return None
         return run if isinstance(run, SundaeTrainerConfig) else None
 
+    def set_timestamp(self) -> None:
+        """Name the run, unless ``--timestamp`` did; runs that start in the same second get different names."""
+        if self.timestamp == "{timestamp}":
+            self.timestamp = folder.new_name()
+
     def save_config(self) -> None:
         """Write ``config.yml`` into the run's folder atomically.
 
@@ -160,6 +165,7 @@ class SundaeTrainerConfig(TrainerConfig):
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StorageError(f"cannot make {path.parent} ({error.strerror}); choose another --output-dir") from error
+        folder.hold(path.parent)
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))
 
@@ -338,12 +344,12 @@ class SundaeTrainer(Trainer):
 
     def _source(self) -> Path | None:
         """The checkpoint to resume from; None for a new run."""
-        folder, step = self.config.load_dir, self.config.load_step
-        if folder is None:
+        saved, step = self.config.load_dir, self.config.load_step
+        if saved is None:
             return self.config.load_checkpoint
         if step is not None:
-            return folder / f"step-{step:09d}.ckpt"
-        path, passed_over = checkpoint.newest_whole(folder)
+            return saved / f"step-{step:09d}.ckpt"
+        path, passed_over = checkpoint.newest_whole(saved)
         for line in passed_over:
             CONSOLE.print(f"[yellow]Warning: skipped a damaged checkpoint: {line}", highlight=False)
         return path

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import re
 import subprocess
 import sys
 import zipfile
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,9 @@ import torch
 import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.plugins.types import MethodSpecification
 
+from sundae_ns import method_configs
 from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, StorageError
 from sundae_ns.method_configs import sundae_tiny
@@ -112,7 +116,8 @@ def test_no_right_to_write_and_nothing_saved_before(tmp_path: Path) -> None:
 def test_nerfstudio_finds_its_newest_beside_a_killed_save(tmp_path: Path) -> None:
     """nerfstudio's own commands read a step off every name in the folder."""
     saved(tmp_path, 10, 20)
-    (tmp_path / checkpoint._PARTIAL).write_bytes(b"half")
+    killed = tmp_path / checkpoint._PARTIAL.format(os.getpid())
+    killed.write_bytes(b"half")
     steps = sorted(int(x[x.find("-") + 1 : x.find(".")]) for x in os.listdir(tmp_path))
     assert steps[-1] == 20
     saved(tmp_path, 30)
@@ -147,6 +152,39 @@ def test_an_archive_that_unpacks_to_more_than_its_size(tmp_path: Path) -> None:
             archive.writestr(entry, content)
     with pytest.raises(CheckpointError, match="unpack to more"):
         checkpoint.load(tmp_path / name(2))
+
+
+def test_a_second_training_in_a_folder_changes_nothing_there(tmp_path: Path) -> None:
+    config = deepcopy(sundae_tiny.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path, "a", "now"
+    run = config.get_base_dir()
+    run.mkdir(parents=True)
+    with (run / "training.lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        print("process 17 on another", file=other, flush=True)
+        with pytest.raises(StorageError, match="^process 17 on another trains in .*/now; "):
+            config.save_config()
+    assert os.listdir(run) == ["training.lock"]
+    config.save_config()
+    assert sorted(os.listdir(run)) == ["config.yml", "training.lock"]
+
+
+def test_runs_of_the_same_second_have_different_names() -> None:
+    names = set()
+    for _ in range(3):
+        config = deepcopy(sundae_tiny.config)
+        config.set_timestamp()
+        names.add(config.timestamp)
+    assert len(names) == 3
+    config.timestamp = "mine"
+    config.set_timestamp()
+    assert config.timestamp == "mine"
+
+
+def test_a_training_with_a_viewer_ends_by_itself() -> None:
+    for method in vars(method_configs).values():
+        if isinstance(method, MethodSpecification):
+            assert method.config.viewer.quit_on_train_completion, method.config.method_name
 
 
 def test_methods_train_with_it() -> None:

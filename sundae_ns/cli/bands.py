@@ -26,7 +26,6 @@ from sundae_ns.gaussians import finite_mask
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, kept_count, response
-from sundae_ns.scenes.cameras import training_cameras
 from sundae_ns.storage import replacing, write_point_cloud, write_text
 from sundae_ns.storage.atomic import writing
 from sundae_ns.storage.kinds import kind_of
@@ -118,6 +117,8 @@ def _cameras_of_run(source: Path) -> Cameras:
     config = find_config(source) if kind_of(source) != "ply" else None
     if config is None:
         raise DataError("the field has no run, and so no cameras")
+    from sundae_ns.scenes.cameras import training_cameras  # loads nerfstudio, which fields without a run do not need
+
     return training_cameras(config)
 
 
@@ -137,7 +138,7 @@ def _project(points: Tensor, source: Path, view: int | None) -> tuple[list[Proje
         return project_along_axes(points), f"three orthogonal views, because {str(error).partition(';')[0]}"
     if view is not None and not 0 <= view < len(cameras):
         raise ConfigError(f"there is no training view {view}: the run has {len(cameras)}, from 0 on")
-    from sundae_ns.rendering.views import view_of  # loads nerfstudio, which fields without a run do not need
+    from sundae_ns.rendering.views import view_of
 
     def project(index: int, centres: Tensor) -> Projection:
         camera = view_of(cameras[index], "cpu")
@@ -169,9 +170,9 @@ def run_bands(
     """Write point clouds, images and ``bands.json`` of a field to a folder; the options are those of the command.
 
     Raises:
-        CheckpointError: the source holds no field.
+        CheckpointError: the source holds no field, or none of its primitives is finite.
         ConfigError: an option is out of range.
-        DataError: no primitive of the field is finite, or it has too few for a graph.
+        DataError: the field has too few primitives for a graph.
         StorageError: the folder cannot be written to.
     """
     console = console or Console()
@@ -181,9 +182,6 @@ def run_bands(
         replace(config, keep_ratio=keep_ratio).validate()
     ratios = sorted(set(keep_ratios))
     run = source.parent if source.name == "config.yml" else source
-    with writing(f"cannot write {out}"):
-        out.mkdir(parents=True, exist_ok=True)
-
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Reading the field", total=3 + len(ratios))
 
@@ -193,8 +191,6 @@ def run_bands(
         field, _ = read_field(run)
         finite = finite_mask(field)
         params = {name: value[finite] for name, value in field.items()}
-        if len(params["means"]) == 0:
-            raise DataError(f"none of the {len(finite)} primitives in {run} is finite; give another field")
         colors = base_colors(params["features_dc"])
         next_is("Graph and response")
         config = band_rule(config, ratios[0], config.gamma)
@@ -203,6 +199,8 @@ def run_bands(
         next_is("Cameras")
         projections, seen_from = _project(params["means"], source, view)
         next_is("Rules")
+        with writing(f"cannot write {out}"):
+            out.mkdir(parents=True, exist_ok=True)
         scalar = torch.nan_to_num(magnitude, nan=-1.0)
         figures, thresholds, files = [], {}, []
 

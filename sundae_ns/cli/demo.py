@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import Progress
 
-from sundae_ns.cli.process import percent_of, run_logged
+from sundae_ns.cli.process import console_script, percent_of, run_logged
 from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import ConfigError
 from sundae_ns.evaluation import ComparisonRow, report_text, save_comparison
@@ -21,12 +20,10 @@ from sundae_ns.evaluation import ComparisonRow, report_text, save_comparison
 METHOD = "sundae-tiny"
 SHOWN = 3
 """Number of test views in the comparison image."""
-
-
-def _command(name: str) -> str:
-    """Path of a console script beside this interpreter, or its bare name if there is none."""
-    path = Path(sys.executable).parent / name
-    return str(path) if path.exists() else name
+POINTS = 5000
+"""Size of the sparse cloud: a smaller one leaves too few points in the sky, which few views see."""
+BACKGROUND = "white"
+"""Colour where no training view looks, above all beside the sky; a dark one shows as stains."""
 
 
 def _read_image(path: Path) -> torch.Tensor:
@@ -68,7 +65,7 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
     with Progress(console=console, transient=True) as progress:
         tracing = progress.add_task("Ray tracing the scene", total=None)
         write_embedded_capture(
-            scene, progress=lambda done, total: progress.update(tracing, completed=done, total=total)
+            scene, points=POINTS, progress=lambda done, total: progress.update(tracing, completed=done, total=total)
         )
         training = progress.add_task(f"ns-train {METHOD}", total=100)
 
@@ -77,8 +74,9 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
             if percent is not None:
                 progress.update(training, completed=percent)
 
-        train = [_command("ns-train"), METHOD, "--data", str(scene), "--output-dir", str(out / "runs")]
+        train = [console_script("ns-train"), METHOD, "--data", str(scene), "--output-dir", str(out / "runs")]
         train += ["--experiment-name", "demo", "--timestamp", "run"]
+        train += ["--pipeline.model.background-color", BACKGROUND]
         if steps is not None:
             train += ["--max-num-iterations", str(steps)]
         # Remove the record of an earlier demo.
@@ -86,7 +84,7 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         run_logged(train, out / "train.log", show)
         progress.update(training, completed=100)
         progress.add_task("ns-eval", total=None)
-        evaluate = [_command("ns-eval"), "--load-config", str(run / "config.yml")]
+        evaluate = [console_script("ns-eval"), "--load-config", str(run / "config.yml")]
         evaluate += ["--output-path", str(out / "eval.json"), "--render-output-path", str(out / "renders")]
         run_logged(evaluate, out / "eval.log")
         progress.add_task("Timing frames", total=None)

@@ -233,7 +233,8 @@ def run_doctor(compile_kernels: bool = False, console: Console | None = None) ->
         console: where to print.
     """
     console = console or Console()
-    findings = examine(compile_kernels)
+    with console.status("Building gsplat's kernels, some minutes" if compile_kernels else "Checking"):
+        findings = examine(compile_kernels)
     table = Table(show_header=False, box=None, pad_edge=False)
     for finding in findings:
         mark = "[green]ok[/]" if finding.ok else "[red]missing[/]" if finding.needed else "[yellow]-[/]"

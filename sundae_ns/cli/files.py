@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from sundae_ns.cli.outputs import Overwrite, check_file
 
-def check_folder(out: Path) -> None:
-    """Raise ``StorageError`` unless the folder of an output file exists."""
-    from sundae_ns.errors import StorageError
+if TYPE_CHECKING:
+    from torch import Tensor
 
-    if not out.parent.is_dir():
-        raise StorageError(f"{out.parent} is no folder; create it first, or choose another")
+
+def _read_primitives(path: Path) -> dict[str, Tensor]:
+    """The field of a 3DGS .ply; raises ``DataError`` if none of its primitives is finite."""
+    from sundae_ns.errors import DataError
+    from sundae_ns.gaussians import finite_mask
+    from sundae_ns.storage import read_ply
+
+    field = read_ply(path)
+    if not finite_mask(field).any():
+        raise DataError(f"{path} has {len(field['means']):,} primitives, and none is finite; export it again")
+    return field
 
 
 def export(
     scene: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     upright: bool = False,
+    overwrite: Overwrite = False,
 ) -> int:
     """Write the base colours of a scene as a .ply, .spz or .sog file; these formats hold no features and no head.
 
@@ -28,38 +38,48 @@ def export(
     Args:
         scene: a run (its folder or config.yml), a packed scene, or a 3DGS .ply of any program.
         out: file to write; its suffix selects the format: .ply (exact), .spz or .sog (quantised, much smaller).
-            An existing file is replaced only once the new one is complete.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
             Do not use the rotated file for a warm start.
+        overwrite: replace an existing file, once the new one is complete.
     """
+    from rich.console import Console
+
     from sundae_ns.errors import ConfigError
-    from sundae_ns.scenes.packed import scene_of_run
-    from sundae_ns.storage import is_nerfstudio_ply, ply_comments, read_ply
+    from sundae_ns.storage import is_nerfstudio_ply, ply_comments
     from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.packing import read_scene
+    from sundae_ns.storage.runs.checkpoint import read_field
+    from sundae_ns.storage.runs.config_file import model_options
+    from sundae_ns.storage.runs.folder import config_of, files_of
     from sundae_ns.storage.viewers import ANTIALIASED, check_format, write_for_viewers
 
     check_format(out)
-    check_folder(out)
+    check_file(out, reads=files_of(scene), overwrite=overwrite)
     kind = kind_of(scene)
     if kind == "ply":
         if out.suffix.lower() == ".ply":
             raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
         if upright and not is_nerfstudio_ply(scene):
             raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
-        field, antialiased, sigmoid_colors = read_ply(scene), ANTIALIASED in ply_comments(scene), False
-    else:
-        packed = kind == "packed" or scene.suffix == ".sundae"
-        found = read_scene(scene) if packed else scene_of_run(scene, max_cameras=0)
+        field, antialiased, sigmoid_colors = _read_primitives(scene), ANTIALIASED in ply_comments(scene), False
+    elif kind == "packed" or scene.suffix == ".sundae":
+        found = read_scene(scene)
         stated = found.meta.get("model")
         model = stated if isinstance(stated, dict) else {}
         field, antialiased = found.field, model.get("rasterize_mode") == "antialiased"
         sigmoid_colors = model.get("sh_degree") == 0
-    written = write_for_viewers(out, field, antialiased=antialiased, sigmoid_colors=sigmoid_colors, upright=upright)
+    else:
+        model, sigmoid_colors = model_options(config_of(scene)), False
+        field, _ = read_field(config_of(scene).parent)
+        antialiased = model.get("rasterize_mode") == "antialiased"
+    with Console(stderr=True).status(f"Writing {len(field['means']):,} primitives"):  # minutes for a .sog of a million
+        written = write_for_viewers(out, field, antialiased=antialiased, sigmoid_colors=sigmoid_colors, upright=upright)
     mode = ", antialiased" if antialiased else ""
     print(f"{out}: {written.primitives:,} primitives, degree {written.degree}{mode}, {written.bytes:,} bytes")
     if written.dropped:
         print(f"left out {written.dropped:,} primitives that were not finite (NaN or infinite)")
+    if written.clamped:
+        print(f"clamped scales or colours of {written.clamped:,} primitives to the range of a .spz; a .sog has none")
     if written.cut:
         print(f"left out harmonics above SH degree {written.degree}, which {out.suffix} cannot store; .ply can")
     return 0
@@ -74,6 +94,7 @@ def prune(
     signal: Literal["attributes", "positions"] = "attributes",
     gamma: float = 0.5,
     seed: int = 0,
+    overwrite: Overwrite = False,
 ) -> int:
     """Prune a 3DGS .ply of any program, without training and without cameras.
 
@@ -90,24 +111,27 @@ def prune(
         signal: graph signal to filter: position, colour, opacity and size, or positions only.
         gamma: share of the kept primitives that the band selection takes from the highest scores.
         seed: random seed.
+        overwrite: replace an existing file, once the new one is complete.
     """
+    from rich.console import Console
+
     from sundae_ns.errors import ConfigError
     from sundae_ns.gaussians import finite_mask
     from sundae_ns.pruning import PruningConfig, decide, footprint, kept_count
-    from sundae_ns.storage import read_ply
     from sundae_ns.storage.kinds import refuse
     from sundae_ns.storage.ply import keep_vertices
 
     if out.suffix.lower() != ".ply":
         raise ConfigError(f"{out} does not end in .ply, the only output format; rename it")
-    check_folder(out)
+    check_file(out, reads=[source], overwrite=overwrite)
     config = PruningConfig(keep_ratio=keep, score=score, selection=selection, signal=signal, gamma=gamma, seed=seed)
     config.validate()
     refuse(source, packed="sundae export makes a .ply of it, which can be pruned")
-    field = read_ply(source)
+    field = _read_primitives(source)
     count = kept_count(keep, int(finite_mask(field).sum()))
-    decision = decide(field, config, lambda: footprint(field), count=count)
-    keep_vertices(source, out, decision.mask)
+    with Console(stderr=True).status(f"Choosing {count:,} primitives"):
+        decision = decide(field, config, lambda: footprint(field), count=count)
+        keep_vertices(source, out, decision.mask)
     print(f"{out}: {decision.kept:,} of {len(decision.mask):,} primitives")
     if decision.dropped_nonfinite:
         print(f"dropped {decision.dropped_nonfinite:,} primitives that were not finite (NaN or infinite)")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,13 +14,22 @@ import tyro
 
 from sundae_ns.cli.bench import app as bench
 from sundae_ns.cli.files import export, prune
+from sundae_ns.cli.outputs import Overwrite, check_folder
 from sundae_ns.cli.packing import pack, unpack
-from sundae_ns.errors import SundaeError
+from sundae_ns.cli.train import train
+from sundae_ns.errors import SundaeError, writing
 
 app = tyro.extras.SubcommandApp()
 app.command(bench, name="bench", help="Benchmark SUNDAE on this machine.")
-for command in (pack, unpack, export, prune):
+for command in (train, pack, unpack, export, prune):
     app.command(command)
+
+
+def _loading() -> AbstractContextManager[object]:
+    """Shows that a command imports its modules, which takes seconds."""
+    from rich.console import Console
+
+    return Console(stderr=True).status("Loading")
 
 
 @app.command
@@ -28,7 +39,8 @@ def doctor(compile: bool = False) -> int:  # noqa: A002
     Args:
         compile: build gsplat's CUDA kernels if they are not built yet; this takes minutes and needs nvcc.
     """
-    from sundae_ns.cli.doctor import run_doctor
+    with _loading():
+        from sundae_ns.cli.doctor import run_doctor
 
     return run_doctor(compile_kernels=compile)
 
@@ -42,6 +54,7 @@ def scene(
     width: int = 128,
     height: int = 128,
     points: int = 2000,
+    overwrite: Overwrite = False,
 ) -> int:
     """Write the embedded scene: a small ray-traced capture in nerfstudio's format, with a sparse point cloud.
 
@@ -53,12 +66,14 @@ def scene(
         width: image width in pixels.
         height: image height in pixels.
         points: number of points in the sparse point cloud.
+        overwrite: replace an earlier scene in the folder.
     """
     from rich.progress import Progress
 
     from sundae_ns.data import write_embedded_capture
 
-    with Progress(transient=True) as progress:
+    check_folder(out, reads=[], overwrite=overwrite)
+    with Progress(transient=True) as progress, writing(f"cannot write to {out}"):
         task = progress.add_task("Ray tracing", total=train_views + test_views)
         write_embedded_capture(
             out,
@@ -75,14 +90,21 @@ def scene(
 
 
 @app.command
-def demo(out: Annotated[Path, tyro.conf.Positional] = Path(".demo"), steps: int | None = None) -> int:
+def demo(
+    out: Annotated[Path, tyro.conf.Positional] = Path(".demo"),
+    steps: int | None = None,
+    overwrite: Overwrite = False,
+) -> int:
     """Write the embedded scene, train it with ns-train, evaluate it with ns-eval, and print the results.
 
     Args:
         out: folder for the scene, the run and the images.
         steps: number of training steps; by default that of sundae-tiny.
+        overwrite: replace an earlier demo in the folder.
     """
-    from sundae_ns.cli.demo import run_demo
+    check_folder(out, reads=[], overwrite=overwrite)
+    with _loading():
+        from sundae_ns.cli.demo import run_demo
 
     return run_demo(out, steps=steps)
 
@@ -95,6 +117,7 @@ def report(
     lpips_net: Literal["alex", "vgg", "squeeze"] = "alex",
     warmup: int = 3,
     repeats: int = 5,
+    overwrite: Overwrite = False,
 ) -> int:
     """Measure quality, speed and size of finished runs on their test views; write tables, plots and training curves.
 
@@ -105,8 +128,11 @@ def report(
         lpips_net: net of LPIPS, which is measured if its weights are on disk; values of different nets do not compare.
         warmup: untimed renderings of each view before timing.
         repeats: timed renderings of each view; 0 measures no times.
+        overwrite: replace the files of an earlier report in the folder.
     """
-    from sundae_ns.cli.report import run_report
+    check_folder(out, reads=[*runs, data], overwrite=overwrite)
+    with _loading():
+        from sundae_ns.cli.report import run_report
 
     return run_report(runs, out, data=data, lpips_net=lpips_net, warmup=warmup, repeats=repeats)
 
@@ -121,6 +147,7 @@ def bands(
     neighbors: int = 16,
     bandwidth: Literal["robust", "literal"] = "robust",
     view: int | None = None,
+    overwrite: Overwrite = False,
 ) -> int:
     """Show the primitives that the high-pass, low-pass and combined rules keep: point clouds, images and statistics.
 
@@ -133,9 +160,12 @@ def bands(
         neighbors: maximum number of neighbours of a primitive in the graph.
         bandwidth: rule that sets radius and width of the graph's edge weights; literal is the paper's.
         view: index of the training view to draw; by default the one with the most primitives.
+        overwrite: replace the files of an earlier command in the folder.
     """
-    from sundae_ns.cli.bands import run_bands
-    from sundae_ns.pruning import PruningConfig
+    check_folder(out, reads=[run], overwrite=overwrite)
+    with _loading():
+        from sundae_ns.cli.bands import run_bands
+        from sundae_ns.pruning import PruningConfig
 
     config = PruningConfig(signal=signal, gamma=gamma, num_neighbors=neighbors, bandwidth=bandwidth)
     return run_bands(run, out, keep_ratios=keep_ratio, config=config, view=view)
@@ -143,12 +173,19 @@ def bands(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``sundae``; a :class:`SundaeError` is printed on one line, and the exit code is 2."""
+    words = sys.argv[1:] if arguments is None else arguments
     try:
-        with warnings.catch_warnings():
+        # Commands name the file that they cannot write; this covers the rest, such as a full disk behind stdout.
+        with warnings.catch_warnings(), writing(f"{' '.join(words[:1])} ended early"):
             # Warnings of nerfstudio's imports, which users of sundae cannot fix.
             warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
-            code = app.cli(prog="sundae", description="SUNDAE for nerfstudio.", args=arguments)
+            code = app.cli(prog="sundae", description="SUNDAE for nerfstudio.", args=words)
     except SundaeError as error:
+        if os.environ.get("SUNDAE_TRACEBACK"):
+            raise
         print(f"sundae: {error}", file=sys.stderr)
         sys.exit(2)
+    except KeyboardInterrupt:
+        print("sundae: interrupted", file=sys.stderr)
+        sys.exit(130)
     sys.exit(code or 0)

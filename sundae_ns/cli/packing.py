@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sundae_ns.cli.files import check_folder
+from sundae_ns.cli.outputs import Overwrite, check_file
 
 
 def pack(
@@ -33,12 +33,13 @@ def pack(
     head: Literal["int8", "fp16"] = "int8",
     head_bits: int | None = None,
     level: int = 19,
+    overwrite: Overwrite = False,
 ) -> int:
     """Pack a finished run into one file that can be rendered, and print the size of each part.
 
     Args:
         run: a run of sundae or splatfacto (its folder or config.yml).
-        out: file to write, for example scene.sundae; an existing file is replaced only once the new one is complete.
+        out: file to write, for example scene.sundae.
         max_cameras: maximum number of training cameras to store for viewers; with 0, the capture is not needed.
         finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
             The defaults then quantise more coarsely, for a smaller file.
@@ -57,13 +58,14 @@ def pack(
         head: number format of the head's weights.
         head_bits: bits per weight of an int8 head, 3 to 8; by default 7, 6 with a fine-tune.
         level: effort of the entropy coder, 1 to 22; it does not change the time to unpack.
+        overwrite: replace an existing file, once the new one is complete.
     """
     from rich.console import Console
     from rich.progress import Progress
 
     from sundae_ns.errors import ConfigError
-    from sundae_ns.scenes.packed import scene_of_run
     from sundae_ns.storage.packing import FINETUNED, PackConfig, fit_scene, write_fitted
+    from sundae_ns.storage.runs.folder import files_of
 
     if finetune < 0:
         raise ConfigError(f"finetune is {finetune}; give the number of steps, or 0 for none")
@@ -85,11 +87,13 @@ def pack(
     chosen = {name: value for name, value in given.items() if value is not None}
     config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, **fixed})  # type: ignore[arg-type]
     config.validate()
-    check_folder(out)
+    check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
     # The bar writes to the real stdout while nerfstudio's messages are suppressed.
     with Progress(console=Console(file=sys.stdout), transient=True) as progress:
         task = progress.add_task("Reading the run", total=2 + finetune)
         with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
+            from sundae_ns.scenes.packed import scene_of_run  # takes seconds
+
             scene = scene_of_run(run, max_cameras=max_cameras, data=data)
             progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
             if finetune:
@@ -126,14 +130,17 @@ def unpack(
     """
     from rich.progress import Progress
 
-    from sundae_ns.scenes.packed import write_run
+    from sundae_ns.errors import writing
     from sundae_ns.storage.packing import read_scene
 
     with Progress(transient=True) as progress:
         task = progress.add_task("Unpacking", total=2)
         found = read_scene(scene)
+        from sundae_ns.scenes.packed import write_run  # takes seconds, which a damaged file should not cost
+
         progress.update(task, advance=1, description="Writing the run")
-        path = write_run(found, out, name or scene.stem, data=data)
+        with writing(f"cannot write to {out}"):
+            path = write_run(found, out, name or scene.stem, data=data)
     print(f"{len(found.field['means']):,} primitives, {'with' if found.head else 'without'} a head")
     print(f"View: ns-viewer --load-config {path}")
     if data is not None:

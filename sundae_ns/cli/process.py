@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +14,12 @@ from sundae_ns.errors import SundaeError
 
 _PERCENT = re.compile(r"^\s*\d+ \(([\d.]+)%\)")
 _TAIL = 12
+
+
+def console_script(name: str) -> str:
+    """Path of a command beside this interpreter, or its bare name if there is none."""
+    path = Path(sys.executable).parent / name
+    return str(path) if path.exists() else name
 
 
 def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], None] | None = None) -> None:

@@ -63,8 +63,6 @@ def run_report(
     if warmup < 0 or repeats < 0:
         raise ConfigError(f"{warmup} warm-up renderings and {repeats} timed renderings; give at least 0 of each")
     console = console or Console()
-    with writing(f"cannot make {out}"):
-        out.mkdir(parents=True, exist_ok=True)
     words = ["sundae", "report", *map(str, paths), "-o", str(out), "--lpips-net", lpips_net]
     words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
     command = shlex.join(words)
@@ -98,7 +96,9 @@ def run_report(
                 notes.append(f"{path}: {error}")
             else:
                 name = f"errors-{number}.{'png' if opened.truths[0].shape[1] <= PNG_WIDTH else 'jpg'}"
-                _save_errors(out / name, opened, measured)
+                with writing(f"cannot write to {out}"):
+                    out.mkdir(parents=True, exist_ok=True)
+                    _save_errors(out / name, opened, measured)
                 title = f"{label}: worst and median test view by PSNR"
                 comparisons.setdefault(measured.scene, []).append((title, name))
                 found = read_curves(opened.curves) if opened.curves is not None else None
@@ -117,7 +117,8 @@ def run_report(
             raise failures[0]
         progress.add_task("Plotting", total=None)
         scenes = {scene: [run for run in runs if run.scene == scene] for scene in dict.fromkeys(r.scene for r in runs)}
-        plots = _plot(out, scenes, curves)
+        with writing(f"cannot write to {out}"):
+            plots = _plot(out, scenes, curves)
         notes += _differences(scenes)
     images = {scene: [*plots[scene], *comparisons[scene]] for scene in scenes}
     write_text(out / "report.json", json.dumps([run.as_json() for run in runs], indent=1) + "\n")

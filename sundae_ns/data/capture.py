@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from sundae_ns.errors import DataError
+from sundae_ns.errors import DataError, regular
 
 MAX_SIDE = 65535
 """Longest side of an image, in pixels: JPEG's limit."""
@@ -84,7 +84,7 @@ def read_json(path: Path) -> dict[str, Any]:
         DataError: the file cannot be read or does not hold a JSON object.
     """
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(regular(path).read_bytes())
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
     except (ValueError, RecursionError) as error:  # invalid UTF-8, endless digits, endless nesting
@@ -243,7 +243,7 @@ def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
         DataError: the file is missing, not an image, of another pixel type, or too short for its size in pixels.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(regular(path)) as image:
             size, mode = image.size, image.mode
         length = path.stat().st_size
     except OSError as error:

@@ -7,13 +7,14 @@ names and identifiers. The formats are those of COLMAP's documentation ("Output 
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from sundae_ns.data.capture import number, side
-from sundae_ns.errors import DataError
+from sundae_ns.errors import DataError, regular
 
 # Identifier: name, number of parameters, number of focal lengths; only models that nerfstudio supports.
 _MODELS = {
@@ -43,7 +44,7 @@ class _BinaryFile:
     def __init__(self, path: Path) -> None:
         self.name = path.name
         try:
-            self.content = path.read_bytes()
+            self.content = regular(path).read_bytes()
         except OSError as error:
             raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
         self.position = 0
@@ -200,11 +201,19 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 
 def _all_lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").split("\n")
+        return regular(path).read_text(encoding="utf-8").split("\n")
     except OSError as error:
         raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
     except UnicodeDecodeError as error:
         raise DataError(f"{path} is not UTF-8 text; export it again") from error
+
+
+def _check_count(path: Path, found: int) -> None:
+    """Compare with the number that COLMAP states in a comment; a text cut between two lines has no other sign."""
+    for line in _all_lines(path):
+        stated = re.match(r"# Number of \w+: (\d+)", line)
+        if stated and int(stated[1]) != found:
+            raise DataError(f"{path.name} states {int(stated[1]):,} entries and has {found:,}; copy or export it again")
 
 
 def _cameras_text(path: Path) -> set[int]:
@@ -219,6 +228,7 @@ def _cameras_text(path: Path) -> set[int]:
             width, height = int(numbers[0]), int(numbers[1])
             _check_camera(models[name], width, height, [float(value) for value in numbers[2:]], where)
             cameras.add(int(identifier))
+    _check_count(path, len(cameras))
     return cameras
 
 
@@ -244,6 +254,7 @@ def _images_text(path: Path, cameras: set[int]) -> list[str]:
             for x, y, point in zip(observations[0::3], observations[1::3], observations[2::3]):
                 float(x), float(y), int(point)
         index += 1
+    _check_count(path, len(names))
     return names
 
 
@@ -255,4 +266,5 @@ def _points_text(path: Path) -> int:
             int(words[0]), [float(w) for w in words[1:4]], float(words[7]), [int(w) for w in words[8:]]
             if not all(0 <= int(w) <= 255 for w in words[4:7]):
                 raise ValueError("a colour must be from 0 to 255")
+    _check_count(path, len(lines))
     return len(lines)

@@ -7,13 +7,15 @@ grouped first, the tree is built and searched once per position, and groups are 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from scipy.spatial import cKDTree
 
 from sundae_ns.graphs.threads import for_each, slices
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -64,6 +66,8 @@ def nearest(coordinates: Floats, k: int, dtype: DTypeLike) -> tuple[Ints, Floats
     distances = np.empty((n, k), dtype)
     positions = _distinct(coordinates)
     first = positions.members[positions.starts]
+    from scipy.spatial import cKDTree  # takes half a second, also in commands that search nothing
+
     # Fitting boxes to their points takes a quarter of the time to build, and saves nothing in a balanced tree.
     tree = cKDTree(positions.coordinates, compact_nodes=False)
 

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, no_images_error
-from sundae_ns.errors import CheckpointError, PackError
+from sundae_ns.errors import CheckpointError, PackError, regular
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rendering.source import degree_in_use
@@ -153,7 +153,7 @@ def _restored(found: SplatfactoModelConfig, loaded: Mapping[str, Any], source: P
 def _frame(path: Path) -> dict[str, Any] | None:
     """Transform from the capture's coordinates to the model's, which nerfstudio writes into the run's folder."""
     try:
-        frame = json.loads(path.read_text(encoding="utf-8"))
+        frame = json.loads(regular(path).read_text(encoding="utf-8"))
         return {"transform": frame["transform"], "scale": float(frame["scale"])}
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -231,7 +231,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
     folder = config.get_base_dir()
     path = folder / "config.yml"
     if path.exists():
-        raise PackError(f"{folder} is a run already; choose another folder, or remove it")
+        raise PackError(f"{folder} is a run already; choose another --name or folder, or remove it")
     model = _model_of(scene)
     config.pipeline.model = model.config
     manager = config.pipeline.datamanager

@@ -2,44 +2,12 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from sundae_ns.errors import StorageError
-
-_REASONS = {
-    errno.ENOSPC: "the disk is full; make room",
-    errno.EDQUOT: "the disk quota is used up; make room",
-    errno.EFBIG: "the file is larger than this process may write; raise the limit (ulimit -f)",
-    errno.EROFS: "the file system is read-only; choose another folder",
-    errno.EACCES: "permission denied; choose another folder, or change its permissions",
-    errno.EPERM: "not permitted; choose another folder",
-    errno.ENOTDIR: "a file stands where a folder should be; choose another folder",
-    errno.EEXIST: "a file stands where a folder should be; choose another folder",
-    errno.EIO: "the disk reports an error; check it, or choose another disk",
-}
-
-
-@contextmanager
-def writing(failure: str) -> Iterator[None]:
-    """Turn file-system errors that a user can correct into ``StorageError``; others pass.
-
-    Args:
-        failure: start of the message, without a full stop: ``"cannot make runs/a"``.
-
-    Raises:
-        StorageError: the disk is full or not writable.
-    """
-    try:
-        yield
-    except OSError as error:  # a StorageError has no errno and passes, too
-        reason = _REASONS.get(error.errno or 0)
-        if reason is None:
-            raise
-        raise StorageError(f"{failure}: {reason}") from error
+from sundae_ns.errors import writing
 
 
 @contextmanager

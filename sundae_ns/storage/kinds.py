@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from sundae_ns.errors import CheckpointError
+from sundae_ns.errors import CheckpointError, regular
 from sundae_ns.storage.packing.container import MAGIC
 
 Kind = Literal["packed", "ply"]
@@ -17,7 +17,7 @@ _NAMES: dict[Kind, str] = {"packed": "a packed scene", "ply": "a .ply file"}
 def kind_of(path: Path) -> Kind | None:
     """Kind of the file at a path; None for any other file, a folder or a missing file."""
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             first = file.read(max(map(len, _FIRST_BYTES)))
     except OSError:
         return None

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
-from sundae_ns.errors import DataError
+from sundae_ns.errors import DataError, regular
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, sh_degree_of
 from sundae_ns.storage.atomic import replacing
 
@@ -90,40 +91,76 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
         data.write(str(partial))
 
 
-def _damage(path: Path) -> str | None:
-    """Why a file is shorter than its header states, or None; the parser allocates by the header."""
-    with path.open("rb") as file:
+class Header(NamedTuple):
+    """What the header of a .ply states."""
+
+    text: bool
+    lists: dict[str, list[str]]
+    """Names of the list properties of each element."""
+    stated: int
+    """Smallest number of bytes that its elements take."""
+    available: int
+    """Bytes behind the header."""
+
+
+def read_header(path: Path) -> Header:
+    """Read the header alone: plyfile allocates by it, and reads lists and text row by row, in minutes.
+
+    Raises:
+        DataError: the file has no header of a .ply, or an element without properties.
+        OSError: the file cannot be read.
+    """
+    with regular(path).open("rb") as file:
         header, end, _ = file.read(MAX_HEADER).partition(b"end_header")
     lines = [line.split() for line in header.splitlines()]
     if not end or lines[:1] != [[b"ply"]]:
-        return "it has no .ply header"
+        raise _incomplete(path, "it has no .ply header")
     text = [b"format", b"ascii", b"1.0"] in lines
     # In ascii, each value takes at least a digit and a space.
     elements: list[tuple[int, int]] = []
+    lists: dict[str, list[str]] = {}
     for words in lines:
         if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
             elements.append((int(words[2]), 0))
+            lists[words[1].decode("latin-1")] = []
         elif words[:1] == [b"property"] and elements and len(words) >= 3:
-            kind = words[2] if words[1] == b"list" else words[1]
+            is_list = words[1] == b"list"
+            kind = words[2] if is_list else words[1]
             count, size = elements[-1]
             elements[-1] = (count, size + (2 if text else _SIZES.get(kind.decode("latin-1"), 1)))
+            if is_list:
+                lists[list(lists)[-1]].append(words[-1].decode("latin-1"))
     if any(count > 0 and size == 0 for count, size in elements):
-        return "an element has no properties"
+        raise _incomplete(path, "an element has no properties")
     stated = sum(count * size for count, size in elements)
-    available = path.stat().st_size - len(header)
-    return f"its header states at least {stated:,} bytes, it has {available:,}" if stated > available else None
+    return Header(text, lists, stated, path.stat().st_size - len(header))
 
 
-def load_ply(path: Path) -> PlyData:
+def _incomplete(path: Path, reason: str) -> DataError:
+    return DataError(f"{path} is not a complete .ply file ({reason}); export it again.")
+
+
+def load_ply(path: Path, *, primitives: bool = False) -> PlyData:
     """Parse any .ply file, allocating no more than a few times its size.
 
+    Args:
+        path: the file.
+        primitives: refuse, by the header, what no binary .ply of Gaussian primitives has: text and lists.
+
     Raises:
-        DataError: the file is missing, not a .ply, truncated, or has no vertices.
+        DataError: the file is missing, not a .ply, truncated, has no vertices, or vertices with lists.
     """
     try:
-        reason = _damage(path)
-        if reason is not None:
-            raise DataError(f"{path} is not a complete .ply file ({reason}); export it again.")
+        header = read_header(path)
+        if header.stated > header.available:
+            raise _incomplete(path, f"its header states at least {header.stated:,} bytes, it has {header.available:,}")
+        if primitives and header.text:
+            raise DataError(f"{path} is an ascii .ply; export it as binary.")
+        for element, names in header.lists.items():
+            if names and (primitives or element == "vertex"):
+                raise DataError(
+                    f"property {names[0]} of each {element} in {path} is a list, not a number; export the .ply again."
+                )
         # plyfile maps the file given a path; from a stream it reads single vertices (90 s per million instead of 1 s).
         data = PlyData.read(str(path))
     except OSError as error:
@@ -132,23 +169,16 @@ def load_ply(path: Path) -> PlyData:
         if isinstance(error, DataError):
             raise
         # A header that is not text raises ValueError.
-        reason = " ".join(str(error).split())[:200]
-        raise DataError(f"{path} is not a complete .ply file ({reason}); export it again.") from error
+        raise _incomplete(path, " ".join(str(error).split())[:200]) from error
     if "vertex" not in data:
         raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussian primitives.")
     return data
 
 
 def stack_columns(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
-    """Properties of all vertices as columns: ``[N, len(columns)]`` float32.
-
-    Raises:
-        DataError: a property is a list.
-    """
+    """Properties of all vertices as columns: ``[N, len(columns)]`` float32."""
     table = np.empty((vertex.count, len(columns)), np.float32)
     for i, name in enumerate(columns):
-        if vertex[name].dtype.kind not in "iuf":
-            raise DataError(f"property {name} of the vertices is a list, not a number; export the .ply again.")
         with np.errstate(over="ignore"):  # values beyond float32 become infinite; callers drop them
             table[:, i] = vertex[name]
     return torch.from_numpy(table)
@@ -167,10 +197,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     Raises:
         DataError: the file is missing, not a binary .ply, truncated, or does not hold Gaussian primitives.
     """
-    data = load_ply(path)
-    if data.text:
-        raise DataError(f"{path} is an ascii .ply; export it as binary.")
-    vertex = data["vertex"]
+    vertex = load_ply(path, primitives=True)["vertex"]
     present = {prop.name for prop in vertex.properties}
     missing = [name for columns in _COLUMNS.values() for name in columns if name not in present]
     if missing:
@@ -191,7 +218,7 @@ def keep_vertices(source: Path, out: Path, mask: Tensor) -> None:
 
     Args:
         source: any .ply.
-        out: the file to write atomically; may be ``source``.
+        out: the file to write atomically.
         mask: True for vertices to keep, bool ``[N]``.
 
     Raises:

@@ -10,7 +10,7 @@ import torch
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from sundae_ns.errors import DataError
+from sundae_ns.errors import DataError, regular
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.ply import MAX_HEADER, load_ply, stack_columns
 
@@ -74,7 +74,7 @@ def write_point_cloud(
 def ply_comments(path: Path) -> list[str]:
     """Comments in the header of a .ply; an empty list for any other file or an unreadable one."""
     try:
-        with Path(path).open("rb") as file:
+        with regular(Path(path)).open("rb") as file:
             header = file.read(MAX_HEADER).partition(b"end_header")[0]
     except OSError:
         return []

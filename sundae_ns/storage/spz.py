@@ -36,6 +36,8 @@ _ANTIALIASED = 0x1  # flag
 _LARGEST = (1 << 23) - 1  # largest coordinate in steps, 24 bits with a sign
 _MOST_BITS = 24  # fractional bits of a coordinate
 _FEWEST_BITS = 8
+_SCALES = (-10.0, 5.9375)  # log-scales that fit
+_COLOR, _HARMONIC = 0.5 / 0.15, 1.0  # largest SH coefficients of degree 0, and of higher degrees
 
 
 def fractional_bits(means: Tensor) -> int:
@@ -97,6 +99,15 @@ def write_spz(
         raw = bytearray(gzip.decompress(partial.read_bytes()))
         raw[_HEADER_FLAGS] |= _ANTIALIASED * antialiased
         partial.write_bytes(gzip.compress(bytes(raw), mtime=0))
+
+
+def clamped(field: Mapping[str, Tensor]) -> int:
+    """Number of primitives with a scale or an SH coefficient beyond what a .spz stores; it stores the nearest value."""
+    low, high = _SCALES
+    beyond = ((field["scales"] < low) | (field["scales"] > high)).any(dim=1)
+    beyond |= (field["features_dc"].abs() > _COLOR).any(dim=1)
+    beyond |= (field["features_rest"].flatten(1).abs() > _HARMONIC).any(dim=1)
+    return int(beyond.sum())
 
 
 def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:

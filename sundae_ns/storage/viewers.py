@@ -15,7 +15,7 @@ from sundae_ns.gaussians.parameters import sh_degree_of
 from sundae_ns.storage.ply import write_ply
 from sundae_ns.storage.point_cloud import MODEL_FRAME
 from sundae_ns.storage.sog import write_sog
-from sundae_ns.storage.spz import MAX_SH_DEGREE, write_spz
+from sundae_ns.storage.spz import MAX_SH_DEGREE, clamped, write_spz
 from sundae_ns.storage.transform import similarity
 
 FORMATS = (".ply", ".spz", ".sog")
@@ -34,6 +34,8 @@ class ViewerFile(NamedTuple):
     """Primitives left out because they are not finite."""
     degree: int
     """SH degree of the file."""
+    clamped: int
+    """Primitives with values beyond the range of a .spz, which stores the nearest value."""
     cut: bool
     """Whether the field has a higher SH degree than the file."""
     bytes: int
@@ -85,5 +87,10 @@ def write_for_viewers(
         (write_spz if kind == ".spz" else write_sog)(path, field, antialiased=antialiased)
     kept = field["features_rest"].shape[1]
     return ViewerFile(
-        len(field["means"]), int((~finite).sum()), sh_degree_of(kept) or 0, kept < coefficients, path.stat().st_size
+        primitives=len(field["means"]),
+        dropped=int((~finite).sum()),
+        degree=sh_degree_of(kept) or 0,
+        clamped=clamped(field) if kind == ".spz" else 0,
+        cut=kept < coefficients,
+        bytes=path.stat().st_size,
     )

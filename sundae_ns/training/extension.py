@@ -52,6 +52,10 @@ class TrainingRun(Protocol):
         """Number of steps of the run; None if no trainer says so."""
 
     @property
+    def schedule_length(self) -> int | None:
+        """Number of steps for which the schedule is made: at least those of the run; None if no trainer says so."""
+
+    @property
     def images_per_step(self) -> int:
         """Number of images in the batch of a step: the number of ranks."""
 

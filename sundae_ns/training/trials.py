@@ -170,7 +170,7 @@ class Trials(Extension):
         """Decide at once where trials cannot; otherwise hold out the views of the phase."""
         views, progress = len(run.view_indices()), self.progress
         # A warm start skips the steps of the warm-up.
-        progress.steps = progress.steps or (run.num_steps or 0) + run.state.offset
+        progress.steps = progress.steps or (run.schedule_length or 0) + run.state.offset
         if progress.phase == "before":
             if run.images_per_step > 1:
                 self._settle(run, "head", "trials need a single GPU")

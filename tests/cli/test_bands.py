@@ -150,6 +150,6 @@ def test_fields_that_cannot_be_shown(tmp_path: Path, capsys: pytest.CaptureFixtu
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 4
     assert all(error.startswith("sundae: ") for error in errors)
-    assert "none of the 5 primitives" in errors[2]
+    assert "5 primitives, and none is finite" in errors[2]
     # A field with fewer primitives than neighbours works.
     assert run(tmp_path / "few.ply", "-o", tmp_path / "out") == 0

@@ -76,6 +76,22 @@ def test_export_of_a_ply_of_any_program(
     assert out.read_bytes() == same.read_bytes()
 
 
+@pytest.mark.parametrize(("kind", "clamped"), [(".spz", 3), (".sog", 0)])
+def test_export_says_how_many_primitives_are_clamped(
+    tmp_path: Path, kind: str, clamped: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = field()
+    given["features_rest"].clamp_(-1, 1)
+    given["scales"][3, 1] = -11.0
+    given["scales"][4, 0] = 6.1
+    given["features_rest"][5, 0, 0] = 1.2
+    write_ply(tmp_path / "in.ply", given)
+    assert run("export", tmp_path / "in.ply", "-o", tmp_path / f"a{kind}") == 0
+    text = capsys.readouterr().out
+    assert (f"clamped scales or colours of {clamped} primitives" in text) == (clamped > 0)
+    assert ("clamped" in text) == (clamped > 0)
+
+
 def test_export_of_a_ply_of_nerfstudio_upright(tmp_path: Path) -> None:
     write_ply(tmp_path / "in.ply", field(), comments=[MODEL_FRAME])
     assert run("export", tmp_path / "in.ply", "-o", tmp_path / "a.spz", "--upright") == 0
@@ -136,6 +152,9 @@ def test_prune_does_not_change_kept_rows(
         (["prune", "nothing.ply", "-o", "a.ply"], "nothing.ply cannot be read"),
         (["prune", "in.ply", "-o", "a.ply", "--keep", "0"], "keep_ratio is 0.0"),
         (["prune", "in.ply", "-o", "a.spz"], "a.spz does not end in .ply"),
+        (["prune", "none.ply", "-o", "a.ply"], "none.ply has 5 primitives, and none is finite; export it again"),
+        (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 primitives, and none is finite; export it again"),
+        (["export", "none.ply", "-o", "a.spz"], "none.ply has 5 primitives, and none is finite; export it again"),
         (["prune", "in.ply", "-o", "no/a.ply"], "no is no folder"),
         (["export", "in.ply", "-o", "a.splat"], "name it .ply or .spz or .sog"),
         (["export", "in.ply", "-o", "no/a.sog"], "no is no folder"),
@@ -152,10 +171,10 @@ def test_prune_does_not_change_kept_rows(
         (["pack", "in.sundae", "-o", "a.sundae"], "in.sundae is a packed scene; give the run that was packed"),
         (["pack", "in.ply", "-o", "a.sundae"], "in.ply is a .ply file; give the folder of a run"),
         (["unpack", "in.ply"], "in.ply is not a packed scene; give a file that sundae pack wrote"),
-        (["bands", "in.sundae", "-o", "."], "in.sundae is a packed scene; sundae unpack makes a run of it"),
+        (["bands", "in.sundae", "-o", "out"], "in.sundae is a packed scene; sundae unpack makes a run of it"),
         (["bench", "frame", "--load-config", "in.sundae"], "in.sundae is a packed scene; give the folder of a run"),
         (["bench", "frame", "--load-config", "in.ply"], "in.ply is a .ply file; it comes without test views"),
-        (["report", "in.ply", "-o", "."], "in.ply is a .ply file; it comes without test views"),
+        (["report", "in.ply", "-o", "out"], "in.ply is a .ply file; it comes without test views"),
         (["export", "nothing.sundae", "-o", "a.ply"], "nothing.sundae cannot be read"),
     ],
 )
@@ -170,6 +189,8 @@ def test_refusals_are_one_line(
     write_ply(Path("in.ply"), field())
     write_scene(Path("in.sundae"), Scene(field()))
     Path("in.bin").write_bytes(b"\x1f\x8b\xff")
+    write_ply(Path("none.ply"), {name: torch.full_like(value[:5], torch.nan) for name, value in field().items()})
+    write_ply(Path("empty.ply"), {name: value[:0] for name, value in field().items()})
     before = sorted(tmp_path.iterdir())
     assert run(*arguments) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line]

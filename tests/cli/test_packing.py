@@ -32,7 +32,7 @@ def test_options_are_those_of_the_configuration() -> None:
         if field.name in FINETUNED:
             (line,) = re.findall(rf"^ +{field.name}: (.*)$", pack.__doc__ or "", re.MULTILINE)
             assert line.endswith(f"; by default {field.default}, {FINETUNED[field.name]} with a fine-tune.")
-    assert set(options) == {"run", "out", "max_cameras", "finetune", "data"} | {
+    assert set(options) == {"run", "out", "max_cameras", "finetune", "data", "overwrite"} | {
         field.name for field in fields(PackConfig)
     }
 

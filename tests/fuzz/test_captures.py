@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import struct
@@ -22,6 +23,7 @@ from PIL import Image
 
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.data import write_embedded_capture
+from sundae_ns.data.colmap import check_colmap
 from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import DataError
 from sundae_ns.model import SundaeModelConfig
@@ -255,6 +257,34 @@ def test_corrupted_text_model(capture: Path, corrupted: Any, verdict: Any, file:
     path = capture / "sparse" / "0" / file
     path.write_bytes(corrupted(path.read_bytes(), seed))
     verdict(lambda: load(capture, colmap=True), bytes_of(capture))
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
+def test_a_model_cut_short_anywhere_is_refused(tmp_path: Path, file: str, text: bool) -> None:
+    names = [f"{index}.png" for index in range(3)]
+    (write_text_model if text else write_model)(tmp_path, names)
+    path = tmp_path / f"{file}.{'txt' if text else 'bin'}"
+    content = path.read_bytes()
+    if text:  # as COLMAP does
+        rows = 1 if file == "cameras" else len(names)
+        content = f"# List of {file}\n# Number of {file[:6]}: {rows}, mean length: 2\n".encode() + content
+    # The last entry of a text may lose letters or observations.
+    end = content.rindex(b"2.png" if file == "images" else b"\n", 0, -1) if text else len(content)
+    check_colmap(tmp_path, None)
+    for length in range(end):
+        if text and length < content.find(b"mean"):
+            continue  # the count itself is cut
+        path.write_bytes(content[:length])
+        with pytest.raises(DataError):
+            check_colmap(tmp_path, None)
+
+
+def test_a_pipe_in_a_capture_is_refused_at_once(capture: Path, verdict: Any) -> None:
+    for path, colmap in ((capture / "transforms.json", False), (capture / "sparse" / "0" / "images.bin", True)):
+        path.unlink()
+        os.mkfifo(path)
+        assert "pipe" in str(verdict(lambda colmap=colmap: load(capture, colmap=colmap), bytes_of(capture)))
 
 
 def _patch(file: str, at: int, content: bytes) -> Callable[[Path], None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numba
@@ -58,18 +58,23 @@ def test_compiles_without_a_cache_folder() -> None:
 def test_a_notice_is_printed_for_long_compilation(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    parallel._print_notice.cache_clear()
+    parallel._print_once.cache_clear()
     monkeypatch.setattr(parallel, "_NOTICE_AFTER", 0.05)
     monkeypatch.setattr(parallel, "_ready", set())
 
-    def slow(begin: int, end: int) -> None:
-        time.sleep(0.5 if begin == end else 0.0)
+    class Loop:
+        """As numba's: it counts the calls that found no code on disk."""
 
-    def fast(begin: int, end: int) -> None:
-        pass
+        def __init__(self, seconds: float, misses: int) -> None:
+            self.seconds, self.stats = seconds, SimpleNamespace(cache_misses={"types": misses} if misses else {})
 
-    parallel.parallel_for(fast, 3)
-    assert capsys.readouterr().err == ""
+        def __call__(self, begin: int, end: int) -> None:
+            time.sleep(self.seconds if begin == end else 0.0)
+
+    slow = Loop(0.5, misses=1)
+    for quiet in (Loop(0.0, misses=1), Loop(0.5, misses=0)):
+        parallel.parallel_for(quiet, 3)
+        assert capsys.readouterr().err == ""
     parallel.parallel_for(slow, 3)
     (line,) = capsys.readouterr().err.splitlines()
     assert "compiling" in line

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import resource
 import signal
@@ -13,10 +14,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from sundae_ns.errors import StorageError
+from sundae_ns.errors import StorageError, regular, writing
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import replacing, write_ply, write_text
-from sundae_ns.storage.atomic import writing
 
 
 @contextmanager
@@ -102,3 +102,24 @@ def test_only_errors_that_a_user_can_correct_are_converted() -> None:
         with pytest.raises(OSError, match=str(error.args[-1])) as caught, writing("cannot make a"):
             raise error
         assert caught.value is error
+
+
+def test_a_full_disk_is_found_behind_the_error_that_replaces_it(tmp_path: Path) -> None:
+    """torch replaces the error of a failed write by its own when it closes the archive."""
+
+    class Full(io.RawIOBase):
+        def write(self, _: object) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(StorageError, match="disk is full"), replacing(tmp_path / "a.ckpt"):
+        torch.save({"values": torch.zeros(9)}, Full())
+
+
+def test_only_regular_files_are_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero")):
+        with pytest.raises(OSError, match="it is a pipe or a device, not a file"):
+            regular(path)
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file", tmp_path, tmp_path / "missing"):
+        assert regular(path) == path

@@ -9,7 +9,7 @@ from plyfile import PlyData, PlyElement
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
-from sundae_ns.storage import is_nerfstudio_ply, read_ply, write_ply
+from sundae_ns.storage import is_nerfstudio_ply, read_ply, read_point_cloud, write_ply
 
 
 def _field(n=7, degree=3, seed=0):
@@ -175,3 +175,41 @@ def test_missing_parameter(tmp_path):
     del params["quats"]
     with pytest.raises(DataError, match="no quats"):
         write_ply(tmp_path / "a.ply", params)
+
+
+def _lists(path, element):
+    """A field whose vertices, or another element, have a list property."""
+    rows = PlyData.read(str(path))["vertex"].data.copy()
+    faces = np.empty(len(rows), [("corners", "O")])
+    faces["corners"] = [np.arange(3, dtype=np.int32)] * len(rows)
+    if element == "vertex":
+        more = np.empty(len(rows), [*rows.dtype.descr, ("corners", "O")])
+        for name in rows.dtype.names:
+            more[name] = rows[name]
+        more["corners"] = faces["corners"]
+        elements = [PlyElement.describe(more, "vertex")]
+    else:
+        elements = [PlyElement.describe(rows, "vertex"), PlyElement.describe(faces, element)]
+    PlyData(elements).write(str(path))
+
+
+@pytest.mark.parametrize("kind", ["vertex", "face", "ascii"])
+def test_what_is_read_row_by_row_is_refused_by_the_header(tmp_path, monkeypatch, kind):
+    path = tmp_path / "a.ply"
+    write_ply(path, _field())
+    _ascii(path) if kind == "ascii" else _lists(path, kind)
+    monkeypatch.setattr(PlyData, "read", lambda *_: pytest.fail("the rows were read"))
+    with pytest.raises(
+        DataError, match="ascii" if kind == "ascii" else f"property corners of each {kind} .* is a list"
+    ):
+        read_ply(path)
+    if kind == "vertex":
+        with pytest.raises(DataError, match="is a list"):
+            read_point_cloud(path)
+
+
+def test_faces_of_a_point_cloud_are_ignored(tmp_path):
+    path = tmp_path / "a.ply"
+    write_ply(path, _field())
+    _lists(path, "face")
+    assert torch.equal(read_point_cloud(path)[0], _field()["means"])

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json as jsonlib
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress
 from rich.table import Table
 
 from sundae_ns.errors import ConfigError
@@ -42,7 +42,8 @@ def run_frame(
     """
     if repeats < 1 or (views is not None and views < 1):
         raise ConfigError(f"{repeats} timed runs of {views} views measure nothing: use at least 1 of each")
-    with redirect_stdout(sys.stderr):  # nerfstudio prints while it loads
+    console = Console(stderr=True)
+    with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
         run = load_run(load_config)
     run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
     device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
@@ -50,23 +51,26 @@ def run_frame(
     wanted: Sequence[str | None] = precisions or every
     jobs = [(factor, precision, count) for factor in factors for precision in wanted for count in phases or (None,)]
     found: list[dict[str, Any]] = []
-    for factor, precision, count in track(jobs, description="Frames", transient=True, console=Console(stderr=True)):
-        line = {"config": str(load_config), "device": device, "primitives": run.model.num_points, "factor": factor}
-        with rendered_as(run, factor=factor, precision=precision, phases=count) as shown:
-            line |= {"repeats": repeats, **_figures(shown, repeats)}
-        found.append(line)
-        if json:
-            rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in line.items()}
-            print(jsonlib.dumps(without_nan(rounded), allow_nan=False), flush=True)
+    with Progress(console=console, transient=True) as progress:
+        task = progress.add_task("Timing frames", total=len(jobs) * len(run.cameras))
+        for factor, precision, count in jobs:
+            line = {"config": str(load_config), "device": device, "primitives": run.model.num_points, "factor": factor}
+            with rendered_as(run, factor=factor, precision=precision, phases=count) as shown:
+                line |= {"repeats": repeats, **_figures(shown, repeats, lambda: progress.advance(task))}
+            found.append(line)
+            if json:
+                rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in line.items()}
+                print(jsonlib.dumps(without_nan(rounded), allow_nan=False), flush=True)
     if not json:
         Console().print(_table(found, f"{run.model.num_points:,} primitives, {device}, {len(run.cameras)} test views"))
     return 0
 
 
 @torch.no_grad()
-def _figures(run: Opened, repeats: int) -> dict[str, Any]:
+def _figures(run: Opened, repeats: int, progress: Callable[[], None]) -> dict[str, Any]:
     """Speed of a configuration beside its error: means over the test views."""
-    measured, head = measure_scene(run, label="", repeats=repeats, with_flip=False), run.model.head
+    measured = measure_scene(run, label="", repeats=repeats, with_flip=False, progress=progress)
+    head = run.model.head
     full, base = measured.full, measured.base
     return {
         "width": int(run.cameras[0].width),

@@ -25,7 +25,7 @@ from numba import njit
 from torch import Tensor
 
 _RANGES_PER_THREAD = 8  # enough for an even load, few enough to cost nothing
-_NOTICE_AFTER = 1.0  # seconds of compilation before a notice is printed; reading from disk takes milliseconds
+_NOTICE_AFTER = 1.0  # seconds of compilation before a notice is printed
 
 _SOURCES = "".join(path.read_text() for path in sorted(Path(__file__).parent.glob("*.py")))
 """Source of this package: loops call functions of its other modules, but numba's cache checks one file only."""
@@ -93,7 +93,7 @@ def parallel_for(loop: Callable[..., None], count: int, *arguments: Any, min_per
 
 def _compile_here(loop: Callable[..., None], arguments: tuple[Any, ...]) -> None:
     """Compile on the calling thread: threads of the pool may have too small a stack for the compiler."""
-    notice = Timer(_NOTICE_AFTER, _print_notice)
+    notice = Timer(_NOTICE_AFTER, _print_notice, [loop])
     notice.daemon = True
     notice.start()
     try:
@@ -102,12 +102,15 @@ def _compile_here(loop: Callable[..., None], arguments: tuple[Any, ...]) -> None
         notice.cancel()
 
 
+def _print_notice(loop: Callable[..., None]) -> None:
+    """Print the notice once per process, unless the loop is only read from disk, which a busy machine does slowly."""
+    if loop.stats.cache_misses:  # type: ignore[attr-defined]
+        _print_once("sundae: compiling the CPU rasteriser, some ten seconds, once for each precision")
+
+
 @lru_cache(maxsize=1)
-def _print_notice() -> None:
-    """Print the notice once per process."""
-    print(
-        "sundae: compiling the CPU rasteriser, some ten seconds, once for each precision", file=sys.stderr, flush=True
-    )
+def _print_once(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 @lru_cache(maxsize=1)

@@ -20,7 +20,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from sundae_ns.errors import PackError
+from sundae_ns.errors import PackError, regular
 from sundae_ns.storage.atomic import replacing
 
 MAGIC = b"\x89SUNDAE\n"
@@ -184,7 +184,7 @@ def read_header(path: Path) -> Header:
         PackError: the file is not a packed scene, of another version, truncated, altered, or states impossible sizes.
     """
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             size = path.stat().st_size
             preamble = file.read(_PREAMBLE.size)
             if preamble[: len(MAGIC)] != MAGIC:

@@ -5,6 +5,7 @@ Files are read weights-only, so that no code of theirs runs, and only after thei
 
 from __future__ import annotations
 
+import os
 import pickle
 import random
 import re
@@ -19,9 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import CheckpointError, StorageError
+from sundae_ns.errors import CheckpointError, StorageError, regular
 from sundae_ns.gaussians.field import Encoding, Field
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, odd_shapes
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.kinds import kind_of, refuse
 from sundae_ns.storage.ply import read_ply
@@ -31,8 +32,8 @@ EXTRA_STATE = "_extra_state"
 FORMAT = 2
 _PREFIX = "gauss_params."
 _NAME = re.compile(r"step-(\d+)\.ckpt")
-_PARTIAL = "partial--1.tmp"
-"""Name of an unfinished checkpoint. nerfstudio parses a step from every file name in the folder; this one gives step -1."""
+_PARTIAL = "partial--1.{}.tmp"
+"""Name of an unfinished checkpoint of a process. nerfstudio parses a step from every file name; this one gives -1."""
 
 
 def random_state() -> dict[str, Any]:
@@ -81,9 +82,8 @@ def save(state: Mapping[str, Any], path: Path) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # A fixed name: the next save overwrites what a killed run left behind.
-        with replacing(path, path.with_name(_PARTIAL)) as partial, partial.open("wb") as file:
-            # Through a Python file, because torch's own writer hides the reason of a failed write.
+        # Through a Python file, because torch's own writer hides the reason of a failed write.
+        with replacing(path, path.with_name(_PARTIAL.format(os.getpid()))) as partial, partial.open("wb") as file:
             torch.save(dict(state), file)
     except OSError as error:
         older = [other for other in checkpoints(path.parent) if other != path]
@@ -98,7 +98,7 @@ def _damage(path: Path) -> str | None:
     torch neither verifies checksums nor refuses a file that unpacks to more than its size.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(regular(path)) as archive:
             entries = archive.infolist()
             packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
             if packed or sum(entry.file_size for entry in entries) > path.stat().st_size:
@@ -347,9 +347,8 @@ def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:
 
 
 def _check_field(field: Mapping[str, Tensor], path: Path) -> None:
-    """Check that there are primitives, and the shape of each parameter."""
-    n = len(field["means"]) if field["means"].ndim else 0
-    if n == 0:
-        raise CheckpointError(f"{path} holds no primitives; give another file")
+    """Check the shape of each parameter, and that a primitive is finite."""
     for odd in odd_shapes(field):
         raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")
+    if not finite_mask(field).any():
+        raise CheckpointError(f"{path} holds {len(field['means']):,} primitives, and none is finite; give another file")

@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 from yaml.constructor import ConstructorError
 
-from sundae_ns.errors import CheckpointError
+from sundae_ns.errors import CheckpointError, regular
 
 _PATHS = {"PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"}
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
@@ -107,6 +107,19 @@ def _find_capture(config: Any, folder: Path) -> None:
         datamanager.data = moved
 
 
+class _ValueLoader(yaml.SafeLoader):
+    """Makes plain values alone: mappings for configurations, text for names, lists for tuples and calls."""
+
+
+def _make_plain(loader: _ValueLoader, suffix: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    return loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else suffix
+
+
+_ValueLoader.add_multi_constructor(_PYTHON, _make_plain)
+
+
 def load_config(path: Path) -> Any:
     """What a run's ``config.yml`` describes, as objects of nerfstudio, without running anything that it asks for.
 
@@ -116,10 +129,28 @@ def load_config(path: Path) -> Any:
     Raises:
         CheckpointError: it cannot be read, is no configuration, or asks for something else.
     """
+    config = _load(path, _ConfigLoader)
+    _find_capture(config, path.absolute().parent)
+    return config
+
+
+def model_options(path: Path) -> dict[str, Any]:
+    """Options of the model in a run's ``config.yml``, as plain values; unlike :func:`load_config`, imports nothing.
+
+    Raises:
+        CheckpointError: it cannot be read, or is no configuration of a run.
+    """
+    found = _load(path, _ValueLoader)
+    for part in ("pipeline", "model"):
+        found = found.get(part) if isinstance(found, dict) else None
+    if not isinstance(found, dict):
+        raise CheckpointError(f"{path} is not a run's config.yml; give the folder of a run")
+    return found
+
+
+def _load(path: Path, loader: type[yaml.SafeLoader]) -> Any:
     try:
-        config = yaml.load(path.read_text(encoding="utf-8"), Loader=_ConfigLoader)
-        _find_capture(config, path.absolute().parent)
-        return config
+        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
     except OSError as error:
         raise CheckpointError(
             f"{path} cannot be read ({error.strerror}); give the folder of a finished run, or its config.yml"

@@ -1,10 +1,60 @@
-"""The folder of a run: where its ``config.yml`` lies, and its records of prunes."""
+"""The folder of a run: its name, who trains in it, where its ``config.yml`` lies, and its records of prunes."""
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import socket
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
+
+from sundae_ns.errors import StorageError, regular, writing
+
+LOCK = "training.lock"
+"""Names the process that trains in a folder. The file stays; the system drops its lock when the process ends."""
+_held: dict[Path, TextIO] = {}
+
+
+def new_name() -> str:
+    """A name for a run: the local time to the microsecond, so that runs of one second differ."""
+    return datetime.now().strftime("%Y-%m-%d_%H%M%S_%f")
+
+
+def hold(run: Path) -> None:
+    """Reserve a run's folder for this process until it ends, and remove files that killed processes left unfinished.
+
+    Args:
+        run: folder of the run; created if missing.
+
+    Raises:
+        StorageError: another process trains in it, or the folder cannot be written.
+    """
+    run = run.resolve()
+    if run in _held:
+        return
+    import fcntl
+
+    with writing(f"cannot write to the run's folder {run}"):
+        run.mkdir(parents=True, exist_ok=True)
+        file = (run / LOCK).open("a+", encoding="utf-8")
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            holder = file.read().strip() or "another process"
+            raise StorageError(f"{holder} trains in {run}; wait for it, or give another --timestamp") from error
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOTSUP):  # network file systems without locks
+                raise
+        file.truncate(0)
+        print(f"process {os.getpid()} on {socket.gethostname()}", file=file, flush=True)
+    _held[run] = file
+    for unfinished in [*run.glob("*.partial"), *run.glob("*/partial--1.*")]:
+        with suppress(OSError):
+            unfinished.unlink()
 
 
 def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
@@ -13,7 +63,7 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
     A file that cannot be read is renamed to ``*.damaged.json``, because it should not end a training.
     """
     try:
-        records = json.loads(path.read_text(encoding="utf-8"))
+        records = json.loads(regular(path).read_text(encoding="utf-8"))
         return [record for record in records if record["step"] < step]
     except FileNotFoundError:
         return []
@@ -29,7 +79,7 @@ def prunes_of(run: Path) -> list[dict[str, Any]]:
         run: folder of the run.
     """
     try:
-        records = json.loads((run / "prune.json").read_text(encoding="utf-8"))
+        records = json.loads(regular(run / "prune.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return []
     known = isinstance(records, list) and all(isinstance(record, dict) for record in records)
@@ -39,6 +89,14 @@ def prunes_of(run: Path) -> list[dict[str, Any]]:
 def config_of(run: Path) -> Path:
     """Path of the ``config.yml`` of a run, given its folder or that file; it need not exist."""
     return run / "config.yml" if run.is_dir() else run
+
+
+def files_of(run: Path) -> list[Path]:
+    """Files and folders of a run that commands read, given its folder or its ``config.yml``; a file alone for others."""
+    if run.is_file() and run.name != "config.yml":
+        return [run]
+    folder = config_of(run).parent
+    return [folder / name for name in ("config.yml", "nerfstudio_models", "dataparser_transforms.json", "prune.json")]
 
 
 def find_config(path: Path) -> Path | None:

@@ -1,10 +1,19 @@
-"""The folder of a run: its ``config.yml`` is found, and damaged records of prunes do not end a training."""
+"""The folder of a run: one process trains in it, and damaged records of prunes do not end a training."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
-from sundae_ns.storage.runs.folder import find_config, prunes_before, prunes_of
+import pytest
+
+from sundae_ns.errors import StorageError
+from sundae_ns.storage.runs.folder import files_of, find_config, hold, new_name, prunes_before, prunes_of
+
+HOLDER = "import sys, time; from pathlib import Path; from sundae_ns.storage.runs.folder import hold; "
+HOLDER += "hold(Path(sys.argv[1])); print(flush=True); time.sleep(600)"
 
 
 def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path: Path) -> None:
@@ -41,3 +50,40 @@ def test_records_of_a_finished_run_are_read_whole_or_not_at_all(tmp_path: Path) 
         (tmp_path / "prune.json").write_text(text)
         assert prunes_of(tmp_path) == []
         assert (tmp_path / "prune.json").read_text() == text
+
+
+def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "a"
+    other = subprocess.Popen([sys.executable, "-c", HOLDER, run], stdout=subprocess.PIPE)
+    try:
+        assert other.stdout is not None
+        other.stdout.readline()
+        for path in (run, tmp_path / "runs" / ".." / "runs" / "a"):
+            with pytest.raises(StorageError, match=f"^process {other.pid} on .* trains in .*; .*--timestamp$"):
+                hold(path)
+        (run / "models").mkdir()
+        for name in ("config.yml.17.partial", "models/partial--1.17.tmp", "config.yml", "models/step-000000001.ckpt"):
+            (run / name).touch()
+    finally:
+        other.kill()
+        other.wait()
+    hold(run)
+    hold(run)  # its own folder
+    assert (run / "training.lock").read_text().startswith(f"process {os.getpid()} on ")
+    assert sorted(path.name for path in run.rglob("*") if path.is_file()) == [
+        "config.yml",
+        "step-000000001.ckpt",
+        "training.lock",
+    ]
+
+
+def test_runs_of_the_same_second_have_different_names() -> None:
+    assert len({new_name() for _ in range(100)}) == 100
+
+
+def test_parts_of_a_run(tmp_path: Path) -> None:
+    (tmp_path / "config.yml").touch()
+    (tmp_path / "a.ply").touch()
+    assert files_of(tmp_path) == files_of(tmp_path / "config.yml")
+    assert tmp_path / "nerfstudio_models" in files_of(tmp_path)
+    assert files_of(tmp_path / "a.ply") == [tmp_path / "a.ply"]

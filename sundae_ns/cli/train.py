@@ -1,0 +1,60 @@
+"""``sundae train``: the options of ``ns-train`` that everyone sets, under short names."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from sundae_ns.cli.process import console_script
+from sundae_ns.errors import ConfigError, DataError
+
+Method = Literal["sundae", "sundae-auto", "sundae-paper", "sundae-tiny"]
+
+
+def train(
+    capture: Annotated[Path, tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs"),
+    method: Method = "sundae",
+    keep: float | None = None,
+    steps: int | None = None,
+) -> int:
+    """Print a command of ns-train and run it; copy the command to add further options.
+
+    Args:
+        capture: folder of the capture, as ns-process-data writes it.
+        out: folder of runs.
+        method: method of ns-train; sundae-tiny suits small images and a CPU.
+        keep: share of the primitives to keep, in (0, 1]; by default that of the method.
+        steps: number of training steps; by default that of the method.
+    """
+    words = command(capture, out, method, keep, steps)
+    print(shlex.join(words), flush=True)
+    # The same process: an interrupt reaches the training, and its exit code is ours.
+    os.execvp(console_script(words[0]), words)
+
+
+def command(capture: Path, out: Path, method: Method, keep: float | None, steps: int | None) -> list[str]:
+    """The words of the command; options as in :func:`train`.
+
+    Raises:
+        ConfigError: a number is out of range, or the method does not take a share.
+        DataError: the capture does not exist.
+    """
+    if not capture.exists():
+        raise DataError(f"{capture} does not exist; give the folder of a capture")
+    if keep is not None and not 0 < keep <= 1:
+        raise ConfigError(f"keep is {keep}; give a share in (0, 1]")
+    if keep is not None and method == "sundae-auto":
+        raise ConfigError("sundae-auto finds the share by itself; leave --keep out, or choose another method")
+    if steps is not None and steps < 1:
+        raise ConfigError(f"steps is {steps}; give at least 1")
+    words = ["ns-train", method, "--data", str(capture), "--output-dir", str(out)]
+    if keep is not None:
+        words += ["--pipeline.model.pruning.keep-ratio", f"{keep:g}"]
+    if steps is not None:
+        words += ["--max-num-iterations", str(steps)]
+    return words

@@ -1,0 +1,263 @@
+"""What commands may write, and what they may read: nothing is lost, nothing hangs, a full disk is one line."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+
+from sundae_ns.cli import main
+from sundae_ns.cli.outputs import check_file, check_folder
+from sundae_ns.errors import StorageError
+from sundae_ns.gaussians import from_points
+from sundae_ns.storage import write_ply
+from sundae_ns.storage.packing import Scene, write_scene
+
+LONG = "x" * 300
+Refused = Callable[..., str]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a field in two formats, as current folder."""
+    monkeypatch.chdir(tmp_path)
+    points = torch.rand(400, 3)
+    field = from_points(points, points, sh_degree=1, num_features=0)
+    write_ply(tmp_path / "a.ply", field)
+    write_scene(tmp_path / "a.sundae", Scene(field))
+    return tmp_path
+
+
+@pytest.fixture
+def refused(capsys: pytest.CaptureFixture[str]) -> Refused:
+    """Run a command that fails; returns its error, one line."""
+
+    def run(*words: object) -> str:
+        with pytest.raises(SystemExit) as caught:
+            main([str(word) for word in words])
+        assert caught.value.code == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert line.startswith("sundae: ")
+        return line
+
+    return run
+
+
+def done(*words: object) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([str(word) for word in words])
+    assert caught.value.code == 0
+
+
+@pytest.mark.parametrize("link", [None, os.symlink, os.link])
+@pytest.mark.parametrize("more", [[], ["--overwrite"]])
+def test_no_command_writes_onto_its_input(
+    here: Path, refused: Refused, link: Callable[[str, str], None] | None, more: list[str]
+) -> None:
+    before = (here / "a.ply").read_bytes()
+    out = "a.ply"
+    if link is not None:
+        out = "b.ply"
+        link("a.ply", out)
+    if link is os.link and more:  # the other name stays
+        done("prune", "a.ply", "-o", out, *more)
+    else:
+        assert out in refused("prune", "a.ply", "-o", out, *more)
+    assert (here / "a.ply").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "out"),
+    [
+        (["prune", "a.ply", "--keep", "0.5"], "out.ply"),
+        (["export", "a.ply"], "out.spz"),
+        (["export", "a.sundae"], "out.ply"),
+        (["bands", "a.ply"], "out"),
+    ],
+)
+def test_an_existing_output_needs_overwrite(here: Path, refused: Refused, words: list[str], out: str) -> None:
+    done(*words, "-o", out)
+    first = {path: path.stat().st_mtime_ns for path in [here / out, *(here / out).glob("*")]}
+    assert "--overwrite" in refused(*words, "-o", out)
+    assert {path: path.stat().st_mtime_ns for path in first} == first
+    done(*words, "-o", out, "--overwrite")
+    assert all(path.stat().st_mtime_ns > earlier for path, earlier in first.items() if path.is_file())
+
+
+@pytest.mark.parametrize("command", ["scene", "demo", "report", "bands"])
+def test_folders_with_files_need_overwrite(here: Path, refused: Refused, command: str) -> None:
+    (here / "mine").mkdir()
+    (here / "mine" / "thesis.txt").write_text("years of work")
+    words = [command, "mine"] if command in ("scene", "demo") else [command, "a.ply", "-o", "mine"]
+    assert "--overwrite" in refused(*words)
+    assert [path.name for path in (here / "mine").iterdir()] == ["thesis.txt"]
+
+
+def test_a_folder_that_holds_the_input_is_no_output(here: Path, refused: Refused) -> None:
+    for command in ("bands", "report"):
+        assert "holds what the command reads" in refused(command, "a.ply", "-o", ".", "--overwrite")
+
+
+def test_parts_of_a_run_are_no_output(here: Path) -> None:
+    (here / "run").mkdir()
+    (here / "run" / "config.yml").write_text("a: 1")
+    (here / "run" / "nerfstudio_models").mkdir()
+    (here / "run" / "nerfstudio_models" / "step-1.ckpt").write_text("weights")
+    reads = [here / "run" / "config.yml", here / "run" / "nerfstudio_models", None]
+    for name in ("config.yml", "nerfstudio_models/step-1.ckpt"):
+        with pytest.raises(StorageError, match="belongs to what the command reads"):
+            check_file(here / "run" / name, reads=reads, overwrite=True)
+    check_file(here / "run" / "scene.sundae", reads=reads, overwrite=False)
+    (here / "run" / "scene.sundae").touch()
+    check_file(here / "run" / "scene.sundae", reads=reads, overwrite=True)
+
+
+def test_only_files_and_folders_are_replaced(here: Path) -> None:
+    os.mkfifo(here / "pipe")
+    for path in (here, here / "pipe", Path(os.devnull)):
+        with pytest.raises(StorageError, match="name a file"):
+            check_file(path, reads=[], overwrite=True)
+    with pytest.raises(StorageError, match="is a file; choose another folder"):
+        check_folder(here / "a.ply", reads=[], overwrite=True)
+    (here / "empty").mkdir()
+    check_folder(here / "empty", reads=[], overwrite=False)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["prune", "in", "-o", "x.ply"],
+        ["export", "in", "-o", "x.spz"],
+        ["export", "run", "-o", "x.spz"],
+        ["pack", "in", "-o", "x.sundae"],
+        ["unpack", "in"],
+        ["bands", "in", "-o", "x"],
+        ["bands", "run", "-o", "x"],
+        ["report", "in", "-o", "x"],
+        ["report", "run", "-o", "x"],
+        ["bench", "frame", "--load-config", "in"],
+    ],
+)
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_what_is_no_file_is_refused_at_once(here: Path, refused: Refused, words: list[str], kind: str) -> None:
+    (here / "run" / "nerfstudio_models").mkdir(parents=True)
+    for path in ("in", "run/config.yml", "run/nerfstudio_models/step-000000001.ckpt"):
+        if kind == "pipe":
+            os.mkfifo(here / path)
+        else:
+            (here / path).symlink_to("/dev/zero")
+    refused(*words)
+    assert not (here / "x").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["unpack", "a.sundae", "--name", LONG],
+        ["unpack", "a.sundae", "-o", LONG],
+        ["prune", "a.ply", "-o", LONG + ".ply"],
+        ["prune", LONG, "-o", "x.ply"],
+        ["export", "a.ply", "-o", LONG + ".spz"],
+        ["pack", LONG, "-o", "x.sundae"],
+        ["scene", LONG],
+        ["bands", "a.ply", "-o", LONG],
+        ["report", LONG, "-o", "x"],
+    ],
+)
+def test_names_too_long_are_one_line(here: Path, refused: Refused, words: list[str]) -> None:
+    if words[0] == "unpack":
+        model = {
+            "sh_degree": 1,
+            "rasterize_mode": "classic",
+            "background_color": "black",
+            "head": None,
+            "trained_focal": None,
+        }
+        points = torch.rand(30, 3)
+        field = from_points(points, points, sh_degree=1, num_features=0)
+        write_scene(here / "a.sundae", Scene(field, meta={"model": model}))
+    assert "too long" in refused(*words)
+    assert {path.name for path in here.iterdir()} <= {"a.ply", "a.sundae", "outputs"}
+
+
+@pytest.fixture
+def full(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 KiB; skips where it cannot be mounted."""
+    folder = tmp_path / "full"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(folder)]
+    try:
+        subprocess.run(mount, check=True, capture_output=True)
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("no right to mount a small file system")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_is_one_line(here: Path, full: Path, refused: Refused) -> None:
+    for words in (
+        ["scene", full / "scene", "--train-views", "8", "--test-views", "2", "--width", "64", "--height", "64"],
+        ["prune", "a.ply", "--keep", "0.9", "-o", full / "a.ply"],
+        ["bands", "a.ply", "-o", full / "bands"],
+    ):
+        line = refused(*words)
+        assert "disk is full" in line
+        assert str(full) in line
+    for kind in ("ply", "spz", "sog"):
+        (full / "rest").write_bytes(b"")
+        room = os.statvfs(full)
+        (full / "rest").write_bytes(bytes(max(room.f_bavail - 1, 0) * room.f_bsize))
+        out = full / f"b.{kind}"
+        assert str(out) in refused("export", "a.sundae", "-o", out)
+        assert not out.exists()
+
+
+def test_a_full_disk_behind_stdout_is_one_line(here: Path) -> None:
+    with open("/dev/full", "w") as nowhere:
+        command = [Path(sys.executable).parent / "sundae", "scene", "scene", "--train-views", "3", "--test-views", "1"]
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        result = subprocess.run(
+            command, stdout=nowhere, stderr=subprocess.PIPE, text=True, check=False, env=environment
+        )
+    assert "Traceback" not in result.stderr
+    assert "disk is full" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["export", "a.sundae", "-o", "x.ply"],
+        ["export", "a.ply", "-o", "x.spz"],
+        ["export", "run", "-o", "x.ply"],
+        ["prune", "a.ply", "-o", "x.ply"],
+        ["bands", "a.ply", "-o", "x"],
+    ],
+)
+def test_commands_on_fields_import_no_nerfstudio(here: Path, words: list[str]) -> None:
+    (here / "run" / "nerfstudio_models").mkdir(parents=True)
+    (here / "run" / "config.yml").write_text(
+        "!!python/object:nerfstudio.engine.trainer.TrainerConfig\n"
+        "data: !!python/object/apply:pathlib.PosixPath [scene]\n"
+        "pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig\n"
+        "  model: !!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig\n"
+        "    _target: !!python/name:nerfstudio.models.splatfacto.SplatfactoModel ''\n"
+        "    rasterize_mode: antialiased\n"
+    )
+    points = torch.rand(30, 3)
+    field = from_points(points, points, sh_degree=1, num_features=0)
+    state = {f"_model.gauss_params.{name}": value for name, value in field.items()}
+    torch.save({"step": 3, "pipeline": state}, here / "run" / "nerfstudio_models" / "step-000000003.ckpt")
+    code = (
+        "import sys\nfrom sundae_ns.cli import main\n"
+        "try:\n    main(sys.argv[1:])\nfinally:\n    print('nerfstudio' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False, cwd=here)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.splitlines()[-1] == "False"
+    if "run" in words:
+        assert b"SplatRenderMode: mip" in (here / "x.ply").read_bytes()[:400]
