@@ -2,7 +2,7 @@
 
     python benchmarks/bench_pack.py                              # 1,000,000 random primitives
     python benchmarks/bench_pack.py --run RUN --views 6          # a finished run, at its training resolution
-    python benchmarks/bench_pack.py --run RUN --set harmonics=codebooks feature_bits=5
+    python benchmarks/bench_pack.py --run RUN --set harmonics_step=0.04 feature_bits=5
     python benchmarks/bench_pack.py --run RUN --views 99 --finetune 1000                # as sundae pack --finetune 1000
 
 Random primitives have no structure for an entropy coder; they measure time. A run is rendered before and after packing:

@@ -25,11 +25,8 @@ def pack(
     rotation_bits: int = 8,
     color_bits: int = 8,
     opacity_bits: int = 8,
-    harmonics: Literal["transform", "codebooks"] = "transform",
     harmonics_step: float | None = None,
-    harmonics_books: int = 4,
     feature_bits: int | None = None,
-    feature_books: int = 0,
     head: Literal["int8", "fp16"] = "int8",
     head_bits: int | None = None,
     level: int = 19,
@@ -50,11 +47,8 @@ def pack(
         rotation_bits: bits per stored component of a rotation (three components), 4 to 16.
         color_bits: bits per channel of the view-independent colour, 4 to 16.
         opacity_bits: bits per opacity logit, 4 to 16.
-        harmonics: coding of view-dependent colour: a transform with rounding, or residual codebooks (smaller, lossier).
-        harmonics_step: rounding step of transformed coefficients; by default 0.02, 0.03 with a fine-tune.
-        harmonics_books: number of residual codebooks of view-dependent colour, 1 to 32; each takes a byte per primitive.
+        harmonics_step: rounding step of the transformed view-dependent colour; by default 0.02, 0.03 with a fine-tune.
         feature_bits: bits per feature, 4 to 16; by default 7, 6 with a fine-tune.
-        feature_books: number of residual codebooks of the feature vectors, up to 32; 0 rounds features instead.
         head: number format of the head's weights.
         head_bits: bits per weight of an int8 head, 3 to 8; by default 7, 6 with a fine-tune.
         level: effort of the entropy coder, 1 to 22; it does not change the time to unpack.
@@ -78,9 +72,6 @@ def pack(
         "rotation_bits": rotation_bits,
         "color_bits": color_bits,
         "opacity_bits": opacity_bits,
-        "harmonics": harmonics,
-        "harmonics_books": harmonics_books,
-        "feature_books": feature_books,
         "head": head,
         "level": level,
     }

@@ -18,7 +18,6 @@ from sundae_ns.gaussians.field import Encoding, Field, as_field
 from sundae_ns.gaussians.parameters import finite_mask, num_primitives
 from sundae_ns.gaussians.surgery import rewrite
 from sundae_ns.pruning.scores import Contribution
-from sundae_ns.training.pruning import Schedule
 from sundae_ns.training.report import PruneReport
 from sundae_ns.training.schedules import PruningSchedule
 
@@ -27,7 +26,7 @@ from sundae_ns.training.schedules import PruningSchedule
 class GlobalPruning(PruningSchedule):
     """A pruning schedule over the shards of one field."""
 
-    schedule: Schedule
+    schedule: PruningSchedule
     shards: Shards
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
@@ -100,7 +99,7 @@ class GlobalPruning(PruningSchedule):
 
 
 def _decide(
-    schedule: Schedule,
+    schedule: PruningSchedule,
     gathered: Mapping[str, Any],
     state: Mapping[str, Any],
     step: int,

@@ -34,11 +34,6 @@ class NeighborGraph:
         return self.indices.shape[0]
 
     @property
-    def Ne(self) -> int:
-        """Number of directed edges (positive weights)."""
-        return int((self.weights > 0).sum())
-
-    @property
     def isolated(self) -> Tensor:
         """True for nodes without an edge, bool ``[N]``."""
         return self.dw == 0

@@ -1,12 +1,11 @@
 """From a field to images: views, sources of primitives, one splatting pass, the head, contribution, recorded frames."""
 
-from sundae_ns.rendering.contribution import contribution, view_weights, weights_by_batch
+from sundae_ns.rendering.contribution import contribution
 from sundae_ns.rendering.lazy import Later, LazyOutputs
-from sundae_ns.rendering.outputs import OUTPUTS, ShownResponse, empty_outputs, late_outputs
-from sundae_ns.rendering.render import RenderSettings, compensate, draw, render, scale_plan, splat
+from sundae_ns.rendering.outputs import ShownResponse, empty_outputs, late_outputs
+from sundae_ns.rendering.render import RenderSettings, compensate, draw, render, scale_plan
 from sundae_ns.rendering.replay import FrameReplay
 from sundae_ns.rendering.source import (
-    NEAR_PLANE,
     ColorSettings,
     FieldSource,
     LocalField,
@@ -18,8 +17,6 @@ from sundae_ns.rendering.source import (
 from sundae_ns.rendering.views import View, cut, view_of, zoomed
 
 __all__ = [
-    "NEAR_PLANE",
-    "OUTPUTS",
     "ColorSettings",
     "FieldSource",
     "FrameReplay",
@@ -41,9 +38,6 @@ __all__ = [
     "late_outputs",
     "render",
     "scale_plan",
-    "splat",
     "view_of",
-    "view_weights",
-    "weights_by_batch",
     "zoomed",
 ]

@@ -16,7 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import CheckpointError, ConfigError, out_of_memory
+from sundae_ns.errors import CheckpointError, ConfigError
+from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.scenes.opening import open_pipeline
 from sundae_ns.scenes.packed import is_unpacked
@@ -98,30 +99,28 @@ def finetune(
     head = _Through.of(weights, codecs.rounded_head)
     optimizer = _optimizer(field.exact, head.exact)
     highest = [group["lr"] for group in optimizer.param_groups]
-    try:
-        with torch.random.fork_rng([torch.cuda.current_device()] if model.device.type == "cuda" else []):
-            torch.manual_seed(opened.config.machine.seed)  # of random backgrounds
-            for step in range(steps):
-                for group, rate in zip(optimizer.param_groups, highest, strict=True):
-                    group["lr"] = rate * rate_factor(step, steps)
-                field.show()
-                head.show()
-                at = opened.step + 1 + step
-                if weights:
-                    model.step = at  # chooses the window of a large image
-                loss: Tensor = sum(pipeline.get_train_loss_dict(at)[1].values())
-                pipeline.zero_grad(set_to_none=True)
-                loss.backward()  # type: ignore[no-untyped-call]
-                field.take_gradients()
-                head.take_gradients()
-                optimizer.step()
-                if codecs.head is not None:
-                    for name, value in head.exact.items():
-                        value.data = codecs.head.within(name, value.data)
-                if progress is not None:
-                    progress(loss.item())
-    except torch.cuda.OutOfMemoryError as error:
-        raise out_of_memory(error, model.num_points) from error
+    generators = [torch.cuda.current_device()] if model.device.type == "cuda" else []
+    with naming_full_memory(lambda: model.num_points), torch.random.fork_rng(generators):
+        torch.manual_seed(opened.config.machine.seed)  # of random backgrounds
+        for step in range(steps):
+            for group, rate in zip(optimizer.param_groups, highest, strict=True):
+                group["lr"] = rate * rate_factor(step, steps)
+            field.show()
+            head.show()
+            at = opened.step + 1 + step
+            if weights:
+                model.step = at  # chooses the window of a large image
+            loss: Tensor = sum(pipeline.get_train_loss_dict(at)[1].values())
+            pipeline.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            field.take_gradients()
+            head.take_gradients()
+            optimizer.step()
+            if codecs.head is not None:
+                for name, value in head.exact.items():
+                    value.data = codecs.head.within(name, value.data)
+            if progress is not None:
+                progress(loss.item())
     source = {**scene.meta.get("source", {}), "finetuned": steps}
     trained = Scene(
         {name: field.exact.get(name, value).detach().cpu() for name, value in scene.field.items()},

@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.packing.codebooks import kmeans, nearest_centre
 from sundae_ns.storage.packing.morton import scene_order
 from sundae_ns.storage.spz import checked
 
@@ -38,13 +37,14 @@ _ROW_ENTRIES = 64  # palette rows in a row of the palette's image
 _ENTRIES = 256  # codebook entries that a byte can index
 _COARSE = 256  # coarse cells of a large palette
 _ROUNDS = 30  # Lloyd iterations of a one-dimensional codebook
+_ROW_ROUNDS = 8  # Lloyd iterations of a palette
+_SAMPLE = 1 << 16  # rows that a k-means is fitted to
+_CHUNK = 1 << 14  # rows compared with all centres at once
 _LEVELS = 65535  # highest level of a position, in two bytes
 _FIRST_MODE = 252  # alpha of a rotation without its first component; the next values stand for the other components
 
 
-def write_sog(
-    path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, max_palette: int = MAX_PALETTE
-) -> None:
+def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
     """Write the base colours of a field as a bundled .sog, atomically.
 
     Args:
@@ -52,7 +52,6 @@ def write_sog(
         params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not
             written, and the order of primitives changes.
         antialiased: mark the scene as trained with antialiasing.
-        max_palette: maximum number of rows of the SH palette, 512 to 65,536.
 
     Raises:
         DataError: the field has no primitives, an SH degree above 3, or wrong shapes.
@@ -91,7 +90,7 @@ def write_sog(
     }
     coefficients = arrays["features_rest"].shape[1]
     if coefficients:
-        rows, labels = palette(arrays["features_rest"].reshape(n, -1), max_palette)
+        rows, labels = palette(arrays["features_rest"].reshape(n, -1))
         values, codes = codebook(rows.reshape(len(rows), coefficients, 3))
         padded = np.zeros((math.ceil(len(rows) / _ROW_ENTRIES) * _ROW_ENTRIES, coefficients, 3), np.uint8)
         padded[: len(rows)] = codes
@@ -159,7 +158,7 @@ def palette(
         return rows, np.arange(n)
     generator = torch.Generator().manual_seed(seed)
     vectors = torch.from_numpy(np.ascontiguousarray(rows)).double()
-    cell_of = nearest_centre(vectors, kmeans(vectors, _COARSE, generator))
+    cell_of = _nearest_centre(vectors, kmeans(vectors, _COARSE, generator))
     centres: list[Tensor] = []
     labels = torch.empty(n, dtype=torch.int64)
     count_before = 0
@@ -169,10 +168,29 @@ def palette(
             continue
         count = min(1 + (max_rows - _COARSE) * len(members) // n, len(members))
         fine = kmeans(vectors[members], count, generator)
-        labels[members] = count_before + nearest_centre(vectors[members], fine)
+        labels[members] = count_before + _nearest_centre(vectors[members], fine)
         centres.append(fine)
         count_before += count
     return torch.cat(centres).float().numpy(), labels.numpy()
+
+
+def kmeans(rows: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Centres ``[count, D]`` by Lloyd iterations on a sample of the rows."""
+    sample = rows[torch.randperm(len(rows), generator=generator)[:_SAMPLE]]
+    centres = sample[:count].clone()
+    for _ in range(_ROW_ROUNDS):
+        nearest = _nearest_centre(sample, centres)
+        number = torch.bincount(nearest, minlength=count)[:, None]
+        sums = torch.zeros_like(centres).index_add_(0, nearest, sample)
+        centres = torch.where(number > 0, sums / number.clamp_min(1), centres)
+    return centres
+
+
+def _nearest_centre(rows: Tensor, centres: Tensor) -> Tensor:
+    """Index ``[N]`` of the nearest centre of each row."""
+    # |x - c|^2 minus |x|^2, in float32: a wrong choice between nearly equal centres costs nothing.
+    flat, half = centres.float(), (centres * centres).sum(dim=1).float() / 2
+    return torch.cat([(chunk.float() @ flat.T - half).argmax(dim=1) for chunk in rows.split(_CHUNK)])
 
 
 def _smallest_three(quats: NDArray[np.float32]) -> NDArray[np.uint8]:

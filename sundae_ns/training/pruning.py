@@ -3,51 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, MutableMapping
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
-from torch.nn import Parameter
-from torch.optim import Optimizer
 
 from sundae_ns.errors import SundaeError
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.rendering.contribution import contribution
 from sundae_ns.training.extension import Extension, TrainingRun
-from sundae_ns.training.report import PruneReport, report_peak, write_report
+from sundae_ns.training.report import report_peak, write_report
 from sundae_ns.training.schedulers import notify_pruned
-
-
-class Schedule(Protocol):
-    """A pruning schedule of one process, or of several that prune as one."""
-
-    @property
-    def config(self) -> PruningConfig:
-        """Options of the prunes."""
-
-    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """Whether a field of ``n`` primitives is pruned after this step."""
-
-    def target(self, n: int) -> int:
-        """Number of primitives that a prune keeps of ``n``."""
-
-    def initialize_state(self) -> dict[str, Any]:
-        """Running state of a field that was not pruned yet."""
-
-    def step_post_backward(
-        self,
-        params: MutableMapping[str, Parameter],
-        optimizers: Mapping[str, Optimizer],
-        state: MutableMapping[str, Any],
-        step: int,
-        info: Mapping[str, Any] | None = None,
-        *,
-        contribution: Callable[[], Tensor] | None = None,
-        strategy_state: MutableMapping[str, Any] | None = None,
-    ) -> PruneReport | None:
-        """Prune if it is due; see :class:`sundae_ns.training.schedules.PruningSchedule`."""
+from sundae_ns.training.schedules import PruningSchedule
 
 
 class ScheduledPruning(Extension):
@@ -60,7 +28,7 @@ class ScheduledPruning(Extension):
 
     name = "pruning"
 
-    def __init__(self, schedule: Schedule, *, evaluate: bool) -> None:
+    def __init__(self, schedule: PruningSchedule, *, evaluate: bool) -> None:
         self.schedule = schedule
         self.evaluate = evaluate
 

@@ -39,10 +39,9 @@ def packed(folder: Path, config: PackConfig) -> bytes:
     return (folder / "a.sundae").read_bytes()
 
 
-@pytest.fixture(scope="module", params=["transform", "codebooks"])
+@pytest.fixture(scope="module", params=["int8", "fp16"])
 def good(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    books = 0 if request.param == "transform" else 2
-    return packed(tmp_path_factory.mktemp("packs"), PackConfig(harmonics=request.param, feature_books=books))
+    return packed(tmp_path_factory.mktemp("packs"), PackConfig(head=request.param))
 
 
 def parts(content: bytes) -> tuple[Json, bytes]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sundae_ns.cli import main
 from sundae_ns.cli.packing import pack
-from sundae_ns.errors import CheckpointError, ConfigError
+from sundae_ns.errors import CheckpointError, ConfigError, MemoryExhaustedError
 from sundae_ns.evaluation import psnr
 from sundae_ns.model import SundaeModel
 from sundae_ns.scenes import finetune as packing_finetune
@@ -141,6 +141,17 @@ def test_an_interrupt_leaves_nothing(tiny: Any, tmp_path: Path, monkeypatch: pyt
         pack(tiny.folder, tmp_path / "a.sundae", finetune=5)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["the one of yesterday"]
     assert digests(tiny.folder) == before
+
+
+def test_full_memory_is_one_line(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
+
+    scene = scene_of_run(tiny.folder, max_cameras=0)
+    monkeypatch.setattr(torch.Tensor, "backward", full)
+    count = len(scene.field["means"])
+    with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} primitives"):
+        finetune(tiny.folder, scene, PackConfig(), 1)
 
 
 def test_a_run_of_splatfacto(tiny: Any, tmp_path: Path) -> None:

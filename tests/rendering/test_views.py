@@ -42,6 +42,8 @@ def test_a_view_is_what_the_matrices_say(seed: int, downscale: int, index: int) 
         int(cameras.height[index]) // downscale,
     )
     torch.testing.assert_close(torch.tensor(view.focal), K[[0, 1], [0, 1]].mean(), rtol=1e-6, atol=0)
+    for name in ("camera_to_worlds", "fx", "cy", "width"):
+        assert torch.equal(getattr(cameras, name), getattr(made(seed), name)), "the camera does not change"
     assert view.viewmat.is_contiguous()
     assert view.K.is_contiguous()
 

@@ -31,18 +31,6 @@ def test_a_primitive_lands_where_the_pinhole_says(build: Build, camera: MakeCame
     assert (column, row) == (int(20 + 30 * 0.55 / 3), int(16 - 30 * 0.25 / 3))
 
 
-@torch.no_grad()
-def test_view_of_downscales_and_leaves_the_camera_alone(build: Build, camera: MakeCamera) -> None:
-    model = build().eval()
-    shown = camera(41, 33)
-    view = model.view_of(shown, downscale=2)
-    assert (view.width, view.height) == (20, 16)
-    torch.testing.assert_close(view.K, torch.tensor([[15.0, 0, 10.25], [0, 15.0, 8.25], [0, 0, 1]]))
-    assert int(shown.width) == 41
-    assert float(shown.fx) == 30.0
-    torch.testing.assert_close(view.viewmat @ torch.tensor([0.0, 0.1, 3.0, 1.0]), torch.tensor([0.0, 0, 0, 1]))
-
-
 @pytest.mark.parametrize("factor", [0.01, 0.4, 1.0, 1.37])
 @torch.no_grad()
 def test_a_zoomed_camera_has_the_zoomed_view(build: Build, camera: MakeCamera, factor: float) -> None:

@@ -21,7 +21,7 @@ from sundae_ns.errors import DataError
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import write_sog
 from sundae_ns.storage.packing.morton import scene_order
-from sundae_ns.storage.sog import codebook, palette
+from sundae_ns.storage.sog import codebook, kmeans, palette
 
 
 def field(n: int = 150, degree: int = 3) -> dict[str, Tensor]:
@@ -138,6 +138,12 @@ def test_the_codebook_is_better_than_equal_steps() -> None:
     step = np.ptp(values) / 255
     equal = np.rint((values - values.min()) / step) * step + values.min()
     assert ((numbers[codes] - values) ** 2).mean() < 0.5 * ((equal - values) ** 2).mean()
+
+
+def test_a_centre_without_rows_is_unchanged() -> None:
+    rows = torch.full((50, 2), 3.0).double()
+    centres = kmeans(rows, 4, torch.Generator().manual_seed(0))
+    assert torch.equal(centres, rows[:4])
 
 
 def test_a_palette_of_two_levels() -> None:

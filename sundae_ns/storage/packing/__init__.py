@@ -2,9 +2,8 @@
 
 from sundae_ns.storage.packing.codecs import Codecs
 from sundae_ns.storage.packing.config import FINETUNED, PackConfig
-from sundae_ns.storage.packing.container import VERSION, read_header
+from sundae_ns.storage.packing.container import read_header
 from sundae_ns.storage.packing.scene import (
-    CAMERAS,
     PackReport,
     Scene,
     fit_scene,
@@ -14,9 +13,7 @@ from sundae_ns.storage.packing.scene import (
 )
 
 __all__ = [
-    "CAMERAS",
     "FINETUNED",
-    "VERSION",
     "Codecs",
     "PackConfig",
     "PackReport",

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES
-from sundae_ns.storage.packing import codebooks, quantize, transform
+from sundae_ns.storage.packing import quantize, transform
 from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array, Encoded, Floats
 from sundae_ns.storage.packing.morton import scene_order
@@ -148,13 +148,9 @@ def fit(
         "features_dc": fit_uniform(values["features_dc"], config.color_bits, color=True),
     }
     rest = values["features_rest"]
-    if rest.shape[1] and config.harmonics == "transform":
+    if rest.shape[1]:
         codecs["features_rest"] = transform.fit(rest, config.harmonics_step)
-    elif rest.shape[1]:
-        codecs["features_rest"] = codebooks.fit(rest, config.harmonics_books)
-    if FEATURES in values and config.feature_books:
-        codecs[FEATURES] = codebooks.fit(values[FEATURES], config.feature_books)
-    elif FEATURES in values:
+    if FEATURES in values:
         codecs[FEATURES] = fit_uniform(values[FEATURES], config.feature_bits)
     positions = quantize.dequantize_positions(blocks, config.position_bits, min(config.block, len(order)))
     ordered = {name: torch.from_numpy(values[name]).reshape(field[name].shape) for name in names}

@@ -1,4 +1,4 @@
-"""Options of packing: bits and codec of each attribute."""
+"""Options of packing: precision of each attribute."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from typing import Literal, get_args
 from sundae_ns.errors import ConfigError
 
 HeadFormat = Literal["int8", "fp16"]
-HarmonicsCodec = Literal["transform", "codebooks"]
 
 
 @dataclass
 class PackConfig:
-    """Bits and codec of each attribute."""
+    """Precision of each attribute."""
 
     position_bits: int = 16
     """Bits of each coordinate within a block, 4 to 21."""
@@ -27,17 +26,10 @@ class PackConfig:
     """Bits of each channel of the view-independent colour, 4 to 16."""
     opacity_bits: int = 8
     """Bits of the logit of the opacity, 4 to 16."""
-    harmonics: HarmonicsCodec = "transform"
-    """Codec of the view-dependent colour: a rounded transform, or residual codebooks, which take fewer bytes and lose
-    more."""
     harmonics_step: float = 0.02
-    """Step of the transformed coefficients, in units of the SH coefficients, 0.0001 to 1."""
-    harmonics_books: int = 4
-    """Residual codebooks of the view-dependent colour, each one byte per primitive, 1 to 32."""
+    """Step of the transformed view-dependent colour, in units of the SH coefficients, 0.0001 to 1."""
     feature_bits: int = 7
-    """Bits of each feature, 4 to 16; unused with feature-books."""
-    feature_books: int = 0
-    """Residual codebooks of the feature vectors, up to 32; 0 quantises each feature with feature-bits instead."""
+    """Bits of each feature, 4 to 16."""
     head: HeadFormat = "int8"
     """Weights of the head: int8 with one step per output channel, or fp16."""
     head_bits: int = 7
@@ -55,8 +47,6 @@ class PackConfig:
         ranges = {name: (4, 16) for name in bits} | {
             "position_bits": (4, 21),
             "block": (16, 1 << 20),
-            "harmonics_books": (1, 32),
-            "feature_books": (0, 32),
             "head_bits": (3, 8),
             "level": (1, 22),
         }
@@ -66,9 +56,8 @@ class PackConfig:
                 raise ConfigError(f"{name.replace('_', '-')} is {value}; give {minimum} to {maximum}")
         if not 1e-4 <= self.harmonics_step <= 1:
             raise ConfigError(f"harmonics-step is {self.harmonics_step}; give 0.0001 to 1")
-        for name, choices in (("head", HeadFormat), ("harmonics", HarmonicsCodec)):
-            if getattr(self, name) not in get_args(choices):
-                raise ConfigError(f"{name} is {getattr(self, name)!r}; give one of {', '.join(get_args(choices))}")
+        if self.head not in get_args(HeadFormat):
+            raise ConfigError(f"head is {self.head!r}; give one of {', '.join(get_args(HeadFormat))}")
 
 
 FINETUNED: dict[str, int | float] = {"harmonics_step": 0.03, "feature_bits": 6, "head_bits": 6}

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, odd_shapes, sh_degree_of
-from sundae_ns.storage.packing import codebooks, container, quantize, transform
+from sundae_ns.storage.packing import container, quantize, transform
 from sundae_ns.storage.packing.codecs import Codecs, as_matrix, fit
 from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array
@@ -241,32 +241,14 @@ def _decode_uniform(reader: _Reader, name: str, n: int, width: int) -> NDArray[n
     return quantize.dequantize(codes, low, step, places, exceptions)
 
 
-def _decode_transform(reader: _Reader, name: str, n: int, width: int) -> NDArray[np.float32]:
-    about = reader.about(name, ("transform",))
+def _decode_rest(reader: _Reader, n: int, width: int) -> NDArray[np.float32]:
+    about = reader.about("features_rest", ("transform",))
     (step,) = reader.numbers({"step": [about.get("step")]}, "step", 1)
-    codes = reader.section(f"{name}/codes", ("|i1", "<i2"), (width, n))
-    basis = reader.section(f"{name}/basis", ("|i1",), (width * width,)).reshape(width, width)
-    rows = reader.places(f"{name}/rows", n)
-    exact = reader.section(f"{name}/exact", ("<f4",), (len(rows), width))
+    codes = reader.section("features_rest/codes", ("|i1", "<i2"), (width, n))
+    basis = reader.section("features_rest/basis", ("|i1",), (width * width,)).reshape(width, width)
+    rows = reader.places("features_rest/rows", n)
+    exact = reader.section("features_rest/exact", ("<f4",), (len(rows), width))
     return transform.restore(codes, basis, float(step), rows, exact)
-
-
-def _decode_books(reader: _Reader, name: str, n: int, width: int) -> NDArray[np.float32]:
-    reader.about(name, ("codebooks",))
-    indices = reader.section(f"{name}/indices", ("|u1",), (None, n))
-    books = len(indices)
-    if not 1 <= books <= 32:
-        raise reader.refuse(f"{name} has {books} codebooks")
-    flat = reader.section(f"{name}/entries", ("|i1",), (books, None))
-    entries = flat.reshape(books, -1, width) if flat.shape[1] % width == 0 else flat[:, :0, None]
-    if entries.shape[1] <= int(indices.max()):
-        raise reader.refuse(f"{name} has an index outside of its codebooks")
-    steps = reader.section(f"{name}/steps", ("<f4",), (books,))
-    if not np.abs(steps).max() < np.finfo(np.float32).max / 2**13:
-        raise reader.refuse(f"{name} has values beyond float32")
-    rows = reader.places(f"{name}/rows", n)
-    exact = reader.section(f"{name}/exact", ("<f4",), (len(rows), width))
-    return codebooks.restore(indices, entries, steps, rows, exact)
 
 
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:
@@ -339,11 +321,10 @@ def read_scene(path: Path) -> Scene:
 
     # Start with the largest jobs, so that the threads end together.
     jobs: dict[str, Callable[[], NDArray[np.float32]]] = {}
-    decoders = {"transform": _decode_transform, "codebooks": _decode_books, "uniform": _decode_uniform}
-    for name, channels in (("features_rest", width), (FEATURES, features)):
-        if channels:
-            decode = decoders[reader.about(name, tuple(decoders))["codec"]]
-            jobs[name] = partial(decode, reader, name, n, channels)
+    if width:
+        jobs["features_rest"] = partial(_decode_rest, reader, n, width)
+    if features:
+        jobs[FEATURES] = partial(_decode_uniform, reader, FEATURES, n, features)
     jobs["means"] = partial(_decode_means, reader, n)
     jobs["quats"] = partial(_decode_quats, reader, n)
     for name, channels in (("scales", 3), ("features_dc", 3), ("opacities", 1)):
@@ -359,24 +340,29 @@ def read_scene(path: Path) -> Scene:
 
 
 def _shape(path: Path, header: container.Header) -> tuple[int, int, int]:
-    """Numbers of primitives, of SH values of degrees 1 and up, and of features, from the header alone."""
+    """Numbers of primitives, of SH values of degrees 1 and up, and of features, from the header alone.
+
+    Raises:
+        PackError: the header contradicts itself, or names a codec that is not supported.
+    """
     refusal = PackError(f"{path} is not a valid scene (its header contradicts itself); pack it again")
     attributes, n = header.meta.get("attributes"), header.meta.get("primitives")
     if not isinstance(attributes, dict) or type(n) is not int or not 1 <= n < 1 << 28:
         raise refusal
     widths = []
-    for name in ("features_rest", FEATURES):
+    for name, codec in (("features_rest", "transform"), (FEATURES, "uniform")):
         about = attributes.get(name)
         if about is None:
             widths.append(0)
             continue
         if not isinstance(about, dict):
             raise refusal
+        if about.get("codec") != codec:
+            raise PackError(f"{path} stores {name} with a codec that is not supported; pack the run again")
         codes = header.sections.get(f"{name}/codes")
-        width = about.get("width") if codes is None else codes.shape[0]
-        if type(width) is not int or not 1 <= width <= _MAX_FEATURES:
+        if codes is None or not 1 <= codes.shape[0] <= _MAX_FEATURES:
             raise refusal
-        widths.append(width)
+        widths.append(codes.shape[0])
     if widths[0] % 3 or sh_degree_of(widths[0] // 3) is None:
         raise refusal
     return n, widths[0], widths[1]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fields import random_field
 from hard_values import hard_values
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,7 +17,6 @@ from sundae_ns.errors import PackError
 from sundae_ns.storage.packing import (
     PackConfig,
     Scene,
-    codebooks,
     fit_scene,
     quantize,
     read_scene,
@@ -89,30 +89,10 @@ def test_transform(kind: str, n: int, seed: int) -> None:
         assert np.abs(arrays["codes"].astype(int)).max(initial=0) <= codec.limit
 
 
-@hard
-def test_codebooks(kind: str, n: int, seed: int) -> None:
-    x = hard_values(kind, n, 9, seed)
-    books = codebooks.fit(x, 1 + seed % 3)
-    for y in (x, drifted(x, seed)):
-        about, arrays = books.encode(y)
-        arrays["entries"] = arrays["entries"].reshape(books.entries.shape)
-        found = codebooks.restore(**arrays)
-        assert np.array_equal(books.rounded(torch.from_numpy(y)).numpy(), found)
-        assert np.abs(found.astype(np.float64) - y).max() <= about["bound"]
-
-
 def scene(n: int = 700) -> Scene:
-    g = torch.Generator().manual_seed(0)
-    field = {
-        "means": torch.randn(n, 3, generator=g),
-        "scales": torch.randn(n, 3, generator=g) - 5,
-        "quats": torch.randn(n, 4, generator=g),
-        "features_dc": torch.randn(n, 3, generator=g),
-        "features_rest": 0.1 * torch.randn(n, 8, 3, generator=g),
-        "opacities": 2 * torch.randn(n, 1, generator=g),
-        "features": torch.randn(n, 5, generator=g),
-    }
-    return Scene(field, {"a.weight": torch.randn(4, 3, 3, 3, generator=g), "a.bias": torch.randn(4, generator=g)})
+    g = torch.Generator().manual_seed(1)
+    head = {"a.weight": torch.randn(4, 3, 3, 3, generator=g), "a.bias": torch.randn(4, generator=g)}
+    return Scene(random_field(n), head)
 
 
 @pytest.mark.parametrize(
@@ -120,7 +100,7 @@ def scene(n: int = 700) -> Scene:
     [
         PackConfig(block=100),
         PackConfig(scale_bits=5, rotation_bits=6, feature_bits=4, head_bits=4, harmonics_step=0.1, position_bits=10),
-        PackConfig(harmonics="codebooks", feature_books=2, head="fp16", feature_bits=12),
+        PackConfig(head="fp16", feature_bits=12),
     ],
 )
 def test_a_file_holds_the_values_rounded_in_training(tmp_path: Path, config: PackConfig) -> None:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sundae_ns.storage.packing import codebooks, morton, quantize, transform
+from sundae_ns.storage.packing import morton, quantize, transform
 from sundae_ns.storage.packing.container import Floats
 
 hard = given(st.sampled_from(KINDS), st.integers(1, 700), st.integers(0, 2**16))
@@ -140,32 +140,6 @@ def test_weights(kind: str, n: int, seed: int) -> None:
     error, step = np.abs(found.double().numpy() - x).reshape(n, -1), steps.numpy()
     assert (error <= step[:, None] / 2 * (1 + 1e-6) + ulp(x.reshape(n, -1))).all()
     assert (step <= np.abs(x.reshape(n, -1)).max(axis=1) / 127 * (1 + 1e-6) + 1e-44).all()
-
-
-def through_books(x: Floats, books: codebooks.Books) -> tuple[NDArray[np.float64], float]:
-    """Vectors after a round trip, and the stated bound of their error."""
-    about, arrays = books.encode(x)
-    arrays["entries"] = arrays["entries"].reshape(books.entries.shape)
-    return codebooks.restore(**arrays).astype(np.float64), about["bound"]
-
-
-@hard
-def test_codebooks(kind: str, n: int, seed: int) -> None:
-    x = hard_values(kind, n, 9, seed)
-    books = codebooks.fit(x, 1 + seed % 3)
-    found, bound = through_books(x, books)
-    others = np.delete(np.arange(n), books.rows)
-    assert np.array_equal(found[books.rows].astype(np.float32), x[books.rows])
-    assert (np.abs(found - x)[others] <= bound).all()
-    assert len(books.rows) <= codebooks.EXACT * n
-
-
-def test_each_codebook_reduces_the_error() -> None:
-    x = hard_values("normal", 3000, 9, 0)
-    errors = [np.square(through_books(x, codebooks.fit(x, books))[0] - x).mean() for books in (1, 2, 4)]
-    assert errors[0] < 0.7
-    assert errors[1] < 0.6 * errors[0]
-    assert errors[2] < 0.4 * errors[1]
 
 
 @hard
