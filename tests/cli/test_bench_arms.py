@@ -12,8 +12,8 @@ from sundae_ns.cli.bench.plan import Arm, Job, plan_scene
 from sundae_ns.errors import ConfigError
 
 DEFAULTS = [
-    *("sundae", "band", "contribution", "random"),
-    *("sundae-no-head", "band-no-head", "contribution-no-head", "random-no-head"),
+    *("sundae", "sundae-with-head", "band", "contribution", "random"),
+    *("sundae-no-head", "sundae-no-head-bytes", "band-no-head", "contribution-no-head", "random-no-head"),
     *("mcmc", "splatfacto", "splatfacto-7k"),
 ]
 MINE = """
@@ -127,7 +127,9 @@ def test_default_arms_and_those_of_a_file_together(tmp_path: Path) -> None:
     assert [arm.name for arm in choose_arms(["random", path], "sundae")] == ["random", "stock"]
     with pytest.raises(ConfigError, match="--arms has random twice; give each once"):
         choose_arms(["random", "random"], "sundae")
-    with pytest.raises(ConfigError, match=r"best is no arm; use some of sundae, band, .*, or a file of arms \(.yaml\)"):
+    with pytest.raises(
+        ConfigError, match=r"best is no arm; use some of sundae, .*, band, .*, or a file of arms \(.yaml\)"
+    ):
         choose_arms(["best"], "sundae")
 
 

@@ -46,8 +46,9 @@ class QualityOptions(ComparisonOptions):
     scene: Annotated[Path, tyro.conf.Positional]
     """folder of a capture: COLMAP layout (sparse/0, images), or with a transforms.json."""
     arms: tuple[str, ...] = ()
-    """files of arms (.yaml), and names of default arms: sundae, band, contribution, random, each also with -no-head;
-    mcmc, splatfacto, splatfacto-7k. All default arms if none is given."""
+    """files of arms (.yaml), and names of default arms: sundae, band (the paper's rule), contribution, random, each also with
+    -no-head; sundae-with-head, sundae-no-head-bytes; mcmc (from scratch to the same count), splatfacto, splatfacto-7k.
+    All default arms if none is given."""
     keep_ratios: tuple[float, ...] = (0.01, 0.1)
     """shares of the warm-up's primitives to keep."""
     seeds: tuple[int, ...] = (42, 43, 44)
