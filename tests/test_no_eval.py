@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 NEVER = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "torch.hub.load", "np.load", "numpy.load"}
 NEVER |= {"yaml.unsafe_load", "yaml.full_load", "yaml.load_all", "shelve.open", "shutil.unpack_archive"}
 READERS = {"pickle", "marshal", "dill", "cloudpickle", "joblib"}
-SAFE_LOADERS = {"_ConfigLoader", "SafeLoader", "BaseLoader"}
+SAFE_LOADERS = {"_ConfigLoader", "_ValueLoader", "SafeLoader", "BaseLoader"}
 METHODS = {"extract", "extractall"}
 """Of archives: nothing is unpacked to a disk."""
 

@@ -332,7 +332,7 @@ def test_the_schedule_is_logged_and_saved(tmp_path: Path, monkeypatch: pytest.Mo
     config.print_to_terminal()
     config.save_config()
     shown = capsys.readouterr().out
-    assert len(shown.splitlines()) <= 13
+    assert len(shown.splitlines()) <= 20
     assert re.search(r"3,000 steps", shown)
     assert re.search(r"prune .* after 1,500", shown)
     saved = load_config(tmp_path / "outputs" / "e" / "sundae" / "t" / "config.yml")

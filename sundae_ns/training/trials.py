@@ -171,12 +171,13 @@ class Trials(Extension):
         views, progress = len(run.view_indices()), self.progress
         # A warm start skips the steps of the warm-up.
         progress.steps = progress.steps or (run.schedule_length or 0) + run.state.offset
-        if progress.phase == "before":
-            if run.images_per_step > 1:
-                self._settle(run, "head", "trials need a single GPU")
-            elif views < FEWEST_VIEWS:
-                self._settle(run, "plain", f"{views} training views are too few to tell whether a head helps")
-        elif progress.phase != "done":
+        if progress.phase == "done":
+            return
+        if run.images_per_step > 1:  # also if one GPU has begun them: its copies are of the whole field
+            self._settle(run, "head", "trials need a single GPU")
+        elif views < FEWEST_VIEWS:
+            self._settle(run, "plain", f"{views} training views are too few to tell whether a head helps")
+        elif progress.phase != "before":
             self._hold_out(run)
 
     def after_step(self, run: TrainingRun) -> None:
@@ -235,7 +236,8 @@ class Trials(Extension):
         """Let the next steps train the arm of this phase."""
         arm = self.progress.arm
         state.regularised = arm == "regularised"
-        state.head_starts_at = self.progress.began if arm == "head" else math.inf
+        # Not the step at which the arm began: a run that resumes on several GPUs counts other steps.
+        state.head_starts_at = self.begins_at if arm == "head" else math.inf
 
     def _end(self, run: TrainingRun) -> None:
         """End the current trial; begin the next one from the same field, or decide."""
@@ -270,7 +272,6 @@ class Trials(Extension):
         progress = self.progress
         if reason:
             CONSOLE.log(f"the head is {'enabled' if decision == 'head' else 'removed'} without a trial: {reason}")
-            progress.began = self.begins_at
         progress.phase, progress.decision, progress.reason = "done", decision, reason
         self._start, self._ends = None, {}
         run.hold_out([])
@@ -285,7 +286,7 @@ class Trials(Extension):
         """The decision and its figures."""
         progress = self.progress
         record: dict[str, Any] = {"decision": progress.decision, "reason": progress.reason, "step": run.state.step}
-        if not progress.measured:
+        if progress.reason:
             return record
         record |= {"held_out_views": self._planned(run).views, "steps_per_trial": self._planned(run).length, "arms": {}}
         for arm in ARMS:

@@ -138,7 +138,7 @@ def test_an_interrupt_leaves_nothing(tiny: Any, tmp_path: Path, monkeypatch: pyt
     assert not list(tmp_path.iterdir())
     (tmp_path / "a.sundae").write_text("the one of yesterday")
     with pytest.raises(KeyboardInterrupt):
-        pack(tiny.folder, tmp_path / "a.sundae", finetune=5)
+        pack(tiny.folder, tmp_path / "a.sundae", finetune=5, overwrite=True)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["the one of yesterday"]
     assert digests(tiny.folder) == before
 

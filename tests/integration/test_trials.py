@@ -12,9 +12,11 @@ from typing import Any
 import pytest
 import torch
 from budget_runs import same, tidy
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.eval_utils import eval_setup
 
+from sundae_ns.callbacks import NerfstudioRun
 from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import CheckpointError
 from sundae_ns.method_configs import sundae
@@ -245,3 +247,22 @@ def test_a_checkpoint_that_lacks_the_field_to_return_to_is_refused(make: Make, j
     inner = {name.removeprefix("_model."): value for name, value in state["pipeline"].items() if "_model." in name}
     with pytest.raises(CheckpointError, match="lacks the fields"):
         model.load_state_dict(inner)
+
+
+def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any) -> None:
+    judge(head=(-0.5, -0.05))
+    stop = PRUNE_AT + LENGTH + 2
+    whole = make(name="whole", save_every=stop)
+    whole.train()
+    resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=3)
+    model: Any = resumed.pipeline.model
+    (trial,) = (extension for extension in model.extensions if extension.name == "trials")
+    assert trial.state_dict()["start"] is not None
+    resumed.pipeline.datamanager.place = (0, 2)
+    attributes = TrainingCallbackAttributes(resumed.optimizers, resumed.grad_scaler, resumed.pipeline, resumed)
+    trial.before_training(NerfstudioRun(model, attributes))
+    resumed.train()
+    assert _record(resumed)["reason"] == "trials need a single GPU"
+    assert model.state.head_enabled
+    assert resumed.pipeline.datamanager.holdout_indices == []
+    assert trial.state_dict()["start"] is None

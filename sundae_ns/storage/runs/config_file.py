@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import Enum
 from functools import cache
 from importlib.metadata import entry_points
@@ -129,7 +129,7 @@ def load_config(path: Path) -> Any:
     Raises:
         CheckpointError: it cannot be read, is no configuration, or asks for something else.
     """
-    config = _load(path, _ConfigLoader)
+    config = _load(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
     _find_capture(config, path.absolute().parent)
     return config
 
@@ -140,7 +140,7 @@ def model_options(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: it cannot be read, or is no configuration of a run.
     """
-    found = _load(path, _ValueLoader)
+    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
     for part in ("pipeline", "model"):
         found = found.get(part) if isinstance(found, dict) else None
     if not isinstance(found, dict):
@@ -148,9 +148,9 @@ def model_options(path: Path) -> dict[str, Any]:
     return found
 
 
-def _load(path: Path, loader: type[yaml.SafeLoader]) -> Any:
+def _load(path: Path, parse: Callable[[str], Any]) -> Any:
     try:
-        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
+        return parse(regular(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise CheckpointError(
             f"{path} cannot be read ({error.strerror}); give the folder of a finished run, or its config.yml"
