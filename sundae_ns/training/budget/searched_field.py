@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
@@ -11,8 +12,6 @@ import torch
 from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead
-from sundae_ns.errors import DataError
-from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.sh_folding import mean_basis
@@ -21,16 +20,14 @@ from sundae_ns.pruning import PruningConfig
 from sundae_ns.pruning.cutting import cut, drop_nonfinite
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering.contribution import contribution, weights_by_batch
-from sundae_ns.rendering.render import render
 from sundae_ns.rendering.source import TrainingView
 from sundae_ns.training.budget.search import NO_IMAGE
 from sundae_ns.training.budget.sizes import bytes_of
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.heldout import measure_heldout
 from sundae_ns.training.schedulers import notify_pruned
 
-EXACT = 100.0
-"""Highest PSNR of a view, dB; 8-bit images carry no more."""
 MAX_VIEWS = 64
 """Training views, evenly chosen, for each score: a search scores the field at every cut."""
 
@@ -95,30 +92,16 @@ class SearchedField:
 
         return mean_basis(weighted())
 
-    @torch.no_grad()
     def measure(self) -> float:
         """Mean PSNR over the held-out views, dB; with the head if it is enabled. Always finite.
 
-        An image that is not finite counts as ``NO_IMAGE``, a view as at most ``EXACT``. Masked pixels do not count.
+        An image that is not finite counts as ``NO_IMAGE``. Masked pixels do not count.
 
         Raises:
             DataError: masks leave no pixel.
         """
-        run, values = self.run, []
-        for view, target, mask in run.heldout_views():
-            images, _ = render(run.source, view, run.background, run.settings, depth=False)
-            image = images["rgb"]
-            if mask is not None:
-                if not mask.any():
-                    continue
-                image, target = image[mask][None], target[mask][None]
-            values.append(psnr(image, target).clamp_max(EXACT))
-        if not values:
-            raise DataError(
-                "masks leave no pixel of the held-out views; mend the masks, or hold out other views with "
-                "--pipeline.datamanager.holdout-every"
-            )
-        value = float(torch.stack(values).mean())
+        mend = "hold out other views with --pipeline.datamanager.holdout-every"
+        value = statistics.fmean(view.psnr for view in measure_heldout(self.run, mend=mend))
         return value if math.isfinite(value) else NO_IMAGE
 
     # ------------------------------------------------------------------------------------------------------- fields

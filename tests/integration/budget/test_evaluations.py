@@ -9,7 +9,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.training.budget.search import NO_IMAGE
-from sundae_ns.training.budget.searched_field import EXACT
+from sundae_ns.training.heldout import EXACT
 
 
 def test_an_evaluation_is_always_a_number(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
