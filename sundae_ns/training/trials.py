@@ -215,11 +215,11 @@ class Trials(Extension):
         return self._plan
 
     def _fits(self, run: TrainingRun) -> bool:
-        """Whether as many steps as the trials take are left after them."""
+        """Whether the chosen arm can train on for the length of a trial."""
         if run.last_step is None:
             return False
         plan = self._planned(run)
-        return run.last_step + run.state.offset >= self.begins_at + 2 * plan.num_trials * plan.length
+        return run.last_step + run.state.offset >= self.begins_at + (plan.num_trials + 1) * plan.length
 
     def _hold_out(self, run: TrainingRun) -> None:
         """Serve training views without the held-out ones of this phase."""

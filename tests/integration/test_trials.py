@@ -49,7 +49,9 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
 
 @pytest.fixture
 def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
-    def trainer(views: int = 16, *, name: str = "run", save_every: int = 1000, **options: Any) -> Trainer:
+    def trainer(
+        views: int = 16, *, name: str = "run", save_every: int = 1000, start_at: int | None = None, **options: Any
+    ) -> Trainer:
         config = deepcopy(sundae.config)
         config.data = config.pipeline.datamanager.data = scenes(views)
         config.output_dir, config.experiment_name, config.timestamp = tmp_path, name, "now"
@@ -60,6 +62,7 @@ def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
         model.num_downscales, model.sh_degree, model.sh_degree_interval, model.warmup_length = 0, 1, 5, 10**9
         model.pruning.prune_at, model.evaluate_prune = PRUNE_AT, False
         model.head.size, model.head.pixel_unshuffle, model.head.num_features = "tiny", 1, 5
+        model.head.start_at = start_at
         for option, value in options.items():
             setattr(config, option, value)
         torch.manual_seed(7)
@@ -233,6 +236,15 @@ def test_a_run_that_is_too_short_for_trials_says_so(make: Make, capsys: pytest.C
     assert not (trainer.base_dir / "trials.json").exists()
     assert not trainer.pipeline.model.state.head_enabled
     assert "before the head could be tried" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_late_head_has_its_trials_late(make: Make, judge: Any) -> None:
+    judge(head=(0.5, 0.01))
+    late = STEPS - 5 * LENGTH
+    trainer = make(start_at=late)
+    trainer.train()
+    assert _record(trainer)["step"] == late + 3 * LENGTH
+    assert trainer.pipeline.model.state.head_enabled
 
 
 def test_a_checkpoint_that_lacks_the_field_to_return_to_is_refused(make: Make, judge: Any) -> None:
