@@ -2,7 +2,8 @@
 # make test: install if need be, then what CI runs.   make test-all: every seed, and the viewer's tests in a browser.
 # make coverage: lines that the tests run.   make mutants: small faults that the tests
 # notice, all in half an hour, or make mutants SAMPLE=40.
-# make browser: the viewer in a headless Chromium (apt-get install chromium); it needs a quiet machine.
+# make browser: the viewer and the exported page in a headless Chromium (apt-get install chromium); it needs a quiet
+# machine.   make web: check the page's sources in web/ and build it (Node 20 or newer).
 PYTHON ?= python3
 WORKERS ?= 2
 VENV := .venv
@@ -11,7 +12,7 @@ INSTALLED := $(VENV)/.installed
 # Files stay whole, because their tests share trained runs. tests/conftest.py puts long files first.
 SIDE_BY_SIDE := --numprocesses $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-all lint types pytest browser coverage mutants install clean
+.PHONY: demo test test-all lint types pytest browser web coverage mutants install clean
 
 install: $(INSTALLED)
 
@@ -48,6 +49,13 @@ pytest: $(INSTALLED)
 browser: $(INSTALLED)
 	$(BIN)/python -m pytest -q -m browser
 
+web: web/node_modules
+	cd web && npm run --silent check && npm run --silent build
+
+web/node_modules: web/package-lock.json
+	cd web && npm ci --silent --no-audit --no-fund
+	touch $@
+
 coverage: $(INSTALLED)
 	$(BIN)/coverage erase
 	$(BIN)/coverage run -m pytest -q -m "not browser" $(SIDE_BY_SIDE)
@@ -58,4 +66,4 @@ mutants: $(INSTALLED)
 	$(BIN)/python benchmarks/mutants.py $(if $(SAMPLE),--sample $(SAMPLE))
 
 clean:
-	rm -rf $(VENV) .demo build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage*
+	rm -rf $(VENV) web/node_modules .demo build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage*

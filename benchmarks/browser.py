@@ -57,6 +57,10 @@ ONLY_LOOPBACK = "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1"
 # What viser 0.2.7 says on an empty page too: the shaders of its own splats have none to show.
 KNOWN = ("THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN",)
 FOREIGN = "net::ERR_NAME_NOT_RESOLVED"
+WEBGPU = """
+--enable-unsafe-webgpu --use-webgpu-adapter=swiftshader --enable-features=Vulkan --use-vulkan=swiftshader
+""".split()
+"""Flags for WebGPU in software; without Vulkan there is no WebGPU canvas."""
 
 
 def find_chromium() -> str | None:
@@ -87,10 +91,12 @@ class Browser:
         executable: from :func:`find_chromium`.
         width: of the page, pixels.
         height: of the page, pixels.
+        flags: more flags of Chromium.
     """
 
-    def __init__(self, executable: str, width: int = 960, height: int = 640) -> None:
-        self._command = [executable, *FLAGS, ONLY_LOOPBACK, f"--window-size={width},{height}", "about:blank"]
+    def __init__(self, executable: str, width: int = 960, height: int = 640, flags: Sequence[str] = ()) -> None:
+        size = f"--window-size={width},{height}"
+        self._command = [executable, *FLAGS, *flags, ONLY_LOOPBACK, size, "about:blank"]
         self._size = (width, height)
         self._stack = ExitStack()
         self._answers: dict[int, queue.SimpleQueue[dict[str, Any]]] = {}

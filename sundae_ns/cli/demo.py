@@ -47,7 +47,7 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
     """Write the scene, train, evaluate, and print the results.
 
     Args:
-        out: folder for scene, run, logs and images; an earlier demo in it is replaced.
+        out: folder for scene, run, logs, images and web page; an earlier demo in it is replaced.
         steps: number of training steps, to which the schedule is scaled; None takes the method's default.
         console: where to print.
 
@@ -93,10 +93,15 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
             from sundae_ns.scenes.measure import frame_times, sizes
             from sundae_ns.scenes.opening import load_run
+            from sundae_ns.scenes.packed import scene_of_run
+            from sundae_ns.scenes.page import write_page
+            from sundae_ns.storage.packing import write_scene
 
             opened = load_run(run / "config.yml")
             model, cameras = opened.model, opened.cameras
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
+            write_scene(out / "scene.sundae", scene_of_run(run))
+            write_page(out / "scene.sundae", out / "scene.html", title="sundae demo")
     _comparison(out / "renders", out / "comparison.png")
 
     results = json.loads((out / "eval.json").read_text())["results"]
@@ -113,5 +118,6 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
     sizes_of_parts = (stored.primitives, stored.head)
     text = report_text(title, stages, sizes_of_parts, (times.splat, times.head, times.frame))
     console.print(text, highlight=False)
-    console.print(f"Images: {out / 'comparison.png'}   View: ns-viewer --load-config {run / 'config.yml'}")
+    console.print(f"Images: {out / 'comparison.png'}   In a browser: {out / 'scene.html'}")
+    console.print(f"View: ns-viewer --load-config {run / 'config.yml'}")
     return 0

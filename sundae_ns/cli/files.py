@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sundae_ns.cli.outputs import Overwrite, check_file
+from sundae_ns.cli.outputs import Overwrite, check_file, check_folder
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -31,13 +35,15 @@ def export(
     upright: bool = False,
     overwrite: Overwrite = False,
 ) -> int:
-    """Write the base colours of a scene as a .ply, .spz or .sog file; these formats hold no features and no head.
+    """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz or .sog.
 
-    Antialiased scenes are marked as such. Primitives with NaN or infinite values are left out.
+    The page needs no network and no server. The other formats hold no features and no head; antialiased scenes are
+    marked as such, and primitives with NaN or infinite values are left out.
 
     Args:
-        scene: a run (its folder or config.yml), a packed scene, or a 3DGS .ply of any program.
-        out: file to write; its suffix selects the format: .ply (exact), .spz or .sog (quantised, much smaller).
+        scene: a run (its folder or config.yml), a packed scene, or, for .spz and .sog, a 3DGS .ply of any program.
+        out: file to write; its suffix selects the format: .html, .ply (exact), .spz or .sog (quantised, much smaller).
+            A name without a suffix is a folder of page and scene, for a web server.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
             Do not use the rotated file for a warm start.
         overwrite: replace an existing file, once the new one is complete.
@@ -53,9 +59,16 @@ def export(
     from sundae_ns.storage.runs.folder import config_of, files_of
     from sundae_ns.storage.viewers import ANTIALIASED, check_format, write_for_viewers
 
-    check_format(out)
-    check_file(out, reads=files_of(scene), overwrite=overwrite)
+    page = out.suffix.lower() == ".html" or not out.suffix
+    if not page:
+        check_format(out)
+    check = check_file if out.suffix else check_folder
+    check(out, reads=files_of(scene), overwrite=overwrite)
     kind = kind_of(scene)
+    if page:
+        if upright:
+            raise ConfigError("a page turns the scene upright by itself; leave out --upright")
+        return _export_page(scene, out)
     if kind == "ply":
         if out.suffix.lower() == ".ply":
             raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
@@ -83,6 +96,33 @@ def export(
     if written.cut:
         print(f"left out harmonics above SH degree {written.degree}, which {out.suffix} cannot store; .ply can")
     return 0
+
+
+def _export_page(scene: Path, out: Path) -> int:
+    from sundae_ns.scenes.page import write_folder, write_page
+
+    write = write_page if out.suffix else write_folder
+    with packed_scene(scene) as packed, redirect_stdout(StringIO()):
+        written = write(packed, out, title=out.resolve().stem)
+    print(f"{out}: {written:,} bytes; open it in a browser" if out.suffix else f"{out}: {written:,} bytes; serve it")
+    return 0
+
+
+@contextmanager
+def packed_scene(scene: Path) -> Iterator[Path]:
+    """A packed scene as it is, or a run packed into a temporary file."""
+    from sundae_ns.scenes.packed import scene_of_run
+    from sundae_ns.storage.kinds import kind_of
+    from sundae_ns.storage.packing import write_scene
+
+    if kind_of(scene) == "packed" or scene.suffix == ".sundae":
+        yield scene
+        return
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.sundae"
+        with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
+            write_scene(path, scene_of_run(scene))
+        yield path
 
 
 def prune(

@@ -17,11 +17,12 @@ from sundae_ns.cli.files import export, prune
 from sundae_ns.cli.outputs import Overwrite, check_folder
 from sundae_ns.cli.packing import pack, unpack
 from sundae_ns.cli.train import train
+from sundae_ns.cli.view import view
 from sundae_ns.errors import SundaeError, writing
 
 app = tyro.extras.SubcommandApp()
 app.command(bench, name="bench", help="Benchmark SUNDAE on this machine.")
-for command in (train, pack, unpack, export, prune):
+for command in (train, pack, unpack, export, view, prune):
     app.command(command)
 
 

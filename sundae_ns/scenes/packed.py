@@ -232,7 +232,7 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
     path = folder / "config.yml"
     if path.exists():
         raise PackError(f"{folder} is a run already; choose another --name or folder, or remove it")
-    model = _model_of(scene)
+    model = model_of(scene)
     config.pipeline.model = model.config
     manager = config.pipeline.datamanager
     assert isinstance(manager, SundaeDatamanagerConfig)
@@ -295,7 +295,7 @@ def _whole(stated: Mapping[str, Any], name: str, least: int, most: int) -> int:
     return value
 
 
-def _model_of(scene: Scene) -> SundaeModel:
+def model_of(scene: Scene) -> SundaeModel:
     """The model of a scene, on the CPU."""
     stated = scene.meta.get("model")
     if not isinstance(stated, dict):
@@ -393,9 +393,7 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
 
 def _transforms(scene: Scene) -> dict[str, Any]:
     """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
-    cameras = scene.cameras
-    if cameras is None or len(cameras["poses"]) == 0:
-        cameras = _outside_camera(scene.field["means"])
+    cameras = cameras_of(scene)
     frames = []
     for i, pose in enumerate(cameras["poses"].double().tolist()):
         fx, fy, cx, cy = cameras["intrinsics"][i].tolist()
@@ -413,6 +411,13 @@ def _transforms(scene: Scene) -> dict[str, Any]:
             }
         )
     return {"camera_model": "PINHOLE", "frames": frames}
+
+
+def cameras_of(scene: Scene) -> dict[str, Tensor]:
+    """The cameras of a scene by the names of ``storage.packing.CAMERAS``; one in front of it if it has none."""
+    if scene.cameras is None or len(scene.cameras["poses"]) == 0:
+        return _outside_camera(scene.field["means"])
+    return scene.cameras
 
 
 def _outside_camera(means: Tensor) -> dict[str, Tensor]:

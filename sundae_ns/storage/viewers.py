@@ -44,7 +44,7 @@ class ViewerFile(NamedTuple):
 def check_format(path: Path) -> None:
     """Raise ``ConfigError`` unless the suffix of a file names a supported format."""
     if path.suffix.lower() not in FORMATS:
-        raise ConfigError(f"{path} has no supported suffix; name it {' or '.join(FORMATS)}")
+        raise ConfigError(f"{path} has no supported suffix; name it {' or '.join((*FORMATS, '.html'))}")
 
 
 def write_for_viewers(

@@ -1,0 +1,77 @@
+"""``sundae view``: show a scene in the browser."""
+
+from __future__ import annotations
+
+import webbrowser
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from sundae_ns.cli.files import packed_scene
+
+
+class _Server(ThreadingHTTPServer):
+    """Serves one page on this machine only."""
+
+    page: bytes
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+
+    def do_GET(self) -> None:
+        """Answer with the page."""
+        found = self.path == "/"
+        self.send_response(200 if found else 404)
+        self.send_header("Content-Type", "text/html; charset=utf-8")
+        self.send_header("Content-Length", str(len(self.server.page) if found else 0))
+        self.end_headers()
+        if found:
+            self.wfile.write(self.server.page)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        """Stay silent."""
+
+
+def serve(page: str, port: int) -> _Server:
+    """A server of one page on 127.0.0.1, not yet started.
+
+    Raises:
+        ConfigError: the port is in use or not allowed.
+    """
+    from sundae_ns.errors import ConfigError
+
+    try:
+        server = _Server(("127.0.0.1", port), _Handler)
+    except (OSError, OverflowError) as error:
+        raise ConfigError(f"port {port} cannot be used ({error}); choose another, or 0 for a free one") from error
+    server.page = page.encode()
+    return server
+
+
+def view(scene: Annotated[Path, tyro.conf.Positional], port: int = 0, open_browser: bool = True) -> int:
+    """Show a scene with its head in the browser, until Ctrl-C.
+
+    Serves the page of sundae export on 127.0.0.1 and opens it. From another machine, forward the port by ssh -L.
+
+    Args:
+        scene: a packed scene, or a run (its folder or config.yml).
+        port: port on 127.0.0.1; 0 takes a free one.
+        open_browser: open the default browser; otherwise only print the address.
+    """
+    from sundae_ns.scenes.page import page_of
+
+    with packed_scene(scene) as packed:
+        page = page_of(packed, title=scene.resolve().stem)
+    with serve(page, port) as server:
+        address = f"http://127.0.0.1:{server.server_port}/"
+        print(f"{scene} is shown at {address} until Ctrl-C", flush=True)
+        if open_browser:
+            webbrowser.open(address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            print()
+    return 0

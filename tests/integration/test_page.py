@@ -1,0 +1,227 @@
+"""The exported page in a headless Chromium with a software adapter, against Python's images of the same file.
+
+The page's images are bytes, whose rounding alone gives 58.9 dB.
+"""
+
+from __future__ import annotations
+
+import base64
+import importlib.util
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from numpy.typing import NDArray
+from packed_scenes import KINDS, write_kind
+
+from sundae_ns.cli.view import serve
+from sundae_ns.scenes.packed import cameras_of, model_of, scene_of_run
+from sundae_ns.scenes.page import page_of, write_folder, write_page
+from sundae_ns.storage.packing import read_scene, write_scene
+
+ROOT = Path(__file__).parents[2]
+spec = importlib.util.spec_from_file_location("browser", ROOT / "benchmarks" / "browser.py")
+assert spec is not None
+assert spec.loader is not None
+browser = sys.modules["browser"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(browser)
+
+CHROMIUM = browser.find_chromium()
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (apt-get install chromium)")
+
+LEAST = 57.0
+"""Lowest PSNR of an image of the page against Python's; the worst is 58.7."""
+SECONDS = 180.0
+"""Shaders compile in software."""
+SIZE = (160, 120)
+
+TICKING = """
+const dot = document.createElement('div');
+dot.style = 'position: absolute; width: 1px; height: 1px';
+document.body.append(dot);
+let odd = 0;
+setInterval(() => { dot.style.background = (odd ^= 1) ? 'red' : 'blue'; }, 30);
+"""
+"""A pixel in the corner that changes: headless Chromium takes screenshots only of frames that differ from the last."""
+
+
+@contextmanager
+def opened(address: str, *, state: str = "ready", flags: Any = browser.WEBGPU) -> Iterator[Any]:
+    """The page of an address, once it has a state."""
+    with browser.Browser(CHROMIUM, *SIZE, flags) as page:
+        page.open(address)
+        found = "window.sundae && window.sundae.state !== 'loading'"
+        browser.wait_for(lambda: bool(page.evaluate(found)), "the page", SECONDS)
+        assert page.evaluate("sundae.state") == state, page.evaluate("sundae.message")
+        yield page
+        assert page.errors == []
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        pass
+
+
+def image(page: Any, camera: int, head: bool, scale: float = 1.0) -> NDArray[np.float64]:
+    """An image of the page ``[H, W, 3]`` in [0, 1]."""
+    found = page.evaluate(f"sundae.image({camera}, {str(head).lower()}, {scale})")
+    pixels = np.frombuffer(base64.b64decode(found["pixels"]), np.uint8)
+    return pixels.reshape(found["height"], found["width"], 4)[..., :3] / 255
+
+
+def truths(packed: Path) -> list[dict[str, NDArray[np.float32]]]:
+    """``rgb`` and ``base_rgb`` of each camera of a packed scene, by Python."""
+    scene = read_scene(packed)
+    model, cameras = model_of(scene), cameras_of(scene)
+    images = []
+    for pose, lens, size in zip(*(cameras[name] for name in ("poses", "intrinsics", "sizes")), strict=True):
+        fx, fy, cx, cy = lens.float().reshape(4, 1, 1)
+        width, height = size.reshape(2, 1, 1)
+        with torch.no_grad():
+            outputs = model.get_outputs(Cameras(pose[None], fx, fy, cx, cy, width, height))
+        images.append({name: outputs[name].numpy() for name in ("rgb", "base_rgb")})
+    return images
+
+
+def psnr(found: NDArray[Any], truth: NDArray[Any]) -> float:
+    assert found.shape == truth.shape
+    return float(-10 * np.log10(np.mean((found - truth) ** 2) + 1e-12))
+
+
+def check(page: Any, packed: Path, cameras: list[int]) -> None:
+    for camera in cameras:
+        truth = truths(packed)[camera]
+        assert psnr(image(page, camera, False), truth["base_rgb"]) > LEAST
+        if page.evaluate("!document.getElementById('head-label').hidden"):
+            assert psnr(image(page, camera, True), truth["rgb"]) > LEAST
+            assert psnr(truth["base_rgb"], truth["rgb"]) < LEAST - 20, "the head changes nothing"
+        assert page.evaluate("sundae.message") == ""
+
+
+def test_images_of_the_page_are_those_of_python(tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual, folded"])
+    write_page(packed, tmp_path / "a.html", title="a")
+    with opened((tmp_path / "a.html").as_uri()) as page:
+        check(page, packed, [0, 1])
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("name", [name for name in KINDS if name != "residual, folded"])
+def test_every_kind_of_scene(name: str, tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS[name])
+    write_page(packed, tmp_path / "a.html", title="a")
+    with opened((tmp_path / "a.html").as_uri()) as page:
+        check(page, packed, [0, 1])
+
+
+@pytest.mark.browser
+def test_six_cameras_of_a_trained_scene(tiny: Any, tmp_path: Path) -> None:
+    write_scene(tmp_path / "a.sundae", scene_of_run(tiny.folder))
+    write_page(tmp_path / "a.sundae", tmp_path / "a.html", title="a")
+    with opened((tmp_path / "a.html").as_uri()) as page:
+        count = page.evaluate("sundae.cameras")
+        images = truths(tmp_path / "a.sundae")
+        assert count == len(images) == 12
+        for camera in range(0, count, 2):
+            assert psnr(image(page, camera, False), images[camera]["base_rgb"]) > LEAST
+            assert psnr(image(page, camera, True), images[camera]["rgb"]) > LEAST
+
+
+@pytest.mark.browser
+def test_the_controls(tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    server = serve(page_of(packed, title="a"), 0)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+
+    def look(page: Any) -> tuple[NDArray[np.int64], str]:
+        """The canvas once it rests, and the words beside the stop."""
+        shots = [page.screenshot().astype(int)]
+        while len(shots) < 2 or np.abs(shots[-1] - shots[-2]).any():
+            assert len(shots) < 20, "the canvas does not rest"
+            shots.append(page.screenshot().astype(int))
+            shots[-1][0, 0] = 0
+        return shots[-1], page.evaluate("document.getElementById('stop').textContent")
+
+    def after(page: Any, act: Callable[[], Any]) -> tuple[NDArray[np.int64], str]:
+        """The same after an act has changed the canvas."""
+        frames = "sundae.frames"
+        before = page.evaluate(frames)
+        act()
+        browser.wait_for(lambda: page.evaluate(frames) > before, "a frame", SECONDS)
+        return look(page)
+
+    def press(page: Any, name: str) -> Callable[[], Any]:
+        return lambda: page.evaluate(f"document.getElementById('{name}').click()")
+
+    try:
+        with opened(f"http://127.0.0.1:{server.server_port}/") as page:
+            page.evaluate(f"{{ document.getElementById('panel').style.visibility = 'hidden'; {TICKING} }}")
+            first, stop = look(page)
+            assert stop == "1 of 2"
+            bare, _ = after(page, press(page, "head"))
+            assert np.abs(bare - first).mean() > 1
+            again, _ = after(page, press(page, "head"))
+            np.testing.assert_array_equal(again, first)
+            second, stop = after(page, press(page, "after"))
+            assert stop == "2 of 2"
+            assert np.abs(second - first).mean() > 1
+            again, stop = after(page, press(page, "after"))
+            assert stop == "1 of 2"
+            np.testing.assert_array_equal(again, first)
+            turned, stop = after(page, lambda: page.drag(80, 60, 110, 70))
+            assert stop == "free"
+            assert np.abs(turned - first).mean() > 1
+            half = "const s = document.getElementById('scale'); s.value = 50; s.dispatchEvent(new Event('input'))"
+            after(page, lambda: page.evaluate(f"{{{half}}}"))
+            assert page.evaluate("document.getElementById('scale-value').textContent") == "50%"
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.mark.browser
+def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    page = page_of(packed, title="a")
+    content = packed.read_bytes()
+    wrong = page.replace(base64.b64encode(content).decode(), base64.b64encode(content[:-1] + b"~").decode())
+    (tmp_path / "a.html").write_text(wrong)
+    with opened((tmp_path / "a.html").as_uri(), state="failed") as found:
+        assert "checksum" in found.evaluate("document.getElementById('message').innerText")
+        assert found.evaluate("!document.getElementById('poster').hidden")
+
+
+@pytest.mark.browser
+def test_a_folder_is_served_and_says_so_when_opened_from_disk(tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    write_folder(packed, tmp_path / "site", title="a")
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=tmp_path / "site")) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with opened(f"http://127.0.0.1:{server.server_port}/") as page:
+            assert psnr(image(page, 0, True), truths(packed)[0]["rgb"]) > LEAST
+        server.shutdown()
+    with browser.Browser(CHROMIUM, *SIZE, browser.WEBGPU) as page:
+        page.open((tmp_path / "site" / "index.html").as_uri())
+        browser.wait_for(lambda: bool(page.evaluate("window.sundae?.state === 'failed'")), "the message", SECONDS)
+        assert "serve this folder" in page.evaluate("sundae.message")
+
+
+@pytest.mark.browser
+def test_without_webgpu_the_page_shows_base_colours(tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    write_page(packed, tmp_path / "a.html", title="a")
+    with opened((tmp_path / "a.html").as_uri(), flags=["--disable-features=WebGPU"]) as page:
+        assert page.evaluate("sundae.drawn") == "webgl"
+        assert "without the compensation head" in page.evaluate("document.getElementById('message').innerText")
+        # Quads have no tiles, and their sums are rounded to bytes; the worst is 50.0.
+        for camera, truth in enumerate(truths(packed)):
+            assert psnr(image(page, camera, False), truth["base_rgb"]) > 47

@@ -1,0 +1,253 @@
+"""The web page of a packed scene: what Python writes, and the page's decoder against Python's."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import re
+import shutil
+import struct
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from packed_scenes import KINDS, write_kind
+from PIL import Image
+
+from sundae_ns.cli import main
+from sundae_ns.errors import PackError
+from sundae_ns.scenes.page import page_of, render_first, write_folder, write_page
+from sundae_ns.storage.packing import read_scene
+
+ROOT = Path(__file__).parents[2]
+WEB = ROOT / "web"
+Json = dict[str, Any]
+
+needs_node = pytest.mark.skipif(
+    shutil.which("node") is None or not (WEB / "node_modules").is_dir(),
+    reason="the page's build tools are not installed (make web)",
+)
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_kind(tmp_path_factory.mktemp("scenes") / "a.sundae", KINDS["residual"])
+
+
+# -------------------------------------------------------------------------------------------------------------- writing
+
+
+def test_a_page_holds_the_scene_and_no_address(packed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.html"
+    assert write_page(packed, out, title="a <b> & c") == out.stat().st_size
+    page = out.read_text()
+    (scene,) = re.findall(r'<script type="application/octet-stream"[^>]*>([^<]*)</script>', page)
+    assert base64.b64decode(scene, validate=True) == packed.read_bytes()
+    assert "<title>a &lt;b&gt; &amp; c</title>" in page
+    assert "@@" not in page
+    # The namespace of XHTML is a name, which nothing loads.
+    assert set(re.findall(r"https?://[\w./]*", page)) <= {"http://www.w3.org/1999/xhtml"}
+    assert "default-src 'none'" in page
+
+
+def test_a_page_shows_the_first_camera_until_it_draws(packed: Path) -> None:
+    (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(packed, title="a"))
+    found = np.asarray(Image.open(io.BytesIO(base64.b64decode(code))), dtype=np.float32)
+    truth = np.asarray(render_first(read_scene(packed)), dtype=np.float32)
+    assert found.shape == truth.shape == (37, 50, 3)
+    assert np.abs(found - truth).mean() < 6  # JPEG
+
+
+def test_a_folder_has_page_and_scene_apart(packed: Path, tmp_path: Path) -> None:
+    out = tmp_path / "site"
+    assert write_folder(packed, out, title="a") == sum(path.stat().st_size for path in out.iterdir())
+    assert (out / "scene.sundae").read_bytes() == packed.read_bytes()
+    assert 'data-source="scene.sundae"></script>' in (out / "index.html").read_text()
+    write_folder(packed, out, title="a")
+
+
+def test_export_writes_pages(packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for out in ("a.html", "folder"):
+        with pytest.raises(SystemExit) as caught:
+            main(["export", str(packed), "-o", str(tmp_path / out)])
+        assert caught.value.code == 0, capsys.readouterr().err
+    assert (tmp_path / "a.html").is_file()
+    assert (tmp_path / "folder" / "index.html").is_file()
+    with pytest.raises(SystemExit) as caught:
+        main(["export", str(packed), "-o", str(tmp_path / "b.html"), "--upright"])
+    assert caught.value.code == 2
+    assert "--upright" in capsys.readouterr().err
+
+
+def test_a_file_that_is_no_scene_is_refused(packed: Path, tmp_path: Path) -> None:
+    (tmp_path / "b.sundae").write_bytes(packed.read_bytes()[:-1])
+    with pytest.raises(PackError):
+        write_page(tmp_path / "b.sundae", tmp_path / "b.html", title="b")
+    assert not (tmp_path / "b.html").exists()
+
+
+# ------------------------------------------------------------------------------------------------------------- building
+
+
+@needs_node
+def test_the_page_is_built_from_its_sources(tmp_path: Path) -> None:
+    built = tmp_path / "page.html"
+    subprocess.run(["node", "build.mjs", built], cwd=WEB, check=True)
+    assert built.read_text() == (ROOT / "sundae_ns" / "scenes" / "page.html").read_text(), "run make web"
+
+
+@needs_node
+def test_the_sources_pass_their_checks() -> None:
+    for command in (["tsc"], ["biome", "ci", "."]):
+        subprocess.run([WEB / "node_modules" / ".bin" / command[0], *command[1:]], cwd=WEB, check=True)
+
+
+# ------------------------------------------------------------------------------------------------------------- decoding
+
+
+@pytest.fixture(scope="module")
+def decode(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[Json]]:
+    """The page's decoder under Node: a JSON object for each file."""
+    program = tmp_path_factory.mktemp("node") / "dump.mjs"
+    bundle = [WEB / "node_modules/.bin/esbuild", "tests/dump.ts", "--bundle", "--platform=node", "--format=esm"]
+    subprocess.run([*bundle, "--log-level=error", f"--outfile={program}"], cwd=WEB, check=True)
+
+    def run(*files: Path) -> list[Json]:
+        found = subprocess.run(["node", program, *files], check=True, capture_output=True, text=True)
+        return [json.loads(line) for line in found.stdout.splitlines()]
+
+    return run
+
+
+@needs_node
+def test_the_decoder_agrees_with_python(decode: Callable[..., list[Json]], tmp_path: Path) -> None:
+    files = [write_kind(tmp_path / f"{i}.sundae", kind) for i, kind in enumerate(KINDS.values())]
+    for file, found, kind in zip(files, decode(*files), KINDS.values(), strict=True):
+        truth = read_scene(file)
+        assert found["count"] == len(truth.field["means"])
+        assert (found["degree"], found["logits"], found["antialiased"]) == (
+            kind.degree,
+            kind.degree == 0,
+            kind.antialiased,
+        )
+        for name, value in {**truth.field, **truth.head}.items():
+            array = np.fromfile(f"{file}.{name}", np.float32)
+            # Sums of the transform and lengths of quaternions round in another order.
+            tolerance = {"features_rest": 1e-6, "quats": 2e-7}.get(name, 0.0)
+            np.testing.assert_allclose(array, value.numpy().reshape(-1), rtol=0, atol=tolerance, err_msg=name)
+        assert truth.cameras is not None
+        poses = [camera["pose"] for camera in found["cameras"]]
+        assert torch.equal(torch.tensor(poses).reshape(-1, 3, 4), truth.cameras["poses"])
+
+
+def parts(content: bytes) -> tuple[Json, bytes]:
+    (length,) = struct.unpack("<I", content[12:16])
+    return json.loads(content[48 : 48 + length]), content[48 + length :]
+
+
+def sealed(meta: Json, body: bytes) -> bytes:
+    """A file with this header and body, and a valid checksum of the header."""
+    text = json.dumps(meta).encode()
+    return b"\x89SUNDAE\n" + struct.pack("<II", 1, len(text)) + hashlib.sha256(text).digest() + text + body
+
+
+def put(path: str, value: Any) -> Callable[[Json], None]:
+    """Set one value of the header. ``path`` is dotted keys; after a leading colon the first names a section."""
+
+    def apply(meta: Json) -> None:
+        *keys, last = path.split(".")
+        place: Any = meta
+        if path.startswith(":"):
+            name = keys.pop(0)[1:]
+            place = next(entry for entry in meta["sections"] if entry["name"] == name)
+        for key in keys:
+            place = place[int(key) if isinstance(place, list) else key]
+        place[int(last) if isinstance(place, list) else last] = value
+
+    return apply
+
+
+LIES: dict[str, Callable[[Json], None]] = {
+    "a billion primitives": put("primitives", 10**9),
+    "no primitives": put("primitives", 0),
+    "half a primitive": put("primitives", 0.5),
+    "more primitives than it has": put("primitives", 401),
+    "no attributes": put("attributes", 3),
+    "an attribute of another codec": put("attributes.scales.codec", "pickle"),
+    "harmonics of an older codec": put("attributes.features_rest.codec", "codebooks"),
+    "too many bits": put("attributes.scales.bits", 200),
+    "an infinite step": put("attributes.opacities.step", [1e308]),
+    "a word for a number": put("attributes.opacities.low", ["nan"]),
+    "empty blocks": put("attributes.means.block", 0),
+    "a huge shape": put(":opacities/codes.shape", [1, 2**27]),
+    "a shape that overflows": put(":opacities/codes.shape", [2**27, 2**27, 2**27]),
+    "a negative length": put(":opacities/codes.parts.0", -5),
+    "a huge length": put(":opacities/codes.parts.0", 2**50),
+    "no parts": put(":opacities/codes.parts", []),
+    "a dtype of objects": put(":opacities/codes.dtype", "|O"),
+    "a section of another name": put(":means/low.name", "means/lower"),
+    "two sections of one name": put(":means/low.name", "means/high"),
+    "a head of another shape": put("attributes.head.tensors.0.1", [2**27, 2**27]),
+    "tensors that are no list": put("attributes.head.tensors", 7),
+    "no list of sections": put("sections", {}),
+}
+
+
+@needs_node
+def test_the_decoder_refuses_what_python_refuses(
+    decode: Callable[..., list[Json]], packed: Path, tmp_path: Path
+) -> None:
+    good = packed.read_bytes()
+    files = {"truncated": good[:-1], "longer": good + b"x", "empty": b"", "another file": b"ply\n" + good[4:]}
+    files |= {"cut in its header": good[:100], "another version": good[:8] + b"\x02" + good[9:]}
+    files |= {"an altered header": good[:60] + b"~" + good[61:], "an altered section": good[:-1] + b"~"}
+    meta, body = parts(good)
+    for name, lie in LIES.items():
+        changed = json.loads(json.dumps(meta))
+        lie(changed)
+        files[name] = sealed(changed, body)
+    # Frames that cannot be decompressed, under a valid checksum.
+    broken = json.loads(json.dumps(meta))
+    first = broken["sections"][0]
+    length = sum(first["parts"])
+    first["sha256"] = hashlib.sha256(body[:20] + bytes(length - 20)).hexdigest()
+    files["broken frames"] = sealed(broken, body[:20] + bytes(length - 20) + body[length:])
+    paths = []
+    for i, content in enumerate(files.values()):
+        paths.append(tmp_path / f"{i}.sundae")
+        paths[-1].write_bytes(content)
+        with pytest.raises(PackError):
+            read_scene(paths[-1])
+    for name, found in zip(files, decode(*paths), strict=True):
+        assert "error" in found, name
+        assert re.fullmatch(r"The [^\n]{10,200}\.", found["error"]), found
+
+
+@needs_node
+def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]], packed: Path, tmp_path: Path) -> None:
+    meta, body = parts(packed.read_bytes())
+    lies = {
+        "model": None,
+        "model.sh_degree": 1,
+        "model.rasterize_mode": "other",
+        "model.background_color": "__proto__",
+        "model.head": {"mode": "residual"},
+        "model.head.size": "compact",
+        "model.head.num_features": 4,
+        "model.head.pixel_unshuffle": 2,
+        "model.trained_focal": [0, 1],
+    }
+    paths = []
+    for i, (place, value) in enumerate(lies.items()):
+        changed = json.loads(json.dumps(meta))
+        put(place, value)(changed)
+        paths.append(tmp_path / f"{i}.sundae")
+        paths[-1].write_bytes(sealed(changed, body))
+    for name, found in zip(lies, decode(*paths), strict=True):
+        assert "error" in found, name

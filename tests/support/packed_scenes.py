@@ -1,0 +1,107 @@
+"""Packed scenes of every kind that the format knows, with random fields and heads whose correction is visible."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.gaussians import from_points
+from sundae_ns.storage.packing import PackConfig, Scene, write_scene
+
+WIDTH, HEIGHT = 50, 37
+FOCAL = 45.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a scene differs in."""
+
+    points: int = 400
+    degree: int = 3
+    antialiased: bool = False
+    background: str = "random"
+    head: HeadConfig | None = None
+    focal: float | None = FOCAL
+    """Focal length that the head was trained at; None if unknown."""
+    config: PackConfig | None = None
+
+
+def _head(mode: str, fold: int, features: int, size: str = "tiny") -> HeadConfig:
+    return HeadConfig(mode=mode, pixel_unshuffle=fold, num_features=features, size=size)  # type: ignore[arg-type]
+
+
+KINDS = {
+    "no head, degree 3": Kind(),
+    "logits": Kind(degree=0, background="white"),
+    "degree 4, antialiased": Kind(degree=4, antialiased=True, background="black"),
+    "residual": Kind(degree=2, head=_head("residual", 1, 5)),
+    "residual, folded": Kind(degree=1, head=_head("residual", 2, 13, "compact"), focal=None),
+    "features": Kind(degree=1, head=_head("features", 2, 8), background="white"),
+    "trained at a larger scale": Kind(degree=1, head=_head("residual", 2, 4), focal=1.7 * FOCAL),
+    "trained at a smaller scale": Kind(degree=1, head=_head("residual", 1, 4), focal=0.6 * FOCAL),
+    # More than one workgroup sorts, and the lists of tiles outgrow their first buffers.
+    "many primitives": Kind(points=20_000, degree=0, head=_head("residual", 1, 1)),
+    "other precisions": Kind(
+        head=_head("residual", 1, 6),
+        config=PackConfig(
+            block=64,
+            scale_bits=12,
+            rotation_bits=12,
+            color_bits=12,
+            opacity_bits=12,
+            harmonics_step=0.0001,
+            feature_bits=12,
+            head="fp16",
+        ),
+    ),
+}
+
+
+def write_kind(path: Path, kind: Kind) -> Path:
+    """Write a packed scene of a kind, with two cameras."""
+    torch.manual_seed(0)
+    n = kind.points
+    points = torch.rand(n, 3) - 0.5
+    features = kind.head.num_features if kind.head else 3
+    field = from_points(points, torch.rand(n, 3), sh_degree=kind.degree, num_features=features)
+    field = {name: value.detach().clone() for name, value in field.items()}
+    field["features_rest"] = 0.2 * torch.randn(n, (kind.degree + 1) ** 2 - 1, 3)
+    field["features"] = torch.randn(n, features)
+    field["quats"] = torch.randn(n, 4)
+    # From specks below a pixel to a fifth of the image.
+    field["scales"] += 1.5 * torch.randn(n, 3) + (1.5 if n > 1000 else -0.5)
+    field["opacities"] = 3 * torch.randn(n, 1) + 1
+    head: dict[str, Tensor] = {}
+    stated = None
+    if kind.head is None:
+        field.pop("features")
+    else:
+        head = {name: value.detach() for name, value in CompensationHead(kind.head).state_dict().items()}
+        if kind.head.mode == "residual":
+            # The last layer starts at zero.
+            head["net.out.weight"] = 0.3 * torch.randn_like(head["net.out.weight"])
+        names = ("mode", "size", "pixel_unshuffle", "num_features", "precision")
+        stated = {name: getattr(kind.head, name) for name in names}
+    model = {
+        "sh_degree": kind.degree,
+        "rasterize_mode": "antialiased" if kind.antialiased else "classic",
+        "background_color": kind.background,
+        "head": stated,
+        "trained_focal": [kind.focal, kind.focal] if stated and kind.focal else None,
+    }
+    write_scene(path, Scene(field, head, _cameras(), {"model": model}), kind.config)
+    return path
+
+
+def _cameras() -> dict[str, Tensor]:
+    turn = torch.linalg.qr(torch.eye(3) + 0.1 * torch.randn(3, 3)).Q
+    turn = turn * turn.diagonal().sign()
+    poses = torch.stack([torch.cat([turn, 1.4 * turn[:, 2:]], dim=1), torch.eye(4)[:3]])
+    # The second camera is close: primitives are behind it, beside it and across the whole image.
+    poses[1, :, 3] = torch.tensor([0.1, 0.0, 0.55])
+    lens = torch.tensor([FOCAL, FOCAL + 1, 24.0, 19.5]).double()
+    return {"poses": poses, "intrinsics": lens.repeat(2, 1), "sizes": torch.tensor([[WIDTH, HEIGHT]]).repeat(2, 1)}

@@ -1,0 +1,211 @@
+// Renders views of a scene with WebGPU: splats, runs the head, and composes the image.
+
+import type { Drawer, Times } from "../drawer";
+import type { Scene } from "../scene/scene";
+import { scalePlan, type View, zoomed } from "../view";
+import composeCode from "./compose.wgsl";
+import { blocksOf, type Gpu, kernel, largestBuffer, Step, shader, storage, uniform } from "./device";
+import { Network, type Plan } from "./network";
+import presentCode from "./present.wgsl";
+import { Splatter, type Target } from "./splatter";
+
+const SIDE = 8;
+/** Longest side of an image in pixels, so that two bytes name a tile. */
+const LONGEST = 4096;
+/** Nanoseconds of a pass are rounded by browsers; times are shown in milliseconds. */
+const NANOSECONDS = 1e6;
+
+/** The buffers of frames of one size. */
+class Frame {
+  readonly texture: GPUTexture;
+  readonly sizes: GPUBuffer;
+
+  constructor(
+    device: GPUDevice,
+    /** The image itself. */
+    readonly base: Target,
+    /** What the head sees: the image itself, or one at the scale that the head was trained at. */
+    readonly seen: Target | null,
+    readonly head: Plan | null,
+  ) {
+    this.sizes = uniform(device, 32);
+    this.texture = device.createTexture({
+      size: [base.width, base.height],
+      format: "rgba8unorm",
+      usage: GPUTextureUsage.STORAGE_BINDING | GPUTextureUsage.TEXTURE_BINDING | GPUTextureUsage.COPY_SRC,
+    });
+  }
+
+  destroy(): void {
+    this.texture.destroy();
+    this.sizes.destroy();
+    this.head?.destroy();
+    if (this.seen !== this.base) this.seen?.destroy();
+    this.base.destroy();
+  }
+}
+
+export class Renderer implements Drawer {
+  private readonly device: GPUDevice;
+  private readonly canvas: GPUCanvasContext;
+  private readonly splatter: Splatter;
+  private readonly network: Network | null;
+  private readonly compose: GPUComputePipeline;
+  private readonly present: GPURenderPipeline;
+  private readonly sampler: GPUSampler;
+  private readonly none: GPUBuffer;
+  private readonly results: GPUBuffer;
+  private readonly queries: GPUQuerySet | null;
+  private frame: Frame | null = null;
+  private frameKey = "";
+  private times: Times = { splat: Number.NaN, head: Number.NaN, withoutHead: false };
+
+  constructor(
+    gpu: Gpu,
+    private readonly scene: Scene,
+    canvas: HTMLCanvasElement,
+  ) {
+    const { device } = gpu;
+    this.device = device;
+    const format = navigator.gpu.getPreferredCanvasFormat();
+    this.canvas = canvas.getContext("webgpu")!;
+    this.canvas.configure({ device, format, alphaMode: "opaque" });
+    this.splatter = new Splatter(gpu, scene);
+    this.network = scene.head && new Network(gpu, scene.head, scene.background);
+    this.compose = kernel(device, shader(device, composeCode), "compose");
+    const module = shader(device, presentCode);
+    this.present = device.createRenderPipeline({
+      layout: "auto",
+      vertex: { module },
+      fragment: { module, targets: [{ format }] },
+    });
+    this.sampler = device.createSampler({ magFilter: "linear", minFilter: "linear" });
+    this.none = storage(device, 16);
+    this.queries = gpu.timed ? device.createQuerySet({ type: "timestamp", count: 4 }) : null;
+    // The number of pairs of two splats, and four times.
+    this.results = device.createBuffer({
+      size: 256 + 32,
+      usage: GPUBufferUsage.QUERY_RESOLVE | GPUBufferUsage.COPY_SRC | GPUBufferUsage.COPY_DST,
+    });
+  }
+
+  get hasHead(): boolean {
+    return this.network !== null;
+  }
+
+  limit(width: number, height: number): number {
+    const pixels = largestBuffer(this.device) / 16;
+    return Math.min(1, LONGEST / Math.max(width, height), Math.sqrt(pixels / (width * height)));
+  }
+
+  render(view: View, head: boolean): Promise<Times> {
+    return this.whole(view, head, true);
+  }
+
+  /** Draws a view, and again if its lists of tiles did not fit. */
+  private async whole(view: View, head: boolean, shown: boolean): Promise<Times> {
+    const wanted = await this.draw(view, head, shown);
+    if (this.splatter.grow(wanted)) await this.draw(view, head, shown);
+    return this.times;
+  }
+
+  async image(view: View, head: boolean): Promise<Uint8ClampedArray<ArrayBuffer>> {
+    await this.whole(view, head, false);
+    const row = Math.ceil((view.width * 4) / 256) * 256;
+    const usage = GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ;
+    const copy = this.device.createBuffer({ size: row * view.height, usage });
+    const encoder = this.device.createCommandEncoder();
+    const size = [view.width, view.height];
+    encoder.copyTextureToBuffer({ texture: this.frame!.texture }, { buffer: copy, bytesPerRow: row }, size);
+    this.device.queue.submit([encoder.finish()]);
+    await copy.mapAsync(GPUMapMode.READ);
+    const rows = new Uint8Array(copy.getMappedRange());
+    const out = new Uint8ClampedArray(view.width * view.height * 4);
+    for (let y = 0; y < view.height; y++) out.set(rows.subarray(y * row, y * row + view.width * 4), y * view.width * 4);
+    copy.destroy();
+    return out;
+  }
+
+  /** Draws one frame; returns how many pairs of tiles and primitives it wanted. */
+  private async draw(view: View, head: boolean, shown: boolean): Promise<number> {
+    const { device } = this;
+    const plan = scalePlan(view, this.scene.trainedFocal);
+    const seen = zoomed(view, plan.zoom);
+    const asked = head && this.network !== null && plan.weight > 0;
+    const corrected = asked && this.network!.fits(seen.width, seen.height) && this.limit(seen.width, seen.height) === 1;
+    this.times = { splat: Number.NaN, head: Number.NaN, withoutHead: asked && !corrected };
+    const frame = this.frameFor(view, corrected ? seen : null);
+    const data = new ArrayBuffer(32);
+    const correction = frame.seen ?? frame.base;
+    new Uint32Array(data).set([view.width, view.height, correction.width, correction.height]);
+    new Float32Array(data, 16).set([...this.scene.background, corrected ? plan.weight : 0]);
+    device.queue.writeBuffer(frame.sizes, 0, data);
+
+    const encoder = device.createCommandEncoder();
+    this.splatter.encode(encoder, view, frame.base, this.timed(0));
+    this.splatter.copyWanted(encoder, this.results, 256);
+    encoder.clearBuffer(this.results, 260, 4);
+    if (frame.seen && frame.seen !== frame.base) {
+      this.splatter.encode(encoder, seen, frame.seen);
+      this.splatter.copyWanted(encoder, this.results, 260);
+    }
+    frame.head?.encode(encoder, this.timed(2));
+    const pass = encoder.beginComputePass();
+    const bindings = { 0: frame.sizes, 1: frame.base.pixels, 2: frame.head?.correction ?? this.none };
+    const composing = new Step(device, this.compose, { ...bindings, 3: frame.texture.createView() });
+    composing.run(pass, blocksOf(view.width, SIDE), blocksOf(view.height, SIDE));
+    pass.end();
+    if (shown) this.show(encoder, frame);
+    return this.finish(encoder, corrected);
+  }
+
+  private timed(first: number): GPUComputePassTimestampWrites | undefined {
+    if (!this.queries) return undefined;
+    return { querySet: this.queries, beginningOfPassWriteIndex: first, endOfPassWriteIndex: first + 1 };
+  }
+
+  private frameFor(view: View, seen: View | null): Frame {
+    const key = [view.width, view.height, seen?.width, seen?.height].join();
+    if (this.frame && key === this.frameKey) return this.frame;
+    this.frame?.destroy();
+    const same = seen !== null && seen.width === view.width && seen.height === view.height;
+    const base = this.splatter.target(view.width, view.height, same);
+    const target = seen === null || same ? seen && base : this.splatter.target(seen.width, seen.height, true);
+    this.frame = new Frame(this.device, base, target, target && this.network!.plan(target));
+    this.frameKey = key;
+    return this.frame;
+  }
+
+  private show(encoder: GPUCommandEncoder, frame: Frame): void {
+    const pass = encoder.beginRenderPass({
+      colorAttachments: [{ view: this.canvas.getCurrentTexture().createView(), loadOp: "clear", storeOp: "store" }],
+    });
+    pass.setPipeline(this.present);
+    const entries = [
+      { binding: 0, resource: frame.texture.createView() },
+      { binding: 1, resource: this.sampler },
+    ];
+    pass.setBindGroup(0, this.device.createBindGroup({ layout: this.present.getBindGroupLayout(0), entries }));
+    pass.draw(3);
+    pass.end();
+  }
+
+  private async finish(encoder: GPUCommandEncoder, corrected: boolean): Promise<number> {
+    const usage = GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ;
+    const copy = this.device.createBuffer({ size: this.results.size, usage });
+    if (this.queries) encoder.resolveQuerySet(this.queries, 0, corrected ? 4 : 2, this.results, 0);
+    encoder.copyBufferToBuffer(this.results, 0, copy, 0, this.results.size);
+    this.device.queue.submit([encoder.finish()]);
+    await copy.mapAsync(GPUMapMode.READ);
+    const data = copy.getMappedRange();
+    if (this.queries) {
+      const stamps = new BigUint64Array(data, 0, 4);
+      const between = (first: number) => Number(stamps[first + 1]! - stamps[first]!) / NANOSECONDS;
+      this.times = { ...this.times, splat: between(0), head: corrected ? between(2) : 0 };
+    }
+    const wanted = new Uint32Array(data, 256, 2);
+    const most = Math.max(wanted[0]!, wanted[1]!);
+    copy.destroy();
+    return most;
+  }
+}

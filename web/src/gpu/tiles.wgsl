@@ -1,0 +1,114 @@
+// Depth-ordered lists of the primitives of each tile: pairs of a tile and a primitive, made in order of depth and then
+// sorted by tile.
+
+struct Pairs {
+  count: u32,
+  // Pairs that the view needs, which may be more than the buffers hold.
+  wanted: u32,
+}
+
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> splats: array<Splat>;
+@group(0) @binding(2) var<storage, read> order: array<u32>;
+@group(0) @binding(3) var<storage, read_write> block_sums: array<u32>;
+@group(0) @binding(4) var<storage, read_write> pairs: Pairs;
+@group(0) @binding(5) var<storage, read_write> blocks: array<u32>;
+@group(0) @binding(6) var<storage, read_write> pair_tiles: array<u32>;
+@group(0) @binding(7) var<storage, read_write> pair_ids: array<u32>;
+@group(1) @binding(0) var<storage, read_write> ranges: array<vec2u>;
+
+const SORT_BLOCK = 2048u;
+
+fn corners(splat: Splat) -> vec4u {
+  return vec4u(splat.low & 0xffffu, splat.low >> 16u, splat.high & 0xffffu, splat.high >> 16u);
+}
+
+fn num_tiles(rank: u32) -> u32 {
+  if (rank >= view.count) {
+    return 0u;
+  }
+  let box = corners(splats[order[rank]]);
+  return (box.z - box.x) * (box.w - box.y);
+}
+
+// The number of pairs of each block of 256 ranks.
+@compute @workgroup_size(256)
+fn measure(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u,
+           @builtin(local_invocation_index) thread: u32) {
+  let block = group.x + group.y * groups.x;
+  let total = sums_before(thread, num_tiles(block * THREADS + thread)).y;
+  if (thread == 0u && block * THREADS < view.count) {
+    block_sums[block] = total;
+  }
+}
+
+// The first place of each block, by one workgroup; and how much the sort by tile has to do.
+@compute @workgroup_size(256)
+fn place(@builtin(local_invocation_index) thread: u32) {
+  let count = (view.count + THREADS - 1u) / THREADS;
+  var total = 0u;
+  for (var start = 0u; start < count; start += THREADS) {
+    var value = 0u;
+    if (start + thread < count) {
+      value = block_sums[start + thread];
+    }
+    let before = sums_before(thread, value);
+    if (start + thread < count) {
+      block_sums[start + thread] = total + before.x;
+    }
+    total += before.y;
+    workgroupBarrier();
+  }
+  if (thread == 0u) {
+    pairs.wanted = total;
+    pairs.count = min(total, view.capacity);
+    blocks[0] = (pairs.count + SORT_BLOCK - 1u) / SORT_BLOCK;
+    blocks[1] = 1u;
+    blocks[2] = 1u;
+    let ranged = (pairs.count + THREADS - 1u) / THREADS;
+    blocks[3] = min(ranged, 32768u);
+    blocks[4] = (ranged + 32767u) / 32768u;
+    blocks[5] = 1u;
+  }
+}
+
+@compute @workgroup_size(256)
+fn emit(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: vec3u,
+        @builtin(local_invocation_index) thread: u32) {
+  let block = group.x + group.y * groups.x;
+  let rank = block * THREADS + thread;
+  let count = num_tiles(rank);
+  let before = sums_before(thread, count).x;
+  if (count == 0u) {
+    return;
+  }
+  var slot = block_sums[block] + before;
+  let id = order[rank];
+  let box = corners(splats[id]);
+  for (var y = box.y; y < box.w; y++) {
+    for (var x = box.x; x < box.z; x++) {
+      if (slot >= view.capacity) {
+        return;
+      }
+      pair_tiles[slot] = y * view.tiles.x + x;
+      pair_ids[slot] = id;
+      slot++;
+    }
+  }
+}
+
+// Where the list of each tile begins and ends; the buffer starts as zeros.
+@compute @workgroup_size(256)
+fn find_ranges(@builtin(global_invocation_id) thread: vec3u) {
+  let i = thread.x + thread.y * 32768u * THREADS;
+  if (i >= pairs.count) {
+    return;
+  }
+  let tile = pair_tiles[i];
+  if (i == 0u || pair_tiles[i - 1u] != tile) {
+    ranges[tile].x = i;
+  }
+  if (i + 1u == pairs.count || pair_tiles[i + 1u] != tile) {
+    ranges[tile].y = i + 1u;
+  }
+}

@@ -1,0 +1,179 @@
+// The camera of the page: orbit and fly by mouse, touch and keys, and the capture's cameras as stops.
+
+import { Matrix4, PerspectiveCamera, Vector3 } from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import type { Camera, Scene } from "../scene/scene";
+import { type View, viewOf } from "../view";
+
+/** Keys that move the camera, by its own axes: right, up, backwards. */
+const MOVES: Record<string, [number, number, number]> = {
+  KeyA: [-1, 0, 0],
+  KeyD: [1, 0, 0],
+  KeyE: [0, 1, 0],
+  KeyQ: [0, -1, 0],
+  KeyW: [0, 0, -1],
+  KeyS: [0, 0, 1],
+};
+/** In fly mode the camera turns around a point this near, in units of the distance to the middle of the scene. */
+const NEAR_TARGET = 1e-3;
+/** Share of the distance to the middle of the scene that a key moves in a second. */
+const SPEED = 0.5;
+const DEFAULT_FOV = 50;
+
+const median = (values: number[]): number => values.sort((a, b) => a - b)[values.length >> 1] ?? 0;
+
+/** The middle of the primitives. */
+function middleOf({ field }: Scene): Vector3 {
+  // A sample of the primitives is enough for a median.
+  const stride = Math.max(Math.floor(field.count / 5000), 1);
+  const along = (axis: number): number => {
+    const values: number[] = [];
+    for (let i = 0; i < field.count; i += stride) values.push(field.means[3 * i + axis]!);
+    return median(values);
+  };
+  return new Vector3(along(0), along(1), along(2));
+}
+
+/** A camera in front of a scene without cameras: it looks along y, with z upwards. */
+function outside(scene: Scene, middle: Vector3): Camera {
+  const distances: number[] = [];
+  const place = new Vector3();
+  for (let i = 0; i < scene.field.count; i++)
+    distances.push(place.fromArray(scene.field.means, 3 * i).distanceTo(middle));
+  const away = 3 * Math.max(median(distances), 1e-6);
+  const pose = [1, 0, 0, middle.x, 0, 0, -1, middle.y - away, 0, 1, 0, middle.z];
+  return { pose, fx: 500, fy: 500, cx: 320, cy: 240, width: 640, height: 480 };
+}
+
+export class Navigation {
+  readonly stops: Camera[];
+  /** Index of the stop that is shown; null once the camera has moved. */
+  stop: number | null = null;
+  private readonly camera = new PerspectiveCamera(DEFAULT_FOV, 1, 1e-3, 1e6);
+  private readonly controls: OrbitControls;
+  private readonly middle: Vector3;
+  private readonly pressed = new Set<string>();
+  private flying = false;
+  private lastMove = 0;
+  private lens: Camera;
+
+  /**
+   * @param element - takes mouse and touch
+   * @param onChange - called when the camera has moved
+   */
+  constructor(
+    scene: Scene,
+    element: HTMLElement,
+    private readonly onChange: () => void,
+  ) {
+    this.middle = middleOf(scene);
+    this.stops = scene.cameras.length ? scene.cameras : [outside(scene, this.middle)];
+    this.lens = this.stops[0]!;
+    this.camera.up.copy(this.up());
+    this.controls = new OrbitControls(this.camera, element);
+    this.controls.addEventListener("change", () => this.onChange());
+    this.controls.addEventListener("start", () => this.leave());
+    window.addEventListener("keydown", (event) => this.press(event));
+    window.addEventListener("keyup", (event) => this.pressed.delete(event.code));
+    window.addEventListener("blur", () => this.pressed.clear());
+    this.visit(0);
+  }
+
+  /** The mean of the upward directions of the stops. */
+  private up(): Vector3 {
+    const sum = new Vector3();
+    for (const { pose } of this.stops) sum.add(new Vector3(pose[1], pose[5], pose[9]));
+    return sum.lengthSq() > 1e-6 ? sum.normalize() : new Vector3(0, 0, 1);
+  }
+
+  /** Goes to a camera of the capture. */
+  visit(index: number): void {
+    const stop = this.stops[index]!;
+    const p = stop.pose as [
+      number,
+      number,
+      number,
+      number,
+      number,
+      number,
+      number,
+      number,
+      number,
+      number,
+      number,
+      number,
+    ];
+    const matrix = new Matrix4().set(...p, 0, 0, 0, 1);
+    matrix.decompose(this.camera.position, this.camera.quaternion, new Vector3());
+    this.lens = stop;
+    this.stop = index;
+    this.aim();
+    this.stop = index;
+    this.onChange();
+  }
+
+  /** Leaves a stop: from now on the controls hold the camera. */
+  private leave(): void {
+    if (this.stop === null) return;
+    this.stop = null;
+    this.controls.update();
+  }
+
+  private get distance(): number {
+    return Math.max(this.camera.position.distanceTo(this.middle), 1e-6);
+  }
+
+  /** Puts the point that the controls turn around straight ahead of the camera. */
+  private aim(): void {
+    const ahead = this.camera.getWorldDirection(new Vector3());
+    const depth = this.middle.clone().sub(this.camera.position).dot(ahead);
+    const away = this.flying ? NEAR_TARGET * this.distance : Math.max(depth, 0.1 * this.distance);
+    this.controls.target.copy(this.camera.position).addScaledVector(ahead, away);
+  }
+
+  get fly(): boolean {
+    return this.flying;
+  }
+
+  set fly(on: boolean) {
+    this.flying = on;
+    this.aim();
+    this.controls.enableZoom = this.controls.enablePan = !on;
+    // A drag moves the scene in orbit mode and turns the head in fly mode.
+    this.controls.rotateSpeed = on ? -0.4 : 1;
+  }
+
+  private press(event: KeyboardEvent): void {
+    if (!(event.code in MOVES) || event.ctrlKey || event.metaKey || event.altKey) return;
+    this.pressed.add(event.code);
+    this.lastMove = performance.now();
+    this.leave();
+    this.onChange();
+  }
+
+  /** Moves by the pressed keys; returns whether the camera is still moving. */
+  move(now: number): boolean {
+    const seconds = Math.min((now - this.lastMove) / 1000, 0.1);
+    this.lastMove = now;
+    if (this.pressed.size === 0) return false;
+    const step = new Vector3();
+    for (const code of this.pressed) step.add(new Vector3(...MOVES[code]!));
+    step.applyQuaternion(this.camera.quaternion).multiplyScalar(SPEED * this.distance * seconds);
+    this.camera.position.add(step);
+    this.controls.target.add(step);
+    this.controls.update();
+    return true;
+  }
+
+  /** The view of a canvas of some size, which shows at least what the camera of the last stop sees. */
+  view(width: number, height: number): View {
+    const { fx, fy, cx, cy } = this.lens;
+    const scale = Math.min(width / this.lens.width, height / this.lens.height);
+    this.camera.updateMatrixWorld();
+    const rows = new Matrix4().copy(this.camera.matrixWorld).transpose().elements;
+    const pose = this.stop === null ? rows.slice(0, 12) : this.stops[this.stop]!.pose;
+    const [x, y] = [cx - this.lens.width / 2, cy - this.lens.height / 2];
+    const centre = { cx: width / 2 + scale * x, cy: height / 2 + scale * y };
+    return viewOf({ pose, fx: fx * scale, fy: fy * scale, ...centre, width, height });
+  }
+}

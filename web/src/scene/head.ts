@@ -1,0 +1,134 @@
+// The compensation head of a scene: its kind, and its tensors; see sundae_ns/compensation.
+
+import { half } from "./codecs";
+import { isObject, type Json } from "./container";
+import type { Reader } from "./reader";
+
+const WIDTHS: Record<string, [number, number]> = {
+  tiny: [8, 64],
+  compact: [32, 64],
+  wide: [64, 64],
+  small: [32, 256],
+  regular: [64, 512],
+  large: [128, 1024],
+};
+const LEVELS = 4;
+const MOST_TENSORS = 10_000;
+
+export type HeadKind = {
+  /** Whether the head corrects the base colours; otherwise it makes the image from features alone. */
+  residual: boolean;
+  fold: number;
+  features: number;
+  /** Channels of each level, the finest first. */
+  widths: number[];
+};
+
+export type Tensor = { shape: number[]; values: Float32Array<ArrayBuffer> };
+export type Head = { kind: HeadKind; tensors: Map<string, Tensor> };
+
+/** One convolution of the network: the prefix of its tensors, and its channels. */
+export type Layer = { name: string; inputs: number; outputs: number; side: number };
+
+/** Channels of the image that the network sees. */
+export const inputChannels = (kind: HeadKind): number => kind.features + (kind.residual ? 4 : 0);
+
+/** All convolutions: the encoder's from fine to coarse, the decoder's from coarse to fine, and the last one. */
+export function layersOf(kind: HeadKind): { encoder: Layer[][]; decoder: Layer[][]; out: Layer } {
+  const { fold, widths } = kind;
+  const pair = (name: string, inputs: number, outputs: number): Layer[] => [
+    { name: `${name}.0`, inputs, outputs, side: 3 },
+    { name: `${name}.2`, inputs: outputs, outputs, side: 3 },
+  ];
+  const encoder = widths.map((width, level) =>
+    pair(`net.encoder.${level}`, level === 0 ? inputChannels(kind) * fold ** 2 : widths[level - 1]!, width),
+  );
+  const decoder = widths
+    .slice(0, -1)
+    .reverse()
+    .map((width, i) => pair(`net.decoder.${i}`, widths[LEVELS - 1 - i]! + width, width));
+  return { encoder, decoder, out: { name: "net.out", inputs: widths[0]!, outputs: 3 * fold ** 2, side: 1 } };
+}
+
+function kindOf(reader: Reader, stated: Json | undefined): HeadKind {
+  if (!isObject(stated)) throw reader.refuse("its header states a head of an unknown kind");
+  const { mode, size } = stated;
+  if (mode !== "residual" && mode !== "features") throw reader.refuse("its header states an unknown mode of the head");
+  if (typeof size !== "string" || !Object.hasOwn(WIDTHS, size)) {
+    throw reader.refuse("its header states an unknown size of the head");
+  }
+  const [width, most] = WIDTHS[size]!;
+  return {
+    residual: mode === "residual",
+    fold: reader.whole(stated, "pixel_unshuffle", 1, 8),
+    features: reader.whole(stated, "num_features", 1, 256),
+    widths: Array.from({ length: LEVELS }, (_, level) => Math.min(width * 2 ** level, most)),
+  };
+}
+
+/** The head, or null for a scene without one. */
+export function readHead(reader: Reader, stated: Json | undefined): Head | null {
+  const weighted = reader.has("head/weights");
+  if ((stated === null || stated === undefined) && !weighted) return null;
+  const kind = kindOf(reader, stated);
+  const tensors = weighted ? readTensors(reader) : new Map<string, Tensor>();
+  const { encoder, decoder, out } = layersOf(kind);
+  const layers = [...encoder.flat(), ...decoder.flat(), out];
+  for (const { name, inputs, outputs, side } of layers) {
+    const wanted: [string, number[]][] = [
+      ["weight", [outputs, inputs, side, side]],
+      ["bias", [outputs]],
+    ];
+    for (const [part, shape] of wanted) {
+      const found = tensors.get(`${name}.${part}`);
+      if (found === undefined || found.shape.join() !== shape.join()) {
+        throw reader.refuse("its header states another head than it has");
+      }
+    }
+  }
+  if (tensors.size !== 2 * layers.length) throw reader.refuse("its header states another head than it has");
+  return { kind, tensors };
+}
+
+function readTensors(reader: Reader): Map<string, Tensor> {
+  const about = reader.about("head", ["int8", "fp16"]);
+  const coded = about.codec === "int8";
+  const plain = reader.section("head/plain", ["<f4"], [null]) as Float32Array;
+  const codes = reader.section("head/weights", coded ? ["|i1"] : ["<f2"], [null]);
+  const weights = codes instanceof Uint16Array ? Float32Array.from(codes, half) : (codes as Int8Array);
+  const steps = coded ? (reader.section("head/steps", ["<f4"], [null]) as Float32Array) : new Float32Array(0);
+  const taken = { plain: 0, weights: 0, steps: 0 };
+  const take = <T extends Float32Array | Int8Array>(name: keyof typeof taken, source: T, count: number): T => {
+    const start = taken[name];
+    taken[name] += count;
+    if (taken[name] > source.length) throw reader.refuse("the head has fewer weights than it states");
+    return source.subarray(start, taken[name]) as T;
+  };
+  const tensors = new Map<string, Tensor>();
+  for (const [name, shape] of listed(reader, about.tensors)) {
+    const count = shape.reduce((product, side) => product * side, 1);
+    const single = shape.length <= 1;
+    const found = single ? take("plain", plain, count) : take("weights", weights as Float32Array, count);
+    const values = Float32Array.from(found);
+    if (coded && !single) {
+      const each = take("steps", steps, shape[0]!);
+      for (let i = 0; i < count; i++) values[i]! *= each[Math.floor(i / (count / shape[0]!))]!;
+    }
+    tensors.set(name, { shape, values });
+  }
+  return tensors;
+}
+
+function listed(reader: Reader, entries: Json | undefined): [string, number[]][] {
+  if (!Array.isArray(entries) || entries.length > MOST_TENSORS) {
+    throw reader.refuse("its header does not list the tensors of the head");
+  }
+  return entries.map((entry) => {
+    const [name, shape] = Array.isArray(entry) && entry.length === 2 ? entry : [];
+    const valid = (side: Json): side is number => Number.isInteger(side) && 0 < Number(side) && Number(side) < 2 ** 28;
+    if (typeof name !== "string" || !Array.isArray(shape) || shape.length > 5 || !shape.every(valid)) {
+      throw reader.refuse("a tensor of the head has an invalid shape");
+    }
+    return [name, shape];
+  });
+}

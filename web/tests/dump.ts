@@ -1,0 +1,21 @@
+// Decodes packed scenes, for the comparison with Python's decoder: prints a JSON line for each file, and writes the
+// arrays of a valid one beside it as raw numbers.
+//
+//     node dump.mjs FILE...
+
+import { readFileSync, writeFileSync } from "node:fs";
+import { PackError } from "../src/scene/container";
+import { readScene } from "../src/scene/scene";
+
+for (const file of process.argv.slice(2)) {
+  try {
+    const { field, head, ...rest } = await readScene(new Uint8Array(readFileSync(file)));
+    const { count, ...arrays } = field;
+    const tensors = [...(head?.tensors ?? [])].map(([name, tensor]) => [name, tensor.values] as const);
+    for (const [name, values] of [...Object.entries(arrays), ...tensors]) writeFileSync(`${file}.${name}`, values);
+    console.log(JSON.stringify({ count, head: head?.kind ?? null, ...rest }));
+  } catch (error) {
+    if (!(error instanceof PackError)) throw error;
+    console.log(JSON.stringify({ error: error.message }));
+  }
+}
