@@ -14,15 +14,16 @@ import tyro
 
 from sundae_ns.cli.bench import app as bench
 from sundae_ns.cli.files import export, prune
-from sundae_ns.cli.outputs import Overwrite, check_folder
+from sundae_ns.cli.outputs import Overwrite, check_file, check_folder
 from sundae_ns.cli.packing import pack, unpack
+from sundae_ns.cli.run import run
 from sundae_ns.cli.train import train
 from sundae_ns.cli.view import view
-from sundae_ns.errors import SundaeError, writing
+from sundae_ns.errors import ConfigError, SundaeError, writing
 
 app = tyro.extras.SubcommandApp()
 app.command(bench, name="bench", help="Benchmark SUNDAE on this machine.")
-for command in (train, pack, unpack, export, view, prune):
+for command in (run, train, pack, unpack, export, view, prune):
     app.command(command)
 
 
@@ -118,6 +119,7 @@ def report(
     lpips_net: Literal["alex", "vgg", "squeeze"] = "alex",
     warmup: int = 3,
     repeats: int = 5,
+    video: Path | None = None,
     overwrite: Overwrite = False,
 ) -> int:
     """Measure quality, speed and size of finished runs on their test views; write tables, plots and training curves.
@@ -129,13 +131,19 @@ def report(
         lpips_net: net of LPIPS, which is measured if its weights are on disk; values of different nets do not compare.
         warmup: untimed renderings of each view before timing.
         repeats: timed renderings of each view; 0 measures no times.
+        video: .mp4 to write of one scene: base colours, compensated image and photograph of every view, side by side.
         overwrite: replace the files of an earlier report in the folder.
     """
     check_folder(out, reads=[*runs, data], overwrite=overwrite)
+    if video is not None:
+        if video.suffix.lower() != ".mp4":
+            raise ConfigError(f"{video} does not end in .mp4, the only format of videos; rename it")
+        if video.resolve().parent != out.resolve():  # the report's folder was checked
+            check_file(video, reads=[*runs, data], overwrite=overwrite)
     with _loading():
         from sundae_ns.cli.report import run_report
 
-    return run_report(runs, out, data=data, lpips_net=lpips_net, warmup=warmup, repeats=repeats)
+    return run_report(runs, out, data=data, lpips_net=lpips_net, warmup=warmup, repeats=repeats, video=video)
 
 
 @app.command

@@ -1,13 +1,15 @@
-"""Subprocesses whose output goes to a log file."""
+"""Subprocesses: with their output in a log file, or in a process group that gets this process's signals."""
 
 from __future__ import annotations
 
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from sundae_ns.errors import SundaeError
@@ -61,6 +63,42 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
     if code != 0:
         tail = "\n".join(last)
         raise SundaeError(f"{Path(arguments[0]).name} failed with {code}; its log is {log}, which ends with:\n{tail}")
+
+
+def run_in_group(words: Sequence[str]) -> int:
+    """Run a command with its output on the terminal; returns its exit code, or 128 + n if signal n arrived.
+
+    A signal reaches the command once, with all processes that it started, whether it comes from a terminal or from
+    another process. The command gets no input.
+
+    Args:
+        words: the command; its program is looked for beside this interpreter first.
+    """
+    # A training that loses its terminal saves itself too.
+    passed_on = {signal.SIGINT: signal.SIGINT, signal.SIGTERM: signal.SIGTERM, signal.SIGHUP: signal.SIGTERM}
+    received: list[int] = []
+    process: subprocess.Popen[bytes] | None = None
+
+    def pass_on(number: int, frame: object) -> None:
+        received.append(passed_on[signal.Signals(number)])
+        if process is not None:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, received[-1])
+
+    before = {number: signal.signal(number, pass_on) for number in passed_on}
+    try:
+        process = subprocess.Popen(
+            [console_script(words[0]), *words[1:]], stdin=subprocess.DEVNULL, start_new_session=True
+        )
+        for number in received:  # those that came before there was a process
+            os.killpg(process.pid, number)
+        code = process.wait()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    if received:
+        return 128 + received[0]
+    return code if code >= 0 else 128 - code
 
 
 def percent_of(line: str) -> float | None:

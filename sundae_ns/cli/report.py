@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
+from PIL import Image
 from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
@@ -27,9 +28,11 @@ from sundae_ns.evaluation.plots import (
     plot_quality,
     plot_views,
 )
+from sundae_ns.evaluation.video import side_by_side, write_video
 from sundae_ns.scenes.measure import comparison_of, measure_scene
 from sundae_ns.scenes.opening import Opened, open_scene
-from sundae_ns.storage.atomic import write_text, writing
+from sundae_ns.scenes.walk import count_views, largest_view, walk
+from sundae_ns.storage.atomic import replacing, write_text, writing
 
 PNG_WIDTH = 400
 """Widest images, in pixels, whose comparison is written as PNG; wider ones are JPEG files, which are much smaller."""
@@ -45,6 +48,7 @@ def run_report(
     lpips_net: Net = "alex",
     warmup: int = 3,
     repeats: int = 5,
+    video: Path | None = None,
     console: Console | None = None,
 ) -> int:
     """Measure runs and write the report; the options are those of the command.
@@ -53,7 +57,7 @@ def run_report(
         The exit code: 1 if a run was left out because of an error, else 0.
 
     Raises:
-        ConfigError: there is no run, or a number is negative.
+        ConfigError: there is no run, a number is negative, or a video is asked of several runs.
         CheckpointError: no run can be opened; the error is that of the first.
         DataError: no run has a capture with test views; the error is that of the first.
         StorageError: the folder cannot be written to.
@@ -62,9 +66,12 @@ def run_report(
         raise ConfigError("there is nothing to report on; give the folders of finished runs")
     if warmup < 0 or repeats < 0:
         raise ConfigError(f"{warmup} warm-up renderings and {repeats} timed renderings; give at least 0 of each")
+    if video is not None and len(paths) > 1:
+        raise ConfigError(f"a video shows one scene, and there are {len(paths)}; give one, or leave --video out")
     console = console or Console()
     words = ["sundae", "report", *map(str, paths), "-o", str(out), "--lpips-net", lpips_net]
     words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
+    words += ["--video", str(video)] if video else []
     command = shlex.join(words)
     lpips = Lpips(lpips_net, download=False) if lpips_weights_available(lpips_net) else None
     runs: list[Measured] = []
@@ -111,6 +118,9 @@ def run_report(
                         "train with --vis viewer+tensorboard to record them."
                     )
                 runs.append(measured)
+                if video is not None:
+                    progress.update(task, description="Rendering the video", completed=0, total=count_views(opened))
+                    _save_video(video, opened, lambda task=task: progress.advance(task))  # type: ignore[misc]
             progress.remove_task(task)
             progress.advance(scenes_done)
         if not runs:
@@ -126,6 +136,8 @@ def run_report(
     write_text(out / "report.md", document(scenes, images, notes, command))
     for note in notes:
         console.print(f"[yellow]Left out: {note}", highlight=False)
+    if video is not None:
+        console.print(f"wrote {video}", highlight=False)
     console.print(f"wrote {out / 'report.md'}, with report.csv, report.json and images beside it", highlight=False)
     return 1 if failures else 0
 
@@ -174,6 +186,21 @@ def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
     for name, index in (("worst", order[0]), ("median", order[len(order) // 2])):
         rows.append(replace(comparison_of(opened, index), title=f"{name}: test view {index}"))
     save_comparison(path, rows)
+
+
+def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> None:
+    """Write every view of a scene beside its photograph; ``progress`` is called after each."""
+    head = opened.model.state.head_enabled
+    with redirect_stdout(StringIO()):  # nerfstudio says that it loads the training images
+        tile = largest_view(opened)
+
+    def frames() -> Iterator[Image.Image]:
+        for row in walk(opened):
+            yield side_by_side(row, tile, head=head)
+            progress()
+
+    with replacing(path) as partial:
+        write_video(partial, frames())
 
 
 def _plot(

@@ -54,6 +54,8 @@ class Opened:
     """Seconds of its prunes; None if unknown."""
     curves: Path | None
     """Folder of tensorboard's event files; None if there cannot be any."""
+    datamanager: SundaeDatamanager
+    """The capture's views, training views too."""
     packed_bytes: int | None = None
     """Size of the packed file; None for a run."""
 
@@ -193,6 +195,7 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
         steps=step + 1,
         prune_s=0.0 if unpruned else _seconds(prunes),
         curves=path.parent,
+        datamanager=pipeline.datamanager,
     )
 
 

@@ -31,15 +31,17 @@ class ProgressWriter(LocalWriter):
         """Print a line if it is due.
 
         Args:
-            step: training step, from 0.
+            step: ignored; it belongs to nerfstudio's first event, which is the configuration after a start and a resume.
         """
-        events = {event["name"]: event["event"] for event in EVENT_STORAGE}
+        events = {event["name"]: event for event in EVENT_STORAGE}
         # nerfstudio measures every few steps only, and ten steps after a prune may take a minute on a CPU.
-        self._metrics = events.get(METRICS, self._metrics)
-        seconds = events.get(EventName.ITER_TRAIN_TIME.value)
-        if seconds is not None and self._metrics is not None and time.monotonic() - self._printed_at >= EVERY:
+        if METRICS in events:
+            self._metrics = events[METRICS]["event"]
+        trained = events.get(EventName.ITER_TRAIN_TIME.value)
+        if trained is not None and self._metrics is not None and time.monotonic() - self._printed_at >= EVERY:
             self._printed_at = time.monotonic()
-            print(progress_line(step + 1, GLOBAL_BUFFER["max_iter"], float(seconds), self._metrics), flush=True)
+            done, seconds = trained["step"] + 1, float(trained["event"])
+            print(progress_line(done, GLOBAL_BUFFER["max_iter"], seconds, self._metrics), flush=True)
 
 
 def progress_line(done: int, total: int, seconds: float, metrics: Mapping[str, Any]) -> str:

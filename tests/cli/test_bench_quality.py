@@ -124,10 +124,13 @@ def plan(arms: list[Arm], **changed: Any) -> list[Job]:
 def test_seeds_repeat_only_what_is_asked_for(arms: list[Arm]) -> None:
     jobs = plan(arms)
     assert len({job.key for job in jobs}) == len(jobs)
-    names = [arm.name for arm in arms if arm.kind != "whole"]
+    names = [arm.name for arm in arms if arm.kind != "whole" and arm.keep_ratio is None]
+    with_own_ratio = {(arm.name, arm.keep_ratio) for arm in arms if arm.keep_ratio is not None}
+    assert with_own_ratio == {("sundae-no-head-bytes", 0.13)}
     for seed, ratios in ((42, {0.01, 0.1}), (43, {0.1})):
         own = [job for job in jobs if job.seed == seed]
-        assert {(job.arm, job.keep_ratio) for job in own if job.needs} == {(a, r) for a in names for r in ratios}
+        expected = {(a, r) for a in names for r in ratios} | (with_own_ratio if seed == 42 else set())
+        assert {(job.arm, job.keep_ratio) for job in own if job.needs} == expected
         assert [job.kind for job in own].count("warm-up") == 1
         assert {job.arm: job.steps for job in own if job.kind == "whole"} == {
             "splatfacto": 30_000,

@@ -8,11 +8,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import av
+import numpy as np
 import pytest
 import torch
 import yaml
 from csv_rows import read_rows
 from nerfstudio.configs.method_configs import method_configs
+from PIL import Image
 
 from sundae_ns.cli import main
 from sundae_ns.evaluation import COLUMNS, flip_available
@@ -20,6 +23,7 @@ from sundae_ns.rendering import render
 from sundae_ns.scenes.measure import quality
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import scene_of_run
+from sundae_ns.scenes.walk import walk
 from sundae_ns.storage.packing import write_scene
 
 
@@ -107,6 +111,51 @@ def test_nerfstudios_own_evaluation_agrees(report: Path, tiny: Any) -> None:
     for way, suffix in zip(ours["configurations"], ("", "_base"), strict=True):
         for name in ("psnr", "ssim"):
             assert way["views"][2][name] == pytest.approx(theirs[name + suffix], rel=1e-5)
+
+
+def frames_of(path: Path) -> list[np.ndarray]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def test_a_video_of_every_view(tiny: Any, stock: Path, tmp_path: Path) -> None:
+    out = tmp_path / "report"
+    assert sundae("report", tiny.folder, "-o", out, "--repeats", 0, "--video", out / "views.mp4") == 0
+    frames = frames_of(out / "views.mp4")
+    photographs = sorted((tiny.scene / "images").iterdir())
+    assert len(frames) == len(photographs) == 15
+    opened = open_scene(tiny.folder)
+    rows = list(walk(opened))
+    assert [row.title for row in rows] == [
+        f"{path.name}, {'test' if index in (2, 7, 12) else 'training'} view" for index, path in enumerate(photographs)
+    ]
+    for index, path in enumerate(photographs):
+        with Image.open(path) as image:
+            truth = np.asarray(image)
+        # Tiles are five times as large, without interpolation; the codec loses a little.
+        tiles = np.split(frames[index][:240, :], 3, axis=1)
+        expected = [
+            255 * np.asarray(torch.as_tensor(each).cpu()) for each in (rows[index].base, rows[index].compensated)
+        ]
+        for tile, wanted in zip(tiles, [*expected, truth], strict=True):
+            assert np.abs(tile[2::5, 2::5].astype(float) - wanted).mean() < 6
+    assert "--video" in json.loads((out / "report.json").read_text())[0]["command"]
+
+    without_head = tmp_path / "stock.mp4"
+    assert sundae("report", stock, "-o", tmp_path / "two", "--repeats", 0, "--video", without_head) == 0
+    assert frames_of(without_head)[0].shape[1] == 2 * 240
+
+
+def test_a_video_that_cannot_be_written(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ("-o", tmp_path / "out", "--video")
+    assert sundae("report", tiny.folder, *out, tmp_path / "a.avi") == 2
+    assert "does not end in .mp4" in one_line(capsys)
+    assert sundae("report", tiny.folder, tiny.folder, *out, tmp_path / "a.mp4") == 2
+    assert "a video shows one scene, and there are 2" in one_line(capsys)
+    (tmp_path / "a.mp4").touch()
+    assert sundae("report", tiny.folder, *out, tmp_path / "a.mp4") == 2
+    assert "--overwrite" in one_line(capsys)
+    assert not (tmp_path / "out").exists()
 
 
 def one_line(capsys: pytest.CaptureFixture[str]) -> str:

@@ -17,13 +17,15 @@ def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, caps
     monkeypatch.setattr(writer, "GLOBAL_BUFFER", {})
     monkeypatch.setattr(progress, "GLOBAL_BUFFER", {"max_iter": 400})
     events: list[dict[str, Any]] = [
-        {"name": "Train Iter (time)", "event": 0.25},
+        # A resumed run writes its configuration first.
+        {"name": "config", "event": {}, "step": 0},
+        {"name": "Train Iter (time)", "event": 0.25, "step": 159},
         {"name": METRICS, "event": {"psnr": 21.456, "gaussian_count": 12345}},
     ]
     monkeypatch.setattr(progress, "EVENT_STORAGE", events)
     made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10), ["Viewer at: somewhere"])
-    made.write_stats_log(159)
-    made.write_stats_log(160)
+    made.write_stats_log(0)
+    made.write_stats_log(0)
     banner, line = capsys.readouterr().out.splitlines()
     assert banner == "Viewer at: somewhere"
     assert line == "160 (40.00%)  1 min 0 s left at 250 ms a step  PSNR 21.46 dB  12,345 primitives"
@@ -33,14 +35,16 @@ def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, caps
 def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.setattr(progress, "EVERY", 0.0)
     monkeypatch.setattr(progress, "GLOBAL_BUFFER", {"max_iter": 4})
-    events: list[dict[str, Any]] = [{"name": "Train Iter (time)", "event": 2.0}]
+    events: list[dict[str, Any]] = [{"name": "Train Iter (time)", "event": 2.0, "step": 0}]
     monkeypatch.setattr(progress, "EVENT_STORAGE", events)
     made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10))
     made.write_stats_log(0)
     assert capsys.readouterr().out == "", "nothing is measured yet"
     events.append({"name": METRICS, "event": {"psnr": 20.0, "gaussian_count": 7}})
+    events[0]["step"] = 1
     made.write_stats_log(1)
     del events[1]
+    events[0]["step"] = 2
     made.write_stats_log(2)
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == ["2", "3"]

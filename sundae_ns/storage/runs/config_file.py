@@ -148,6 +148,19 @@ def model_options(path: Path) -> dict[str, Any]:
     return found
 
 
+def schedule_length(path: Path) -> int:
+    """Number of steps of a run's schedule, from its ``config.yml``; imports nothing.
+
+    Raises:
+        CheckpointError: it cannot be read, or is no configuration of a run of ours.
+    """
+    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
+    length = found.get("schedule_length") if isinstance(found, dict) else None
+    if not isinstance(length, int):
+        raise CheckpointError(f"{path} states no length of its schedule; give a run of sundae")
+    return length
+
+
 def _load(path: Path, parse: Callable[[str], Any]) -> Any:
     try:
         return parse(regular(path).read_text(encoding="utf-8"))

@@ -15,7 +15,7 @@ from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.scenes.cameras import training_cameras
 from sundae_ns.scenes.opening import load_run, open_scene
 from sundae_ns.scenes.packed import scene_of_run
-from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.runs.config_file import load_config, schedule_length
 
 METHODS = sorted(name for name in all_methods if name.startswith("sundae")) + ["splatfacto", "nerfacto"]
 
@@ -123,3 +123,16 @@ def test_a_capture_that_has_moved_with_its_run_is_found(tmp_path: Path) -> None:
     assert load_config(moved).pipeline.datamanager.data == tmp_path / "there" / "capture"
     (tmp_path / "there" / "capture").rmdir()
     assert load_config(moved).pipeline.datamanager.data == tmp_path / "here" / "capture", "the error names this one"
+
+
+def test_the_length_of_the_schedule(tmp_path: Path) -> None:
+    config = copy.deepcopy(sundae_tiny.config)
+    config.output_dir, config.experiment_name, config.timestamp = tmp_path, "e", "t"
+    config.schedule_length, config.max_num_iterations = 500, 20
+    config.save_config()
+    path = config.get_base_dir() / "config.yml"
+    assert schedule_length(path) == 500
+    for text in ("a: 1", "schedule_length: null", "[]"):
+        path.write_text(text)
+        with pytest.raises(CheckpointError, match="states no length"):
+            schedule_length(path)
