@@ -75,6 +75,7 @@ class Project:
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
         evaluated, packed, page = self.out / "eval.json", self.out / "scene.sundae", self.out / "report" / "report.md"
+        web = self.out / "scene.html"
         config = str(self.run / "config.yml")
         data = ["--data", str(self.capture)]
         steps = [
@@ -92,6 +93,7 @@ class Project:
                 page.is_file,
                 page,
             ),
+            Step("web page", lambda: ["sundae", "export", str(packed), "-o", str(web)], web.is_file, web),
         ]
         if self.capture != self.photos:
             posed = self.capture / "transforms.json"
@@ -180,14 +182,14 @@ def run(
     steps: int | None = None,
     matching: Matching = "exhaustive",
 ) -> int:
-    """Turn photos into a packed scene: find camera poses, train, evaluate, pack, and write a report.
+    """Turn photos into a packed scene: find camera poses, train, evaluate, pack, and write a report and a web page.
 
     Each step prints the command that it runs. The same command again skips the steps that are done, and resumes an
     interrupted training.
 
     Args:
         photos: folder of photos, or a capture, which has poses already.
-        out: folder for the capture, the run, eval.json, scene.sundae and the report; created if missing.
+        out: folder for the capture, the run, eval.json, scene.sundae, scene.html and the report; created if missing.
         method: method of ns-train; sundae-tiny suits small images and a CPU.
         keep: share of the primitives to keep, in (0, 1]; by default that of the method.
         steps: number of training steps; by default that of the method.
@@ -219,7 +221,8 @@ def run(
             if not step.done():
                 raise SundaeError(f"{words[0]} ended without its result; the output above says why")
         step.check()
-    print(f"# packed scene: {out / 'scene.sundae'}; report: {out / 'report' / 'report.md'}; to look at the scene:")
+    print(f"# packed scene: {out / 'scene.sundae'}; report: {out / 'report' / 'report.md'}")
+    print(f"# to look at the scene: open {out / 'scene.html'} in a browser, or")
     print(shlex.join(["ns-viewer", "--load-config", str(project.run / "config.yml")]))
     return 0
 

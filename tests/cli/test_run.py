@@ -12,8 +12,8 @@ import pytest
 from sundae_ns.cli import main
 
 PHOTOS = 8
-STEPS = ["ns-process-data", "ns-train", "ns-eval", "sundae pack", "sundae report"]
-NAMES = ["camera poses", "train", "evaluate", "pack", "report"]
+STEPS = ["ns-process-data", "ns-train", "ns-eval", "sundae pack", "sundae report", "sundae export"]
+NAMES = ["camera poses", "train", "evaluate", "pack", "report", "web page"]
 
 
 class Commands:
@@ -61,7 +61,7 @@ class Commands:
             (capture / "transforms.json").write_text(json.dumps({"frames": [{}] * self.placed}))
         elif name == "ns-eval":
             Path(self.option("--output-path")).write_text("{}")
-        elif name == "sundae pack":
+        elif name in ("sundae pack", "sundae export"):
             Path(self.option("-o")).touch()
         else:
             Path(self.option("-o")).mkdir(exist_ok=True)
@@ -124,7 +124,7 @@ def test_what_is_done_is_skipped(commands: Commands, capsys: pytest.CaptureFixtu
     capsys.readouterr()
     assert run("photos", "-o", "out") == 0
     assert commands.ran == []
-    assert capsys.readouterr().out.count(": done\n") == 5
+    assert capsys.readouterr().out.count(": done\n") == 6
 
 
 @pytest.mark.parametrize(("step", "name"), zip(STEPS, NAMES))

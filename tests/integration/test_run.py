@@ -85,6 +85,7 @@ def test_photos_to_a_report_with_an_interruption(
     page = Path("out/report/report.md").read_text()
     assert "Training curves" in page
     assert "scene.sundae" in page
+    assert "<canvas" in Path("out/scene.html").read_text(encoding="utf-8")
 
     assert run(*words) == 0
-    assert capfd.readouterr().out.count(": done\n") == 5
+    assert capfd.readouterr().out.count(": done\n") == 6
