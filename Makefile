@@ -53,7 +53,7 @@ web: web/node_modules
 	cd web && npm run --silent check && npm run --silent build
 
 web/node_modules: web/package-lock.json
-	cd web && npm ci --silent --no-audit --no-fund
+	cd web && npm install --no-save --silent --no-audit --no-fund
 	touch $@
 
 coverage: $(INSTALLED)

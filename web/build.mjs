@@ -20,6 +20,14 @@ const shaders = {
   },
 };
 
+/** Three without its renderer: the controls need vectors and cameras, and its shaders would be a third of the page. */
+const core = {
+  name: "core",
+  setup({ onResolve }) {
+    onResolve({ filter: /^three$/ }, () => ({ path: `${here}node_modules/three/build/three.core.js` }));
+  },
+};
+
 const { outputFiles } = await build({
   absWorkingDir: here,
   entryPoints: ["src/main.ts"],
@@ -30,7 +38,7 @@ const { outputFiles } = await build({
   target: "es2022",
   charset: "ascii",
   legalComments: "none",
-  plugins: [shaders],
+  plugins: [shaders, core],
 });
 const program = outputFiles[0].text.trim().replaceAll("</script", "<\\/script");
 const { dependencies } = JSON.parse(await readFile(`${here}package.json`, "utf8"));

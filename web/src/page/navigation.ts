@@ -89,21 +89,7 @@ export class Navigation {
   /** Goes to a camera of the capture. */
   visit(index: number): void {
     const stop = this.stops[index]!;
-    const p = stop.pose as [
-      number,
-      number,
-      number,
-      number,
-      number,
-      number,
-      number,
-      number,
-      number,
-      number,
-      number,
-      number,
-    ];
-    const matrix = new Matrix4().set(...p, 0, 0, 0, 1);
+    const matrix = new Matrix4().fromArray([...stop.pose, 0, 0, 0, 1]).transpose(); // rows to columns
     matrix.decompose(this.camera.position, this.camera.quaternion, new Vector3());
     this.lens = stop;
     this.stop = index;
