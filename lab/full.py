@@ -45,5 +45,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 trainer.callbacks.insert(1, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], lambda step: evaluate(step) if step in at else None))
 started = time.time()
 trainer.train()
+record = trainer.base_dir / "trials.json"
 with open(f"{out}/{name}-{capture}.jsonl", "a") as f:
-    f.write(json.dumps({"name": name, "capture": capture, "t": round(time.time() - started, 1), "head_json": json.loads((trainer.base_dir / "head.json").read_text()) if (trainer.base_dir / "head.json").exists() else None}) + "\n")
+    f.write(json.dumps({"name": name, "capture": capture, "t": round(time.time() - started, 1), "trials": json.loads(record.read_text()) if record.exists() else None}) + "\n")
+trainer.checkpoint_dir.mkdir(parents=True, exist_ok=True)  # without optimizers: for packing alone
+torch.save({"step": steps - 1, "pipeline": trainer.pipeline.state_dict(), "optimizers": {}, "schedulers": {}, "scalers": {}}, trainer.checkpoint_dir / f"step-{steps - 1:09d}.ckpt")

@@ -11,7 +11,7 @@ from torch import Tensor
 from sundae_ns.errors import BackendError
 from sundae_ns.rasterization.constants import constant
 from sundae_ns.rasterization.gsplat_harmonics import harmonics
-from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, tile_lists
+from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, TileLists, tile_lists
 from sundae_ns.rasterization.reference import ReferenceBackend, largest_axis, strategy_info
 from sundae_ns.rasterization.types import Inputs, Rasterization
 
@@ -22,8 +22,8 @@ class GsplatBackend:
     """gsplat's kernels, for float32 tensors on a CUDA device.
 
     Args:
-        capacity: for tile/primitive pairs, to record frames: tiles get our own lists, shorter than gsplat's, nothing
-            waits for the GPU, and harmonics have no gradients. None for gsplat's own lists and harmonics.
+        capacity: for tile/primitive pairs, to record CUDA graphs: tiles get our own lists, shorter than gsplat's, and
+            harmonics our own kernels, so that nothing waits for the GPU. None for gsplat's own lists and harmonics.
     """
 
     name = "gsplat"
@@ -49,7 +49,7 @@ class GsplatBackend:
             far_plane=inputs.far_plane,
             antialiased=inputs.antialiased,
         )
-        starts, primitives = self._lists(means2d, conics, seen_opacities, depths, radii, width, height)
+        lists = self._lists(means2d, conics, seen_opacities, depths, radii, width, height)
         channels = inputs.colors
         if inputs.render_depth:
             channels = torch.cat([channels, depths[0, :, None]], dim=1)
@@ -64,8 +64,9 @@ class GsplatBackend:
                 width,
                 height,
                 TILE,
-                starts,
-                primitives,
+                lists.starts,
+                lists.primitives,
+                masks=lists.drawn,
                 absgrad=inputs.absgrad,
             )
             for part in passes
@@ -85,14 +86,12 @@ class GsplatBackend:
 
     def _lists(
         self, means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, radii: Tensor, width: int, height: int
-    ) -> tuple[Tensor, Tensor]:
-        """Start of each tile's list, and the primitives of all lists."""
+    ) -> TileLists:
         if self._capacity is None:
-            return square_lists(means2d, radii, depths, width, height)
-        lists = tile_lists(
+            return TileLists(*square_lists(means2d, radii, depths, width, height))
+        return tile_lists(
             means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, capacity=self._capacity
         )
-        return lists.starts, lists.primitives
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``.

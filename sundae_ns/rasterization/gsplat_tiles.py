@@ -182,6 +182,8 @@ class TileLists:
     """Start of each tile's list, int32 ``[1, rows, columns]``."""
     primitives: Tensor
     """Indices, int32 ``[L]``."""
+    drawn: Tensor | None = None
+    """Tiles of the image, bool ``[1, rows, columns]``; None if all are."""
 
 
 @torch.no_grad()
@@ -238,7 +240,10 @@ def tile_lists(
     tiles, by_tile = torch.sort(tiles, stable=True)  # stable, so each list stays in order of depth
     numbers = torch.arange(columns * (rows + below), dtype=dtype, device=device)
     starts = torch.searchsorted(tiles, numbers, out_int32=True)
-    return TileLists(starts.view(1, rows + below, columns), primitives.index_select(0, by_tile))
+    shape = (1, rows + below, columns)
+    # Gradients would walk through the unused pairs, so their tiles are marked.
+    drawn = (numbers < columns * rows).view(shape) if below else None
+    return TileLists(starts.view(shape), primitives.index_select(0, by_tile), drawn)
 
 
 def lanes_per_primitive(n: int) -> int:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sundae_ns.errors import BackendError
+from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu import nvrtc
 from sundae_ns.rasterization import GsplatBackend, gsplat_backend, gsplat_harmonics, gsplat_tiles
 from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, tile_lists
@@ -28,11 +28,9 @@ def on_cpu(compile_kernels: Callable[..., dict[str, Any]], monkeypatch: pytest.M
         return tuple(compile_kernels(gsplat_tiles.SOURCE, names, gsplat_tiles.definitions(dtype)).values())
 
     monkeypatch.setattr(gsplat_tiles, "_compiled", compiled)
-    monkeypatch.setattr(
-        gsplat_harmonics,
-        "_compiled",
-        lambda _: compile_kernels(gsplat_harmonics.SOURCE, ["harmonics"])["harmonics"],
-    )
+    names = gsplat_harmonics.Launches._fields
+    launches = gsplat_harmonics.Launches(**compile_kernels(gsplat_harmonics.SOURCE, names))
+    monkeypatch.setattr(gsplat_harmonics, "_compiled", lambda _: launches)
 
 
 def field(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Field:
@@ -190,6 +188,28 @@ def test_harmonics_match_the_reference(degree: int) -> None:
     found = gsplat_harmonics.harmonics(degree, directions, coeffs)
     exact = evaluate_harmonics(degree, directions.double(), coeffs.double())
     torch.testing.assert_close(found.double(), exact, rtol=0, atol=5e-6)
+
+
+@pytest.mark.parametrize("degree", range(5))
+def test_gradients_of_harmonics_match_the_reference(degree: int) -> None:
+    inputs = torch.randn(100, 3) * 3, torch.randn(100, 25, 3)
+    weights = torch.randn(100, 3)
+    ours = [value.clone().requires_grad_() for value in inputs]
+    exact = [value.double().requires_grad_() for value in inputs]
+    (gsplat_harmonics.harmonics(degree, *ours) * weights).sum().backward()
+    (evaluate_harmonics(degree, *exact) * weights).sum().backward()
+    for found, expected in zip(ours, exact, strict=True):
+        assert found.grad is not None
+        # The constant harmonic does not depend on the direction.
+        gradient = torch.zeros_like(expected) if expected.grad is None else expected.grad
+        torch.testing.assert_close(found.grad.double(), gradient, rtol=0, atol=5e-5)
+
+
+def test_second_derivatives_of_harmonics_are_refused() -> None:
+    directions = torch.ones(1, 3, requires_grad=True)
+    found = gsplat_harmonics.harmonics(1, directions, torch.ones(1, 4, 3))
+    with pytest.raises(SundaeError, match="second derivative"):
+        torch.autograd.grad(found.sum(), directions, create_graph=True)
 
 
 def test_kernels_compile_for_gpus() -> None:
