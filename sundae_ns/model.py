@@ -24,7 +24,7 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 
 from sundae_ns.callbacks import NerfstudioRun, training_views
-from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.compensation import CompensationHead, HeadConfig, Window
 from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, no_images_error
 from sundae_ns.evaluation import Lpips, psnr, ssim
 from sundae_ns.gpu.memory import naming_full_memory
@@ -51,7 +51,7 @@ from sundae_ns.training.build import build
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.initial_field import Start
-from sundae_ns.training.losses import image_losses, regularisers
+from sundae_ns.training.losses import StepLosses
 from sundae_ns.training.step import training_image
 from sundae_ns.viewer import ViewerControls
 
@@ -123,6 +123,7 @@ class SundaeModel(SplatfactoModel):
             num_cameras=self.num_train_data, device="cpu"
         )
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
+        self.losses = StepLosses(self.ssim, config.ssim_lambda, config.base_loss_weight, config.warmup == "mcmc")
         self.lpips = Lpips()  # type: ignore[assignment]
         self.crop_box: OrientedBox | None = None
         # As in splatfacto: training backgrounds are random, shown ones have viser's own colour.
@@ -263,7 +264,7 @@ class SundaeModel(SplatfactoModel):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
 
     def _training_outputs(self, camera: Cameras) -> _Outputs:
-        background, at = self._get_background_color(), self._resolution(self.step)
+        background, at = self._get_background_color(), self.resolution(self.step)
         rendered = training_image(
             self.source,
             self.state,
@@ -271,9 +272,9 @@ class SundaeModel(SplatfactoModel):
             partial(self.view_of, camera, at.downscale),
             background,
             self.render_settings(training=True),
-            index=(camera.metadata or {}).get("cam_idx"),
+            index=view_index(camera),
             at=at,
-            following=self._resolution(self.step + 1),
+            following=self.resolution(self.step + 1),
             depth=self.config.output_depth_during_training,
         )
         return {**rendered.images, "background": background, "window": rendered.window}
@@ -306,9 +307,9 @@ class SundaeModel(SplatfactoModel):
     # ----------------------------------------------------------------------------------------------------- training
 
     def _get_downscale_factor(self) -> int:
-        return self._resolution(self.step).downscale if self.training else 1
+        return self.resolution(self.step).downscale if self.training else 1
 
-    def _resolution(self, step: int) -> StepResolution:
+    def resolution(self, step: int) -> StepResolution:
         """Size of the training images at a step; for a later step, as far as it is known now."""
         config, state = self.config, self.state
         rising = config.num_downscales - step // config.resolution_schedule if config.warm_start is None else 0
@@ -341,11 +342,18 @@ class SundaeModel(SplatfactoModel):
         """The true image at full resolution over a background ``[H, W, 3]``."""
         return self.composite_with_background(self.get_gt_img(image, 1), background)
 
-    def _target(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
+    def truth(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
+        """The truth of outputs, over their background ``[H, W, 3]``."""
         if NO_IMAGES in batch:
             raise no_images_error()
         truth = cut(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
+
+    def mask(self, batch: dict[str, Any], window: Window | None) -> Tensor | None:
+        """Pixels of a batch that count, at the resolution of this step ``[H, W, 1]``; None for all."""
+        if "mask" not in batch:
+            return None
+        return cut(self._downscale_if_required(batch["mask"]).to(self.device), window).float()
 
     def get_metrics_dict(  # type: ignore[override]
         self, outputs: dict[str, Any], batch: dict[str, Any]
@@ -353,7 +361,7 @@ class SundaeModel(SplatfactoModel):
         """PSNR with and without the head, and the number of primitives; computed on access, which few steps need."""
         # They may be read during the next step. Bind the resolution now, and do not keep the autograd graph alive.
         rgb, base, downscale = outputs["rgb"].detach(), outputs["base_rgb"].detach(), self._get_downscale_factor()
-        target = partial(self._target, batch, {name: outputs.get(name) for name in ("window", "background")}, downscale)
+        target = partial(self.truth, batch, {name: outputs.get(name) for name in ("window", "background")}, downscale)
         metrics = LazyOutputs(
             {
                 "psnr": Later(lambda: psnr(rgb.clamp(0, 1), target())),
@@ -368,29 +376,25 @@ class SundaeModel(SplatfactoModel):
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: dict[str, Any] | None = None
     ) -> dict[str, Tensor]:
         """Loss of the image and, while the head is enabled, an L1 loss of the base colours."""
-        target, rgb, base = self._target(batch, outputs), outputs["rgb"], outputs["base_rgb"]
-        if "mask" in batch:
-            mask = cut(self._downscale_if_required(batch["mask"]).to(self.device), outputs.get("window"))
-            target, rgb, base = target * mask, rgb * mask, base * mask
-        compared = base if self.state.head_enabled and self.config.base_loss_weight > 0 else None
-        main_loss, base_loss = image_losses(rgb, compared, target, self.ssim, self.config.ssim_lambda)
-        losses = {"main_loss": main_loss}
-        if base_loss is not None:
-            losses["base_loss"] = self.config.base_loss_weight * base_loss
+        target, mask = self.truth(batch, outputs), self.mask(batch, outputs.get("window"))
+        losses = self.losses(self.state, self.state.field, outputs["rgb"], outputs["base_rgb"], target, mask)
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
-            if self.state.regularised or (self.config.warmup == "mcmc" and self.state.densifying):
-                losses.update(regularisers(self.state.field))
         return losses
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Any], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """PSNR, SSIM and, if its weights are installed, LPIPS; each with the head and without (``_base``)."""
-        target = self._target(batch, outputs)
+        target = self.truth(batch, outputs)
         metrics = {"gaussian_count": float(self.source.total)}
         for suffix, image in (("", outputs["rgb"]), ("_base", outputs["base_rgb"])):
             found = {"psnr": psnr(image, target), "ssim": ssim(image, target), "lpips": self.lpips(image, target)}
             metrics |= {name + suffix: float(value) for name, value in found.items() if value is not None}
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}
         return metrics, images
+
+
+def view_index(camera: Cameras) -> int | None:
+    """Index of the training view of a camera, if it says so."""
+    return (camera.metadata or {}).get("cam_idx")

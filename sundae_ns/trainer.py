@@ -11,10 +11,13 @@ import time
 from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
+import torch
 import yaml
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import profiler, writer
@@ -23,17 +26,20 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
 from sundae_ns import distributed
-from sundae_ns.datamanager import check_before_training
-from sundae_ns.errors import CheckpointError, ConfigError, StorageError, SundaeError
+from sundae_ns.datamanager import SundaeDatamanager, check_before_training
+from sundae_ns.errors import BackendError, CheckpointError, ConfigError, StorageError, SundaeError
 from sundae_ns.gpu.memory import naming_full_memory
-from sundae_ns.model import SundaeModel
+from sundae_ns.model import SundaeModel, view_index
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import find_config
 from sundae_ns.training.interruption import Interruption, resume_command
+from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
+from sundae_ns.training.recorded import RecordedStep, StepInputs, StepResult
 from sundae_ns.training.run_length import fit_to_length, given_options, schedule_table, take_options
+from sundae_ns.training.step import training_view
 
 
 @dataclass
@@ -41,6 +47,9 @@ class SundaeTrainerConfig(TrainerConfig):
     """Configuration of a run."""
 
     _target: type = field(default_factory=lambda: SundaeTrainer)
+    record_steps: bool = True
+    """On one CUDA device: record training steps as CUDA graphs, which saves most of Python's time. Steps that cannot be
+    recorded (camera optimizer, mixed precision, gradient accumulation or clipping) run kernel by kernel, with equal results."""
     schedule_length: int | None = None
     """Steps over which prune, densification, resolution and learning rates are spread, unless you set their options: by
     default max_num_iterations, and the length of the run that is resumed. A larger number trains the first part only."""
@@ -170,6 +179,30 @@ class SundaeTrainerConfig(TrainerConfig):
         write_text(path, yaml.dump(self))
 
 
+def recorded_outputs(
+    model: SundaeModel, camera: Cameras, batch: dict[str, Any], step: RecordedStep
+) -> tuple[dict[str, Any], StepResult]:
+    """Train a whole step by a recording.
+
+    Args:
+        model: in training.
+        camera: of shape ``(1,)``.
+        batch: with the image, and the mask if there is one.
+        step: makes and replays recordings.
+
+    Returns:
+        The outputs of :meth:`SundaeModel.get_outputs` in training but for depth, and the result of the step.
+    """
+    outputs: dict[str, Any] = {"background": model._get_background_color()}
+    at = model.resolution(model.step)
+    make_view = partial(model.view_of, camera, at.downscale)
+    view, outputs["window"] = training_view(model.source, model.state, make_view, index=view_index(camera), at=at)
+    truth, mask = model.truth(batch, outputs), model.mask(batch, outputs["window"])
+    inputs = StepInputs(view, truth, mask, outputs["background"])
+    result = step(model.state, inputs, model.render_settings(training=True))
+    return {**result.images, **outputs}, result
+
+
 class SundaeTrainer(Trainer):
     """Saves atomically, resumes from the newest whole checkpoint, and restores the random generators."""
 
@@ -180,6 +213,8 @@ class SundaeTrainer(Trainer):
         # nerfstudio sees one process. For more it would wrap the model in DDP, which breaks when the field changes its size.
         super().__init__(self.team.configured(config), local_rank, world_size=1)
         self.team.make_folder(self.base_dir)
+        self._recorded: RecordedStep | None = None
+        """Runs whole steps; None where they run kernel by kernel."""
         self._trained: int | None = None
         """The last step that is trained."""
         self._stopped_by = 0
@@ -193,6 +228,8 @@ class SundaeTrainer(Trainer):
         except KeyboardInterrupt:
             CONSOLE.print("Stopped before the first step: nothing to save.")
             raise SystemExit(130) from None
+        if self._recordable():
+            self._recorded = RecordedStep(self.model.losses)
         writer.GLOBAL_BUFFER["max_iter"] = self.last_step + 1  # nerfstudio forgets the steps before a resume
 
     @property
@@ -238,13 +275,45 @@ class SundaeTrainer(Trainer):
 
     def train_iteration(self, step: int) -> Any:
         """Train one step; several ranks agree on whether to stop after it."""
-        result = super().train_iteration(step)
+        result = self._recorded_iteration(step) or super().train_iteration(step)
         self._trained = step
         self._foretell(step - self._start_step)
         self._stopped_by = self.team.agreed(self._interruption.number, step)
         if self._stopped_by:
             self.stop_training = True
         return result
+
+    def _recordable(self) -> bool:
+        """Whether options allow to record training steps."""
+        model, config = self.model, self.config
+        single = config.record_steps and model.source.replayable and not self.team.collective
+        plain = model.camera_optimizer.config.mode == "off" and not model.config.output_depth_during_training
+        usual = not (self.mixed_precision or config.log_gradients) and set(
+            self.gradient_accumulation_steps.values()
+        ) <= {1}
+        adam = all(
+            isinstance(options["optimizer"], FusedAdamConfig) and options["optimizer"].max_norm is None
+            for name, options in config.optimizers.items()
+            if name in self.optimizers.optimizers
+        )
+        return single and plain and usual and adam and model.device.type == "cuda" and model.backend.name == "gsplat"
+
+    def _recorded_iteration(self, step: int) -> Any:
+        """Train one step by a recording: loss, its terms, and metrics; None if it has to run kernel by kernel."""
+        if self._recorded is None:
+            return None
+        model = self.model
+        camera, batch = cast(SundaeDatamanager, self.pipeline.datamanager).next_train(step)
+        try:
+            outputs, result = recorded_outputs(model, camera, batch, self._recorded)
+        except (BackendError, torch.cuda.OutOfMemoryError) as error:
+            reason = str(error).splitlines()[0]
+            CONSOLE.print(f"[yellow]Warning: training goes on without recordings, slower: {reason}", soft_wrap=True)
+            self._recorded = None
+            torch.cuda.empty_cache()
+            return None
+        self.optimizers.scheduler_step_all(step)
+        return result.loss, result.losses, model.get_metrics_dict(outputs, batch)
 
     def _foretell(self, number: int) -> None:
         """On a CPU, warn of a training of hours once ten steps are measured; the first compiles, and the second warms up."""

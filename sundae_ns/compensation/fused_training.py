@@ -30,7 +30,7 @@ from sundae_ns.compensation.fused import (
 from sundae_ns.compensation.kernels import BACKWARD, FORWARD, PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, SundaeError
-from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, record, warm_up
+from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, is_recording, record, warm_up
 
 _log = logging.getLogger(__name__)
 
@@ -199,10 +199,12 @@ class FusedTraining:
         net = self.net
         height, width = splatted.shape[:2]
         key = (height, width, dtype, net.out.weight.data_ptr())
-        current = self._recorded.get(key)
+        # Work that is being recorded as part of something larger contains no graph of its own.
+        inside = is_recording()
+        current = None if inside else self._recorded.get(key)
         if current is None:
             folded = folded_input(net, height, width, splatted, dtype)
-            if splatted.is_cuda and self._can_record and len(self._recorded) < MAX_GRAPHS:
+            if splatted.is_cuda and self._can_record and not inside and len(self._recorded) < MAX_GRAPHS:
                 try:
                     current = self._recorded[key] = self._record(folded.zero_(), launches)
                 except BackendError as error:

@@ -22,6 +22,9 @@ from sundae_ns.pruning import PruningConfig
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 
+COUNTED = "counted"
+"""Entry of ``info`` of a recorded step, which has added its statistics to the running state by itself."""
+
 
 def limit_growth(
     state: MutableMapping[str, Any], small: Tensor, capacity: int, threshold: float, radius: float | None
@@ -60,6 +63,38 @@ class Statistics(NamedTuple):
     """Radius as a share of the longer side of the image; 0 if it is not drawn ``[S]``."""
 
 
+def start_counting(state: MutableMapping[str, Any], means: Tensor) -> None:
+    """Make the tensors that are missing in the running state of gsplat's strategy.
+
+    Args:
+        state: the running state; that of a chain has none.
+        means: centres ``[N, 3]``.
+    """
+    for name in ("grad2d", "count", "radii"):
+        if name in state and state[name] is None:
+            state[name] = means.new_zeros(len(means))
+
+
+@torch.no_grad()
+def count_view(state: Mapping[str, Any], grads: Tensor, radii: Tensor, width: int, height: int) -> None:
+    """Add the statistics of one view to the running state of gsplat's strategy, without waiting for the GPU.
+
+    Args:
+        state: with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used; changed in place.
+        grads: gradients of the projected centres, per pixel ``[N, 2]``.
+        radii: on the screen, pixels ``[N]``, or one per axis ``[N, 2]``; 0 where a primitive is not drawn.
+        width: image width in pixels.
+        height: image height in pixels.
+    """
+    drawn = radii > 0 if radii.ndim == 1 else (radii > 0).all(dim=-1)
+    norms = torch.hypot(grads[:, 0] * (width / 2), grads[:, 1] * (height / 2))
+    state["grad2d"].add_(torch.where(drawn, norms, 0.0))
+    state["count"].add_(drawn)
+    if state.get("radii") is not None:
+        shares = (radii if radii.ndim == 1 else radii.amax(dim=-1)) / float(max(width, height))
+        torch.maximum(state["radii"], torch.where(drawn, shares, 0.0), out=state["radii"])
+
+
 @dataclass
 class CappedStrategy(DefaultStrategy):
     """gsplat's densification with an exact cap: under it, the primitives with the highest gradients grow first."""
@@ -87,13 +122,13 @@ class CappedStrategy(DefaultStrategy):
     @torch.no_grad()
     def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
         """Add the statistics of a step; those of several ranks include rows of zeros, so that nothing waits for the GPU."""
+        if info.get(COUNTED):
+            return
         found: Statistics | None = info.get("statistics")
         if found is None:
             super()._update_state(params, state, info, packed=packed)
             return
-        for name in ("grad2d", "count", "radii"):
-            if name in state and state[name] is None:
-                state[name] = torch.zeros(len(params["means"]), device=found.norms.device)
+        start_counting(state, params["means"])
         norms, radii = found.norms.to(state["grad2d"]), found.radii.to(state["grad2d"])
         state["grad2d"].index_add_(0, found.ids, norms)
         state["count"].index_add_(0, found.ids, (radii > 0).to(state["count"]))

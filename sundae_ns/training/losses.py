@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import torch
 from pytorch_msssim import SSIM
@@ -12,11 +13,60 @@ from torch import Tensor
 
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.fused_loss import WINDOW, compiled, fused_loss
+from sundae_ns.training.field_state import FieldState
 
 REGULARISER = 0.01
 """Weights of opacities and scales in the loss (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class StepLosses:
+    """Terms of the loss of a training step."""
+
+    ssim: SSIM
+    """SSIM of images ``[1, 3, H, W]``."""
+    ssim_weight: float
+    """lambda_2 of the paper."""
+    base_weight: float
+    """Weight of the L1 loss of the base colours while the head is enabled."""
+    chain: bool
+    """Whether the field grows as a Markov chain, whose loss has regularisers."""
+
+    def __call__(
+        self,
+        state: FieldState,
+        params: Mapping[str, Tensor],
+        rgb: Tensor,
+        base: Tensor,
+        target: Tensor,
+        mask: Tensor | None,
+    ) -> dict[str, Tensor]:
+        """The terms by name, each ``[]``.
+
+        Args:
+            state: says what is enabled at this step.
+            params: trained parameters.
+            rgb: the image ``[H, W, 3]``.
+            base: its base colours ``[H, W, 3]``.
+            target: the truth ``[H, W, 3]``.
+            mask: pixels that count ``[H, W, 1]``; None for all.
+        """
+        if mask is not None:
+            target, rgb, base = target * mask, rgb * mask, base * mask
+        compared = base if state.head_enabled and self.base_weight > 0 else None
+        main_loss, base_loss = image_losses(rgb, compared, target, self.ssim, self.ssim_weight)
+        losses = {"main_loss": main_loss}
+        if base_loss is not None:
+            losses["base_loss"] = self.base_weight * base_loss
+        if self.regularises(state):
+            losses.update(regularisers(params))
+        return losses
+
+    def regularises(self, state: FieldState) -> bool:
+        """Whether opacities and scales are kept down at this step."""
+        return state.regularised or (self.chain and state.densifying)
 
 
 def image_losses(

@@ -26,6 +26,25 @@ class TrainingImage:
     """The part of the training image; None for the whole image."""
 
 
+def training_view(
+    source: FieldSource, state: FieldState, make_view: Callable[[], View], *, index: int | None, at: StepResolution
+) -> tuple[View, Window | None]:
+    """The view of a step, and the part of the training image that it shows; None for the whole image.
+
+    Args:
+        source: of the primitives.
+        state: the field in training; it remembers the focal lengths that the head is trained on.
+        make_view: builds the whole view from the camera that was served.
+        index: of the training view that was served; None if the camera does not say.
+        at: resolution at this step.
+    """
+    view = source.training_view(at, make_view, index)
+    if state.head_enabled and at.downscale == 1:
+        state.remember_focal(view.focal)
+    window = training_window(view.width, view.height, at.window_pixels, seed=at.step)
+    return view if window is None else view.cut(window), window
+
+
 def training_image(
     source: FieldSource,
     state: FieldState,
@@ -53,11 +72,7 @@ def training_image(
         following: resolution at the next step, as far as it is known now.
         depth: whether to render depth.
     """
-    view = source.training_view(at, make_view, index)
-    if state.head_enabled and at.downscale == 1:
-        state.remember_focal(view.focal)
-    window = training_window(view.width, view.height, at.window_pixels, seed=at.step)
-    view = view if window is None else view.cut(window)
+    view, window = training_view(source, state, make_view, index=index, at=at)
     head = settings.head
     primitives = source.primitives(view, settings, features=head is not None, at=at)
     images, splatted = draw(primitives, view, background, settings, depth=depth)

@@ -84,12 +84,24 @@ def save(state: Mapping[str, Any], path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Through a Python file, because torch's own writer hides the reason of a failed write.
         with replacing(path, path.with_name(_PARTIAL.format(os.getpid()))) as partial, partial.open("wb") as file:
-            torch.save(dict(state), file)
+            torch.save(_compact(dict(state)), file)
     except OSError as error:
         older = [other for other in checkpoints(path.parent) if other != path]
         kept = f"{older[-1].name} is whole, resume from it with --load-dir" if older else "no older checkpoint"
         reason = str(error) if isinstance(error, StorageError) else f"cannot write {path}: {error.strerror or error}"
         raise StorageError(f"{reason} ({kept})") from error
+
+
+def _compact(value: Any) -> Any:
+    """The value with tensors that own all of their memory: torch would save the whole memory of a part."""
+    if isinstance(value, Tensor):
+        whole = value.untyped_storage().nbytes() > value.numel() * value.element_size()
+        return value.detach().cpu().clone() if whole else value
+    if isinstance(value, dict):
+        return {key: _compact(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_compact(one) for one in value]
+    return value
 
 
 def _damage(path: Path) -> str | None:

@@ -1,0 +1,321 @@
+"""A training step as one CUDA graph: rendering, head, loss, gradients, densification's statistics, and Adam.
+
+A step is some two hundred small kernels. Launched one by one from Python they take several times as long as the GPU works.
+The graph reads the view, the truth, the background and the learning rates where the last call has put them.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections import OrderedDict
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sundae_ns.compensation import CompensationHead
+from sundae_ns.gaussians.field import Field
+from sundae_ns.gpu.cuda_graphs import record, warm_up
+from sundae_ns.rasterization import Capacity, GsplatBackend
+from sundae_ns.rendering.render import RenderSettings, compensate, draw
+from sundae_ns.rendering.source import LocalField, degree_in_use
+from sundae_ns.rendering.views import View
+from sundae_ns.training.buffers import MOMENTS, Buffers, start_moments, trained_parameters
+from sundae_ns.training.densification import COUNTED, count_view, start_counting
+from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.losses import StepLosses
+
+MAX_RECORDINGS = 8
+"""Recordings kept at a time: one for each image size and SH degree in use."""
+
+SPARE_PAIRS = 2.0
+"""Capacity for tile/primitive pairs, as a multiple of the most that a view has needed."""
+
+HEAD = "compensation"
+"""Name of the head's optimizer."""
+
+
+@dataclass(frozen=True)
+class StepInputs:
+    """What a step trains on."""
+
+    view: View
+    target: Tensor
+    """The truth over the background ``[H, W, 3]``."""
+    mask: Tensor | None
+    """Pixels that count, float ``[H, W, 1]``; None for all."""
+    background: Tensor
+    """Colour ``[3]``."""
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """Images and losses of a step; the next step overwrites them."""
+
+    images: dict[str, Tensor]
+    """``rgb``, ``base_rgb`` and ``accumulation``, each ``[H, W, C]``."""
+    losses: dict[str, Tensor]
+    """Terms of the loss ``[]``."""
+    loss: Tensor
+    """Their sum ``[]``."""
+
+
+@dataclass(frozen=True)
+class _Recording:
+    graph: torch.cuda.CUDAGraph
+    inputs: StepInputs
+    """The graph reads them here."""
+    rates: Tensor
+    """Learning rates of all groups, in the order of :func:`_groups`."""
+    result: StepResult
+    pairs: int
+    """Tile/primitive pairs that fit."""
+
+
+class RecordedStep:
+    """Training steps of one field.
+
+    The first step of a kind runs kernel by kernel, because libraries choose and load kernels then; later ones replay. A step
+    whose view has more tile/primitive pairs than fit changes nothing, and the next recording has room for them.
+
+    Args:
+        losses: terms of the loss.
+        record: False runs every step kernel by kernel, as a test does on a CPU.
+    """
+
+    def __init__(self, losses: StepLosses, *, record: bool = True) -> None:
+        self._losses = losses
+        self._record = record
+        self._buffers = Buffers()
+        self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
+        self._warm: set[Hashable] = set()
+        self._most: Tensor | None = None
+        """Most pairs that a view has needed, on the device and, some steps later, on the host; int64 ``[]``."""
+        self._most_on_host: Tensor | None = None
+
+    def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        """Train one step.
+
+        Args:
+            state: the field. Afterwards its tensors are rows of this object's buffers, and ``info`` says that the
+                statistics of densification are counted.
+            inputs: of this step.
+            settings: of training images, with the backend gsplat for recording.
+
+        Raises:
+            BackendError: the step cannot be recorded. Nothing has changed.
+            torch.cuda.OutOfMemoryError: the same.
+        """
+        trained = trained_parameters(state)
+        start_moments(state, (*trained, HEAD) if settings.head is not None else trained)
+        if state.densifying:
+            start_counting(state.densification, state.field["means"])
+        # Regularisers are means over all rows.
+        growing = state.densifying and not self._losses.regularises(state)
+        if self._buffers.hold(state, trained, growing=growing):
+            self._recordings.clear()
+        kind = _kind(state, inputs, settings)
+        if not self._record or kind not in self._warm:
+            result = self._run(state, inputs, settings)
+            self._warm.add(kind)
+        else:
+            key = (kind, _addresses(state, settings.head))
+            result = self._replayed(key, state, inputs, settings)
+        state.info = {COUNTED: True}
+        return result
+
+    # ------------------------------------------------------------------------------------------------------ running
+
+    def _run(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        """Run a step kernel by kernel, on the stream of the recordings."""
+        device = state.device
+        rates = torch.tensor(_rates(state, settings.head), device=device)
+        if device.type != "cuda":
+            return self._step(state, inputs, settings, rates, None)
+        capacity = Capacity()
+        with warm_up(device):
+            result = self._step(state, inputs, replace(settings, backend=GsplatBackend(capacity)), rates, capacity)
+        if self._most_on_host is None:
+            self._most = torch.zeros((), dtype=torch.int64, device=device)
+            self._most_on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
+        assert self._most is not None
+        most = max(*(int(number) for number in capacity.needed), int(self._most))
+        self._most.fill_(most)
+        self._most_on_host.fill_(most)
+        return result
+
+    def _replayed(self, key: Hashable, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        assert self._most_on_host is not None
+        recording, most = self._recordings.get(key), int(self._most_on_host)
+        if recording is None or most > recording.pairs:
+            if recording is None and len(self._recordings) >= MAX_RECORDINGS:
+                self._recordings.popitem(last=False)
+            recording = self._recordings[key] = self._recorded(state, inputs, settings, int(SPARE_PAIRS * most) + 1)
+        self._recordings.move_to_end(key)
+        _copy(inputs, recording.inputs)
+        recording.rates.copy_(torch.tensor(_rates(state, settings.head)))
+        recording.graph.replay()
+        return recording.result
+
+    def _recorded(self, state: FieldState, inputs: StepInputs, settings: RenderSettings, pairs: int) -> _Recording:
+        device, own = state.device, _clone(inputs)
+        rates = torch.tensor(_rates(state, settings.head), device=device)
+
+        def step() -> StepResult:
+            capacity = Capacity(pairs)
+            limited = replace(settings, backend=GsplatBackend(capacity))
+            return self._step(state, own, limited, rates, capacity)
+
+        last = next(reversed(self._recordings.values()), None)
+        # Results are read before the next replay, so all recordings can work in the same memory.
+        graph, result = record(step, device, share_memory_with=None if last is None else last.graph)
+        return _Recording(graph, own, rates, result, pairs)
+
+    def _step(
+        self,
+        state: FieldState,
+        inputs: StepInputs,
+        settings: RenderSettings,
+        rates: Tensor,
+        capacity: Capacity | None,
+    ) -> StepResult:
+        """One step on the buffers; all of its work is recorded."""
+        tensors, head, view = self._buffers.tensors, settings.head, inputs.view
+        trained = trained_parameters(state)
+        field = Field({name: tensors[name] for name in trained}, state.field.encoding)
+        with torch.enable_grad():
+            primitives = LocalField(_complete(field, state.field)).primitives(view, settings, features=head is not None)
+            images, splatted = draw(primitives, view, inputs.background, settings, depth=False)
+            if head is not None:
+                images["rgb"] = compensate(head, images["base_rgb"], splatted, inputs.background, training=True)
+            losses = self._losses(state, field, images["rgb"], images["base_rgb"], inputs.target, inputs.mask)
+            loss = functools.reduce(torch.add, losses.values())
+        network = [] if head is None else list(head.parameters())
+        counting, centers = state.densifying and "grad2d" in tensors, splatted.info["means2d"]
+        wanted = [*field.values(), *network, *([centers] if counting else [])]
+        grads = torch.autograd.grad(loss, wanted, allow_unused=True)
+        with torch.no_grad():
+            overflow = self._overflow(capacity, loss)
+            if counting:
+                of_centers, radii = centers.absgrad if settings.absgrad else grads[-1], splatted.info["radii"]
+                radii = radii if overflow is None else radii * (overflow == 0)
+                count_view(tensors, of_centers[0], radii[0], view.width, view.height)
+            self._descend(state, dict(zip([*field.values(), *network], grads, strict=False)), rates, overflow, head)
+        shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
+        return StepResult(shown, {name: value.detach() for name, value in losses.items()}, loss.detach())
+
+    def _overflow(self, capacity: Capacity | None, loss: Tensor) -> Tensor | None:
+        """1 if the lists of tiles were too short, so that the step must change nothing, else 0; float ``[]``."""
+        if capacity is None or capacity.pairs is None:
+            return None
+        assert self._most is not None
+        assert self._most_on_host is not None
+        needed = torch.stack(capacity.needed).amax()
+        torch.maximum(self._most, needed, out=self._most)
+        self._most_on_host.copy_(self._most, non_blocking=True)
+        return (needed > capacity.pairs).to(loss.dtype)
+
+    def _descend(
+        self,
+        state: FieldState,
+        grads: Mapping[Tensor, Tensor | None],
+        rates: Tensor,
+        overflow: Tensor | None,
+        head: CompensationHead | None,
+    ) -> None:
+        """Adam, as ``torch.optim.Adam`` with ``fused`` does it, with rates in memory."""
+        for rate, (name, optimizer, group) in zip(rates, _groups(state, head), strict=True):
+            beta1, beta2 = group["betas"]
+            values: list[Tensor] = []
+            slopes: list[Tensor] = []
+            moments: dict[str, list[Tensor]] = {moment: [] for moment in (*MOMENTS, "step")}
+            for value in group["params"]:
+                held = optimizer.state[value]
+                whole = self._buffers.tensors.get(name, value)
+                grad = grads.get(whole)
+                if grad is None:
+                    continue
+                values.append(whole)
+                # The kernel walks through all tensors in the order of memory.
+                slopes.append(grad if grad.stride() == whole.stride() else torch.empty_like(whole).copy_(grad))
+                for moment in MOMENTS:
+                    moments[moment].append(self._buffers.tensors.get(f"{name}.{moment}", held[moment]))
+                moments["step"].append(held["step"])
+            if not values:
+                continue
+            torch._foreach_add_(moments["step"], 1)
+            torch._fused_adam_(
+                values,
+                slopes,
+                moments["exp_avg"],
+                moments["exp_avg_sq"],
+                [],
+                moments["step"],
+                lr=rate,
+                beta1=beta1,
+                beta2=beta2,
+                weight_decay=group["weight_decay"],
+                eps=group["eps"],
+                amsgrad=False,
+                maximize=False,
+                grad_scale=None,
+                found_inf=overflow,
+            )
+            if overflow is not None:
+                torch._foreach_sub_(moments["step"], [overflow] * len(values))
+
+
+def _complete(field: Field, whole: Field) -> Field:
+    """The trained parameters, and those without values, such as the features of a field without a head."""
+    empty = {name: value for name, value in whole.items() if name not in field and value.numel() == 0}
+    return Field({**empty, **field}, field.encoding)
+
+
+def _groups(
+    state: FieldState, head: CompensationHead | None
+) -> list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]:
+    """The groups of parameters that a step trains: name of the optimizer, optimizer, group."""
+    names = trained_parameters(state) if head is None else (*trained_parameters(state), HEAD)
+    return [(name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups]
+
+
+def _rates(state: FieldState, head: CompensationHead | None) -> list[float]:
+    return [float(group["lr"]) for _, _, group in _groups(state, head)]
+
+
+def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Hashable:
+    """What decides on the kernels of a step, beside numbers of primitives."""
+    view, head = inputs.view, settings.head
+    degree = degree_in_use(state.field.sh_degree, settings.active_sh_degree)
+    return (
+        (view.width, view.height, inputs.mask is not None, degree, settings.antialiased, settings.absgrad),
+        (state.densifying, state.regularised, state.head_enabled),
+        None if head is None else (head.net, *vars(head.config).values()),
+    )
+
+
+def _addresses(state: FieldState, head: CompensationHead | None) -> Hashable:
+    """Addresses that a recording reads beside the buffers: the head's weights, all moments and counts of steps."""
+    held = [optimizer.state[value] for name, optimizer, group in _groups(state, head) for value in group["params"]]
+    moments = tuple(one[name].data_ptr() for one in held for name in (*MOMENTS, "step"))
+    return moments, None if head is None else head.addresses()
+
+
+def _clone(inputs: StepInputs) -> StepInputs:
+    view, mask = inputs.view, inputs.mask
+    return StepInputs(
+        view._replace(viewmat=view.viewmat.clone(), K=view.K.clone()),
+        inputs.target.detach().clone(memory_format=torch.contiguous_format),
+        None if mask is None else mask.clone(memory_format=torch.contiguous_format),
+        inputs.background.clone(),
+    )
+
+
+def _copy(inputs: StepInputs, into: StepInputs) -> None:
+    pairs = [(into.view.viewmat, inputs.view.viewmat), (into.view.K, inputs.view.K)]
+    pairs += [(into.background, inputs.background), (into.target, inputs.target)]
+    if inputs.mask is not None and into.mask is not None:
+        pairs.append((into.mask, inputs.mask))
+    torch._foreach_copy_([own for own, _ in pairs], [value.detach() for _, value in pairs])
