@@ -85,6 +85,11 @@ def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *
         check_transforms(path, splits=splits, camera_models=CAMERA_MODEL_TO_TYPE)
 
 
+def view_index(camera: Cameras) -> int | None:
+    """Index of the training view that :meth:`SundaeDatamanager.next_train` gave; None for other cameras."""
+    return (camera.metadata or {}).get("cam_idx")
+
+
 def capture_of(config: FullImageDatamanagerConfig) -> Path:
     """Where the capture of a datamanager lies."""
     return Path(config.dataparser.data if config.data is None else config.data)

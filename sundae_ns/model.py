@@ -25,7 +25,7 @@ from torch import Tensor
 
 from sundae_ns.callbacks import NerfstudioRun, training_views
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window
-from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, no_images_error
+from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, no_images_error, view_index
 from sundae_ns.evaluation import Lpips, psnr, ssim
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.pruning import PruningConfig
@@ -139,6 +139,10 @@ class SundaeModel(SplatfactoModel):
         self._replay = FrameReplay()
 
     # ---------------------------------------------------------------------------------------------------- the field
+
+    def train(self, mode: bool = True) -> SundaeModel:
+        """Switch between training and evaluation; a walk over all modules at each step would take time."""
+        return self if self.training == mode else super().train(mode)
 
     @property
     def step(self) -> int:
@@ -393,8 +397,3 @@ class SundaeModel(SplatfactoModel):
             metrics |= {name + suffix: float(value) for name, value in found.items() if value is not None}
         images = {"img": torch.cat([target, outputs["rgb"]], dim=1), "base": outputs["base_rgb"]}
         return metrics, images
-
-
-def view_index(camera: Cameras) -> int | None:
-    """Index of the training view of a camera, if it says so."""
-    return (camera.metadata or {}).get("cam_idx")

@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterable
 from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -26,10 +25,11 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
 
 from sundae_ns import distributed
-from sundae_ns.datamanager import SundaeDatamanager, check_before_training
+from sundae_ns.datamanager import SundaeDatamanager, check_before_training, view_index
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError, StorageError, SundaeError
 from sundae_ns.gpu.memory import naming_full_memory
-from sundae_ns.model import SundaeModel, view_index
+from sundae_ns.model import SundaeModel
+from sundae_ns.rendering import View
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
 from sundae_ns.storage.runs.config_file import load_config
@@ -180,7 +180,11 @@ class SundaeTrainerConfig(TrainerConfig):
 
 
 def recorded_outputs(
-    model: SundaeModel, camera: Cameras, batch: dict[str, Any], step: RecordedStep
+    model: SundaeModel,
+    camera: Cameras,
+    batch: dict[str, Any],
+    step: RecordedStep,
+    views: dict[tuple[int | None, int], View],
 ) -> tuple[dict[str, Any], StepResult]:
     """Train a whole step by a recording.
 
@@ -189,14 +193,20 @@ def recorded_outputs(
         camera: of shape ``(1,)``.
         batch: with the image, and the mask if there is one.
         step: makes and replays recordings.
+        views: the views made so far, by index and divisor of their sides; cameras do not move.
 
     Returns:
         The outputs of :meth:`SundaeModel.get_outputs` in training but for depth, and the result of the step.
     """
     outputs: dict[str, Any] = {"background": model._get_background_color()}
     at = model.resolution(model.step)
-    make_view = partial(model.view_of, camera, at.downscale)
-    view, outputs["window"] = training_view(model.source, model.state, make_view, index=view_index(camera), at=at)
+    index = view_index(camera)
+    whole = views.get((index, at.downscale))
+    if whole is None:
+        whole = model.view_of(camera, at.downscale)
+        if index is not None:
+            views[index, at.downscale] = whole
+    view, outputs["window"] = training_view(model.source, model.state, lambda: whole, index=index, at=at)
     truth, mask = model.truth(batch, outputs), model.mask(batch, outputs["window"])
     inputs = StepInputs(view, truth, mask, outputs["background"])
     result = step(model.state, inputs, model.render_settings(training=True))
@@ -215,6 +225,7 @@ class SundaeTrainer(Trainer):
         self.team.make_folder(self.base_dir)
         self._recorded: RecordedStep | None = None
         """Runs whole steps; None where they run kernel by kernel."""
+        self._views: dict[tuple[int | None, int], View] = {}
         self._trained: int | None = None
         """The last step that is trained."""
         self._stopped_by = 0
@@ -305,14 +316,18 @@ class SundaeTrainer(Trainer):
         model = self.model
         camera, batch = cast(SundaeDatamanager, self.pipeline.datamanager).next_train(step)
         try:
-            outputs, result = recorded_outputs(model, camera, batch, self._recorded)
+            outputs, result = recorded_outputs(model, camera, batch, self._recorded, self._views)
         except (BackendError, torch.cuda.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0]
             CONSOLE.print(f"[yellow]Warning: training goes on without recordings, slower: {reason}", soft_wrap=True)
             self._recorded = None
             torch.cuda.empty_cache()
             return None
-        self.optimizers.scheduler_step_all(step)
+        for scheduler in self.optimizers.schedulers.values():
+            scheduler.step()
+        if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
+            for name, scheduler in self.optimizers.schedulers.items():
+                writer.put_scalar(f"learning_rate/{name}", scheduler.get_last_lr()[0], step)
         return result.loss, result.losses, model.get_metrics_dict(outputs, batch)
 
     def _foretell(self, number: int) -> None:

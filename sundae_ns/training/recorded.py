@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections import OrderedDict
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -74,6 +74,56 @@ class _Recording:
     """Tile/primitive pairs that fit."""
 
 
+@dataclass(frozen=True)
+class _Held:
+    """The tensors of a state whose field lies in the buffers, to notice cheaply when one is replaced."""
+
+    trained: tuple[str, ...]
+    """Names of the parameters of the field that are trained."""
+    groups: list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]
+    """Groups of parameters that a step trains: name of the optimizer, optimizer, group."""
+    parameters: list[tuple[str, Tensor]]
+    statistics: list[tuple[str, Tensor]]
+    states: Sequence[tuple[Mapping[Tensor, Any], Tensor, dict[str, Any]]]
+    """States of an optimizer, a parameter, and its state."""
+    addresses: Hashable
+    """What a recording reads beside the buffers: the head's weights, and the counts of steps."""
+
+    @classmethod
+    def of(cls, state: FieldState, trained: tuple[str, ...], head: CompensationHead | None) -> _Held:
+        names = trained if head is None else (*trained, HEAD)
+        groups = [
+            (name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups
+        ]
+        values = [(optimizer, value) for _, optimizer, group in groups for value in group["params"]]
+        states = [(optimizer.state, value, optimizer.state[value]) for optimizer, value in values]
+        addresses = tuple(own[name].data_ptr() for _, _, own in states for name in (*MOMENTS, "step"))
+        return cls(
+            trained,
+            groups,
+            [(name, state.field[name]) for name in trained],
+            [(name, value) for name, value in state.densification.items() if isinstance(value, Tensor)],
+            states,
+            (addresses, None if head is None else head.addresses()),
+        )
+
+    @property
+    def rates(self) -> list[float]:
+        """Learning rates of the groups."""
+        return [float(group["lr"]) for _, _, group in self.groups]
+
+    def unchanged(self, state: FieldState, settings: RenderSettings) -> bool:
+        """Whether the state still consists of these tensors; surgery and restored snapshots put new ones in their place."""
+        with_head = self.groups[-1][0] == HEAD
+        return (
+            with_head == (settings.head is not None)
+            and all(state.field[name] is value for name, value in self.parameters)
+            and all(state.densification.get(name) is value for name, value in self.statistics)
+            and all(states.get(value) is own for states, value, own in self.states)
+            and self.trained == trained_parameters(state)
+        )
+
+
 class RecordedStep:
     """Training steps of one field.
 
@@ -89,6 +139,7 @@ class RecordedStep:
         self._losses = losses
         self._record = record
         self._buffers = Buffers()
+        self._held: _Held | None = None
         self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
         self._warm: set[Hashable] = set()
         self._most: Tensor | None = None
@@ -108,35 +159,43 @@ class RecordedStep:
             BackendError: the step cannot be recorded. Nothing has changed.
             torch.cuda.OutOfMemoryError: the same.
         """
+        held = self._held
+        if held is None or not held.unchanged(state, settings):
+            held = self._held = self._hold(state, settings)
+        kind = _kind(state, inputs, settings)
+        if not self._record or kind not in self._warm:
+            result = self._run(state, held, inputs, settings)
+            self._warm.add(kind)
+        else:
+            result = self._replayed((kind, held.addresses), state, held, inputs, settings)
+        state.info = {COUNTED: True}
+        return result
+
+    def _hold(self, state: FieldState, settings: RenderSettings) -> _Held:
+        """Let the field be rows of the buffers, with all states that its optimizers need."""
         trained = trained_parameters(state)
-        start_moments(state, (*trained, HEAD) if settings.head is not None else trained)
+        start_moments(state, trained if settings.head is None else (*trained, HEAD))
         if state.densifying:
             start_counting(state.densification, state.field["means"])
         # Regularisers are means over all rows.
         growing = state.densifying and not self._losses.regularises(state)
         if self._buffers.hold(state, trained, growing=growing):
             self._recordings.clear()
-        kind = _kind(state, inputs, settings)
-        if not self._record or kind not in self._warm:
-            result = self._run(state, inputs, settings)
-            self._warm.add(kind)
-        else:
-            key = (kind, _addresses(state, settings.head))
-            result = self._replayed(key, state, inputs, settings)
-        state.info = {COUNTED: True}
-        return result
+        return _Held.of(state, trained, settings.head)
 
     # ------------------------------------------------------------------------------------------------------ running
 
-    def _run(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+    def _run(self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Run a step kernel by kernel, on the stream of the recordings."""
         device = state.device
-        rates = torch.tensor(_rates(state, settings.head), device=device)
+        rates = torch.tensor(held.rates, device=device)
         if device.type != "cuda":
-            return self._step(state, inputs, settings, rates, None)
+            return self._step(state, held, inputs, settings, rates, None)
         capacity = Capacity()
         with warm_up(device):
-            result = self._step(state, inputs, replace(settings, backend=GsplatBackend(capacity)), rates, capacity)
+            result = self._step(
+                state, held, inputs, replace(settings, backend=GsplatBackend(capacity)), rates, capacity
+            )
         if self._most_on_host is None:
             self._most = torch.zeros((), dtype=torch.int64, device=device)
             self._most_on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
@@ -146,27 +205,33 @@ class RecordedStep:
         self._most_on_host.fill_(most)
         return result
 
-    def _replayed(self, key: Hashable, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+    def _replayed(
+        self, key: Hashable, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings
+    ) -> StepResult:
         assert self._most_on_host is not None
         recording, most = self._recordings.get(key), int(self._most_on_host)
         if recording is None or most > recording.pairs:
             if recording is None and len(self._recordings) >= MAX_RECORDINGS:
                 self._recordings.popitem(last=False)
-            recording = self._recordings[key] = self._recorded(state, inputs, settings, int(SPARE_PAIRS * most) + 1)
+            recording = self._recordings[key] = self._recorded(
+                state, held, inputs, settings, int(SPARE_PAIRS * most) + 1
+            )
         self._recordings.move_to_end(key)
         _copy(inputs, recording.inputs)
-        recording.rates.copy_(torch.tensor(_rates(state, settings.head)))
+        recording.rates.copy_(torch.tensor(held.rates))
         recording.graph.replay()
         return recording.result
 
-    def _recorded(self, state: FieldState, inputs: StepInputs, settings: RenderSettings, pairs: int) -> _Recording:
+    def _recorded(
+        self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings, pairs: int
+    ) -> _Recording:
         device, own = state.device, _clone(inputs)
-        rates = torch.tensor(_rates(state, settings.head), device=device)
+        rates = torch.tensor(held.rates, device=device)
 
         def step() -> StepResult:
             capacity = Capacity(pairs)
             limited = replace(settings, backend=GsplatBackend(capacity))
-            return self._step(state, own, limited, rates, capacity)
+            return self._step(state, held, own, limited, rates, capacity)
 
         last = next(reversed(self._recordings.values()), None)
         # Results are read before the next replay, so all recordings can work in the same memory.
@@ -176,6 +241,7 @@ class RecordedStep:
     def _step(
         self,
         state: FieldState,
+        held: _Held,
         inputs: StepInputs,
         settings: RenderSettings,
         rates: Tensor,
@@ -183,8 +249,7 @@ class RecordedStep:
     ) -> StepResult:
         """One step on the buffers; all of its work is recorded."""
         tensors, head, view = self._buffers.tensors, settings.head, inputs.view
-        trained = trained_parameters(state)
-        field = Field({name: tensors[name] for name in trained}, state.field.encoding)
+        field = Field({name: tensors[name] for name in held.trained}, state.field.encoding)
         with torch.enable_grad():
             primitives = LocalField(_complete(field, state.field)).primitives(view, settings, features=head is not None)
             images, splatted = draw(primitives, view, inputs.background, settings, depth=False)
@@ -202,7 +267,7 @@ class RecordedStep:
                 of_centers, radii = centers.absgrad if settings.absgrad else grads[-1], splatted.info["radii"]
                 radii = radii if overflow is None else radii * (overflow == 0)
                 count_view(tensors, of_centers[0], radii[0], view.width, view.height)
-            self._descend(state, dict(zip([*field.values(), *network], grads, strict=False)), rates, overflow, head)
+            self._descend(held, dict(zip([*field.values(), *network], grads, strict=False)), rates, overflow)
         shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
         return StepResult(shown, {name: value.detach() for name, value in losses.items()}, loss.detach())
 
@@ -218,21 +283,16 @@ class RecordedStep:
         return (needed > capacity.pairs).to(loss.dtype)
 
     def _descend(
-        self,
-        state: FieldState,
-        grads: Mapping[Tensor, Tensor | None],
-        rates: Tensor,
-        overflow: Tensor | None,
-        head: CompensationHead | None,
+        self, held: _Held, grads: Mapping[Tensor, Tensor | None], rates: Tensor, overflow: Tensor | None
     ) -> None:
         """Adam, as ``torch.optim.Adam`` with ``fused`` does it, with rates in memory."""
-        for rate, (name, optimizer, group) in zip(rates, _groups(state, head), strict=True):
+        for rate, (name, optimizer, group) in zip(rates, held.groups, strict=True):
             beta1, beta2 = group["betas"]
             values: list[Tensor] = []
             slopes: list[Tensor] = []
             moments: dict[str, list[Tensor]] = {moment: [] for moment in (*MOMENTS, "step")}
             for value in group["params"]:
-                held = optimizer.state[value]
+                own = optimizer.state[value]
                 whole = self._buffers.tensors.get(name, value)
                 grad = grads.get(whole)
                 if grad is None:
@@ -241,8 +301,8 @@ class RecordedStep:
                 # The kernel walks through all tensors in the order of memory.
                 slopes.append(grad if grad.stride() == whole.stride() else torch.empty_like(whole).copy_(grad))
                 for moment in MOMENTS:
-                    moments[moment].append(self._buffers.tensors.get(f"{name}.{moment}", held[moment]))
-                moments["step"].append(held["step"])
+                    moments[moment].append(self._buffers.tensors.get(f"{name}.{moment}", own[moment]))
+                moments["step"].append(own["step"])
             if not values:
                 continue
             torch._foreach_add_(moments["step"], 1)
@@ -273,18 +333,6 @@ def _complete(field: Field, whole: Field) -> Field:
     return Field({**empty, **field}, field.encoding)
 
 
-def _groups(
-    state: FieldState, head: CompensationHead | None
-) -> list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]:
-    """The groups of parameters that a step trains: name of the optimizer, optimizer, group."""
-    names = trained_parameters(state) if head is None else (*trained_parameters(state), HEAD)
-    return [(name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups]
-
-
-def _rates(state: FieldState, head: CompensationHead | None) -> list[float]:
-    return [float(group["lr"]) for _, _, group in _groups(state, head)]
-
-
 def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Hashable:
     """What decides on the kernels of a step, beside numbers of primitives."""
     view, head = inputs.view, settings.head
@@ -294,13 +342,6 @@ def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Ha
         (state.densifying, state.regularised, state.head_enabled),
         None if head is None else (head.net, *vars(head.config).values()),
     )
-
-
-def _addresses(state: FieldState, head: CompensationHead | None) -> Hashable:
-    """Addresses that a recording reads beside the buffers: the head's weights, all moments and counts of steps."""
-    held = [optimizer.state[value] for name, optimizer, group in _groups(state, head) for value in group["params"]]
-    moments = tuple(one[name].data_ptr() for one in held for name in (*MOMENTS, "step"))
-    return moments, None if head is None else head.addresses()
 
 
 def _clone(inputs: StepInputs) -> StepInputs:

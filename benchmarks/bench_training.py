@@ -1,0 +1,200 @@
+"""Time whole trainings, alone on one GPU, with the error of what was trained; print one JSON line for each.
+
+    python benchmarks/bench_training.py CAPTURE --arms splatfacto sundae -o benchmarks/results/training_time.jsonl
+    python benchmarks/bench_training.py CAPTURE --arms sundae --steps 3000
+
+Every arm trains in a process of its own, on images of full size on the GPU, with every 8th image for the test and the head
+as the method decides. Nothing is evaluated or saved while the clock runs; the clock waits for the GPU. ``gpu_busy_share`` is
+the share of 100 steps in which a kernel runs, before and after the prune (``--profile``: in a further training, because the
+profiler takes time). ``curve`` lists seconds, PSNR and SSIM of the test views on the way, measured with the clock stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+import tyro
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.scripts.train import _set_random_seed
+
+from sundae_ns.evaluation import psnr, ssim
+from sundae_ns.trainer import SundaeTrainerConfig
+
+ARMS: dict[str, list[str]] = {
+    "splatfacto": ["splatfacto"],
+    "sundae": ["sundae"],
+    "sundae-unrecorded": ["sundae", "--record-steps", "False"],
+    "sundae-with-head": ["sundae", "--pipeline.model.head.mode", "residual"],
+}
+NEVER = str(10**9)
+PROFILED = 100
+"""Steps of a profile."""
+
+
+def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
+    """A trainer that is set up."""
+    words = [*ARMS[arm], "--data", str(options.capture), "--output-dir", out, "--vis", "tensorboard"]
+    words += ["--max-num-iterations", str(options.steps), "--machine.seed", str(options.seed)]
+    words += ["--viewer.quit-on-train-completion", "True", "--pipeline.datamanager.cache-images", "gpu"]
+    for name in ("save", "eval-batch", "eval-image", "eval-all-images"):
+        words += [f"--steps-per-{name}", NEVER]
+    if arm != "splatfacto":
+        words += ["--pipeline.model.evaluate-prune", "False"]
+    words += options.option
+    words += ["colmap", "--colmap-path", "sparse/0", "--downscale-factor", "1", "--eval-mode", "interval"]
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=words)
+    config.set_timestamp()
+    if isinstance(config, SundaeTrainerConfig):
+        config.make_schedule(words)
+    config.pipeline.datamanager.data = config.data
+    _set_random_seed(options.seed)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.save_checkpoint = lambda step: None
+    return trainer
+
+
+def quality(trainer: Any) -> tuple[float, float]:
+    """Mean PSNR and SSIM of the test views."""
+    model, figures = trainer.pipeline.model, []
+    model.eval()
+    with torch.no_grad():
+        for camera, batch in trainer.pipeline.datamanager.fixed_indices_eval_dataloader:
+            image = model.get_outputs_for_camera(camera.to(model.device))["rgb"]
+            truth = batch["image"].to(model.device)[..., :3]
+            truth = truth.float() / 255 if truth.dtype == torch.uint8 else truth
+            figures.append([float(psnr(image, truth)), float(ssim(image, truth))])
+    model.train()
+    return tuple(torch.tensor(figures).mean(dim=0).tolist())
+
+
+def after_step(trainer: Any, act: Callable[[int], None]) -> None:
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], act))
+
+
+def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
+    """Train with the clock running."""
+    trainer = trainer_of(options, arm, out)
+    curve: list[list[float]] = []
+    spent = 0.0
+
+    def look(step: int) -> None:
+        nonlocal spent
+        if step + 1 not in options.curve:
+            return
+        torch.cuda.synchronize()
+        stopped = time.perf_counter()
+        curve.append([round(stopped - started - spent, 2), *(round(value, 4) for value in quality(trainer))])
+        spent += time.perf_counter() - stopped
+
+    after_step(trainer, look)
+    torch.cuda.reset_peak_memory_stats()
+    torch.cuda.synchronize()
+    started = time.perf_counter()
+    trainer.train()
+    torch.cuda.synchronize()
+    seconds = time.perf_counter() - started - spent
+    peak = torch.cuda.max_memory_allocated() / 2**20
+    decibels, similarity = quality(trainer)
+    return {
+        "train_s": round(seconds, 2),
+        "psnr": round(decibels, 3),
+        "ssim": round(similarity, 4),
+        "primitives": int(trainer.pipeline.model.num_points),
+        "head": getattr(trainer.pipeline.model, "head", None) is not None,
+        "peak_mib": round(peak),
+        "curve": curve,
+    }
+
+
+def busy(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
+    """Shares of time in which a kernel runs: a third into the training, and at its end."""
+    trainer = trainer_of(options, arm, out)
+    shares: list[float] = []
+    profile: Any = None
+    began = 0.0
+
+    def look(step: int) -> None:
+        nonlocal profile, began
+        if step + 1 in (options.steps // 3 + 1, options.steps - PROFILED - 1):
+            torch.cuda.synchronize()
+            profile = torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA])
+            profile.__enter__()
+            began = time.perf_counter()
+        elif profile is not None and step + 1 in (options.steps // 3 + 1 + PROFILED, options.steps - 1):
+            torch.cuda.synchronize()
+            span = time.perf_counter() - began
+            profile.__exit__(None, None, None)
+            shares.append(round(covered(profile) / span, 3))
+            profile = None
+
+    after_step(trainer, look)
+    trainer.train()
+    return {"gpu_busy_share": shares}
+
+
+def covered(profile: Any) -> float:
+    """Seconds in which at least one kernel runs."""
+    spans = sorted(
+        (event.time_range.start, event.time_range.end)
+        for event in profile.events()
+        if event.device_type == torch.autograd.DeviceType.CUDA
+    )
+    total, reached = 0.0, 0.0
+    for start, end in spans:
+        total += max(end - max(start, reached), 0.0)
+        reached = max(reached, end)
+    return total / 1e6
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path, help="folder with images and sparse/0")
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=["splatfacto", "sundae"])
+    parser.add_argument("--steps", type=int, default=30_000)
+    parser.add_argument("--seed", type=int, default=42)
+    parser.add_argument(
+        "--curve", type=int, nargs="*", default=[], help="steps after which the test views are measured"
+    )
+    parser.add_argument("--profile", action="store_true", help="also train each arm under a profiler")
+    parser.add_argument("--option", action="append", default=[], help="a further word of ns-train")
+    parser.add_argument("-o", "--output", type=Path, help="file to append the lines to")
+    parser.add_argument("--child", choices=("timed", "busy"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child is not None:
+        with TemporaryDirectory() as out:
+            print("ROW " + json.dumps({"timed": timed, "busy": busy}[options.child](options, options.arms[0], out)))
+        return
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], check=False, capture_output=True, text=True
+    ).stdout.strip()
+    for arm in options.arms:
+        row: dict[str, Any] = {"arm": arm, "scene": options.capture.name, "steps": options.steps, "seed": options.seed}
+        for child in ("timed", "busy") if options.profile else ("timed",):
+            words = [sys.executable, __file__, str(options.capture), "--arms", arm, "--steps", str(options.steps)]
+            words += ["--seed", str(options.seed), "--child", child, "--curve", *map(str, options.curve)]
+            words += [f"--option={word}" for word in options.option]
+            done = subprocess.run(words, check=False, capture_output=True, text=True)
+            lines = [line for line in done.stdout.splitlines() if line.startswith("ROW ")]
+            if not lines:
+                sys.exit(f"{arm} failed:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}")
+            row |= json.loads(lines[0][4:])
+        row |= {"gpu": torch.cuda.get_device_name(0), "commit": commit}
+        print(json.dumps(row), flush=True)
+        if options.output is not None:
+            with options.output.open("a") as file:
+                file.write(json.dumps(row) + "\n")
+
+
+if __name__ == "__main__":
+    main()
