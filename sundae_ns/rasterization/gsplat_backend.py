@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sundae_ns.errors import BackendError
 from sundae_ns.rasterization.constants import constant
-from sundae_ns.rasterization.gsplat_harmonics import harmonics
+from sundae_ns.rasterization.gsplat_colors import harmonic_colors
 from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, TileLists, tile_lists
 from sundae_ns.rasterization.reference import ReferenceBackend, largest_axis, strategy_info
 from sundae_ns.rasterization.types import Inputs, Rasterization
@@ -19,17 +19,9 @@ _CHANNELS_PER_PASS = 32
 
 
 class GsplatBackend:
-    """gsplat's kernels, for float32 tensors on a CUDA device.
-
-    Args:
-        capacity: for tile/primitive pairs, to record CUDA graphs: tiles get our own lists, shorter than gsplat's, and
-            harmonics our own kernels, so that nothing waits for the GPU. None for gsplat's own lists and harmonics.
-    """
+    """gsplat's kernels, for float32 tensors on a CUDA device."""
 
     name = "gsplat"
-
-    def __init__(self, capacity: Capacity | None = None) -> None:
-        self._capacity = capacity
 
     def rasterize(self, inputs: Inputs) -> Rasterization:
         """Render one view.
@@ -87,11 +79,7 @@ class GsplatBackend:
     def _lists(
         self, means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, radii: Tensor, width: int, height: int
     ) -> TileLists:
-        if self._capacity is None:
-            return TileLists(*square_lists(means2d, radii, depths, width, height))
-        return tile_lists(
-            means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, capacity=self._capacity
-        )
+        return TileLists(*square_lists(means2d, radii, depths, width, height))
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``.
@@ -104,9 +92,38 @@ class GsplatBackend:
         _check_kernels_take(directions)
         if directions.shape[0] == 0:
             return ReferenceBackend().spherical_harmonics(degree, directions, coeffs)
-        if self._capacity is not None:
-            return harmonics(degree, directions, coeffs)
         return spherical_harmonics(degree, directions, coeffs)
+
+
+class RecordableGsplat(GsplatBackend):
+    """gsplat with what CUDA graphs need: nothing waits for the GPU, and all work is on torch's current stream.
+
+    Tiles get our own lists, shorter than gsplat's, and colours our own kernels.
+
+    Args:
+        capacity: for tile/primitive pairs.
+    """
+
+    def __init__(self, capacity: Capacity) -> None:
+        self._capacity = capacity
+
+    def _lists(
+        self, means2d: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, radii: Tensor, width: int, height: int
+    ) -> TileLists:
+        return tile_lists(
+            means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, capacity=self._capacity
+        )
+
+    def harmonic_colors(
+        self, degree: int, means: Tensor, center: Tensor, features_dc: Tensor, features_rest: Tensor
+    ) -> Tensor:
+        """See :func:`sundae_ns.rasterization.harmonic_colors`.
+
+        Raises:
+            BackendError: The tensors are not float32 on a CUDA device, or the kernels cannot be compiled.
+        """
+        _check_kernels_take(means)
+        return harmonic_colors(degree, means, center, features_dc, features_rest)
 
 
 def project(

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.rasterization.constants import constant
-from sundae_ns.rasterization.types import Backend, Inputs, Rasterization
+from sundae_ns.rasterization.types import Backend, ColorBackend, Inputs, Rasterization
 
 MAX_SH_DEGREE = 4
 
@@ -104,6 +104,31 @@ def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, back
     ahead = constant((0.0, 0.0, 1.0), directions.dtype, directions.device)
     directions = torch.where(is_zero, ahead, directions)
     return backend.spherical_harmonics(degree, directions, coeffs)
+
+
+def harmonic_colors(
+    degree: int, means: Tensor, center: Tensor, features_dc: Tensor, features_rest: Tensor, *, backend: Backend
+) -> Tensor:
+    """Colours of primitives as seen from a place: their harmonics plus 0.5, at least 0.
+
+    Args:
+        degree: SH degree, 0 to 4.
+        means: Centres in world units. ``[N, 3]``
+        center: Camera centre ``[3]``, or one for each primitive ``[N, 3]``.
+        features_dc: First coefficients. ``[N, 3]``
+        features_rest: The others, at least those of the degree. ``[N, K - 1, 3]``
+        backend: From :func:`sundae_ns.rasterization.select_backend`.
+
+    Returns:
+        ``[N, 3]``
+
+    Raises:
+        DataError: The degree is out of range or a shape is wrong.
+    """
+    if isinstance(backend, ColorBackend) and len(means) > 0:
+        return backend.harmonic_colors(degree, means, center, features_dc, features_rest)
+    coeffs = torch.cat([features_dc[:, None], features_rest], dim=1)
+    return (spherical_harmonics(degree, means - center, coeffs, backend=backend) + 0.5).clamp_min(0)
 
 
 def blending_weights(

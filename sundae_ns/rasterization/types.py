@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
@@ -65,3 +65,13 @@ class Backend(Protocol):
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""
+
+
+@runtime_checkable
+class ColorBackend(Protocol):
+    """A backend that makes colours by itself."""
+
+    def harmonic_colors(
+        self, degree: int, means: Tensor, center: Tensor, features_dc: Tensor, features_rest: Tensor
+    ) -> Tensor:
+        """See :func:`sundae_ns.rasterization.harmonic_colors`."""

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.cuda_graphs import GraphCache, record, warm_up
-from sundae_ns.rasterization import Capacity, GsplatBackend
+from sundae_ns.rasterization import Capacity, RecordableGsplat
 from sundae_ns.rendering.render import RenderSettings, render, scale_plan
 from sundae_ns.rendering.source import FieldSource, degree_in_use
 from sundae_ns.rendering.views import View
@@ -137,7 +137,7 @@ def _record(
         here = view._replace(viewmat=inputs[0], K=inputs[1])
 
         def run(pairs: Capacity) -> dict[str, Any]:
-            limited = replace(settings, backend=GsplatBackend(pairs))
+            limited = replace(settings, backend=RecordableGsplat(pairs))
             return render(source, here, inputs[2], limited, depth=False)[0]
 
         device = view.viewmat.device

@@ -10,12 +10,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
-import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
 from sundae_ns.gaussians.field import Field
-from sundae_ns.rasterization import Backend, spherical_harmonics
+from sundae_ns.rasterization import Backend, harmonic_colors
 from sundae_ns.rendering.views import View
 
 NEAR_PLANE = 0.01
@@ -154,8 +153,8 @@ def colors_from(params: Mapping[str, Tensor], field: Field, center: Tensor, sett
     if field.encoding == "logits":
         return params["features_dc"].sigmoid()
     degree = degree_in_use(field.sh_degree, settings.active_sh_degree)
-    coeffs = torch.cat([params["features_dc"][:, None], params["features_rest"]], dim=1)
-    return (spherical_harmonics(degree, params["means"] - center, coeffs, backend=settings.backend) + 0.5).clamp_min(0)
+    coefficients = params["features_dc"], params["features_rest"]
+    return harmonic_colors(degree, params["means"], center, *coefficients, backend=settings.backend)
 
 
 def degree_in_use(sh_degree: int, active: int | None) -> int:

@@ -17,7 +17,7 @@ from torch import Tensor
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.training.field_state import FieldState
 
-SPARE = 1.25
+SPARE = 1.1
 """Capacity for a field that grows, as a multiple of its number of primitives."""
 
 MOMENTS = ("exp_avg", "exp_avg_sq")

@@ -10,7 +10,7 @@ import functools
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,7 +18,8 @@ from torch import Tensor
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.cuda_graphs import record, warm_up
-from sundae_ns.rasterization import Capacity, GsplatBackend
+from sundae_ns.gpu.fused_adam import adam
+from sundae_ns.rasterization import Capacity, RecordableGsplat
 from sundae_ns.rendering.render import RenderSettings, compensate, draw
 from sundae_ns.rendering.source import LocalField, degree_in_use
 from sundae_ns.rendering.views import View
@@ -194,7 +195,7 @@ class RecordedStep:
         capacity = Capacity()
         with warm_up(device):
             result = self._step(
-                state, held, inputs, replace(settings, backend=GsplatBackend(capacity)), rates, capacity
+                state, held, inputs, replace(settings, backend=RecordableGsplat(capacity)), rates, capacity
             )
         if self._most_on_host is None:
             self._most = torch.zeros((), dtype=torch.int64, device=device)
@@ -230,7 +231,7 @@ class RecordedStep:
 
         def step() -> StepResult:
             capacity = Capacity(pairs)
-            limited = replace(settings, backend=GsplatBackend(capacity))
+            limited = replace(settings, backend=RecordableGsplat(capacity))
             return self._step(state, held, own, limited, rates, capacity)
 
         last = next(reversed(self._recordings.values()), None)
@@ -286,45 +287,56 @@ class RecordedStep:
         self, held: _Held, grads: Mapping[Tensor, Tensor | None], rates: Tensor, overflow: Tensor | None
     ) -> None:
         """Adam, as ``torch.optim.Adam`` with ``fused`` does it, with rates in memory."""
-        for rate, (name, optimizer, group) in zip(rates, held.groups, strict=True):
-            beta1, beta2 = group["betas"]
-            values: list[Tensor] = []
-            slopes: list[Tensor] = []
-            moments: dict[str, list[Tensor]] = {moment: [] for moment in (*MOMENTS, "step")}
+        tensors, updates = self._buffers.tensors, []
+        for name, optimizer, group in held.groups:
+            parts = []
             for value in group["params"]:
-                own = optimizer.state[value]
-                whole = self._buffers.tensors.get(name, value)
+                whole, own = tensors.get(name, value), optimizer.state[value]
                 grad = grads.get(whole)
                 if grad is None:
                     continue
-                values.append(whole)
-                # The kernel walks through all tensors in the order of memory.
-                slopes.append(grad if grad.stride() == whole.stride() else torch.empty_like(whole).copy_(grad))
-                for moment in MOMENTS:
-                    moments[moment].append(self._buffers.tensors.get(f"{name}.{moment}", own[moment]))
-                moments["step"].append(own["step"])
-            if not values:
-                continue
-            torch._foreach_add_(moments["step"], 1)
-            torch._fused_adam_(
-                values,
-                slopes,
-                moments["exp_avg"],
-                moments["exp_avg_sq"],
-                [],
-                moments["step"],
-                lr=rate,
-                beta1=beta1,
-                beta2=beta2,
-                weight_decay=group["weight_decay"],
-                eps=group["eps"],
-                amsgrad=False,
-                maximize=False,
-                grad_scale=None,
-                found_inf=overflow,
-            )
-            if overflow is not None:
-                torch._foreach_sub_(moments["step"], [overflow] * len(values))
+                if grad.stride() != whole.stride():  # kernels walk through all tensors in the order of memory
+                    grad = torch.empty_like(whole).copy_(grad)
+                mean, square = (tensors.get(f"{name}.{moment}", own[moment]) for moment in MOMENTS)
+                parts.append(_Update(whole, grad, mean, square, own["step"]))
+            updates.append(parts)
+        steps = [one.step for parts in updates for one in parts]
+        torch._foreach_add_(steps, 1)
+        for rate, parts, (_, _, group) in zip(rates, updates, held.groups, strict=True):
+            if parts:
+                _adam(parts, group, rate, overflow)
+        if overflow is not None:
+            torch._foreach_sub_(steps, [overflow] * len(steps))
+
+
+class _Update(NamedTuple):
+    """What Adam changes of one parameter, and its gradient."""
+
+    value: Tensor
+    grad: Tensor
+    mean: Tensor
+    square: Tensor
+    step: Tensor
+
+
+def _adam(parts: Sequence[_Update], group: Mapping[str, Any], rate: Tensor, overflow: Tensor | None) -> None:
+    """Update the parameters of one group."""
+    if len(parts) == 1 and parts[0].value.is_cuda and group["weight_decay"] == 0:
+        adam(*parts[0], rate, overflow, betas=group["betas"], eps=group["eps"])
+        return
+    values, grads, means, squares, steps = ([part[column] for part in parts] for column in range(5))
+    beta1, beta2 = group["betas"]
+    torch._fused_adam_(
+        *(values, grads, means, squares, [], steps),
+        lr=rate,
+        beta1=beta1,
+        beta2=beta2,
+        weight_decay=group["weight_decay"],
+        eps=group["eps"],
+        amsgrad=False,
+        maximize=False,
+        found_inf=overflow,
+    )
 
 
 def _complete(field: Field, whole: Field) -> Field:

@@ -14,9 +14,16 @@ from torch import Tensor
 
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu import nvrtc
-from sundae_ns.rasterization import GsplatBackend, gsplat_backend, gsplat_harmonics, gsplat_tiles
+from sundae_ns.rasterization import (
+    GsplatBackend,
+    RecordableGsplat,
+    gsplat_backend,
+    gsplat_colors,
+    gsplat_tiles,
+    harmonic_colors,
+    select_backend,
+)
 from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, tile_lists
-from sundae_ns.rasterization.harmonics import evaluate_harmonics
 
 Field = dict[str, Tensor]
 
@@ -28,9 +35,10 @@ def on_cpu(compile_kernels: Callable[..., dict[str, Any]], monkeypatch: pytest.M
         return tuple(compile_kernels(gsplat_tiles.SOURCE, names, gsplat_tiles.definitions(dtype)).values())
 
     monkeypatch.setattr(gsplat_tiles, "_compiled", compiled)
-    names = gsplat_harmonics.Launches._fields
-    launches = gsplat_harmonics.Launches(**compile_kernels(gsplat_harmonics.SOURCE, names))
-    monkeypatch.setattr(gsplat_harmonics, "_compiled", lambda _: launches)
+    source, options = gsplat_colors.SOURCE, gsplat_colors.definitions()
+    launches = gsplat_colors.Launches(**compile_kernels(source, gsplat_colors.Launches._fields, options))
+    monkeypatch.setattr(gsplat_colors, "_compiled", lambda _: launches)
+    monkeypatch.setattr(gsplat_backend, "_check_kernels_take", lambda _: None)
 
 
 def field(n: int, width: int, height: int, *, largest: float = 4.0, seed: int = 0) -> Field:
@@ -182,58 +190,63 @@ def test_more_tiles_than_16_bits_count() -> None:
     assert {tile % 3300 // 100 for tile, list_ in enumerate(found) if len(list_)} == {32}
 
 
-@pytest.mark.parametrize("degree", range(5))
-def test_harmonics_match_the_reference(degree: int) -> None:
-    directions, coeffs = torch.randn(100, 3) * 3, torch.randn(100, 25, 3)
-    found = gsplat_harmonics.harmonics(degree, directions, coeffs)
-    exact = evaluate_harmonics(degree, directions.double(), coeffs.double())
-    torch.testing.assert_close(found.double(), exact, rtol=0, atol=5e-6)
+def colors_inputs() -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Centres, a camera's centre, and coefficients of degree 4; some colours are negative, and one centre is the camera's."""
+    means, center = torch.randn(300, 3) * 3, torch.tensor([0.5, -1.0, 2.0])
+    means[7] = center
+    return means, center, torch.randn(300, 3) * 2, torch.randn(300, 24, 3)
 
 
 @pytest.mark.parametrize("degree", range(5))
-def test_gradients_of_harmonics_match_the_reference(degree: int) -> None:
-    inputs = torch.randn(100, 3) * 3, torch.randn(100, 25, 3)
-    weights = torch.randn(100, 3)
-    ours = [value.clone().requires_grad_() for value in inputs]
-    exact = [value.double().requires_grad_() for value in inputs]
-    (gsplat_harmonics.harmonics(degree, *ours) * weights).sum().backward()
-    (evaluate_harmonics(degree, *exact) * weights).sum().backward()
-    for found, expected in zip(ours, exact, strict=True):
-        assert found.grad is not None
-        # The constant harmonic does not depend on the direction.
-        gradient = torch.zeros_like(expected) if expected.grad is None else expected.grad
-        torch.testing.assert_close(found.grad.double(), gradient, rtol=0, atol=5e-5)
+@pytest.mark.parametrize("each", [False, True], ids=["one place", "a place each"])
+def test_colors_and_gradients_match_the_reference(degree: int, each: bool) -> None:
+    means, center, dc, rest = colors_inputs()
+    center = center + torch.randn(300, 3) if each else center
+    rest = rest[:, : max((degree + 1) ** 2 - 1, 8)]  # some coefficients are of higher degrees
+    weights = torch.randn(300, 3)
+    ours = [value.clone().requires_grad_() for value in (means, dc, rest)]
+    exact = [value.double().requires_grad_() for value in (means, dc, rest)]
+    found = harmonic_colors(degree, ours[0], center, *ours[1:], backend=RecordableGsplat(Capacity()))
+    expected = harmonic_colors(
+        degree, exact[0], center.double(), *exact[1:], backend=select_backend("reference", "cpu")
+    )
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=1e-5)
+    assert 0.1 < (found == 0).float().mean() < 0.9
+    (found * weights).sum().backward()
+    (expected * weights).sum().backward()
+    for one, other in zip(ours, exact, strict=True):
+        assert one.grad is not None
+        # The constant harmonic does not depend on the place.
+        gradient = torch.zeros_like(other) if other.grad is None else other.grad
+        torch.testing.assert_close(one.grad.double(), gradient, rtol=1e-4, atol=5e-5)
 
 
-def test_second_derivatives_of_harmonics_are_refused() -> None:
-    directions = torch.ones(1, 3, requires_grad=True)
-    found = gsplat_harmonics.harmonics(1, directions, torch.ones(1, 4, 3))
+def test_second_derivatives_of_colors_are_refused() -> None:
+    means, center, dc, rest = colors_inputs()
+    found = gsplat_colors.harmonic_colors(1, means.requires_grad_(), center, dc, rest)
     with pytest.raises(SundaeError, match="second derivative"):
-        torch.autograd.grad(found.sum(), directions, create_graph=True)
+        torch.autograd.grad(found.sum(), means, create_graph=True)
 
 
 def test_kernels_compile_for_gpus() -> None:
     try:
         for dtype in (torch.int16, torch.int32):
             nvrtc.compile_cubin(gsplat_tiles.SOURCE, "sm_75", gsplat_tiles.definitions(dtype))
-        nvrtc.compile_cubin(gsplat_harmonics.SOURCE, "sm_90")
+        nvrtc.compile_cubin(gsplat_colors.SOURCE, "sm_90", gsplat_colors.definitions())
     except BackendError as error:
         if "libnvrtc" not in str(error) and "without CUDA" not in str(error):
             raise
         pytest.skip(f"no NVRTC here: {error}")
 
 
-def test_without_capacity_harmonics_are_gsplats(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_harmonics_that_are_not_recorded_are_gsplats(monkeypatch: pytest.MonkeyPatch) -> None:
     """A GPU on which our kernels do not compile can still use gsplat's, and an error of gsplat's is raised."""
 
     def refuse(*_: Any) -> Tensor:
         raise RuntimeError("no kernel image")
 
-    monkeypatch.setattr(gsplat_backend, "_check_kernels_take", lambda _: None)
     monkeypatch.setattr("gsplat.spherical_harmonics", refuse)
     directions, coeffs = torch.ones(1, 3), torch.ones(1, 1, 3)
     for gradients in (True, False):
         with torch.set_grad_enabled(gradients), pytest.raises(RuntimeError, match="no kernel image"):
             GsplatBackend().spherical_harmonics(0, directions, coeffs)
-    found = GsplatBackend(Capacity()).spherical_harmonics(0, directions, coeffs)
-    torch.testing.assert_close(found, evaluate_harmonics(0, directions, coeffs))

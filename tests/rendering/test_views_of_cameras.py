@@ -73,8 +73,8 @@ def test_a_window_is_a_part_of_the_whole_picture(
     rows, columns = slice(window.top, window.top + window.height), slice(window.left, window.left + window.width)
     for name in ("base_rgb", "accumulation"):
         torch.testing.assert_close(outputs[cut][name], outputs[whole][name][rows, columns], atol=1e-5, rtol=0)
-    truth = whole._target(masked, outputs[whole])[rows, columns]
-    assert torch.equal(cut._target(masked, outputs[cut]), truth)
+    truth = whole.truth(masked, outputs[whole])[rows, columns]
+    assert torch.equal(cut.truth(masked, outputs[cut]), truth)
     losses = cut.get_loss_dict(outputs[cut], masked, {})
     expected = ((outputs[cut]["base_rgb"] - truth).abs() * masked["mask"][rows, columns]).mean()
     torch.testing.assert_close(losses["base_loss"], cut.config.base_loss_weight * expected)
@@ -83,12 +83,12 @@ def test_a_window_is_a_part_of_the_whole_picture(
 def test_windows_wait_for_the_head_and_for_densification(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
     model = build(head={"max_train_pixels": 600})
     assert not model.state.head_enabled
-    assert model._resolution(0).window_pixels == 0
+    assert model.resolution(0).window_pixels == 0
     perturb(model)
-    assert model._resolution(0).window_pixels == 600
+    assert model.resolution(0).window_pixels == 600
     assert model.eval().get_outputs(camera())["rgb"].shape == (32, 40, 3)  # what is shown is whole
     early = perturb(
         build(head={"max_train_pixels": 600, "start_at": 0}, pruning={"mode": "continuous", "start": 5, "stop": 50})
     )
     assert early.state.head_enabled
-    assert early._resolution(0).window_pixels == 0  # densification takes its statistics from whole pictures
+    assert early.resolution(0).window_pixels == 0  # densification takes its statistics from whole pictures

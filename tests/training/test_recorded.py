@@ -12,8 +12,9 @@ from torch import Tensor
 
 from sundae_ns.model import SundaeModel
 from sundae_ns.trainer import recorded_outputs
+from sundae_ns.training import buffers as buffers_module
 from sundae_ns.training import recorded as recorded_module
-from sundae_ns.training.buffers import SPARE, Buffers, start_moments, trained_parameters
+from sundae_ns.training.buffers import Buffers, start_moments, trained_parameters
 from sundae_ns.training.recorded import RecordedStep
 
 Build = Callable[..., SundaeModel]
@@ -171,8 +172,11 @@ def test_a_field_without_growth_has_no_spare_rows(both: Callable[..., tuple[Any,
     assert recorded.recorded._buffers.capacity == recorded.model.num_points == 30
 
 
-def test_buffers_are_new_only_when_the_field_does_not_fit(build: Build, training_of: TrainingOf) -> None:
+def test_buffers_are_new_only_when_the_field_does_not_fit(
+    build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
+) -> None:
     training = training_of(build(n=60))
+    monkeypatch.setattr(buffers_module, "SPARE", 1.25)
     state = training.model.state
     trained = trained_parameters(state)
     start_moments(state, trained)
@@ -193,4 +197,3 @@ def test_buffers_are_new_only_when_the_field_does_not_fit(build: Build, training
     assert int(buffers.tensors["means.exp_avg"].sum()) == 65 * 3
     assert buffers.hold(state, trained, growing=False)
     assert buffers.capacity == 65
-    assert int(SPARE * 60) == 75

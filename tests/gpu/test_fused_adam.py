@@ -1,0 +1,61 @@
+"""Adam's kernel, compiled for the CPU, beside torch's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from sundae_ns.errors import BackendError
+from sundae_ns.gpu import fused_adam, nvrtc
+
+N = 1000
+BETAS = (0.9, 0.999)
+
+
+@pytest.fixture
+def launch(compile_kernels: Callable[..., dict[str, Any]]) -> Any:
+    return compile_kernels(fused_adam.SOURCE, ["adam"], fused_adam.definitions())["adam"]
+
+
+def test_it_follows_torch(launch: Any) -> None:
+    """Over gradients of all sizes, with vanishing ones, and with a rate that changes."""
+    value = torch.randn(N)
+    exact = torch.nn.Parameter(value.double())
+    optimizer = torch.optim.Adam([exact], lr=1.0, betas=BETAS, eps=1e-15)
+    mean, square, step = torch.zeros(N), torch.zeros(N), torch.zeros(())
+    scales = 10 ** (torch.rand(N) * 12 - 10)
+    scales[:10] = 0
+    for count in range(1, 30):
+        gradient, rate = torch.randn(N) * scales, 0.01 / count
+        step += 1
+        fused_adam.adam(
+            value, gradient, mean, square, step, torch.tensor(rate), None, betas=BETAS, eps=1e-15, launch=launch
+        )
+        optimizer.param_groups[0]["lr"], exact.grad = rate, gradient.double()
+        optimizer.step()
+    torch.testing.assert_close(value.double(), exact.detach(), rtol=0, atol=2e-6)
+    state = optimizer.state[exact]
+    torch.testing.assert_close(mean.double(), state["exp_avg"], rtol=1e-3, atol=1e-12)
+    torch.testing.assert_close(square.double(), state["exp_avg_sq"], rtol=1e-4, atol=1e-20)
+
+
+def test_a_skipped_step_changes_nothing(launch: Any) -> None:
+    tensors = [torch.ones(N) for _ in range(4)]
+    before = [value.clone() for value in tensors]
+    one, rate = torch.ones(()), torch.tensor(0.1)
+    fused_adam.adam(*tensors, one, rate, one, betas=BETAS, eps=1e-8, launch=launch)
+    assert all(torch.equal(value, old) for value, old in zip(tensors, before, strict=True))
+    fused_adam.adam(*tensors, one, rate, torch.zeros(()), betas=BETAS, eps=1e-8, launch=launch)
+    assert (tensors[0] != before[0]).all()
+
+
+def test_it_compiles_for_gpus() -> None:
+    try:
+        nvrtc.compile_cubin(fused_adam.SOURCE, "sm_75", fused_adam.definitions())
+    except BackendError as error:
+        if "libnvrtc" not in str(error) and "without CUDA" not in str(error):
+            raise
+        pytest.skip(f"no NVRTC here: {error}")
