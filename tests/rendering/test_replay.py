@@ -20,7 +20,7 @@ from sundae_ns.errors import BackendError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.cuda_graphs import RECORD_AT
 from sundae_ns.model import SundaeModel
-from sundae_ns.rasterization import Capacity, GsplatBackend
+from sundae_ns.rasterization import Capacity, RecordableGsplat
 from sundae_ns.rendering import FieldSource, FrameReplay, LocalField, RenderSettings, View, render, replay
 
 Build = Callable[..., SundaeModel]
@@ -293,7 +293,7 @@ def test_shorter_lists_make_the_same_picture(build: Build, camera: MakeCamera, s
     settings = model.render_settings(training=False)
     theirs = render(model.source, view, background, settings)[0]
     capacity = Capacity()
-    ours = render(model.source, view, background, replace(settings, backend=GsplatBackend(capacity)))[0]
+    ours = render(model.source, view, background, replace(settings, backend=RecordableGsplat(capacity)))[0]
     assert int(capacity.needed[0]) > 0
     for name in ("base_rgb", "depth", "accumulation"):
         assert torch.equal(ours[name], theirs[name])
