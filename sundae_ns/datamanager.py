@@ -229,7 +229,6 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             reason = " ".join(str(error).split())[:200] or type(error).__name__
             raise DataError(f"{data} cannot be parsed ({reason}); check the capture") from error
         self._order: tuple[int, list[int]] = (-1, [])
-        self._held_back: frozenset[int] = frozenset()
         self._served = self.train_indices
         self._cameras: dict[int, Cameras] = {}
         self.place: tuple[int, int] = (0, 1)
@@ -258,22 +257,18 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     @property
     def holdout_indices(self) -> list[int]:
         """Indices of the training views that are held out now."""
-        return sorted({*self._always_held_out, *self._held_back})
-
-    @property
-    def _always_held_out(self) -> range:
-        every = self.config.holdout_every
-        return range(every - 1, len(self.train_dataset), every) if every else range(0)
+        return sorted({*range(len(self.train_dataset))}.difference(self._served))
 
     @property
     def train_indices(self) -> list[int]:
         """Indices of the training views that are not held out for the whole training."""
-        return [i for i in range(len(self.train_dataset)) if i not in self._always_held_out]
+        every = self.config.holdout_every
+        return [i for i in range(len(self.train_dataset)) if not every or (i + 1) % every]
 
     def hold_back(self, indices: Iterable[int]) -> None:
         """Hold out these of :attr:`train_indices` too, from the next step on, until the next call."""
-        self._held_back = frozenset(indices)
-        self._served = [index for index in self.train_indices if index not in self._held_back]
+        held_back = frozenset(indices)
+        self._served = [index for index in self.train_indices if index not in held_back]
         self._order = (-1, [])
 
     def view_of_step(self, step: int) -> int:

@@ -183,6 +183,9 @@ def bands(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``sundae``; a :class:`SundaeError` is printed on one line, and the exit code is 2."""
     words = sys.argv[1:] if arguments is None else arguments
+    # Before torch is loaded, and for the commands that these run: where another program takes one of two cores, threads
+    # that spin while they wait make a training step on a CPU ten times as long.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         # Commands name the file that they cannot write; this covers the rest, such as a full disk behind stdout.
         with warnings.catch_warnings(), writing(f"{' '.join(words[:1])} ended early"):

@@ -16,6 +16,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from sundae_ns.compensation import CompensationHead
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, restore, restore_module, snapshot
 from sundae_ns.rasterization import Backend
 from sundae_ns.rendering.render import RenderSettings
 
@@ -126,6 +127,21 @@ class FieldState:
             head=self.head if self.head_enabled else None,
             trained_focal=self.trained_focal,
         )
+
+    def snapshot(self, *, head: bool) -> dict[str, Snapshot]:
+        """Copy the field, and the head if asked for, with the states of their optimizers."""
+        saved = {"field": snapshot(self.field, self.optimizers)}
+        if head:
+            assert self.head is not None
+            saved[_HEAD] = module_snapshot(self.head.parameters(), self.optimizers["compensation"])
+        return saved
+
+    def restore(self, saved: Mapping[str, Snapshot]) -> None:
+        """Restore a :meth:`snapshot`, with any number of primitives."""
+        restore(self.field, self.optimizers, saved["field"])
+        if _HEAD in saved:
+            assert self.head is not None
+            restore_module(self.head.parameters(), self.optimizers["compensation"], saved[_HEAD])
 
     def running_states(self) -> dict[str, dict[str, Any]]:
         """Running states for a checkpoint."""

@@ -27,16 +27,17 @@ class HeldOutQuality(NamedTuple):
     psnr: float
     """PSNR of these pixels, dB, at most :data:`EXACT`."""
     ssim: float
-    """SSIM of these pixels; 0 for an image that is smaller than the window of SSIM."""
+    """SSIM of these pixels; 0 for an image that is smaller than the window of SSIM, NaN if it was not asked for."""
 
 
 @torch.no_grad()
-def measure_heldout(run: TrainingRun, *, mend: str) -> list[HeldOutQuality]:
+def measure_heldout(run: TrainingRun, *, mend: str, with_ssim: bool = True) -> list[HeldOutQuality]:
     """Quality of the held-out views as the field is now, with the head if it is enabled; without fully masked views.
 
     Args:
         run: the training.
         mend: what the user can do if masks leave no pixel, for the error.
+        with_ssim: whether to compute SSIM.
 
     Raises:
         DataError: masks leave no pixel.
@@ -44,7 +45,7 @@ def measure_heldout(run: TrainingRun, *, mend: str) -> list[HeldOutQuality]:
     qualities = []
     for view, target, mask in run.heldout_views():
         images, _ = render(run.source, view, run.background, run.settings, depth=False)
-        quality = view_quality(images["rgb"], target, mask)
+        quality = view_quality(images["rgb"], target, mask, with_ssim=with_ssim)
         if quality.pixels:
             qualities.append(quality)
     if not qualities:
@@ -52,13 +53,14 @@ def measure_heldout(run: TrainingRun, *, mend: str) -> list[HeldOutQuality]:
     return qualities
 
 
-def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQuality:
+def view_quality(image: Tensor, target: Tensor, mask: Tensor | None, *, with_ssim: bool = True) -> HeldOutQuality:
     """Quality of an image under a mask.
 
     Args:
         image: ``[H, W, 3]``.
         target: the truth ``[H, W, 3]``.
         mask: pixels that count, bool ``[H, W]``; None for all.
+        with_ssim: whether to compute SSIM.
     """
     whole = target[..., 0].numel()
     pixels = whole if mask is None else int(mask.sum())
@@ -68,8 +70,8 @@ def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQ
     compared = image if mask is None else torch.where(mask[..., None], image, target)
     share = pixels / whole
     decibels = float(psnr(compared, target)) + 10 * math.log10(share)
-    similarity = 0.0
-    if min(target.shape[:2]) >= SSIM_WINDOW:
+    similarity = 0.0 if with_ssim else math.nan
+    if with_ssim and min(target.shape[:2]) >= SSIM_WINDOW:
         similarity = 1 - (1 - float(ssim(compared, target))) / share
     return HeldOutQuality(pixels, min(decibels, EXACT), similarity)
 

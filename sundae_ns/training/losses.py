@@ -14,6 +14,7 @@ from torch import Tensor
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.fused_loss import WINDOW, compiled, fused_loss
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.similarity import mean_ssim
 
 REGULARISER = 0.01
 """Weights of opacities and scales in the loss (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
@@ -101,8 +102,8 @@ def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float) -> 
     """The first loss of :func:`image_losses` by convolutions, on any device."""
     ssim.win = ssim.win.to(target.device)  # once; each call would copy it and wait
     # Contiguous planes: convolutions of a large image with interleaved colours take much longer.
-    planes = (one.permute(2, 0, 1)[None].contiguous() for one in (target, image))
-    return (1 - weight) * (image - target).abs().mean() + weight * (1 - ssim(*planes))
+    planes, truth = (one.permute(2, 0, 1)[None].contiguous() for one in (image, target))
+    return (1 - weight) * (image - target).abs().mean() + weight * (1 - mean_ssim(planes, truth, ssim))
 
 
 @functools.cache

@@ -18,7 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sundae_ns.errors import CheckpointError
 from sundae_ns.evaluation import without_nan
-from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, restore, restore_module, snapshot
+from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
@@ -148,7 +148,7 @@ class Trials(Extension):
         Raises:
             CheckpointError: the checkpoint carries no decision.
         """
-        if _progress_of(saved).decision in ("plain", "regularised"):
+        if _progress_of(saved).decision not in ("", "head"):
             state.remove_head()
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
@@ -193,7 +193,7 @@ class Trials(Extension):
                 f"({', '.join(ARMS)}); {len(plan.views)} of {len(run.view_indices())} training views are held out"
             )
             progress.phase = "trials"
-            self._start = _copies(run.state)
+            self._start = run.state.snapshot(head=True)
             self._begin(run)
         elif progress.phase == "trials" and step - progress.began >= self._planned(run).length:
             self._end(run)
@@ -245,13 +245,12 @@ class Trials(Extension):
         mend = "decide by hand with --pipeline.model.head.mode residual or off"
         progress.measured.append([list(view) for view in measure_heldout(run, mend=mend)])
         if progress.arm != "head":  # it is the last, so a chosen head needs no copy
-            self._ends[progress.arm] = snapshot(state.field, state.optimizers)
+            self._ends[progress.arm] = state.snapshot(head=False)["field"]
         if progress.trial + 1 == self._planned(run).num_trials:
             self._decide(run)
             return
         assert self._start is not None
-        restore(state.field, state.optimizers, self._start["field"])
-        restore_module(_head(state), state.optimizers["compensation"], self._start["head"])
+        state.restore(self._start)
         postpone(state.schedulers, state.schedule_step - progress.began)
         progress.trial += 1
         self._begin(run)
@@ -264,7 +263,7 @@ class Trials(Extension):
         CONSOLE.log(f"step {state.step}: held-out training views: {'; '.join(texts)}. Continuing with: {decision}")
         run.log_scalars("Trials", {f"psnr_{arm}": decibels for arm, (decibels, _) in figures.items()})
         if decision != "head":
-            restore(state.field, state.optimizers, self._ends[decision])
+            state.restore({"field": self._ends[decision]})
         self._settle(run, decision, "")
 
     def _settle(self, run: TrainingRun, decision: str, reason: str) -> None:
@@ -294,20 +293,6 @@ class Trials(Extension):
             decibels, similarity = mean_quality(views)
             record["arms"][arm] = {"psnr": decibels, "ssim": similarity, "views": [view._asdict() for view in views]}
         return record
-
-
-def _head(state: FieldState) -> list[Any]:
-    """The parameters of the head."""
-    assert state.head is not None
-    return list(state.head.parameters())
-
-
-def _copies(state: FieldState) -> dict[str, Snapshot]:
-    """Copies of field and head with the states of their optimizers."""
-    return {
-        "field": snapshot(state.field, state.optimizers),
-        "head": module_snapshot(_head(state), state.optimizers["compensation"]),
-    }
 
 
 def _progress_of(saved: Mapping[str, Any]) -> Progress:

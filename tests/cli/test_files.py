@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -196,3 +198,18 @@ def test_refusals_are_one_line(
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
     assert message in line
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> None:
+    write_scene(tmp_path / "a.sundae", Scene(field()))
+    commands = [
+        ["export", "a.sundae", "-o", "a.ply"],
+        ["export", "a.ply", "-o", "a.spz"],
+        ["prune", "a.ply", "-o", "pruned.ply"],
+    ]
+    code = "import sys\nsys.modules['nerfstudio'] = None  # an import fails\nfrom sundae_ns.cli import main\nmain(sys.argv[1:])"
+    for words in commands:
+        started = [sys.executable, "-c", code, *words]
+        done = subprocess.run(started, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / words[-1]).stat().st_size > 0

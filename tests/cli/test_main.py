@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -88,3 +89,19 @@ def test_installed_command_and_its_exit_code(tmp_path: Path) -> None:
     result = subprocess.run([command, "scene", out], capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert len(result.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("chosen", [None, "ACTIVE"])
+def test_threads_of_torch_do_not_spin_unless_the_user_chose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, chosen: str | None
+) -> None:
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    if chosen is None:
+        monkeypatch.delenv("OMP_WAIT_POLICY")
+    run("export", tmp_path / "missing", tmp_path / "out.ply")
+    assert os.environ["OMP_WAIT_POLICY"] == (chosen or "PASSIVE")
+
+
+def test_torch_is_not_loaded_before_a_command_starts() -> None:
+    code = "import sys, sundae_ns.cli; sys.exit(bool({'torch', 'numpy', 'nerfstudio'} & sys.modules.keys()))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -6,8 +6,6 @@ the browser's enlarging to the size of its canvas, done here by the same bilinea
 
 from __future__ import annotations
 
-import importlib.util
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from chromium import CHROMIUM, browser, needs_chromium
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.utils import colormaps
 from nerfstudio.utils.eval_utils import eval_setup
@@ -28,18 +27,7 @@ from sundae_ns.pruning import decide, kept_count
 from sundae_ns.rendering import render
 from sundae_ns.viewer import rule_config
 
-ROOT = Path(__file__).parents[2]
-spec = importlib.util.spec_from_file_location("browser", ROOT / "benchmarks" / "browser.py")
-assert spec is not None
-assert spec.loader is not None
-browser = sys.modules["browser"] = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(browser)
-
-CHROMIUM = browser.find_chromium()
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (apt-get install chromium)"),
-]
+pytestmark = [pytest.mark.browser, needs_chromium]
 SIDE = 256
 """Longer side of pictures after "Fast" has been pressed, pixels."""
 FAR = 48

@@ -6,8 +6,6 @@ The page's images are bytes, whose rounding alone gives 58.9 dB.
 from __future__ import annotations
 
 import base64
-import importlib.util
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from chromium import CHROMIUM, browser, needs_chromium
 from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 from packed_scenes import KINDS, write_kind
@@ -28,15 +27,7 @@ from sundae_ns.scenes.packed import cameras_of, model_of, scene_of_run
 from sundae_ns.scenes.page import page_of, write_folder, write_page
 from sundae_ns.storage.packing import read_scene, write_scene
 
-ROOT = Path(__file__).parents[2]
-spec = importlib.util.spec_from_file_location("browser", ROOT / "benchmarks" / "browser.py")
-assert spec is not None
-assert spec.loader is not None
-browser = sys.modules["browser"] = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(browser)
-
-CHROMIUM = browser.find_chromium()
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (apt-get install chromium)")
+pytestmark = needs_chromium
 
 LEAST = 57.0
 """Lowest PSNR of an image of the page against Python's; the worst is 58.7."""

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.evaluation import psnr, ssim
+from sundae_ns.training import heldout
 from sundae_ns.training.heldout import EXACT, HeldOutQuality, mean_quality, view_quality
 
 
@@ -57,3 +58,10 @@ def test_an_image_smaller_than_the_window_of_ssim_has_a_psnr(pair: tuple[Tensor,
     found = view_quality(image, target, None)
     assert found.ssim == 0
     assert math.isfinite(found.psnr)
+
+
+def test_ssim_is_computed_only_if_asked_for(pair: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(heldout, "ssim", lambda *_: pytest.fail("computed"))
+    found = view_quality(*pair, None, with_ssim=False)
+    assert found.psnr == pytest.approx(float(psnr(*pair)))
+    assert math.isnan(found.ssim)

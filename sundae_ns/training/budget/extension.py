@@ -214,7 +214,7 @@ class BudgetSearch(Extension):
         search.degree = searched.field.sh_degree
         if search.degree > 0 and not self._time_is_up(searched):
             search.phase = "degrees"
-            self._fallback = searched.snapshot(head=search.head)
+            self._fallback = searched.state.snapshot(head=search.head)
             self._start_trial(searched, search.degree)
         else:
             self._after_degrees(searched)
@@ -284,7 +284,7 @@ class BudgetSearch(Extension):
         count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
         if count is None or searched.steps_left < config.search_every:  # no evaluation would judge it
             return
-        self._accepted = searched.snapshot(head=search.head)
+        self._accepted = searched.state.snapshot(head=search.head)
         self._count_dropped(searched.cut_to(count))
         search.cut(value, count, searched.state.schedule_step)
 
@@ -292,7 +292,7 @@ class BudgetSearch(Extension):
         search, step = self.search, searched.state.schedule_step
         too_late = self._is_over(searched, self.config.stop, searched.steps_left)
         if search.phase == "field" and heads.may_pay(searched, self._largest) and not too_late:
-            self._fallback = searched.snapshot(head=search.head)
+            self._fallback = searched.state.snapshot(head=search.head)
             search.begin("head", search.accepted)
             search.head_at, search.lost_at_join = step, search.steps_lost
             heads.enable(searched, search, self._largest, searched.count)
@@ -382,7 +382,7 @@ class BudgetSearch(Extension):
         value = search.degrees[str(search.degree)] = self._measure_finite(searched)
         top = max(int(name) for name in search.degrees)
         if search.degree == search.lowest_degree(top, tolerated):
-            self._accepted = searched.snapshot(head=search.head) if value > NO_IMAGE else self._fallback
+            self._accepted = searched.state.snapshot(head=search.head) if value > NO_IMAGE else self._fallback
         degree = search.next_degree(top, tolerated)
         if len(search.degrees) > 1 or value == NO_IMAGE:  # this trial, or the one that it has replaced
             search.steps_lost += searched.state.schedule_step - search.cut_at

@@ -1,4 +1,4 @@
-"""The field under search: its PSNR on held-out views, its contribution, cuts, and snapshots to return to."""
+"""The field under search: its PSNR on held-out views, its contribution, cuts, and returns to snapshots."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ import math
 import statistics
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from sundae_ns.compensation import CompensationHead
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.sh_folding import mean_basis
-from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, restore, restore_module, snapshot
+from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.pruning.cutting import cut, drop_nonfinite
 from sundae_ns.rasterization.harmonics import harmonic_basis
@@ -101,7 +99,8 @@ class SearchedField:
             DataError: masks leave no pixel.
         """
         mend = "hold out other views with --pipeline.datamanager.holdout-every"
-        value = statistics.fmean(view.psnr for view in measure_heldout(self.run, mend=mend))
+        views = measure_heldout(self.run, mend=mend, with_ssim=False)
+        value = statistics.fmean(view.psnr for view in views)
         return value if math.isfinite(value) else NO_IMAGE
 
     # ------------------------------------------------------------------------------------------------------- fields
@@ -136,29 +135,12 @@ class SearchedField:
         )
         return decision.dropped_nonfinite
 
-    def snapshot(self, *, head: bool) -> dict[str, Snapshot]:
-        """Copies of the field, and of the head if asked for, with their optimizers' states."""
-        optimizers = self.state.optimizers
-        saved = {"field": snapshot(self.field, optimizers)}
-        if head:
-            saved["head"] = module_snapshot(self._head.parameters(), optimizers["compensation"])
-        return saved
-
     def restore(self, saved: Mapping[str, Snapshot] | None) -> None:
         """Return to a snapshot."""
         assert saved is not None
-        optimizers: Mapping[str, Any] = self.state.optimizers
-        restore(self.field, optimizers, saved["field"])
-        if "head" in saved:
-            restore_module(self._head.parameters(), optimizers["compensation"], saved["head"])
+        self.state.restore(saved)
         # Whatever is cached by the number of prunes is stale.
         self.state.pruning["num_prunes"] += 1
-
-    @property
-    def _head(self) -> CompensationHead:
-        head = self.state.head
-        assert head is not None
-        return head
 
     def restart_rates(self, *, head: bool) -> None:
         """Restart the learning rates of the field, or those of the head."""

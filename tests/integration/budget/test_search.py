@@ -32,6 +32,7 @@ from sundae_ns.scenes.opening import open_scene
 from sundae_ns.training.budget import bytes_of, extension
 from sundae_ns.training.budget.search import Search
 from sundae_ns.training.budget.searched_field import SearchedField
+from sundae_ns.training.field_state import FieldState
 
 
 def test_it_cuts_and_keeps_the_target(done: Run) -> None:
@@ -128,13 +129,13 @@ def degree_0_suffices(searched: SearchedField) -> float:
 def test_nothing_is_tried_that_cannot_be_judged(
     make: Make, monkeypatch: pytest.MonkeyPatch, stop: int, steps: int, degree: int, lost: int
 ) -> None:
-    snapshot, kept = SearchedField.snapshot, []
+    snapshot, kept = FieldState.snapshot, []
 
-    def noted(searched: SearchedField, *, head: bool) -> Any:
-        kept.append(searched.field["means"].detach().clone())
-        return snapshot(searched, head=head)
+    def noted(state: FieldState, *, head: bool) -> Any:
+        kept.append(state.field["means"].detach().clone())
+        return snapshot(state, head=head)
 
-    monkeypatch.setattr(SearchedField, "snapshot", noted)
+    monkeypatch.setattr(FieldState, "snapshot", noted)
     monkeypatch.setattr(SearchedField, "measure", degree_0_suffices)
     trainer = make(model_options={"head": HeadConfig(mode="off")}, stop=stop, max_num_iterations=steps)
     trainer.train()
