@@ -34,6 +34,7 @@ def trained(trainer_of: MakeTrainer, steps: type[RecordedStep] | None) -> Any:
 
     def change(config: Any) -> None:
         config.steps_per_save, config.save_only_latest_checkpoint = 40, False
+        config.pipeline.model.background_color = "black"  # a failed step draws a random one twice
 
     torch.manual_seed(0)
     trainer: Any = trainer_of(change)
@@ -47,9 +48,9 @@ def alike(one: Any, other: Any) -> None:
     """Rounding decides about a few primitives at the thresholds of densification; the fields are the same otherwise."""
     assert one.num_points == pytest.approx(other.num_points, rel=0.02)
     for name in ("means", "scales", "opacities", "features_dc"):
-        values = (model.gauss_params[name].detach() for model in (one, other))
-        spread, expected = (torch.stack([value.mean(), value.std()]) for value in values)
-        torch.testing.assert_close(spread, expected, rtol=0.02, atol=0.02)
+        shares = torch.tensor([0.25, 0.5, 0.75])
+        found, expected = (model.gauss_params[name].detach().quantile(shares) for model in (one, other))
+        torch.testing.assert_close(found, expected, rtol=0.02, atol=0.03)
 
 
 def test_a_run_by_recorded_steps_is_the_same(trainer_of: MakeTrainer) -> None:
