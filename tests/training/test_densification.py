@@ -9,8 +9,15 @@ import torch
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from sundae_ns.rasterization.reference import _radii_per_axis
-from sundae_ns.training.densification import CappedStrategy, ChainStrategy, limit_growth, start_of_chain
+from sundae_ns.rasterization.reference import _radii_per_axis, strategy_info
+from sundae_ns.training.densification import (
+    CappedStrategy,
+    ChainStrategy,
+    count_view,
+    limit_growth,
+    start_counting,
+    start_of_chain,
+)
 
 FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
 N = 40
@@ -110,3 +117,34 @@ def test_a_field_grows_however_many_images_there_are(reset_every: int, images: i
     strategy = CappedStrategy(refine_every=10, refine_start_iter=0, refine_stop_iter=1000, reset_every=reset_every)
     strategy.see_each_image_after_resets(images)
     assert strategy.pause_refine_after_reset == pause
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_statistics_are_those_of_gsplat(absgrad: bool) -> None:
+    """Of three views, with primitives that are not drawn."""
+    strategy = CappedStrategy(refine_scale2d_stop_iter=100, absgrad=absgrad)
+    params = {"means": torch.zeros(50, 3)}
+    theirs, ours = strategy.initialize_state(), strategy.initialize_state()
+    start_counting(ours, params["means"])
+    for _ in range(3):
+        centers, radii = torch.zeros(1, 50, 2), torch.randint(0, 30, (1, 50))
+        grads = torch.randn(1, 50, 2)
+        if absgrad:
+            centers.absgrad = grads.abs()  # type: ignore[attr-defined]
+        else:
+            centers.grad = grads
+        shaped = radii[..., None].expand(-1, -1, 2) if _radii_per_axis() else radii
+        info = strategy_info(centers, shaped, 80, 60)
+        strategy._update_state(params, theirs, info)
+        count_view(ours, (grads.abs() if absgrad else grads)[0], radii[0], 80, 60)
+    assert (ours["count"] < 3).any()
+    for name in ("grad2d", "count", "radii"):
+        torch.testing.assert_close(ours[name], theirs[name])
+
+
+def test_statistics_of_radii_per_axis() -> None:
+    running = {"grad2d": torch.zeros(3), "count": torch.zeros(3), "radii": torch.zeros(3)}
+    count_view(running, torch.ones(3, 2), torch.tensor([[4, 8], [0, 8], [2, 2]]), 80, 40)
+    assert running["count"].tolist() == [1, 0, 1]
+    assert running["radii"].tolist() == pytest.approx([0.1, 0, 0.025])
+    assert running["grad2d"].tolist() == pytest.approx([2000**0.5, 0, 2000**0.5])
