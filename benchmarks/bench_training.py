@@ -27,6 +27,7 @@ from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 
+from sundae_ns.cli.bench.job import without_lpips
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.trainer import SundaeTrainerConfig
 
@@ -58,8 +59,9 @@ def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
         config.make_schedule(words)
     config.pipeline.datamanager.data = config.data
     _set_random_seed(options.seed)
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+    with without_lpips():
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
     trainer.save_checkpoint = lambda step: None
     return trainer
 

@@ -168,15 +168,17 @@ def rules() -> list[str]:
 
 
 def trials() -> list[str]:
-    """What held-out training views say of the head, and what it does on test views at the end."""
-    heads = ["capture", "training views", "held out", "dB", "SSIM", "chosen", "dB, test", "SSIM, test"]
+    """What held-out training views say of the head and of regularisers, and the finished run on test views."""
+    heads = ["capture", "training views", "held out", "head: dB", "SSIM", "regularisers: dB", "SSIM"]
+    heads += ["chosen", "dB, test", "SSIM, test"]
     rows = []
     for line in lines_of("trials.csv"):
-        gains = [float(line[f"{name}_head"]) - float(line[f"{name}_plain"]) for name in ("psnr", "ssim")]
+        arms = [(name, arm) for arm in ("head", "regularised") for name in ("psnr", "ssim")]
+        gains = [float(line[f"{name}_{arm}"]) - float(line[f"{name}_plain"]) for name, arm in arms]
         rows.append(
             [
                 *(line["capture"], line["training_views"], line["held_out"]),
-                *(f"{gains[0]:+.2f}", f"{gains[1]:+.4f}", line["chosen"]),
+                *(f"{gains[0]:+.2f}", f"{gains[1]:+.4f}", f"{gains[2]:+.2f}", f"{gains[3]:+.4f}", line["chosen"]),
                 *(number(float(line["psnr_test"]), 2), number(float(line["ssim_test"]), 4)),
             ]
         )

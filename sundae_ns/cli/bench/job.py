@@ -93,7 +93,7 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
     shutil.rmtree(config.get_base_dir(), ignore_errors=True)
     config.save_config()
     _set_random_seed(config.machine.seed)
-    with _no_lpips():
+    with without_lpips():
         trainer: Trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         save = trainer.save_checkpoint
@@ -180,7 +180,7 @@ class _Nothing(torch.nn.Module):
 
 
 @contextlib.contextmanager
-def _no_lpips() -> Iterator[None]:
+def without_lpips() -> Iterator[None]:
     """Keep stock splatfacto from building LPIPS; training evaluates nothing."""
     import torchmetrics.image.lpip as module
 
