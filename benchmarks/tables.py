@@ -113,6 +113,25 @@ def speed() -> list[str]:
     return table(heads, first_of_each(rows))
 
 
+def training_time() -> list[str]:
+    """Seconds of whole trainings, each with the error of what was trained."""
+    heads = ["capture", "method", "steps", "seconds", "ms a step", "primitives", "PSNR, dB", "SSIM", "GPU"]
+    rows = [
+        [
+            *(line["scene"], line["arm"], number(line["steps"], 0), number(line["train_s"], 0)),
+            number(1000 * line["train_s"] / line["steps"], 2),
+            number(line["primitives"], 0),
+            *(
+                number(line[name], digits) if line[name] is not None else "-"
+                for name, digits in (("psnr", 2), ("ssim", 4))
+            ),
+            gpu(line["gpu"]),
+        ]
+        for line in lines_of("training_time.jsonl")
+    ]
+    return table(heads, first_of_each(rows))
+
+
 def packing() -> list[str]:
     """Packed runs: bytes, and PSNR before and after."""
     heads = ["run", "options", "fine-tuning", "primitives", "MB", "PSNR of the run", "packed", "head off, packed"]
@@ -194,6 +213,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "headline": headline,
     "quality": quality,
     "speed": speed,
+    "training-time": training_time,
     "packing": packing,
     "multi-gpu": multi_gpu,
     "rules": rules,
