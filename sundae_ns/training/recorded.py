@@ -31,6 +31,10 @@ from sundae_ns.training.losses import StepLosses
 MAX_RECORDINGS = 8
 """Recordings kept at a time: one for each image size and SH degree in use."""
 
+UNUSED = 1000
+"""Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by kernel,
+because recording takes longer than a step."""
+
 SPARE_PAIRS = 2.0
 """Capacity for tile/primitive pairs, as a multiple of the most that a view has needed."""
 
@@ -69,7 +73,7 @@ class _Recording:
     inputs: StepInputs
     """The graph reads them here."""
     rates: Tensor
-    """Learning rates of all groups, in the order of :func:`_groups`."""
+    """Learning rates in the order of :attr:`_Held.groups`."""
     result: StepResult
     pairs: int
     """Tile/primitive pairs that fit."""
@@ -81,6 +85,8 @@ class _Held:
 
     trained: tuple[str, ...]
     """Names of the parameters of the field that are trained."""
+    growing: bool
+    """Whether the buffers have spare rows."""
     groups: list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]
     """Groups of parameters that a step trains: name of the optimizer, optimizer, group."""
     parameters: list[tuple[str, Tensor]]
@@ -91,7 +97,7 @@ class _Held:
     """What a recording reads beside the buffers: the head's weights, and the counts of steps."""
 
     @classmethod
-    def of(cls, state: FieldState, trained: tuple[str, ...], head: CompensationHead | None) -> _Held:
+    def of(cls, state: FieldState, trained: tuple[str, ...], head: CompensationHead | None, *, growing: bool) -> _Held:
         names = trained if head is None else (*trained, HEAD)
         groups = [
             (name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups
@@ -101,6 +107,7 @@ class _Held:
         addresses = tuple(own[name].data_ptr() for _, _, own in states for name in (*MOMENTS, "step"))
         return cls(
             trained,
+            growing,
             groups,
             [(name, state.field[name]) for name in trained],
             [(name, value) for name, value in state.densification.items() if isinstance(value, Tensor)],
@@ -113,11 +120,12 @@ class _Held:
         """Learning rates of the groups."""
         return [float(group["lr"]) for _, _, group in self.groups]
 
-    def unchanged(self, state: FieldState, settings: RenderSettings) -> bool:
+    def unchanged(self, state: FieldState, settings: RenderSettings, *, growing: bool) -> bool:
         """Whether the state still consists of these tensors; surgery and restored snapshots put new ones in their place."""
         with_head = self.groups[-1][0] == HEAD
         return (
-            with_head == (settings.head is not None)
+            growing == self.growing
+            and with_head == (settings.head is not None)
             and all(state.field[name] is value for name, value in self.parameters)
             and all(state.densification.get(name) is value for name, value in self.statistics)
             and all(states.get(value) is own for states, value, own in self.states)
@@ -142,7 +150,11 @@ class RecordedStep:
         self._buffers = Buffers()
         self._held: _Held | None = None
         self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
+        self._used: dict[Hashable, int] = {}
+        """Step at which a recording was last replayed."""
+        self._steps = 0
         self._warm: set[Hashable] = set()
+        """Kinds of steps that have run kernel by kernel."""
         self._most: Tensor | None = None
         """Most pairs that a view has needed, on the device and, some steps later, on the host; int64 ``[]``."""
         self._most_on_host: Tensor | None = None
@@ -160,29 +172,37 @@ class RecordedStep:
             BackendError: the step cannot be recorded. Nothing has changed.
             torch.cuda.OutOfMemoryError: the same.
         """
+        # Regularisers are means over all rows, so they allow no spare ones.
+        growing = state.densifying and not self._losses.regularises(state)
         held = self._held
-        if held is None or not held.unchanged(state, settings):
-            held = self._held = self._hold(state, settings)
+        if held is None or not held.unchanged(state, settings, growing=growing):
+            held = self._held = self._hold(state, settings, growing=growing)
         kind = _kind(state, inputs, settings)
-        if not self._record or kind not in self._warm:
+        recording = self._recording(kind, state, held, inputs, settings) if kind in self._warm else None
+        if recording is None:
             result = self._run(state, held, inputs, settings)
             self._warm.add(kind)
         else:
-            result = self._replayed((kind, held.addresses), state, held, inputs, settings)
+            _copy(inputs, recording.inputs)
+            recording.rates.copy_(torch.tensor(held.rates))
+            recording.graph.replay()
+            result = recording.result
+        self._steps += 1
         state.info = {COUNTED: True}
         return result
 
-    def _hold(self, state: FieldState, settings: RenderSettings) -> _Held:
+    def _hold(self, state: FieldState, settings: RenderSettings, *, growing: bool) -> _Held:
         """Let the field be rows of the buffers, with all states that its optimizers need."""
         trained = trained_parameters(state)
         start_moments(state, trained if settings.head is None else (*trained, HEAD))
         if state.densifying:
             start_counting(state.densification, state.field["means"])
-        # Regularisers are means over all rows.
-        growing = state.densifying and not self._losses.regularises(state)
         if self._buffers.hold(state, trained, growing=growing):
             self._recordings.clear()
-        return _Held.of(state, trained, settings.head)
+            self._used.clear()
+            if not growing:  # a pruned field needs far fewer pairs: measure them again
+                self._warm.clear()
+        return _Held.of(state, trained, settings.head, growing=growing)
 
     # ------------------------------------------------------------------------------------------------------ running
 
@@ -197,31 +217,35 @@ class RecordedStep:
             result = self._step(
                 state, held, inputs, replace(settings, backend=RecordableGsplat(capacity)), rates, capacity
             )
-        if self._most_on_host is None:
+        needed = max(int(number) for number in capacity.needed)
+        if self._most is None or self._most_on_host is None:
             self._most = torch.zeros((), dtype=torch.int64, device=device)
             self._most_on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
-        assert self._most is not None
-        most = max(*(int(number) for number in capacity.needed), int(self._most))
+        most = max(needed, int(self._most)) if self._warm else needed
         self._most.fill_(most)
         self._most_on_host.fill_(most)
         return result
 
-    def _replayed(
-        self, key: Hashable, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings
-    ) -> StepResult:
+    def _recording(
+        self, kind: Hashable, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings
+    ) -> _Recording | None:
+        """The recording of a kind of steps; None if it has to run kernel by kernel."""
+        if not self._record:
+            return None
         assert self._most_on_host is not None
-        recording, most = self._recordings.get(key), int(self._most_on_host)
+        key, most = (kind, held.addresses), int(self._most_on_host)
+        recording = self._recordings.get(key)
+        if recording is None and len(self._recordings) >= MAX_RECORDINGS:
+            oldest = next(iter(self._recordings))
+            if self._steps - self._used[oldest] < UNUSED:
+                return None
+            del self._recordings[oldest], self._used[oldest]
         if recording is None or most > recording.pairs:
-            if recording is None and len(self._recordings) >= MAX_RECORDINGS:
-                self._recordings.popitem(last=False)
-            recording = self._recordings[key] = self._recorded(
-                state, held, inputs, settings, int(SPARE_PAIRS * most) + 1
-            )
+            recording = self._recorded(state, held, inputs, settings, int(SPARE_PAIRS * most) + 1)
+            self._recordings[key] = recording
         self._recordings.move_to_end(key)
-        _copy(inputs, recording.inputs)
-        recording.rates.copy_(torch.tensor(held.rates))
-        recording.graph.replay()
-        return recording.result
+        self._used[key] = self._steps
+        return recording
 
     def _recorded(
         self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings, pairs: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -145,6 +146,34 @@ def test_a_step_without_room_for_its_pairs_changes_nothing(
     recorded.step(3)
     torch.cuda.synchronize()
     assert not torch.equal(recorded.model.gauss_params["means"], before["means"])
+
+
+def test_more_image_sizes_than_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last sizes run kernel by kernel until a recording has not been used for long; recording would take longer."""
+    step, made = RecordedStep(None), []  # type: ignore[arg-type]
+
+    def recorded(*arguments: Any) -> SimpleNamespace:
+        made.append(arguments[-1])
+        return SimpleNamespace(pairs=arguments[-1])
+
+    monkeypatch.setattr(step, "_recorded", recorded)
+    step._most_on_host = torch.tensor(5)
+    held = SimpleNamespace(addresses=())
+
+    def ask(kind: int) -> Any:
+        step._steps += 1
+        return step._recording(kind, None, held, None, None)  # type: ignore[arg-type]
+
+    sizes = recorded_module.MAX_RECORDINGS
+    for _ in range(3):
+        assert all(ask(kind) is not None for kind in range(sizes))
+        assert ask(sizes) is None
+    assert made == [11] * sizes
+    step._most_on_host.fill_(12)  # a view needed more pairs than fit
+    assert ask(0).pairs == 25
+    step._steps += recorded_module.UNUSED
+    assert ask(sizes) is not None
+    assert len(step._recordings) == sizes
 
 
 def test_the_field_lies_in_the_buffers_and_unseen_rows_stay_as_they_are(
