@@ -2,19 +2,22 @@
 
     python benchmarks/bench_pack.py                              # 1,000,000 random primitives
     python benchmarks/bench_pack.py --run RUN --views 6          # a finished run, at its training resolution
-    python benchmarks/bench_pack.py --run RUN --set harmonics_step=0.04 feature_bits=5
+    python benchmarks/bench_pack.py --run RUN --set harmonics_step=0.04 feature_step=0.3
     python benchmarks/bench_pack.py --run RUN --views 99 --finetune 1000                # as sundae pack --finetune 1000
 
 Random primitives have no structure for an entropy coder; they measure time. A run is rendered before and after packing:
-``psnr`` and ``psnr_packed`` are against the test images, with the head and without (``_base``); ``psnr_between``
-compares the two renderings. With ``--finetune`` the packed model trains with rounding in the loop, from the coarser
-options of ``FINETUNED``, which ``--set`` changes. Lines belong in results/packs.jsonl.
+``psnr``, ``ssim`` and ``psnr_packed``, ``ssim_packed`` are against the test images, with the head and without
+(``_base``); ``psnr_between`` compares the two renderings. With ``--finetune`` the packed model trains with rounding and
+the rate in the loop, from the coarser options of ``FINETUNED``, which ``--set`` changes. ``--keep`` keeps the packed
+file. Lines belong in results/pack.jsonl.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable
@@ -28,8 +31,8 @@ from rich.progress import Progress, track
 from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.evaluation import psnr
-from sundae_ns.scenes.finetune import finetune
+from sundae_ns.evaluation import psnr, ssim
+from sundae_ns.scenes.finetune import RATE, finetune
 from sundae_ns.scenes.opening import load_run, open_scene
 from sundae_ns.scenes.packed import scene_of_run
 from sundae_ns.storage.packing import (
@@ -42,6 +45,7 @@ from sundae_ns.storage.packing import (
     read_scene,
     write_fitted,
 )
+from sundae_ns.storage.runs.config_file import load_config
 
 
 def random_scene(n: int) -> Scene:
@@ -69,7 +73,9 @@ def config_of(settings: list[str], finetuned: bool) -> PackConfig:
     return PackConfig(**values)
 
 
-def prepared(run: Path | None, scene: Scene, config: PackConfig, steps: int) -> tuple[Scene, Codecs, list[float]]:
+def prepared(
+    run: Path | None, scene: Scene, config: PackConfig, steps: int, rate: float
+) -> tuple[Scene, Codecs, list[float]]:
     """The scene to write, fine-tuned for ``steps``, its codecs, and the loss of each step."""
     losses: list[float] = []
     if run is None or steps == 0:
@@ -81,7 +87,7 @@ def prepared(run: Path | None, scene: Scene, config: PackConfig, steps: int) -> 
             losses.append(loss)
             progress.advance(task)
 
-        return *finetune(run, scene, config, steps, progress=note), losses
+        return *finetune(run, scene, config, steps, rate=rate, progress=note), losses
 
 
 def seconds(action: Callable[[], Any]) -> tuple[float, float]:
@@ -107,7 +113,7 @@ def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
     before = load_run(run / "config.yml")
     after = open_scene(file, data=before.capture).model
     chosen = torch.linspace(0, len(before.cameras) - 1, min(views, len(before.cameras))).round().long().tolist()
-    names = ("psnr", "psnr_packed", "psnr_between")
+    names = ("psnr", "psnr_packed", "psnr_between", "ssim", "ssim_packed")
     sums = {name + suffix: 0.0 for name in names for suffix in ("", "_base")}
     for i in track(chosen, description="Rendering", transient=True):
         camera, truth = before.cameras[i], before.truths[i]
@@ -115,8 +121,9 @@ def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
         for suffix, output in (("", "rgb"), ("_base", "base_rgb")):
             old, new = (image[output].clamp(0, 1) for image in images)
             # Errors of all views together: PSNR is their logarithm.
-            for name, (a, b) in zip(names, ((old, truth), (new, truth), (new, old)), strict=True):
-                value = float(psnr(a, b))
+            pairs = (old, truth), (new, truth), (new, old), (old, truth), (new, truth)
+            for name, (a, b) in zip(names, pairs, strict=True):
+                value = float((ssim if name.startswith("ssim") else psnr)(a, b))
                 sums[name + suffix] += (10 ** (-value / 10) if name == "psnr_between" else value) / len(chosen)
     for name in ("psnr_between", "psnr_between_base"):
         sums[name] = -10 * torch.tensor(sums[name]).log10().item()
@@ -126,8 +133,21 @@ def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
         "width": int(camera.width),
         "height": int(camera.height),
         "rasterizer": before.model.backend.name,
-        **{name: round(value, 3) for name, value in sums.items()},
+        **{name: round(value, 4) for name, value in sums.items()},
     }
+
+
+def scene_name(run: Path) -> str:
+    """The capture's name, from the folder that the run's configuration names."""
+    opened = load_config(run / "config.yml")
+    return Path(opened.pipeline.datamanager.data or opened.data).name
+
+
+def commit() -> str | None:
+    """The checked-out commit; None outside of a repository."""
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    return found.stdout.strip() or None
 
 
 def main() -> None:
@@ -139,6 +159,8 @@ def main() -> None:
     parser.add_argument(
         "--finetune", type=int, default=0, metavar="STEPS", help="train with rounding in the loop first"
     )
+    parser.add_argument("--rate", type=float, default=RATE, help="loss for each bit per stored number in the fine-tune")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="keep the packed scene here")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
@@ -150,15 +172,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         file = Path(name) / "scene.sundae"
         start = time.perf_counter()
-        scene, codecs, losses = prepared(options.run, scene, config, steps)
+        scene, codecs, losses = prepared(options.run, scene, config, steps, options.rate)
         tuning = time.perf_counter() - start
         report = write_fitted(file, scene, codecs)
         packing = time.perf_counter() - start - (tuning if steps else 0)
         times = [seconds(lambda: read_scene(file)) for _ in range(options.repeats)]
         result = {
-            "run": None if options.run is None else options.run.resolve().parents[1].name,
+            "run": None if options.run is None else scene_name(options.run),
             "set": options.set,
             "finetune_steps": steps,
+            "rate": options.rate if steps else 0.0,
             "threads": options.threads,
             **sizes(report),
             "s_pack": round(packing, 2),
@@ -173,6 +196,9 @@ def main() -> None:
             result["loss_first_last_tenth"] = [round(mean(part), 5) for part in (losses[:tenth], losses[-tenth:])]
         if options.run is not None:
             result |= quality(options.run, file, options.views)
+        if options.keep is not None:
+            shutil.copy(file, options.keep)
+        result["commit"] = commit()
     print(json.dumps(result))
 
 

@@ -133,17 +133,19 @@ def training_time() -> list[str]:
 
 
 def packing() -> list[str]:
-    """Packed runs: bytes, and PSNR before and after."""
-    heads = ["run", "options", "fine-tuning", "primitives", "MB", "PSNR of the run", "packed", "head off, packed"]
+    """Packed runs: bytes, and PSNR and SSIM before and after."""
+    heads = ["run", "fine-tuning", "primitives", "MB", "bits", "PSNR of the run", "packed", "SSIM of the run", "packed"]
     rows = []
-    for line in lines_of("packs.jsonl"):
+    for line in lines_of("pack.jsonl"):
         if line["run"] is not None:
-            steps = line.get("finetune_steps", 0)
+            steps = line["finetune_steps"]
+            bits = 8 * line["bytes"] / line["primitives"]
             rows.append(
                 [
-                    *(line["run"], " ".join(line["set"]) or "default", f"{steps:,} steps" if steps else ""),
-                    *(number(line["primitives"], 0), number(line["bytes"] / MB, 2)),
-                    *(number(line[name], 2) for name in ("psnr", "psnr_packed", "psnr_packed_base")),
+                    *(line["run"], f"{steps:,} steps" if steps else "", number(line["primitives"], 0)),
+                    *(number(line["bytes"] / MB, 2), number(bits, 0)),
+                    *(number(line[name], 2) for name in ("psnr", "psnr_packed")),
+                    *(number(line[name], 4) for name in ("ssim", "ssim_packed")),
                 ]
             )
     return table(heads, first_of_each(rows))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import sys
 from contextlib import redirect_stdout
 from io import StringIO
+from json import dumps
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
@@ -19,17 +20,18 @@ def pack(
     max_cameras: int = 100,
     finetune: int = 0,
     data: Path | None = None,
-    position_bits: int = 16,
+    target_bytes: int | None = None,
+    target_drop: float | None = None,
+    position_bits: int | None = None,
     block: int = 1024,
-    scale_bits: int = 8,
-    rotation_bits: int = 8,
-    color_bits: int = 8,
-    opacity_bits: int = 8,
+    scale_step: float | None = None,
+    rotation_step: float | None = None,
+    color_step: float | None = None,
+    opacity_step: float | None = None,
     harmonics_step: float | None = None,
-    feature_bits: int | None = None,
-    head: Literal["int8", "fp16"] = "int8",
-    head_bits: int | None = None,
-    level: int = 19,
+    feature_step: float | None = None,
+    head_step: float | None = None,
+    json: bool = False,
     overwrite: Overwrite = False,
 ) -> int:
     """Pack a finished run into one file that can be rendered, and print the size of each part.
@@ -41,17 +43,18 @@ def pack(
         finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
             The defaults then quantise more coarsely, for a smaller file.
         data: folder of the capture, if it moved.
-        position_bits: bits per coordinate within a block, 4 to 21.
+        target_bytes: find the finest steps whose file has at most this many bytes.
+        target_drop: find the coarsest steps that lose at most this PSNR on some test views, dB.
+        position_bits: bits per coordinate within a block, 4 to 16; by default 13, 12 with a fine-tune.
         block: number of primitives per block of positions; smaller blocks are more exact and larger on disk.
-        scale_bits: bits per log-scale, 4 to 16.
-        rotation_bits: bits per stored component of a rotation (three components), 4 to 16.
-        color_bits: bits per channel of the view-independent colour, 4 to 16.
-        opacity_bits: bits per opacity logit, 4 to 16.
-        harmonics_step: rounding step of the transformed view-dependent colour; by default 0.02, 0.03 with a fine-tune.
-        feature_bits: bits per feature, 4 to 16; by default 7, 6 with a fine-tune.
-        head: number format of the head's weights.
-        head_bits: bits per weight of an int8 head, 3 to 8; by default 7, 6 with a fine-tune.
-        level: effort of the entropy coder, 1 to 22; it does not change the time to unpack.
+        scale_step: rounding step of log-scales; by default 0.05, 0.1 with a fine-tune.
+        rotation_step: rounding step of x, y and z of unit quaternions; by default 0.008, 0.018 with a fine-tune.
+        color_step: rounding step of the view-independent colour; by default 0.03, 0.07 with a fine-tune.
+        opacity_step: rounding step of the opacity's logit; by default 0.2, 0.4 with a fine-tune.
+        harmonics_step: rounding step of the view-dependent colour; by default 0.02, 0.06 with a fine-tune.
+        feature_step: rounding step of features; by default 0.09, 0.2 with a fine-tune.
+        head_step: rounding step of weights, as a share of their channel's largest; by default 0.02, 0.14 with a fine-tune.
+        json: print one JSON object in place of the table.
         overwrite: replace an existing file, once the new one is complete.
     """
     from rich.console import Console
@@ -63,24 +66,29 @@ def pack(
 
     if finetune < 0:
         raise ConfigError(f"finetune is {finetune}; give the number of steps, or 0 for none")
+    if target_bytes is not None and target_drop is not None:
+        raise ConfigError("--target-bytes and --target-drop exclude each other; give one")
+    if target_bytes is not None and target_bytes < 1:
+        raise ConfigError(f"target-bytes is {target_bytes}; give 1 or more")
+    if target_drop is not None and not 0 < target_drop < 100:
+        raise ConfigError(f"target-drop is {target_drop}; give a positive number of dB")
     # A fine-tune changes the defaults of these options.
-    given = {"harmonics_step": harmonics_step, "feature_bits": feature_bits, "head_bits": head_bits}
-    fixed = {
+    given = {
         "position_bits": position_bits,
-        "block": block,
-        "scale_bits": scale_bits,
-        "rotation_bits": rotation_bits,
-        "color_bits": color_bits,
-        "opacity_bits": opacity_bits,
-        "head": head,
-        "level": level,
+        "scale_step": scale_step,
+        "rotation_step": rotation_step,
+        "color_step": color_step,
+        "opacity_step": opacity_step,
+        "harmonics_step": harmonics_step,
+        "feature_step": feature_step,
+        "head_step": head_step,
     }
     chosen = {name: value for name, value in given.items() if value is not None}
-    config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, **fixed})  # type: ignore[arg-type]
+    config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, "block": block})  # type: ignore[arg-type]
     config.validate()
     check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
     # The bar writes to the real stdout while nerfstudio's messages are suppressed.
-    with Progress(console=Console(file=sys.stdout), transient=True) as progress:
+    with Progress(console=Console(file=sys.stdout), transient=True, disable=json) as progress:
         task = progress.add_task("Reading the run", total=2 + finetune)
         with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
             from sundae_ns.scenes.packed import scene_of_run  # takes seconds
@@ -95,8 +103,17 @@ def pack(
                 )
             else:
                 scene, codecs = fit_scene(scene, config)
-        progress.update(task, description="Packing")
+            progress.update(task, description="Packing")
+            if target_bytes is not None or target_drop is not None:
+                from sundae_ns.scenes.targets import Search
+
+                search = Search(run, scene, config, data=data)
+                found = search.smaller_than(target_bytes) if target_bytes else search.better_than(target_drop or 0.0)
+                scene, codecs = found.scene, found.codecs
         report = write_fitted(out, scene, codecs)
+    if json:
+        print(dumps({"file": str(out), **report.summary()}))
+        return 0
     print(f"{out}: {report.primitives:,} primitives in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
     print(f"{'':14}{'bytes':>12}{'bits per primitive':>20}")
     for name, bits in report.bits.items():

@@ -72,7 +72,7 @@ def start_counting(state: MutableMapping[str, Any], means: Tensor) -> None:
     """
     for name in ("grad2d", "count", "radii"):
         if name in state and state[name] is None:
-            state[name] = means.new_zeros(len(means))
+            state[name] = torch.zeros(len(means), device=means.device)
 
 
 @torch.no_grad()

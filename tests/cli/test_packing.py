@@ -32,18 +32,29 @@ def test_options_are_those_of_the_configuration() -> None:
         if field.name in FINETUNED:
             (line,) = re.findall(rf"^ +{field.name}: (.*)$", pack.__doc__ or "", re.MULTILINE)
             assert line.endswith(f"; by default {field.default}, {FINETUNED[field.name]} with a fine-tune.")
-    assert set(options) == {"run", "out", "max_cameras", "finetune", "data", "overwrite"} | {
-        field.name for field in fields(PackConfig)
-    }
+    assert set(options) == {
+        "run",
+        "out",
+        "max_cameras",
+        "finetune",
+        "data",
+        "target_bytes",
+        "target_drop",
+        "json",
+        "overwrite",
+    } | {field.name for field in fields(PackConfig)}
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["pack", "nothing", "-o", "a.sundae"], "nothing cannot be read"),
-        (["pack", "nothing", "-o", "a.sundae", "--scale-bits", "2"], "scale-bits is 2; give 4 to 16"),
+        (["pack", "nothing", "-o", "a.sundae", "--scale-step", "2"], "scale-step is 2.0; give 0.0001 to 1"),
         (["pack", "nothing", "-o", "no/a.sundae"], "no is no folder"),
         (["pack", "nothing", "-o", "a.sundae", "--finetune", "-1"], "finetune is -1"),
+        (["pack", "nothing", "-o", "a.sundae", "--target-bytes", "0"], "target-bytes is 0"),
+        (["pack", "nothing", "-o", "a.sundae", "--target-drop", "nan"], "target-drop is nan"),
+        (["pack", "nothing", "-o", "a.sundae", "--target-drop", "1", "--target-bytes", "9"], "exclude each other"),
         (["unpack", "nothing"], "nothing cannot be read"),
         (["unpack", "cut.sundae"], "not a whole packed scene"),
         (["unpack", "harmed.sundae"], "the checksum of"),

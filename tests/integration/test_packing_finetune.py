@@ -27,14 +27,14 @@ from sundae_ns.storage.packing import FINETUNED, PackConfig, Scene, fit_scene, r
 from sundae_ns.storage.runs import checkpoint
 
 COARSE = PackConfig(
-    position_bits=8,
-    scale_bits=4,
-    rotation_bits=4,
-    color_bits=4,
-    opacity_bits=4,
-    harmonics_step=0.2,
-    feature_bits=4,
-    head_bits=3,
+    position_bits=12,
+    scale_step=0.2,
+    rotation_step=0.04,
+    color_step=0.6,
+    opacity_step=0.5,
+    harmonics_step=1.0,
+    feature_step=0.3,
+    head_step=0.1,
 )
 
 
@@ -96,7 +96,7 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
     assert all(torch.equal(found.field[name], shown[name]) for name in codecs.field)
     write_fitted(tmp_path / "b.sundae", *fit_scene(scene, COARSE))
     plain = quality(tiny, read_scene(tmp_path / "b.sundae"), tmp_path / "plain")
-    # As many steps without rounding in the loop; on so small a scene the rounding of the positions costs most.
+    # As many steps without coarse rounding in the loop.
     blind, _ = finetune(tiny.folder, scene, PackConfig(), 60)
     write_fitted(tmp_path / "c.sundae", *fit_scene(blind, COARSE))
     surprised = quality(tiny, read_scene(tmp_path / "c.sundae"), tmp_path / "blind")
@@ -112,7 +112,7 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     shutil.copytree(tiny.folder, run)
     text = (run / "config.yml").read_text()
     (run / "config.yml").write_text(text.replace(f"- {tiny.scene.name}\n", "- elsewhere\n"))
-    words = ["pack", str(run), "-o", str(file), "--finetune", "3", "--feature-bits", "9"]
+    words = ["pack", str(run), "-o", str(file), "--finetune", "3", "--feature-step", "0.01"]
     with pytest.raises(SystemExit, match="2"):
         main(words)
     assert "elsewhere does not exist" in capsys.readouterr().err
@@ -122,7 +122,7 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     meta = read_header(file).meta
     assert meta["source"]["finetuned"] == 3
     stored = meta["attributes"]
-    assert (stored["features"]["bits"], stored["features_rest"]["step"]) == (9, FINETUNED["harmonics_step"])
+    assert (stored["features"]["step"], stored["features_rest"]["step"]) == (0.01, FINETUNED["harmonics_step"])
 
 
 def test_an_interrupt_leaves_nothing(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

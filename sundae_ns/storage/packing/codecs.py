@@ -14,75 +14,69 @@ from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES
 from sundae_ns.storage.packing import quantize, transform
 from sundae_ns.storage.packing.config import PackConfig
-from sundae_ns.storage.packing.container import Array, Encoded, Floats
+from sundae_ns.storage.packing.container import Array, Coded, Floats
 from sundae_ns.storage.packing.morton import scene_order
-from sundae_ns.storage.packing.quantize import Blocks, Rotations, fit_uniform
+from sundae_ns.storage.packing.quantize import Blocks, Rotations
+
+LOGITS = (-6.0, 8.0)
+"""Opacities outside of these logits look the same as at them: below 1/255 nothing is drawn."""
+_NONE = np.zeros((0, 0), np.float32)
 
 
 class Codec(Protocol):
     """Codec of one attribute ``[N, C]``."""
 
-    def encode(self, values: Floats) -> Encoded:
+    def encode(self, values: Floats) -> Coded:
         """Return the stored form."""
 
     def rounded(self, values: Tensor) -> Tensor:
         """Return the values that a reader decodes, on the device of ``values``; on a CPU bit for bit."""
 
+    def coefficients(self, values: Tensor) -> Tensor:
+        """Return what is rounded to levels, float64 ``[N, C]``; gradients flow through it."""
+
 
 @dataclass(frozen=True, eq=False)
 class HeadCodec:
-    """Weights of the head: int8 with one step per output channel, or fp16. One-dimensional tensors stay float32."""
+    """Weights of the head in steps of their output channel. One-dimensional tensors stay float32."""
 
-    bits: int
-    """Bits of each weight, at most 8; 16 means fp16."""
     steps: dict[str, Tensor]
-    """Steps ``[O]`` of each tensor with more than one dimension; empty for fp16."""
+    """Steps ``[O]`` of each tensor with more than one dimension."""
 
-    def encode(self, head: Mapping[str, Tensor]) -> Encoded:
-        """Return the stored form.
+    def encode(self, head: Mapping[str, Tensor]) -> Coded:
+        """Return the stored form, with the levels of all weights in one column.
 
         Raises:
-            PackError: weights are not finite, or too large for fp16.
+            PackError: weights are not finite.
         """
         names = sorted(head)
-        values = {name: as_array(head[name]) for name in names}
-        if not all(np.isfinite(value).all() for value in values.values()):
+        values = {name: torch.from_numpy(as_array(head[name])) for name in names}
+        if not all(torch.isfinite(value).all() for value in values.values()):
             raise PackError("the head has weights that are not finite; go back to an earlier checkpoint")
         weights = [name for name in names if values[name].ndim > 1]
         none = np.zeros(0, np.float32)
-        plain = [values[name].reshape(-1) for name in names if values[name].ndim <= 1]
-        arrays: dict[str, Array] = {"plain": np.concatenate([*plain, none])}
-        if self.bits <= 8:
-            tensors = [(torch.from_numpy(values[name]), self.steps[name]) for name in weights]
-            levels = [quantize.weight_levels(value, step, self.bits) for value, step in tensors]
-            codes = [level.flatten().to(torch.int8).numpy() for level in levels]
-            arrays["weights"] = np.concatenate([*codes, np.zeros(0, np.int8)])
-            arrays["steps"] = np.concatenate([*(self.steps[name].numpy() for name in weights), none])
-        else:
-            largest = max((float(np.abs(values[name]).max(initial=0.0)) for name in weights), default=0.0)
-            if largest > np.finfo(np.float16).max:
-                raise PackError(f"the head has a weight of {largest:.3g}, too large for fp16; pack it with int8")
-            flat = np.concatenate([*(values[name].reshape(-1) for name in weights), none])
-            arrays["weights"] = flat.astype(np.float16)
+        levels = [quantize.weight_levels(values[name], self.steps[name]).flatten() for name in weights]
+        arrays: dict[str, Array] = {
+            "plain": np.concatenate(
+                [*(values[name].numpy().reshape(-1) for name in names if name not in weights), none]
+            ),
+            "steps": np.concatenate([*(self.steps[name].numpy() for name in weights), none]),
+        }
+        column = torch.cat([*levels, torch.zeros(0, dtype=torch.float64)])[:, None]
         shapes = [[name, list(values[name].shape)] for name in names]
-        return {"codec": "int8" if self.bits <= 8 else "fp16", "tensors": shapes}, arrays
+        about = {"codec": "steps", "weights": len(column), "tensors": shapes}
+        return about, column.numpy().astype(np.int32), arrays
 
     def rounded(self, name: str, values: Tensor) -> Tensor:
         """Return the values that a reader decodes for the tensor ``name``."""
         if values.ndim <= 1:
             return values
-        if self.bits > 8:
-            return values.half().float()
         step = self.steps[name]
-        return quantize.weights_at(quantize.weight_levels(values, step, self.bits), step)
+        return quantize.weights_at(quantize.weight_levels(values, step), step)
 
-    def within(self, name: str, values: Tensor) -> Tensor:
-        """Clamp weights to the range of the steps, which were fitted to earlier weights."""
-        if name not in self.steps:
-            return values
-        limit = self.steps[name] * (2 ** (self.bits - 1) - 1)
-        limit = limit.reshape(-1, *([1] * (values.ndim - 1)))
-        return values.clamp(-limit, limit)
+    def coefficients(self, name: str, values: Tensor) -> Tensor:
+        """Return the weights of a tensor in steps ``[O, ...]``, flattened to ``[O, I]``; gradients flow through them."""
+        return quantize.in_steps(values, self.steps[name]).flatten(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,31 +135,29 @@ def fit(
     blocks, within = quantize.quantize_positions(values["means"][order], config.position_bits, config.block)
     order = order[within]
     values = {name: value[order] for name, value in values.items()}
-    codecs: dict[str, Codec] = {
-        "quats": Rotations(config.rotation_bits),
-        "scales": fit_uniform(values["scales"], config.scale_bits),
-        "opacities": fit_uniform(values["opacities"], config.opacity_bits),
-        "features_dc": fit_uniform(values["features_dc"], config.color_bits, color=True),
+    values["means"] = quantize.dequantize_positions(blocks, config.position_bits, config.block)
+    values["quats"], values["scales"] = quantize.aligned(values["quats"], values["scales"])
+    values["opacities"] = values["opacities"].clip(*LOGITS)
+    steps = {
+        "scales": config.scale_step,
+        "opacities": config.opacity_step,
+        "features_dc": config.color_step,
+        "features_rest": config.harmonics_step,
+        FEATURES: config.feature_step,
     }
-    rest = values["features_rest"]
-    if rest.shape[1]:
-        codecs["features_rest"] = transform.fit(rest, config.harmonics_step)
-    if FEATURES in values:
-        codecs[FEATURES] = fit_uniform(values[FEATURES], config.feature_bits)
-    positions = quantize.dequantize_positions(blocks, config.position_bits, min(config.block, len(order)))
+    codecs: dict[str, Codec] = {"quats": Rotations(config.rotation_step)}
+    for name, step in steps.items():
+        if values.get(name, _NONE).size:
+            codecs[name] = transform.fit(values[name], step, centred=name != "features_rest")
     ordered = {name: torch.from_numpy(values[name]).reshape(field[name].shape) for name in names}
-    return {**ordered, "means": torch.from_numpy(positions)}, Codecs(config, blocks, codecs, _fit_head(head, config))
+    return ordered, Codecs(config, blocks, codecs, _fit_head(head, config))
 
 
 def _fit_head(head: Mapping[str, Tensor], config: PackConfig) -> HeadCodec | None:
     if not head:
         return None
-    if config.head == "fp16":
-        return HeadCodec(16, {})
     weights = {name: torch.from_numpy(as_array(value)) for name, value in head.items() if value.ndim > 1}
-    return HeadCodec(
-        config.head_bits, {name: quantize.weight_steps(value, config.head_bits) for name, value in weights.items()}
-    )
+    return HeadCodec({name: quantize.weight_steps(value, config.head_step) for name, value in weights.items()})
 
 
 def as_array(values: Tensor) -> Floats:

@@ -3,39 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 from sundae_ns.errors import ConfigError
-
-HeadFormat = Literal["int8", "fp16"]
 
 
 @dataclass
 class PackConfig:
     """Precision of each attribute."""
 
-    position_bits: int = 16
-    """Bits of each coordinate within a block, 4 to 21."""
+    position_bits: int = 13
+    """Bits of each coordinate within a block, 4 to 16."""
     block: int = 1024
     """Primitives per block of positions; smaller blocks are more exact and take more bytes."""
-    scale_bits: int = 8
-    """Bits of each log-scale, 4 to 16."""
-    rotation_bits: int = 8
-    """Bits of each of the three stored components of a rotation, 4 to 16."""
-    color_bits: int = 8
-    """Bits of each channel of the view-independent colour, 4 to 16."""
-    opacity_bits: int = 8
-    """Bits of the logit of the opacity, 4 to 16."""
+    scale_step: float = 0.05
+    """Step of log-scales."""
+    rotation_step: float = 0.008
+    """Step of the components x, y and z of unit quaternions."""
+    color_step: float = 0.03
+    """Step of the view-independent colour, in units of the SH coefficients."""
+    opacity_step: float = 0.2
+    """Step of the logit of the opacity."""
     harmonics_step: float = 0.02
-    """Step of the transformed view-dependent colour, in units of the SH coefficients, 0.0001 to 1."""
-    feature_bits: int = 7
-    """Bits of each feature, 4 to 16."""
-    head: HeadFormat = "int8"
-    """Weights of the head: int8 with one step per output channel, or fp16."""
-    head_bits: int = 7
-    """Bits of each weight of an int8 head, 3 to 8; fewer bits compress to fewer bytes."""
-    level: int = 19
-    """Compression level of zstandard, 1 to 22; the speed of unpacking does not depend on it."""
+    """Step of the view-dependent colour, in units of the SH coefficients."""
+    feature_step: float = 0.09
+    """Step of features."""
+    head_step: float = 0.02
+    """Step of the head's weights, in units of the largest weight of their output channel."""
 
     def validate(self) -> None:
         """Check every option.
@@ -43,22 +36,26 @@ class PackConfig:
         Raises:
             ConfigError: names the first invalid option and its valid values.
         """
-        bits = ("scale_bits", "rotation_bits", "color_bits", "opacity_bits", "feature_bits")
-        ranges = {name: (4, 16) for name in bits} | {
-            "position_bits": (4, 21),
-            "block": (16, 1 << 20),
-            "head_bits": (3, 8),
-            "level": (1, 22),
-        }
-        for name, (minimum, maximum) in ranges.items():
+        for name, (minimum, maximum) in {"position_bits": (4, 16), "block": (16, 1 << 20)}.items():
             value = getattr(self, name)
             if not minimum <= value <= maximum:
                 raise ConfigError(f"{name.replace('_', '-')} is {value}; give {minimum} to {maximum}")
-        if not 1e-4 <= self.harmonics_step <= 1:
-            raise ConfigError(f"harmonics-step is {self.harmonics_step}; give 0.0001 to 1")
-        if self.head not in get_args(HeadFormat):
-            raise ConfigError(f"head is {self.head!r}; give one of {', '.join(get_args(HeadFormat))}")
+        for name in STEPS:
+            value = getattr(self, name)
+            if not 1e-4 <= value <= 1:
+                raise ConfigError(f"{name.replace('_', '-')} is {value}; give 0.0001 to 1")
 
 
-FINETUNED: dict[str, int | float] = {"harmonics_step": 0.03, "feature_bits": 6, "head_bits": 6}
+STEPS = ("scale_step", "rotation_step", "color_step", "opacity_step", "harmonics_step", "feature_step", "head_step")
+
+FINETUNED: dict[str, int | float] = {
+    "position_bits": 12,
+    "scale_step": 0.1,
+    "rotation_step": 0.018,
+    "color_step": 0.07,
+    "opacity_step": 0.4,
+    "harmonics_step": 0.06,
+    "feature_step": 0.2,
+    "head_step": 0.14,
+}
 """Coarser options for scenes that were fine-tuned with them (``sundae_ns.scenes.finetune``)."""

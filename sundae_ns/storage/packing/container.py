@@ -24,18 +24,20 @@ from sundae_ns.errors import PackError, regular
 from sundae_ns.storage.atomic import replacing
 
 MAGIC = b"\x89SUNDAE\n"
-VERSION = 1
+VERSION = 2
 SPARE, MAX_RATIO = 8 << 20, 32
 MAX_HEADER = 4 << 20
 PADDING = "padding"
 _PREAMBLE = struct.Struct("<8sII32s")
 _DTYPES = ("|u1", "<u2", "<u4", "<u8", "|i1", "<i2", "<f2", "<f4", "<f8")
 _THREADS = 2
+_LEVEL = 19
 
 Array = NDArray[Any]
 Floats = NDArray[np.float32]
-Encoded = tuple[dict[str, Any], dict[str, Array]]
-"""The stored form of an attribute: its entry in the header, and its sections by name."""
+Levels = NDArray[np.int32]
+Coded = tuple[dict[str, Any], Levels, dict[str, Array]]
+"""The stored form of an attribute: its entry in the header, its levels ``[N, C]``, and its other sections by name."""
 
 
 class Section(NamedTuple):
@@ -100,8 +102,8 @@ def _join(planes: list[bytes], section: Section) -> Array:
     return table.reshape(-1).view(section.dtype).reshape(section.shape)
 
 
-def _compress(plane: bytes, level: int) -> bytes:
-    frame = zstandard.ZstdCompressor(level=level, write_checksum=False).compress(plane)
+def _compress(plane: bytes) -> bytes:
+    frame = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=False).compress(plane)
     return frame if len(frame) < len(plane) else plane
 
 
@@ -117,9 +119,7 @@ def _decompress(part: memoryview, size: int) -> bytes:
         raise PackError("a section cannot be decompressed") from error
 
 
-def write(
-    path: Path, meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0, level: int = 19
-) -> int:
+def write(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0) -> int:
     """Write a file, atomically.
 
     Args:
@@ -138,7 +138,7 @@ def write(
 
     def encode(array: Array) -> list[bytes]:
         little = array.astype(array.dtype.newbyteorder("<"), copy=False)
-        return [_compress(plane, level) for plane in _split(little)]
+        return [_compress(plane) for plane in _split(little)]
 
     with ThreadPoolExecutor(_THREADS) as pool:
         parts = dict(zip(named, pool.map(encode, named.values()), strict=True))

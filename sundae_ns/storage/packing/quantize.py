@@ -1,4 +1,4 @@
-"""Quantisation: ranges robust to outliers, positions in blocks, rotations by three components, weights of the head.
+"""Quantisation: positions in blocks, rotations near the identity, weights of the head.
 
 Error bounds do not count the rounding of the result to float32 (half a unit in the last place). Rounding is implemented
 once, in torch: files store levels, and training with rounding uses the values of the same levels.
@@ -6,117 +6,34 @@ once, in torch: files store levels, and training with rounding uses the values o
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.storage.packing.container import Array, Encoded, Floats
+from sundae_ns.storage.packing.container import Coded, Floats
+from sundae_ns.storage.packing.entropy import LARGEST
 from sundae_ns.storage.packing.morton import interleave, separate
-
-TAIL = 0.001
-"""Fraction of the values of a channel at either end that may lie outside of its range; they are stored exactly."""
-_ROOT_HALF = 0.5**0.5
-_FOUR_PAIRS = np.array([0, 2, 4, 6], np.uint8)
-
-
-def code_type(bits: int) -> type[np.unsignedinteger[Any]]:
-    """Smallest unsigned integer type with at least ``bits`` bits, at most 16."""
-    return np.uint8 if bits <= 8 else np.uint16
-
-
-@dataclass(frozen=True, eq=False)
-class Uniform:
-    """Codec of values ``[N, C]`` by even levels of each channel; see :func:`fit_uniform`."""
-
-    low: Tensor
-    """Value of code 0, float64 ``[C]``."""
-    high: Tensor
-    """Value of the last code, float64 ``[C]``; values outside of [low, high] are stored exactly."""
-    step: Tensor
-    """Distance between neighbouring levels, 0 for a constant channel, float64 ``[C]``."""
-    bits: int
-    differences: bool
-    """Store the codes of channels 0 and 2 as differences from those of channel 1."""
-
-    def encode(self, values: Floats) -> Encoded:
-        """Round finite values; ``places`` index the exceptions in the flattened ``[C, N]``."""
-        nearest, outside = self.levels(torch.from_numpy(values))
-        codes = nearest.T.numpy().astype(code_type(self.bits), order="C")
-        places = np.flatnonzero(outside.T.numpy()).astype(np.uint32)
-        low, step = self.low.tolist(), self.step.numpy()
-        about = {"codec": "uniform", "bits": self.bits, "low": low, "step": step.tolist(), "bound": (step / 2).tolist()}
-        if self.differences:
-            about["differences"] = True
-            codes = np.stack([codes[0] - codes[1], codes[1], codes[2] - codes[1]])
-        exceptions = np.ascontiguousarray(values.T).reshape(-1)[places]
-        return about, {"codes": codes, "places": places, "exceptions": exceptions}
-
-    def rounded(self, values: Tensor) -> Tensor:
-        """Return the values that a reader decodes, float32; bit for bit on a CPU."""
-        nearest, outside = self.levels(values)
-        return torch.where(outside, values, _at_levels(nearest, self.low, self.step))
-
-    def levels(self, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Nearest levels, float64 ``[N, C]``, and a mask ``[N, C]`` of values outside of the range."""
-        exact = values.double()
-        safe = torch.where(self.step > 0, self.step, 1.0)
-        outside = (exact < self.low) | (exact > self.high)
-        return ((exact - self.low) / safe).round().clamp(0, 2**self.bits - 1), outside
-
-
-def fit_uniform(values: Floats, bits: int, *, color: bool = False) -> Uniform:
-    """Fit levels to values; the outermost :data:`TAIL` at either end is excluded if it is far from the others.
-
-    Args:
-        values: ``[N, C]``, finite, N at least 1.
-        color: the values are colours ``[N, 3]``, which correlate: use one range for all channels, and store differences.
-    """
-    columns = values.T.astype(np.float64)
-    rows = columns.reshape(1, -1) if color else columns
-    smallest, largest = rows.min(axis=1), rows.max(axis=1)
-    low, high = np.quantile(rows, [TAIL, 1 - TAIL], axis=1, method="nearest")
-    # Exclude the tails only if that makes the step a quarter finer; else the exceptions cost more than they save.
-    excluded = 1.25 * (high - low) < largest - smallest
-    ends = (np.where(excluded, low, smallest), np.where(excluded, high, largest))
-    low, high = (torch.from_numpy(np.broadcast_to(end, len(columns)).copy()) for end in ends)
-    return Uniform(low, high, (high - low) / (2**bits - 1), bits, color)
-
-
-def dequantize(
-    codes: Array, low: NDArray[np.float64], step: NDArray[np.float64], places: NDArray[np.uint32], exceptions: Floats
-) -> Floats:
-    """Values ``[N, C]`` from the arrays of :meth:`Uniform.encode`, with codes that are not differences ``[C, N]``.
-
-    The error is at most half of the channel's step.
-    """
-    channels, n = codes.shape
-    every = torch.arange(int(np.iinfo(codes.dtype).max) + 1, dtype=torch.float64)
-    tables = _at_levels(every, *(torch.from_numpy(ends)[:, None] for ends in (low, step))).numpy()
-    out = np.empty((n, channels), np.float32)
-    for c in range(channels):
-        out[:, c] = tables[c][codes[c]]
-    column, row = np.divmod(places.astype(np.int64), max(n, 1))
-    out[row, column] = exceptions
-    return out
-
-
-def _at_levels(levels: Tensor, low: Tensor, step: Tensor) -> Tensor:
-    return (low + levels * step).float()
 
 
 class Blocks(NamedTuple):
     """Positions in blocks of neighbours; per block and axis, the error is at most (high - low) / (2^bits - 1) / 2."""
 
-    deltas: NDArray[np.uint64]
-    """Differences of consecutive Morton codes, which ascend in a block; each block starts with a whole code ``[N]``."""
+    codes: NDArray[np.uint64]
+    """Morton codes of the cells, ascending in each block ``[N]``."""
     low: Floats
     """Lower bounds of the blocks ``[B, 3]``."""
     high: Floats
     """Upper bounds of the blocks ``[B, 3]``."""
+
+    @property
+    def cells(self) -> NDArray[np.uint64]:
+        """Cells ``[N, 3]`` of the blocks' grids."""
+        return np.stack([separate(self.codes, axis) for axis in range(3)], axis=1)
 
 
 def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDArray[np.int64]]:
@@ -124,6 +41,7 @@ def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDA
 
     Args:
         means: ``[N, 3]``, finite, in the order of ``morton.scene_order``.
+        bits: bits of each coordinate of a cell.
         size: primitives per block.
 
     Returns:
@@ -138,133 +56,126 @@ def quantize_positions(means: Floats, bits: int, size: int) -> tuple[Blocks, NDA
     cells = np.rint((means.astype(np.float64) - low[block]) / extent[block] * (2**bits - 1)).astype(np.uint64)
     codes = interleave(cells)
     order = np.lexsort((codes, block))
-    codes = codes[order]
-    deltas = np.diff(codes, prepend=np.uint64(0))
-    deltas[starts] = codes[starts]
-    return Blocks(deltas, low, high), order
+    return Blocks(codes[order], low, high), order
 
 
 def dequantize_positions(packed: Blocks, bits: int, size: int) -> Floats:
     """Positions ``[N, 3]`` of the result of :func:`quantize_positions`, in the order of the blocks."""
-    n, count = len(packed.deltas), len(packed.low)
-    padded = np.zeros(count * size, np.uint64)
-    padded[:n] = packed.deltas
-    codes = np.cumsum(padded.reshape(count, size), axis=1, dtype=np.uint64).reshape(-1)[:n]
+    block = np.arange(len(packed.codes)) // size
     step = (packed.high.astype(np.float64) - packed.low) / (2**bits - 1)
-    out = np.empty((n, 3), np.float32)
-    for axis in range(3):
-        cells = np.zeros(count * size, np.float64)
-        cells[:n] = separate(codes, axis)
-        table = cells.reshape(count, size)
-        table *= step[:, axis, None]
-        table += packed.low[:, axis, None]
-        out[:, axis] = cells[:n]
-    return out
+    return (packed.cells * step[block] + packed.low[block]).astype(np.float32)
+
+
+def _turns() -> NDArray[np.float64]:
+    """The 24 rotations of a cube as unit quaternions wxyz ``[24, 4]``."""
+    found = [q for q in itertools.product((1, 0, -1), repeat=4) if np.count_nonzero(q) in (1, 2, 4)]
+    # Of a quaternion and its negative, keep the one whose first component that is not 0 is positive.
+    kept = np.array([q for q in found if q > (0, 0, 0, 0)], np.float64)
+    return kept / np.linalg.norm(kept, axis=1, keepdims=True)
+
+
+def aligned(quats: Floats, scales: Floats) -> tuple[Floats, Floats]:
+    """Turn the axes of ellipsoids so that their rotations are as small as possible; the ellipsoids are the same.
+
+    An ellipsoid has 24 descriptions: its axes in another order, or reversed. The one with the smallest rotation has
+    w of at least 0.85, so that three components tell the fourth, and takes 4.6 bits less.
+
+    Args:
+        quats: wxyz, finite, of any length ``[N, 4]``; zero ones are the identity, as in the rasterisers.
+        scales: one for each axis ``[N, 3]``.
+
+    Returns:
+        Unit quaternions ``[N, 4]`` with w positive, and the scales in their new order ``[N, 3]``.
+    """
+    turns = _turns()
+    w, x, y, z = torch.from_numpy(quats).double().T.numpy()
+    products = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    best = np.abs(np.einsum("cn,gc->gn", products[0], turns)).argmax(axis=0)
+    turned = np.einsum("rcn,nc->nr", products, turns[best])
+    turned = _normalized(torch.from_numpy(turned)).numpy()
+    # A turn puts the axis in which it has a column's 1 into that column's place.
+    places = np.abs(_matrices(turns)).argmax(axis=1)
+    return turned.astype(np.float32), np.take_along_axis(scales, places[best], axis=1)
+
+
+def _matrices(quats: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation matrices ``[N, 3, 3]`` of unit quaternions wxyz ``[N, 4]``."""
+    w, x, y, z = quats.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.array(rows).transpose(2, 0, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Rotations:
-    """Codec of quaternions ``[N, 4]`` wxyz by their three smallest components; see :func:`rotation_bound`."""
+    """Codec of quaternions ``[N, 4]`` wxyz by x, y and z; see :func:`rotation_bound`."""
 
-    bits: int
-    """Bits per component, 4 to 16."""
+    step: float
 
-    def encode(self, values: Floats) -> Encoded:
+    def encode(self, values: Floats) -> Coded:
         """Quantise finite quaternions of any length; zero ones are the identity, as in the rasterisers."""
-        nearest, largest = _rotation_levels(torch.from_numpy(values), self.bits)
-        codes = nearest.numpy().astype(code_type(self.bits))
-        about = {"codec": "smallest-three", "bits": self.bits, "bound": rotation_bound(self.bits)}
-        return about, {"codes": codes, "largest": _pack_pairs_of_bits(largest.numpy().astype(np.uint8))}
+        about = {"codec": "xyz", "width": 3, "step": self.step, "bound": rotation_bound(self.step)}
+        return about, self._levels(torch.from_numpy(values)).numpy().astype(np.int32), {}
 
     def rounded(self, values: Tensor) -> Tensor:
         """Return the unit quaternions that a reader decodes; bit for bit on a CPU."""
-        nearest, largest = _rotation_levels(values, self.bits)
-        return _unit(_component(nearest, self.bits), largest)
+        return rotations_at(self._levels(values), self.step)
+
+    def coefficients(self, values: Tensor) -> Tensor:
+        """Components x, y and z in steps, float64 ``[N, 3]``; gradients flow through them."""
+        return _normalized(values.double())[:, 1:] / self.step
+
+    def _levels(self, values: Tensor) -> Tensor:
+        return self.coefficients(values).round()
 
 
-def dequantize_rotations(codes: Array, largest: NDArray[np.uint8], bits: int) -> Floats:
-    """Unit quaternions wxyz ``[N, 4]`` from the arrays of :meth:`Rotations.encode`; the largest component is positive.
-
-    Args:
-        codes: levels of the three smallest components, in the order wxyz ``[3, N]``.
-        largest: index in wxyz of the component that is not stored, two bits each ``[ceil(N / 4)]``.
-        bits: bits per component.
-    """
-    every = torch.arange(int(np.iinfo(codes.dtype).max) + 1, dtype=torch.float64)
-    three = _component(every, bits).numpy()[codes]
-    pairs = (largest[:, None] >> _FOUR_PAIRS & np.uint8(3)).reshape(-1)[: codes.shape[1]]
-    out: Floats = _unit(torch.from_numpy(three), torch.from_numpy(pairs)).numpy()
-    return out
-
-
-def _pack_pairs_of_bits(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Pack two-bit numbers ``[N]`` four to a byte, the first in the lowest bits."""
-    four = np.pad(values, (0, -len(values) % 4)).reshape(-1, 4)
-    joined: NDArray[np.uint8] = np.bitwise_or.reduce(four << _FOUR_PAIRS, axis=1)
-    return joined
-
-
-def rotation_bound(bits: int) -> float:
-    """Maximum error of the angle of a rotation, radians.
-
-    Each of three components has an error of at most e = sqrt(1/2) / (2^bits - 1), and their vector v one of at most
-    sqrt(3) e. On the sphere of unit quaternions, where the fourth component is w = sqrt(1 - |v|^2), a step of v is
-    stretched by at most 1 / w. The largest of four components is at least 1/2, so |v| is at most sqrt(3)/2 before
-    rounding. The angle of a rotation is twice the angle on that sphere.
-    """
-    off = 3**0.5 * _ROOT_HALF / (2**bits - 1)
-    return 2 * off / (1 - (3**0.5 / 2 + off) ** 2) ** 0.5
-
-
-def _rotation_levels(quats: Tensor, bits: int) -> tuple[Tensor, Tensor]:
-    """Nearest levels of the three smallest components, float64 ``[3, N]``, and the index of the largest ``[N]``."""
-    q = quats.double()
-    scale = q.abs().amax(dim=1, keepdim=True)
-    q = torch.where(scale > 0, q / torch.where(scale > 0, scale, 1.0), q.new_tensor([1.0, 0.0, 0.0, 0.0]))
-    largest = q.abs().argmax(dim=1)
+def rotations_at(levels: Tensor, step: float) -> Tensor:
+    """Unit quaternions wxyz ``[N, 4]``, float32, of levels of x, y and z ``[N, 3]``; w is positive."""
+    x, y, z = (levels.double() * step).float().T
     # Written out: a reduction could round differently for another number of rows.
+    square = x * x + y * y + z * z
+    w = (1 - square).clamp_min(0).sqrt()
+    length = (w * w + square).sqrt()
+    return torch.stack([part / length for part in (w, x, y, z)], dim=1)
+
+
+def rotation_bound(step: float) -> float:
+    """Maximum error of the angle of an aligned rotation, radians.
+
+    The vector v of x, y and z has an error of at most sqrt(3) / 2 steps, and w is sqrt(1 - |v|^2). On the sphere of unit
+    quaternions, a step of v is stretched by at most 1 / w. Aligned rotations turn by at most 62.8 degrees, so |v| is at
+    most 0.522 before rounding. The angle of a rotation is twice the angle on that sphere.
+    """
+    off = 3**0.5 * step / 2
+    return 2 * off / (1 - min(0.522 + off, 0.999) ** 2) ** 0.5
+
+
+def _normalized(quats: Tensor) -> Tensor:
+    """Unit quaternions ``[N, 4]``, float64, with w at least 0; zero ones become the identity."""
+    scale = quats.abs().amax(dim=1, keepdim=True)
+    q = torch.where(scale > 0, quats / torch.where(scale > 0, scale, 1.0), quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
     w, x, y, z = q.T
-    length = (w * w + x * x + y * y + z * z).sqrt()
-    sign = torch.where(q.gather(1, largest[:, None])[:, 0] < 0, -1.0, 1.0)
-    w, x, y, z = (component / length * sign for component in (w, x, y, z))
-    three = torch.stack(
-        [torch.where(largest <= i, after, before) for i, (before, after) in enumerate(((w, x), (x, y), (y, z)))]
-    )
-    nearest = ((three / _ROOT_HALF + 1) / 2 * (2**bits - 1)).round()
-    return nearest.clamp(0, 2**bits - 1), largest
+    length = (w * w + x * x + y * y + z * z).sqrt() * torch.where(w < 0, -1.0, 1.0)
+    return torch.stack([part / length for part in (w, x, y, z)], dim=1)
 
 
-def _component(levels: Tensor, bits: int) -> Tensor:
-    """Components of unit quaternions, float32, of levels, float64."""
-    return ((levels * 2 / (2**bits - 1) - 1) * _ROOT_HALF).float()
+def weight_steps(weight: Tensor, share: float) -> Tensor:
+    """Step of each output channel, float32 ``[O]``: a share of the largest weight of ``[O, ...]``."""
+    return (weight.reshape(len(weight), -1).double().abs().amax(dim=1) * share).float()
 
 
-def _unit(three: Tensor, largest: Tensor) -> Tensor:
-    """Unit quaternions wxyz ``[N, 4]`` from their three smallest components ``[3, N]``; the largest one is positive."""
-    a, b, c = three
-    fourth = (1 - (a * a + b * b + c * c)).clamp_min(0).sqrt()
-    places = []
-    for i in range(4):
-        other = torch.where(largest < i, three[max(i - 1, 0)], three[min(i, 2)])
-        places.append(torch.where(largest == i, fourth, other))
-    w, x, y, z = places
-    length = (w * w + x * x + y * y + z * z).sqrt().clamp_min(torch.finfo(torch.float32).tiny)
-    return torch.stack([place / length for place in places], dim=1)
-
-
-def weight_steps(weight: Tensor, bits: int) -> Tensor:
-    """Step of each output channel, float32 ``[O]``: the largest weight of ``[O, ...]`` is at level 2^(bits - 1) - 1."""
-    step = weight.reshape(len(weight), -1).double().abs().amax(dim=1) / (2 ** (bits - 1) - 1)
-    stored = step.float()
-    # Round up, so that the largest weight does not exceed the last level.
-    return torch.where(step > 0, torch.nextafter(stored, torch.full_like(stored, torch.inf)), 0.0)
-
-
-def weight_levels(weight: Tensor, step: Tensor, bits: int) -> Tensor:
+def weight_levels(weight: Tensor, step: Tensor) -> Tensor:
     """Nearest levels of weights ``[O, ...]``, float64; the error is at most half of the channel's step."""
+    return in_steps(weight, step).round().clamp(-LARGEST, LARGEST)
+
+
+def in_steps(weight: Tensor, step: Tensor) -> Tensor:
+    """Weights ``[O, ...]`` in steps of their channel ``[O]``, float64; gradients flow through them."""
     wide = step.reshape(-1, *([1] * (weight.ndim - 1))).double()
-    last = 2 ** (bits - 1) - 1
-    return (weight.double() / torch.where(wide > 0, wide, 1.0)).round().clamp(-last, last)
+    return weight.double() / torch.where(wide > 0, wide, 1.0)
 
 
 def weights_at(levels: Tensor, step: Tensor) -> Tensor:

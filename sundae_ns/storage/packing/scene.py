@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from dataclasses import field as default
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -20,16 +20,18 @@ from torch import Tensor
 
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, odd_shapes, sh_degree_of
-from sundae_ns.storage.packing import container, quantize, transform
+from sundae_ns.storage.packing import container, entropy, quantize, transform
 from sundae_ns.storage.packing.codecs import Codecs, as_matrix, fit
 from sundae_ns.storage.packing.config import PackConfig
-from sundae_ns.storage.packing.container import Array
+from sundae_ns.storage.packing.container import Array, Levels
+from sundae_ns.storage.packing.entropy import Near
 from sundae_ns.storage.packing.quantize import Blocks
 
 CAMERAS = {"poses": ("<f4", (3, 4)), "intrinsics": ("<f8", (4,)), "sizes": ("<u4", (2,))}
 """dtype and shape, after ``[M, ...]``, of the arrays of M cameras: camera-to-world with OpenGL axes in the model's
 coordinates; fx, fy, cx, cy in pixels; width and height in pixels."""
-_MAX_FEATURES = 256
+_MAX_WIDTH = 256
+Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,15 @@ class PackReport(NamedTuple):
             sums[attribute] = sums.get(attribute, 0.0) + 8 * count / self.primitives
         return sums
 
+    def summary(self) -> dict[str, Any]:
+        """JSON values: primitives, bytes, and the bits per primitive of each attribute and of all."""
+        bits = {name: round(value, 2) for name, value in self.bits.items()}
+        return {
+            "primitives": self.primitives,
+            "bytes": self.bytes,
+            "bits": {**bits, "all": round(8 * self.bytes / self.primitives, 2)},
+        }
+
 
 def _check(params: Mapping[str, Tensor]) -> None:
     missing = [name for name in SPLAT_NAMES if name not in params]
@@ -76,9 +87,9 @@ def _check(params: Mapping[str, Tensor]) -> None:
         raise PackError(odd)
     features = params.get(FEATURES)
     if features is not None and not (
-        features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MAX_FEATURES
+        features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MAX_WIDTH
     ):
-        raise PackError(f"features has shape {list(features.shape)}; it must be [{n}, 1 to {_MAX_FEATURES}]")
+        raise PackError(f"features has shape {list(features.shape)}; it must be [{n}, 1 to {_MAX_WIDTH}]")
     known = {name: params[name].float() for name in (*SPLAT_NAMES, FEATURES) if name in params}
     broken = n - int(finite_mask(known).sum())
     if broken:
@@ -124,23 +135,28 @@ def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
     config, blocks = codecs.config, codecs.blocks
     n = num_primitives(scene.field)
     wanted = {"means", "features_rest", *codecs.field}
-    if n != len(blocks.deltas) or set(scene.field) != wanted or bool(scene.head) != (codecs.head is not None):
+    if n != len(blocks.codes) or set(scene.field) != wanted or bool(scene.head) != (codecs.head is not None):
         raise PackError("the codecs were fitted to another scene; fit them again")
+    arrays: dict[str, Array] = {"means/low": blocks.low, "means/high": blocks.high}
+    arrays["means/gaps"] = entropy.encode_gaps(blocks.codes, config.block, config.position_bits)
     about: dict[str, Any] = {"means": {"codec": "blocks", "bits": config.position_bits, "block": config.block}}
-    arrays: dict[str, Array] = {"means/deltas": blocks.deltas, "means/low": blocks.low, "means/high": blocks.high}
-    encoded = {name: codec.encode(as_matrix(scene.field[name])) for name, codec in codecs.field.items()}
+    near = entropy.neighbours_of(blocks.cells, config.block)
+    coded = {name: (codec.encode(as_matrix(scene.field[name])), near) for name, codec in codecs.field.items()}
     if codecs.head is not None:
-        encoded["head"] = codecs.head.encode(scene.head)
-    for name, (entry, parts) in encoded.items():
-        about[name] = entry
-        arrays |= {f"{name}/{part}": array for part, array in parts.items()}
+        head = codecs.head.encode(scene.head)
+        coded["head"] = head, entropy.predecessors(len(head[1]))
+    with ThreadPoolExecutor(2) as pool:
+        streams = pool.map(lambda one: entropy.encode(one[0][1], one[1]), coded.values())
+        for (name, ((entry, _, parts), _)), stream in zip(coded.items(), streams, strict=True):
+            about[name] = entry
+            arrays |= {f"{name}/levels": stream, **{f"{name}/{part}": array for part, array in parts.items()}}
     if scene.cameras is not None:
         for name, (dtype, _) in CAMERAS.items():
             arrays[f"cameras/{name}"] = scene.cameras[name].detach().cpu().numpy().astype(dtype)
 
     meta = {**scene.meta, "primitives": n, "attributes": about}
     unpacked = 4 * sum(value.numel() for value in (*scene.field.values(), *scene.head.values()))
-    size = container.write(path, meta, arrays, unpacked=unpacked, level=config.level)
+    size = container.write(path, meta, arrays, unpacked=unpacked)
     sections = {name: section.length for name, section in container.read_header(path).sections.items()}
     sections["header"] = size - sum(sections.values())
     return PackReport(n, size, sections)
@@ -154,6 +170,7 @@ class _Reader:
 
     def __init__(self, path: Path, header: container.Header, arrays: Mapping[str, Array]) -> None:
         self.path = path
+        self.size = header.size
         self.meta = header.meta
         self.arrays = arrays
 
@@ -194,90 +211,75 @@ class _Reader:
             array = np.array(value, np.float64)
         except OverflowError:
             array = np.array([np.inf])
-        # A grid has up to 2^16 steps and a transform adds several; the sums must stay finite in float32.
-        if not (np.abs(array) < np.finfo(np.float32).max / 2**20).all():
+        # Levels are below 2^24 and a transform adds up to 2^8 products; the sums must stay finite in float32.
+        if not (np.abs(array) < np.finfo(np.float32).max / 2**34).all():
             raise self.refuse(f"{key} has values beyond float32")
         return array
 
-    def places(self, name: str, limit: int) -> Array:
-        """A section of indices below ``limit``."""
-        array = self.section(name, ("<u4",), (None,))
-        if len(array) and int(array.max()) >= limit:
-            raise self.refuse(f"{name} has an index outside of the field")
-        return array
+    def decoded(self, name: str, decode: Callable[..., Decoded], *arguments: Any) -> Decoded:
+        """What the entropy coder decodes from a section."""
+        stream = self.section(name, ("|u1",), (None,))
+        try:
+            return decode(stream, *arguments)
+        except PackError as error:
+            raise self.refuse(f"{name}: {error}") from error
 
 
-def _decode_means(reader: _Reader, n: int) -> NDArray[np.float32]:
+def _decode_means(reader: _Reader, n: int) -> tuple[Blocks, int, int]:
     about = reader.about("means", ("blocks",))
-    bits, size = reader.number(about, "bits", 4, 21), reader.number(about, "block", 16, 1 << 20)
-    count = -(-n // size)
-    deltas = reader.section("means/deltas", ("<u8",), (n,))
-    low, high = (reader.section(f"means/{end}", ("<f4",), (count, 3)) for end in ("low", "high"))
-    return quantize.dequantize_positions(Blocks(deltas, low, high), bits, min(size, n))
+    bits, size = reader.number(about, "bits", 4, 16), reader.number(about, "block", 16, 1 << 20)
+    low, high = (reader.section(f"means/{end}", ("<f4",), (-(-n // size), 3)) for end in ("low", "high"))
+    return Blocks(reader.decoded("means/gaps", entropy.decode_gaps, n, size, bits), low, high), bits, size
 
 
-def _decode_quats(reader: _Reader, n: int) -> NDArray[np.float32]:
-    about = reader.about("quats", ("smallest-three",))
-    bits = reader.number(about, "bits", 4, 16)
-    codes = reader.section("quats/codes", (_code(bits),), (3, n))
-    return quantize.dequantize_rotations(codes, reader.section("quats/largest", ("|u1",), (-(-n // 4),)), bits)
-
-
-def _code(bits: int) -> str:
-    return "|u1" if bits <= 8 else "<u2"
-
-
-def _decode_uniform(reader: _Reader, name: str, n: int, width: int) -> NDArray[np.float32]:
-    about = reader.about(name, ("uniform",))
-    bits = reader.number(about, "bits", 4, 16)
-    codes = reader.section(f"{name}/codes", (_code(bits),), (width, n))
-    if about.get("differences") is True:
-        if width != 3:
-            raise reader.refuse(f"{name} does not have three channels")
-        codes = np.stack([codes[0] + codes[1], codes[1], codes[2] + codes[1]])
-    places = reader.places(f"{name}/places", width * n)
-    exceptions = reader.section(f"{name}/exceptions", ("<f4",), (len(places),))
-    low, step = reader.numbers(about, "low", width), reader.numbers(about, "step", width)
-    return quantize.dequantize(codes, low, step, places, exceptions)
-
-
-def _decode_rest(reader: _Reader, n: int, width: int) -> NDArray[np.float32]:
-    about = reader.about("features_rest", ("transform",))
+def _decode_levels(reader: _Reader, name: str, codec: str, near: Near, width: int) -> tuple[Levels, float]:
+    """Levels ``[N, C]`` of an attribute, and their step."""
+    about = reader.about(name, (codec,))
     (step,) = reader.numbers({"step": [about.get("step")]}, "step", 1)
-    codes = reader.section("features_rest/codes", ("|i1", "<i2"), (width, n))
-    basis = reader.section("features_rest/basis", ("|i1",), (width * width,)).reshape(width, width)
-    rows = reader.places("features_rest/rows", n)
-    exact = reader.section("features_rest/exact", ("<f4",), (len(rows), width))
-    return transform.restore(codes, basis, float(step), rows, exact)
+    return reader.decoded(f"{name}/levels", entropy.decode, width, near), float(step)
+
+
+def _decode_quats(reader: _Reader, near: Near) -> NDArray[np.float32]:
+    levels, step = _decode_levels(reader, "quats", "xyz", near, 3)
+    found: NDArray[np.float32] = quantize.rotations_at(torch.from_numpy(levels), step).numpy()
+    return found
+
+
+def _decode_rows(reader: _Reader, name: str, near: Near, width: int) -> NDArray[np.float32]:
+    levels, step = _decode_levels(reader, name, "transform", near, width)
+    mean = reader.section(f"{name}/mean", ("<f4",), (width,))
+    basis = reader.section(f"{name}/basis", ("|i1",), (width * width,)).reshape(width, width)
+    return transform.restore(levels, mean, basis, step)
 
 
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:
-    if "head/weights" not in reader.arrays:
+    if "head/levels" not in reader.arrays:
         return {}
-    about = reader.about("head", ("int8", "fp16"))
-    plain = reader.section("head/plain", ("<f4",), (None,))
-    coded = about["codec"] == "int8"
-    weights = reader.section("head/weights", ("|i1",) if coded else ("<f2",), (None,))
-    steps = reader.section("head/steps", ("<f4",), (None,)) if coded else np.zeros(0, np.float32)
-    taken = {"plain": 0, "weights": 0, "steps": 0}
+    about = reader.about("head", ("steps",))
+    plain, steps = (reader.section(f"head/{part}", ("<f4",), (None,)) for part in ("plain", "steps"))
+    tensors = _tensors(reader, about.get("tensors"))
+    sizes = {name: int(np.prod(shape, dtype=object)) for name, shape in tensors}
+    count = sum(sizes[name] for name, shape in tensors if len(shape) > 1)
+    if reader.number(about, "weights", 0, 1 << 28) != count:
+        raise reader.refuse("the head has another number of weights than it states")
+    container.check_ratio(reader.path, 4 * count, reader.size)
+    levels = reader.decoded("head/levels", entropy.decode, 1, entropy.predecessors(count)).reshape(-1)
+    taken = {"plain": 0, "levels": 0, "steps": 0}
 
-    def take(name: str, source: Array, count: int) -> Array:
+    def take(name: str, source: Array, count: int) -> Tensor:
         start = taken[name]
         taken[name] += count
         if taken[name] > len(source):
             raise reader.refuse("the head has fewer weights than it states")
-        return source[start : taken[name]]
+        return torch.from_numpy(source[start : taken[name]].astype(np.float32))
 
     head: dict[str, Tensor] = {}
-    for name, shape in _tensors(reader, about.get("tensors")):
-        count = int(np.prod(shape, dtype=object))
+    for name, shape in tensors:
         if len(shape) <= 1:
-            value = take("plain", plain, count)
+            head[name] = take("plain", plain, sizes[name]).reshape(shape)
         else:
-            value = take("weights", weights, count)
-        head[name] = torch.from_numpy(value.astype(np.float32).reshape(shape))
-        if coded and len(shape) > 1:
-            head[name] = quantize.weights_at(head[name], torch.from_numpy(take("steps", steps, shape[0]).copy()))
+            found = take("levels", levels, sizes[name]).reshape(shape)
+            head[name] = quantize.weights_at(found, take("steps", steps, shape[0]))
     return head
 
 
@@ -319,24 +321,27 @@ def read_scene(path: Path) -> Scene:
     container.check_ratio(path, 4 * n * (14 + width + features), header.size)
     reader = _Reader(path, header, container.read_sections(path, header))
 
+    blocks, bits, block = _decode_means(reader, n)
+    near = entropy.neighbours_of(blocks.cells, block)
     # Start with the largest jobs, so that the threads end together.
-    jobs: dict[str, Callable[[], NDArray[np.float32]]] = {}
-    if width:
-        jobs["features_rest"] = partial(_decode_rest, reader, n, width)
-    if features:
-        jobs[FEATURES] = partial(_decode_uniform, reader, FEATURES, n, features)
-    jobs["means"] = partial(_decode_means, reader, n)
-    jobs["quats"] = partial(_decode_quats, reader, n)
-    for name, channels in (("scales", 3), ("features_dc", 3), ("opacities", 1)):
-        jobs[name] = partial(_decode_uniform, reader, name, n, channels)
+    wide = {name: channels for name, channels in (("features_rest", width), (FEATURES, features)) if channels}
+    narrow = {"scales": 3, "features_dc": 3, "opacities": 1}
+    rows = {name: partial(_decode_rows, reader, name, near, channels) for name, channels in (wide | narrow).items()}
+    jobs: dict[str, Callable[[], Any]] = {name: rows[name] for name in wide}
+    jobs["head"] = partial(_decode_head, reader)
+    jobs["quats"] = partial(_decode_quats, reader, near)
+    jobs |= {name: rows[name] for name in narrow}
+    jobs["means"] = partial(quantize.dequantize_positions, blocks, bits, block)
     with ThreadPoolExecutor(2) as pool:
         started = {name: pool.submit(job) for name, job in jobs.items()}
-        field = {name: torch.from_numpy(future.result()) for name, future in started.items()}
+        done = {name: future.result() for name, future in started.items()}
+    head = done.pop("head")
+    field = {name: torch.from_numpy(value) for name, value in done.items()}
     rest = field.get("features_rest")
     field["features_rest"] = torch.zeros(n, 0, 3) if rest is None else rest.reshape(n, width // 3, 3)
     ordered = {name: field[name] for name in (*SPLAT_NAMES, FEATURES) if name in field}
     meta = {name: value for name, value in header.meta.items() if name not in ("sections", "attributes", "primitives")}
-    return Scene(ordered, _decode_head(reader), _decode_cameras(reader), meta)
+    return Scene(ordered, head, _decode_cameras(reader), meta)
 
 
 def _shape(path: Path, header: container.Header) -> tuple[int, int, int]:
@@ -350,19 +355,12 @@ def _shape(path: Path, header: container.Header) -> tuple[int, int, int]:
     if not isinstance(attributes, dict) or type(n) is not int or not 1 <= n < 1 << 28:
         raise refusal
     widths = []
-    for name, codec in (("features_rest", "transform"), (FEATURES, "uniform")):
-        about = attributes.get(name)
-        if about is None:
-            widths.append(0)
-            continue
-        if not isinstance(about, dict):
+    for name in ("features_rest", FEATURES):
+        about = attributes.get(name, {"width": 0})
+        width = about.get("width") if isinstance(about, dict) else None
+        if type(width) is not int or not int(name in attributes) <= width <= _MAX_WIDTH:
             raise refusal
-        if about.get("codec") != codec:
-            raise PackError(f"{path} stores {name} with a codec that is not supported; pack the run again")
-        codes = header.sections.get(f"{name}/codes")
-        if codes is None or not 1 <= codes.shape[0] <= _MAX_FEATURES:
-            raise refusal
-        widths.append(codes.shape[0])
+        widths.append(width)
     if widths[0] % 3 or sh_degree_of(widths[0] // 3) is None:
         raise refusal
     return n, widths[0], widths[1]

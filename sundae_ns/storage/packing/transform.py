@@ -12,10 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.storage.packing.container import Array, Encoded, Floats
+from sundae_ns.storage.packing.container import Coded, Floats, Levels
+from sundae_ns.storage.packing.entropy import LARGEST
 
-EXACT = 0.001
-"""Fraction of rows that may exceed one byte per coefficient; they are stored exactly."""
 _UNIT = 127
 _CHUNK = 1 << 16
 
@@ -24,13 +23,13 @@ _CHUNK = 1 << 16
 class Transform:
     """Codec of rows ``[N, D]``; see :func:`fit`."""
 
+    mean: Tensor
+    """Row of which all coefficients are 0, float32 ``[D]``."""
     basis: Tensor
     """Change of a row per step of each coefficient, in 127ths of the step, int8 ``[D, D]``."""
     inverse: Tensor
     """Matrix from rows to coefficients, float64 ``[D, D]``."""
     step: float
-    limit: int
-    """Rows with a larger coefficient, in steps, are stored exactly."""
 
     @property
     def bound(self) -> float:
@@ -38,59 +37,58 @@ class Transform:
         columns = self.basis.T.contiguous().numpy().astype(np.float64) / _UNIT
         return float(self.step / 2 * np.abs(columns).sum(axis=1).max())
 
-    def encode(self, values: Floats) -> Encoded:
+    def encode(self, values: Floats) -> Coded:
         """Transform and round finite rows."""
-        levels, kept = self.levels(torch.from_numpy(values))
-        rows = np.flatnonzero(kept.numpy())
-        return {"codec": "transform", "step": self.step, "bound": self.bound}, {
-            "codes": levels.T.numpy().astype(np.int8 if self.limit < 128 else np.int16, order="C"),
-            "basis": self.basis.numpy().reshape(-1),
-            "rows": rows.astype(np.uint32),
-            "exact": values[rows],
-        }
+        about = {"codec": "transform", "width": values.shape[1], "step": self.step, "bound": self.bound}
+        levels = self._levels(torch.from_numpy(values)).numpy().astype(np.int32)
+        return about, levels, {"mean": self.mean.numpy(), "basis": self.basis.numpy().reshape(-1)}
 
     def rounded(self, values: Tensor) -> Tensor:
         """Return the rows that a reader decodes; bit for bit on a CPU, up to rounding elsewhere."""
-        levels, exact = self.levels(values)
-        return torch.where(exact[:, None], values, _expand(levels.T.contiguous(), self.basis, self.step))
+        return _expand(self._levels(values), self.mean, self.basis, self.step)
 
-    def levels(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Coefficients in whole steps, float64 ``[N, D]``, and a mask ``[N]`` of rows stored exactly."""
-        levels = (rows.double() @ self.inverse / self.step).round()
-        exact = levels.abs().amax(dim=1) > self.limit
-        return levels.masked_fill(exact[:, None], 0.0), exact
+    def coefficients(self, rows: Tensor) -> Tensor:
+        """Coefficients in steps, float64 ``[N, D]``; gradients flow through them."""
+        return (rows.double() - self.mean.double()) @ self.inverse / self.step
+
+    def _levels(self, rows: Tensor) -> Tensor:
+        return self.coefficients(rows).round().clamp(-LARGEST, LARGEST)
 
 
-def fit(rows: Floats, step: float) -> Transform:
-    """Fit a transform with a positive step to finite rows ``[N, D]``, N and D at least 1."""
+def fit(rows: Floats, step: float, *, centred: bool = True) -> Transform:
+    """Fit a transform to finite rows ``[N, D]``, N and D at least 1.
+
+    Args:
+        rows: the values.
+        step: positive; a larger one is used where the largest coefficient would not fit.
+        centred: subtract the mean row; else rows of zeros stay exact.
+    """
     values = rows.astype(np.float64)
+    mean = (values.mean(axis=0) if centred else np.zeros(rows.shape[1])).astype(np.float32)
+    values = values - mean
     # Divide rows by the square root of their length, so that a few huge rows do not dominate the basis.
-    weight = 1 / np.sqrt(np.maximum(np.linalg.norm(values, axis=1, keepdims=True), step))
-    shrunk = values * weight
+    shrunk = values / np.sqrt(np.maximum(np.linalg.norm(values, axis=1, keepdims=True), step))
     axes = np.linalg.eigh(shrunk.T @ shrunk)[1][:, ::-1].T
-    basis = np.rint(axes * _UNIT).astype(np.int8)
+    # In the order of a file: products of other layouts round differently.
+    basis = np.ascontiguousarray(np.rint(axes * _UNIT).astype(np.int8))
     # Invert the stored basis, so that its rounding adds no error.
     inverse = torch.from_numpy(np.linalg.inv(basis / _UNIT))
-    # In the order of a file: products of other layouts round differently.
-    stored = torch.from_numpy(np.ascontiguousarray(basis))
-    wide = Transform(stored, inverse, step, int(np.iinfo(np.int16).max))
-    small = int(np.iinfo(np.int8).max)
-    largest = wide.levels(torch.from_numpy(rows))[0].abs().amax(dim=1)
-    return replace(wide, limit=small) if float((largest > small).double().mean()) <= EXACT else wide
+    fitted = Transform(torch.from_numpy(mean), torch.from_numpy(basis), inverse, step)
+    largest = float(fitted.coefficients(torch.from_numpy(rows)).abs().max())
+    return replace(fitted, step=step * max(2 * largest / LARGEST, 1.0))
 
 
-def restore(codes: Array, basis: NDArray[np.int8], step: float, rows: NDArray[np.uint32], exact: Floats) -> Floats:
-    """Rows ``[N, D]`` from the arrays of :meth:`Transform.encode`, with a basis ``[D, D]``."""
-    out: Floats = _expand(torch.from_numpy(codes), torch.from_numpy(basis.astype(np.float32)), step).numpy()
-    out[rows] = exact
+def restore(levels: Levels, mean: Floats, basis: NDArray[np.int8], step: float) -> Floats:
+    """Rows ``[N, D]`` from levels ``[N, D]`` and the arrays of :meth:`Transform.encode`, with a basis ``[D, D]``."""
+    # Copies, because arrays of a file are read-only.
+    out: Floats = _expand(torch.tensor(levels), torch.tensor(mean), torch.tensor(basis), step).numpy()
     return out
 
 
-def _expand(codes: Tensor, basis: Tensor, step: float) -> Tensor:
-    """Rows ``[N, D]``, float32, of coefficients in steps ``[D, N]``, for a basis in 127ths of the step ``[D, D]``."""
-    width, n = codes.shape
-    out = torch.empty(n, width, device=codes.device)
+def _expand(levels: Tensor, mean: Tensor, basis: Tensor, step: float) -> Tensor:
+    """Rows ``[N, D]``, float32, of levels ``[N, D]``, for a basis in 127ths of the step ``[D, D]``."""
+    out = torch.empty(levels.shape, device=levels.device)
     scaled = basis.float() * float(np.float32(step / _UNIT))
-    for start in range(0, n, _CHUNK):
-        torch.mm(codes[:, start : start + _CHUNK].float().T, scaled, out=out[start : start + _CHUNK])
+    for start in range(0, len(levels), _CHUNK):
+        torch.addmm(mean, levels[start : start + _CHUNK].float(), scaled, out=out[start : start + _CHUNK])
     return out

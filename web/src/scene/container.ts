@@ -9,7 +9,7 @@ export type Json = null | boolean | number | string | Json[] | { [key: string]: 
 export type JsonObject = { [key: string]: Json };
 
 const MAGIC = [0x89, 0x53, 0x55, 0x4e, 0x44, 0x41, 0x45, 0x0a];
-const VERSION = 1;
+const VERSION = 2;
 const PREAMBLE = 48;
 const MAX_HEADER = 4 << 20;
 const SPARE = 8 << 20;

@@ -1,7 +1,7 @@
 // The compensation head of a scene: its kind, and its tensors; see sundae_ns/compensation.
 
-import { half } from "./codecs";
-import { isObject, type Json } from "./container";
+import { checkRatio, isObject, type Json } from "./container";
+import { levels, predecessors } from "./entropy";
 import type { Reader } from "./reader";
 
 const WIDTHS: Record<string, [number, number]> = {
@@ -68,7 +68,7 @@ function kindOf(reader: Reader, stated: Json | undefined): HeadKind {
 
 /** The head, or null for a scene without one. */
 export function readHead(reader: Reader, stated: Json | undefined): Head | null {
-  const weighted = reader.has("head/weights");
+  const weighted = reader.has("head/levels");
   if ((stated === null || stated === undefined) && !weighted) return null;
   const kind = kindOf(reader, stated);
   const tensors = weighted ? readTensors(reader) : new Map<string, Tensor>();
@@ -91,26 +91,30 @@ export function readHead(reader: Reader, stated: Json | undefined): Head | null 
 }
 
 function readTensors(reader: Reader): Map<string, Tensor> {
-  const about = reader.about("head", ["int8", "fp16"]);
-  const coded = about.codec === "int8";
+  const about = reader.about("head", ["steps"]);
   const plain = reader.section("head/plain", ["<f4"], [null]) as Float32Array;
-  const codes = reader.section("head/weights", coded ? ["|i1"] : ["<f2"], [null]);
-  const weights = codes instanceof Uint16Array ? Float32Array.from(codes, half) : (codes as Int8Array);
-  const steps = coded ? (reader.section("head/steps", ["<f4"], [null]) as Float32Array) : new Float32Array(0);
-  const taken = { plain: 0, weights: 0, steps: 0 };
-  const take = <T extends Float32Array | Int8Array>(name: keyof typeof taken, source: T, count: number): T => {
+  const steps = reader.section("head/steps", ["<f4"], [null]) as Float32Array;
+  const shapes = listed(reader, about.tensors);
+  const sizeOf = (shape: number[]): number => shape.reduce((product, side) => product * side, 1);
+  const weights = shapes.reduce((sum, [, shape]) => sum + (shape.length > 1 ? sizeOf(shape) : 0), 0);
+  if (reader.whole(about, "weights", 0, 2 ** 28) !== weights) {
+    throw reader.refuse("the head has another number of weights than it states");
+  }
+  checkRatio(4 * weights, reader.size);
+  const found = levels(reader.stream("head/levels"), 1, predecessors(weights));
+  const taken = { plain: 0, levels: 0, steps: 0 };
+  const take = <T extends Float32Array | Int32Array>(name: keyof typeof taken, source: T, count: number): T => {
     const start = taken[name];
     taken[name] += count;
     if (taken[name] > source.length) throw reader.refuse("the head has fewer weights than it states");
     return source.subarray(start, taken[name]) as T;
   };
   const tensors = new Map<string, Tensor>();
-  for (const [name, shape] of listed(reader, about.tensors)) {
-    const count = shape.reduce((product, side) => product * side, 1);
+  for (const [name, shape] of shapes) {
+    const count = sizeOf(shape);
     const single = shape.length <= 1;
-    const found = single ? take("plain", plain, count) : take("weights", weights as Float32Array, count);
-    const values = Float32Array.from(found);
-    if (coded && !single) {
+    const values = Float32Array.from(single ? take("plain", plain, count) : take("levels", found, count));
+    if (!single) {
       const each = take("steps", steps, shape[0]!);
       for (let i = 0; i < count; i++) values[i]! *= each[Math.floor(i / (count / shape[0]!))]!;
     }

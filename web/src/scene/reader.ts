@@ -1,6 +1,5 @@
 // Sections of a file; each is checked before use.
 
-import { half } from "./codecs";
 import { type Header, isObject, type Json, type JsonObject, PackError, type Stored } from "./container";
 
 export type Numbers =
@@ -12,24 +11,24 @@ export type Numbers =
   | Float32Array<ArrayBuffer>
   | Float64Array<ArrayBuffer>;
 
-/** Arrays of the dtypes. Numbers of 64 bits come as their low and high halves, and halves of precision as their bits. */
+/** Arrays of the dtypes that a scene uses. */
 const ARRAYS: Record<string, new (bytes: ArrayBuffer) => Numbers> = {
   "|u1": Uint8Array,
   "<u2": Uint16Array,
   "<u4": Uint32Array,
-  "<u8": Uint32Array,
   "|i1": Int8Array,
   "<i2": Int16Array,
-  "<f2": Uint16Array,
   "<f4": Float32Array,
   "<f8": Float64Array,
 };
-// A grid has up to 2^16 steps and a transform adds several; the sums must stay finite in float32.
-const LARGEST = 3.4028234663852886e38 / 2 ** 20;
+// Levels are below 2^24 and a transform adds up to 2^8 products; the sums must stay finite in float32.
+const LARGEST = 3.4028234663852886e38 / 2 ** 34;
 
 export class Reader {
   constructor(
     readonly header: Header,
+    /** Bytes of the file. */
+    readonly size: number,
     private readonly stored: Map<string, Stored>,
   ) {}
 
@@ -54,8 +53,7 @@ export class Reader {
       throw this.refuse(`${name} is missing or has another shape`);
     }
     const array = new ARRAYS[found.dtype]!(found.bytes);
-    const real = found.dtype === "<f2" ? Float32Array.from(array, half) : array;
-    if (found.dtype.includes("f") && !real.every(Number.isFinite)) {
+    if (found.dtype.includes("f") && !array.every(Number.isFinite)) {
       throw this.refuse(`${name} has values that are not finite`);
     }
     return array;
@@ -89,10 +87,8 @@ export class Reader {
     return value;
   }
 
-  /** A section of indices below `limit`. */
-  places(name: string, limit: number): Uint32Array {
-    const array = this.section(name, ["<u4"], [null]) as Uint32Array;
-    if (array.some((place) => place >= limit)) throw this.refuse(`${name} has an index outside of the field`);
-    return array;
+  /** A section of coded numbers. */
+  stream(name: string): Uint8Array {
+    return this.section(name, ["|u1"], [null]) as Uint8Array;
   }
 }

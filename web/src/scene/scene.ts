@@ -1,7 +1,8 @@
 // A packed scene as arrays; the twin of sundae_ns/storage/packing/scene.py and of its checks.
 
-import { positions, rotations, transformed, uniform, withoutDifferences } from "./codecs";
+import { cellsOf, positions, rotations, transformed } from "./codecs";
 import { checkRatio, type Header, isObject, type JsonObject, PackError, readAll, readHeader } from "./container";
+import { gaps, levels, neighboursOf } from "./entropy";
 import { type Head, readHead } from "./head";
 import { Reader } from "./reader";
 
@@ -39,7 +40,7 @@ export type Scene = {
 };
 
 const MOST_PRIMITIVES = 2 ** 28;
-const MOST_FEATURES = 256;
+const MOST_WIDTH = 256;
 /** Random backgrounds are shown in viser's colour. */
 const BACKGROUNDS: Record<string, [number, number, number]> = {
   random: [0.149, 0.1647, 0.2157],
@@ -52,7 +53,7 @@ export async function readScene(file: Uint8Array<ArrayBuffer>): Promise<Scene> {
   const header = await readHeader(file);
   const shape = shapeOf(header);
   checkRatio(4 * shape.count * (14 + shape.rest + shape.features), file.length);
-  const reader = new Reader(header, await readAll(file, header));
+  const reader = new Reader(header, file.length, await readAll(file, header));
   const model = modelOf(reader);
   const degree = Math.sqrt(shape.rest / 3 + 1) - 1;
   if (degree > model.degree) throw reader.refuse("its header states a lower SH degree than it has");
@@ -85,11 +86,9 @@ function shapeOf(header: Header): Shape {
   if (!isObject(attributes) || !whole(primitives, MOST_PRIMITIVES)) throw refusal;
   const width = (name: string): number => {
     const about = attributes[name];
-    if (about === undefined || about === null) return 0;
-    if (!isObject(about)) throw refusal;
-    const found = header.sections.get(`${name}/codes`)?.shape[0];
-    if (!whole(found, MOST_FEATURES + 1)) throw refusal;
-    return found;
+    if (about === undefined) return 0;
+    if (!isObject(about) || !whole(about.width, MOST_WIDTH + 1)) throw refusal;
+    return about.width;
   };
   const rest = width("features_rest");
   if (rest % 3 !== 0 || ![1, 2, 3, 4, 5].includes(Math.sqrt(rest / 3 + 1))) throw refusal;
@@ -98,65 +97,45 @@ function shapeOf(header: Header): Shape {
 
 function readField(reader: Reader, { count, rest, features }: Shape): Field {
   const none = new Float32Array(0);
+  const about = reader.about("means", ["blocks"]);
+  const bits = reader.whole(about, "bits", 4, 16);
+  const block = reader.whole(about, "block", 16, 2 ** 20);
+  const [low, high] = ["low", "high"].map(
+    (end) => reader.section(`means/${end}`, ["<f4"], [Math.ceil(count / block), 3]) as Float32Array,
+  );
+  const cells = cellsOf(gaps(reader.stream("means/gaps"), count, block, bits));
+  const near = neighboursOf(cells, block);
+  const rows = (name: string, width: number): Float32Array => (width ? readRows(reader, name, near, width) : none);
   return {
     count,
-    means: readMeans(reader, count),
-    quats: readQuats(reader, count),
-    scales: readUniform(reader, "scales", count, 3),
-    opacities: readUniform(reader, "opacities", count, 1),
-    features_dc: readUniform(reader, "features_dc", count, 3),
-    features_rest: rest ? readRows(reader, "features_rest", count, rest) : none,
-    features: features ? readRows(reader, "features", count, features) : none,
+    means: positions(cells, low!, high!, bits, block),
+    quats: rotations(...readLevels(reader, "quats", "xyz", near, 3)),
+    scales: rows("scales", 3),
+    opacities: rows("opacities", 1),
+    features_dc: rows("features_dc", 3),
+    features_rest: rows("features_rest", rest),
+    features: rows("features", features),
   } as Field;
 }
 
-function readMeans(reader: Reader, n: number): Float32Array {
-  const about = reader.about("means", ["blocks"]);
-  const bits = reader.whole(about, "bits", 4, 21);
-  const block = reader.whole(about, "block", 16, 2 ** 20);
-  const deltas = reader.section("means/deltas", ["<u8"], [n]) as Uint32Array;
-  const [low, high] = ["low", "high"].map(
-    (end) => reader.section(`means/${end}`, ["<f4"], [Math.ceil(n / block), 3]) as Float32Array,
-  );
-  return positions(deltas, low!, high!, bits, block);
-}
-
-const codeType = (bits: number): string => (bits <= 8 ? "|u1" : "<u2");
-
-function readQuats(reader: Reader, n: number): Float32Array {
-  const bits = reader.whole(reader.about("quats", ["smallest-three"]), "bits", 4, 16);
-  const codes = reader.section("quats/codes", [codeType(bits)], [3, n]) as Uint8Array | Uint16Array;
-  const largest = reader.section("quats/largest", ["|u1"], [Math.ceil(n / 4)]) as Uint8Array;
-  return rotations(codes, largest, bits);
-}
-
-function readUniform(reader: Reader, name: string, n: number, width: number): Float32Array {
-  const about = reader.about(name, ["uniform"]);
-  const bits = reader.whole(about, "bits", 4, 16);
-  let codes = reader.section(`${name}/codes`, [codeType(bits)], [width, n]) as Uint8Array | Uint16Array;
-  if (about.differences === true) {
-    if (width !== 3) throw reader.refuse(`${name} does not have three channels`);
-    codes = withoutDifferences(codes);
-  }
-  const places = reader.places(`${name}/places`, width * n);
-  const exceptions = reader.section(`${name}/exceptions`, ["<f4"], [places.length]) as Float32Array;
-  const low = reader.numbers(about.low, "low", width);
-  return uniform(codes, low, reader.numbers(about.step, "step", width), places, exceptions);
-}
-
-function readTransform(reader: Reader, name: string, n: number, width: number): Float32Array {
-  const about = reader.about(name, ["transform"]);
+/** Levels [N, width] of an attribute, and their step. */
+function readLevels(
+  reader: Reader,
+  name: string,
+  codec: string,
+  near: Int32Array,
+  width: number,
+): [Int32Array, number] {
+  const about = reader.about(name, [codec]);
   const [step] = reader.numbers([about.step ?? null], "step", 1);
-  const codes = reader.section(`${name}/codes`, ["|i1", "<i2"], [width, n]) as Int8Array | Int16Array;
-  const basis = reader.section(`${name}/basis`, ["|i1"], [width * width]) as Int8Array;
-  const rows = reader.places(`${name}/rows`, n);
-  const exact = reader.section(`${name}/exact`, ["<f4"], [rows.length, width]) as Float32Array;
-  return transformed(codes, basis, step!, rows, exact);
+  return [levels(reader.stream(`${name}/levels`), width, near), step!];
 }
 
-function readRows(reader: Reader, name: string, n: number, width: number): Float32Array {
-  const { codec } = reader.about(name, ["transform", "uniform"]);
-  return codec === "transform" ? readTransform(reader, name, n, width) : readUniform(reader, name, n, width);
+function readRows(reader: Reader, name: string, near: Int32Array, width: number): Float32Array {
+  const [found, step] = readLevels(reader, name, "transform", near, width);
+  const mean = reader.section(`${name}/mean`, ["<f4"], [width]) as Float32Array;
+  const basis = reader.section(`${name}/basis`, ["|i1"], [width * width]) as Int8Array;
+  return transformed(found, mean, basis, step);
 }
 
 function readCameras(reader: Reader): Camera[] {
