@@ -60,12 +60,13 @@ class Buffers:
             Whether the buffers are new, so that work on the older ones is void.
         """
         n, rows = state.field.num_primitives, list(_rows_of(state, trained))
-        names = {row.name for row in rows}
+        shapes = {row.name: row.value.shape[1:] for row in rows}
         fits = n <= self.capacity <= 2 * n if growing else n == self.capacity
-        renewed = not fits or names != self.tensors.keys()
+        # A search for a budget narrows harmonics and features.
+        renewed = not fits or shapes != {name: held.shape[1:] for name, held in self.tensors.items()}
         if renewed:
             self.capacity = int(SPARE * n) if growing else n
-            for name in self.tensors.keys() - names:
+            for name in self.tensors.keys() - shapes.keys():
                 del self.tensors[name]
         for row in rows:
             held = self.tensors.get(row.name)

@@ -225,8 +225,13 @@ def test_a_signal_before_the_first_step_saves_nothing(tiny: Any, trainer_of: Any
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(SundaeDatamanager, "create_train_dataset", stop)
-    with pytest.raises(SystemExit) as end:
-        trainer_of(lambda config: None)
+    # A shell starts background jobs with this signal ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(SystemExit) as end:
+            trainer_of(lambda config: None)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert end.value.code == 130
 
 

@@ -11,6 +11,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from torch import Tensor
 
+from sundae_ns.gaussians.snapshot import narrow
 from sundae_ns.model import SundaeModel
 from sundae_ns.trainer import recorded_outputs
 from sundae_ns.training import buffers as buffers_module
@@ -226,3 +227,7 @@ def test_buffers_are_new_only_when_the_field_does_not_fit(
     assert int(buffers.tensors["means.exp_avg"].sum()) == 65 * 3
     assert buffers.hold(state, trained, growing=False)
     assert buffers.capacity == 65
+    assert not buffers.hold(state, trained, growing=False)
+    narrow(state.field, state.optimizers, "features_rest", 2)
+    assert buffers.hold(state, trained, growing=False)
+    assert buffers.tensors["features_rest"].shape == buffers.tensors["features_rest.exp_avg"].shape == (65, 2, 3)
