@@ -19,11 +19,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
 from browser import WEBGPU, Browser, find_chromium, wait_for
 from nerfstudio.cameras.cameras import Cameras
+from numpy.typing import NDArray
 
 from sundae_ns.scenes.packed import cameras_of, model_of
 from sundae_ns.scenes.page import write_page
@@ -50,7 +52,7 @@ def scaled(scene: Scene, scale: float) -> Scene:
     return replace(scene, cameras=cameras, meta=meta)
 
 
-def truths(scene: Scene) -> list[dict[str, np.ndarray]]:
+def truths(scene: Scene) -> list[dict[str, NDArray[np.float32]]]:
     """``rgb`` and ``base_rgb`` of each camera, by Python."""
     model, cameras = model_of(scene), cameras_of(scene)
     images = []
@@ -63,8 +65,16 @@ def truths(scene: Scene) -> list[dict[str, np.ndarray]]:
     return images
 
 
-def psnr(one: np.ndarray, other: np.ndarray) -> float:
-    return round(float(-10 * np.log10(np.mean((one - other) ** 2) + 1e-12)), 2)
+def image(page: Any, camera: int, head: bool, scale: float = 1.0) -> NDArray[np.float64]:
+    """An image of the page ``[H, W, 3]`` in [0, 1]."""
+    found = page.evaluate(f"sundae.image({camera}, {str(head).lower()}, {scale})")
+    pixels = np.frombuffer(base64.b64decode(found["pixels"]), np.uint8)
+    return pixels.reshape(found["height"], found["width"], 4)[..., :3] / 255
+
+
+def psnr(found: NDArray[Any], truth: NDArray[Any]) -> float:
+    assert found.shape == truth.shape
+    return float(-10 * np.log10(np.mean((found - truth) ** 2) + 1e-12))
 
 
 def main() -> None:
@@ -93,12 +103,10 @@ def main() -> None:
             times = page.evaluate("sundae.times") or {}
             row |= {f"ms_{name}": round(times.get(name, 0)) for name in ("splat", "head")}
             row["psnr_base"], row["psnr_head"] = [], []
-            for camera, image in enumerate(images):
-                for name, head in (("base", False), ("head", True)) if scene.head else (("base", False),):
-                    found = page.evaluate(f"sundae.image({camera}, {str(head).lower()}, 1)")
-                    pixels = np.frombuffer(base64.b64decode(found["pixels"]), np.uint8)
-                    shown = pixels.reshape(found["height"], found["width"], 4)[..., :3] / 255
-                    row[f"psnr_{name}"].append(psnr(shown, image["rgb" if head else "base_rgb"]))
+            for camera, truth in enumerate(images):
+                row["psnr_base"].append(round(psnr(image(page, camera, False), truth["base_rgb"]), 2))
+                if scene.head:
+                    row["psnr_head"].append(round(psnr(image(page, camera, True), truth["rgb"]), 2))
     print(json.dumps(row))
 
 

@@ -323,6 +323,7 @@ class SundaeTrainer(Trainer):
             self._recorded = None
             torch.cuda.empty_cache()
             return None
+        # Not nerfstudio's method, which also writes every rate at every step; that takes longer than to launch one.
         for scheduler in self.optimizers.schedulers.values():
             scheduler.step()
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.gaussians import FEATURES
+from sundae_ns.training.densification import STATISTICS
 from sundae_ns.training.field_state import FieldState
 
 SPARE = 1.1
@@ -22,9 +23,6 @@ SPARE = 1.1
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 """Adam's moments in the state of its optimizer."""
-
-STATISTICS = ("grad2d", "count", "radii")
-"""Tensors in the running state of densification."""
 
 _UNSEEN = {"means": 1e15, "scales": -30.0, "opacities": -30.0}
 """Values of the rows beyond: behind the far plane, without width, transparent. Others are zero."""

@@ -22,6 +22,9 @@ from sundae_ns.pruning import PruningConfig
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 
+STATISTICS = ("grad2d", "count", "radii")
+"""Tensors ``[N]`` in the running state of gsplat's strategy."""
+
 COUNTED = "counted"
 """Entry of ``info`` of a recorded step, which has added its statistics to the running state by itself."""
 
@@ -70,7 +73,7 @@ def start_counting(state: MutableMapping[str, Any], means: Tensor) -> None:
         state: the running state; that of a chain has none.
         means: centres ``[N, 3]``.
     """
-    for name in ("grad2d", "count", "radii"):
+    for name in STATISTICS:
         if name in state and state[name] is None:
             state[name] = torch.zeros(len(means), device=means.device)
 

@@ -16,18 +16,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from chromium import CHROMIUM, browser, needs_chromium
-from nerfstudio.cameras.cameras import Cameras
+from chromium import CHROMIUM, bench_page, browser, needs_chromium
 from numpy.typing import NDArray
 from packed_scenes import KINDS, write_kind
 
 from sundae_ns.cli.view import serve
-from sundae_ns.scenes.packed import cameras_of, model_of, scene_of_run
+from sundae_ns.scenes.packed import scene_of_run
 from sundae_ns.scenes.page import page_of, write_folder, write_page
 from sundae_ns.storage.packing import read_scene, write_scene
 
 pytestmark = needs_chromium
+image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths
 
 LEAST = 57.0
 """Lowest PSNR of an image of the page against Python's; the worst is 58.7."""
@@ -62,35 +61,9 @@ class Quiet(SimpleHTTPRequestHandler):
         pass
 
 
-def image(page: Any, camera: int, head: bool, scale: float = 1.0) -> NDArray[np.float64]:
-    """An image of the page ``[H, W, 3]`` in [0, 1]."""
-    found = page.evaluate(f"sundae.image({camera}, {str(head).lower()}, {scale})")
-    pixels = np.frombuffer(base64.b64decode(found["pixels"]), np.uint8)
-    return pixels.reshape(found["height"], found["width"], 4)[..., :3] / 255
-
-
-def truths(packed: Path) -> list[dict[str, NDArray[np.float32]]]:
-    """``rgb`` and ``base_rgb`` of each camera of a packed scene, by Python."""
-    scene = read_scene(packed)
-    model, cameras = model_of(scene), cameras_of(scene)
-    images = []
-    for pose, lens, size in zip(*(cameras[name] for name in ("poses", "intrinsics", "sizes")), strict=True):
-        fx, fy, cx, cy = lens.float().reshape(4, 1, 1)
-        width, height = size.reshape(2, 1, 1)
-        with torch.no_grad():
-            outputs = model.get_outputs(Cameras(pose[None], fx, fy, cx, cy, width, height))
-        images.append({name: outputs[name].numpy() for name in ("rgb", "base_rgb")})
-    return images
-
-
-def psnr(found: NDArray[Any], truth: NDArray[Any]) -> float:
-    assert found.shape == truth.shape
-    return float(-10 * np.log10(np.mean((found - truth) ** 2) + 1e-12))
-
-
 def check(page: Any, packed: Path, cameras: list[int]) -> None:
     for camera in cameras:
-        truth = truths(packed)[camera]
+        truth = truths(read_scene(packed))[camera]
         assert psnr(image(page, camera, False), truth["base_rgb"]) > LEAST
         if page.evaluate("!document.getElementById('head-label').hidden"):
             assert psnr(image(page, camera, True), truth["rgb"]) > LEAST
@@ -120,7 +93,7 @@ def test_six_cameras_of_a_trained_scene(tiny: Any, tmp_path: Path) -> None:
     write_page(tmp_path / "a.sundae", tmp_path / "a.html", title="a")
     with opened((tmp_path / "a.html").as_uri()) as page:
         count = page.evaluate("sundae.cameras")
-        images = truths(tmp_path / "a.sundae")
+        images = truths(read_scene(tmp_path / "a.sundae"))
         assert count == len(images) == 12
         for camera in range(0, count, 2):
             assert psnr(image(page, camera, False), images[camera]["base_rgb"]) > LEAST

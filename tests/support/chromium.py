@@ -1,18 +1,26 @@
-"""The driver of ``benchmarks/browser.py`` as a module, and the Chromium that it finds."""
+"""The scripts of ``benchmarks`` that drive a Chromium as modules, and the Chromium that they find."""
 
 from __future__ import annotations
 
 import importlib.util
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-_spec = importlib.util.spec_from_file_location("browser", Path(__file__).parents[2] / "benchmarks" / "browser.py")
-assert _spec is not None
-assert _spec.loader is not None
-browser = sys.modules["browser"] = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(browser)
+
+def _script(name: str) -> Any:
+    spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[2] / "benchmarks" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+browser = _script("browser")
+bench_page = _script("bench_page")  # imports the one before
 
 CHROMIUM = browser.find_chromium()
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (apt-get install chromium)")

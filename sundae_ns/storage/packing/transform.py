@@ -24,7 +24,7 @@ class Transform:
     """Codec of rows ``[N, D]``; see :func:`fit`."""
 
     mean: Tensor
-    """Row of which all coefficients are 0, float32 ``[D]``."""
+    """The row whose coefficients are all 0, float32 ``[D]``."""
     basis: Tensor
     """Change of a row per step of each coefficient, in 127ths of the step, int8 ``[D, D]``."""
     inverse: Tensor
