@@ -22,14 +22,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-import tyro
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from bench_pack import commit
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 
-from sundae_ns.cli.bench.job import without_lpips
+from sundae_ns.cli.bench.job import configure, without_lpips
+from sundae_ns.cli.bench.plan import Job, parser_of
 from sundae_ns.evaluation import psnr, ssim
-from sundae_ns.trainer import SundaeTrainerConfig
+from sundae_ns.scenes.opening import views_to_test
 
 ARMS: dict[str, list[str]] = {
     "splatfacto": ["splatfacto"],
@@ -37,30 +37,32 @@ ARMS: dict[str, list[str]] = {
     "sundae-unrecorded": ["sundae", "--record-steps", "False"],
     "sundae-with-head": ["sundae", "--pipeline.model.head.mode", "residual"],
 }
-NEVER = str(10**9)
 PROFILED = 100
 """Steps of a profile."""
 
 
 def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
     """A trainer that is set up."""
-    words = [*ARMS[arm], "--data", str(options.capture), "--output-dir", out, "--vis", "tensorboard"]
-    words += ["--max-num-iterations", str(options.steps), "--machine.seed", str(options.seed)]
+    method, *words = ARMS[arm]
     words += ["--viewer.quit-on-train-completion", "True", "--pipeline.datamanager.cache-images", "gpu"]
-    for name in ("save", "eval-batch", "eval-image", "eval-all-images"):
-        words += [f"--steps-per-{name}", NEVER]
-    if arm != "splatfacto":
+    if method != "splatfacto":
         words += ["--pipeline.model.evaluate-prune", "False"]
-    words += options.option
-    words += ["colmap", "--colmap-path", "sparse/0", "--downscale-factor", "1", "--eval-mode", "interval"]
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=words)
-    config.set_timestamp()
-    if isinstance(config, SundaeTrainerConfig):
-        config.make_schedule(words)
-    config.pipeline.datamanager.data = config.data
+    job = Job(
+        key=arm,
+        kind="whole",
+        scene=options.capture.name,
+        arm=arm,
+        data=str(options.capture),
+        method=method,
+        steps=options.steps,
+        seed=options.seed,
+        options=(*words, *options.option),
+        parser=parser_of(options.capture),
+    )
+    config, _ = configure(job, Path(out))
     _set_random_seed(options.seed)
     with without_lpips():
-        trainer = config.setup(local_rank=0, world_size=1)
+        trainer: Any = config.setup(local_rank=0, world_size=1)
         trainer.setup()
     trainer.save_checkpoint = lambda step: None
     return trainer
@@ -68,14 +70,12 @@ def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
 
 def quality(trainer: Any) -> tuple[float, float]:
     """Mean PSNR and SSIM of the test views."""
-    model, figures = trainer.pipeline.model, []
+    model = trainer.pipeline.model
     model.eval()
     with torch.no_grad():
-        for camera, batch in trainer.pipeline.datamanager.fixed_indices_eval_dataloader:
-            image = model.get_outputs_for_camera(camera.to(model.device))["rgb"]
-            truth = batch["image"].to(model.device)[..., :3]
-            truth = truth.float() / 255 if truth.dtype == torch.uint8 else truth
-            figures.append([float(psnr(image, truth)), float(ssim(image, truth))])
+        cameras, truths = views_to_test(model, trainer.pipeline.datamanager)
+        images = [model.get_outputs_for_camera(camera)["rgb"] for camera in cameras]
+        figures = [[float(psnr(*pair)), float(ssim(*pair))] for pair in zip(images, truths, strict=True)]
     model.train()
     return tuple(torch.tensor(figures).mean(dim=0).tolist())
 
@@ -177,9 +177,6 @@ def main() -> None:
         with TemporaryDirectory() as out:
             print("ROW " + json.dumps({"timed": timed, "busy": busy}[options.child](options, options.arms[0], out)))
         return
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], check=False, capture_output=True, text=True
-    ).stdout.strip()
     for arm in options.arms:
         row: dict[str, Any] = {"arm": arm, "scene": options.capture.name, "steps": options.steps, "seed": options.seed}
         for child in ("timed", "busy") if options.profile else ("timed",):
@@ -191,7 +188,7 @@ def main() -> None:
             if not lines:
                 sys.exit(f"{arm} failed:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}")
             row |= json.loads(lines[0][4:])
-        row |= {"gpu": torch.cuda.get_device_name(0), "commit": commit}
+        row |= {"gpu": torch.cuda.get_device_name(0), "commit": commit()}
         print(json.dumps(row), flush=True)
         if options.output is not None:
             with options.output.open("a") as file:
