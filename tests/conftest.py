@@ -29,7 +29,7 @@ _FIRST = ("integration", "distributed", "cli")
 """Folders with long files, the longest first. Workers that start with these end together."""
 
 # Definitions that a GPU's compiler has built in, and a setter of the block index. A block has one thread here, so
-# memory that threads of a block share is filled before it is read.
+# memory that threads of a block share is filled before it is read, and a warp of one lane exchanges with itself.
 _SHIM = """
 #include <math.h>
 #define __device__
@@ -39,6 +39,13 @@ _SHIM = """
 #define __shared__ static
 #define __align__(n) __attribute__((aligned(n)))
 #define __syncthreads()
+#define __syncthreads_count(x) ((x) ? 1 : 0)
+#define __any_sync(mask, x) (x)
+#define __shfl_xor_sync(mask, x, offset) (x)
+#define __expf expf
+#define __fdividef(a, b) ((a) / (b))
+inline void atomicAdd(float* to, float x) { *to += x; }
+inline void atomicMax(int* to, int x) { *to = *to < x ? x : *to; }
 inline float rsqrtf(float x) { return 1 / sqrtf(x); }
 struct Index { unsigned x; };
 static Index blockIdx, blockDim = {1}, threadIdx;

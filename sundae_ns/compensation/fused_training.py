@@ -32,6 +32,9 @@ from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, is_recording, record, warm_up
 
+MOST_WORKERS = 2**15
+"""Threads that sum a gradient over the pixels; fewer leave the GPU idle, and more wait for each other to add."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -53,17 +56,24 @@ def network_backward(
         convolution in turn, float32.
     """
     levels = len(net.encoder)
+    widths = [conv.out_channels for conv in convolutions(net)]
+    grad_biases = torch.zeros(sum(widths), device=gradient.device).split(widths)
     gradients: dict[int, tuple[Tensor, Tensor]] = {}
 
     def convolved(number: int, grad_raw: Tensor) -> Tensor:
         x, weight = tape.inputs[number], weights.cast[number]
-        grad_bias = grad_raw.sum(dim=(0, 2, 3), dtype=torch.float32)
+        pixels = grad_raw.shape[2] * grad_raw.shape[3]
+        workers = min(pixels * widths[number] // PACK, MOST_WORKERS)
+        launches["sum_pixels"](workers, [grad_raw, widths[number], pixels, workers, grad_biases[number]])
         grad_x, grad_weight, _ = torch.ops.aten.convolution_backward(
             grad_raw, x, weight, None, [1, 1], [1, 1], [1, 1], False, [0, 0], 1, [True, True, False]
         )
         channels = convolutions(net)[number].in_channels
         # The memory format of the weights, so that autograd need not copy the gradient.
-        gradients[number] = grad_weight[:, :channels].float().contiguous(memory_format=torch.channels_last), grad_bias
+        gradients[number] = (
+            grad_weight[:, :channels].float().contiguous(memory_format=torch.channels_last),
+            grad_biases[number],
+        )
         return cast("Tensor", grad_x).contiguous(memory_format=torch.channels_last)
 
     def double(block: int, grad_raw: Tensor) -> Tensor:

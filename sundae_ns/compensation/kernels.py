@@ -13,6 +13,7 @@ import functools
 from collections.abc import Mapping
 
 import torch
+from torch import nn
 
 from sundae_ns.compensation.unet import SLOPE, UNet
 from sundae_ns.gpu.nvrtc import Kernel, Launch
@@ -23,7 +24,7 @@ PACK = 8
 FORWARD = ("fold", "activate", "pool", "upsample", "unfold")
 """Kernels of :data:`SOURCE` for the forward pass."""
 
-BACKWARD = tuple(f"{name}_backward" for name in FORWARD)
+BACKWARD = (*(f"{name}_backward" for name in FORWARD), "sum_pixels")
 """Kernels of :data:`SOURCE` for the backward pass."""
 
 _CONVERSIONS = {
@@ -243,6 +244,29 @@ extern "C" __global__ void activate_backward(T* gradient, const T* __restrict__ 
     ((Pack*)gradient)[i] = pack;
 }
 
+// Adds the sum over all pixels to each channel's current value. Threads must number at least `workers`.
+extern "C" __global__ void sum_pixels(const T* __restrict__ x, int channels, int pixels, int workers,
+                                      float* __restrict__ sums) {
+    __shared__ float partial[MOST_CHANNELS];
+    const int packs = channels / PACK, stride = workers / packs;
+    const int thread = (int)(blockIdx.x * blockDim.x + threadIdx.x), c = thread % packs * PACK;
+    for (int k = threadIdx.x; k < channels; k += blockDim.x) partial[k] = 0;
+    __syncthreads();
+    if (thread < stride * packs && thread / packs < pixels) {
+        float sum[PACK] = {};
+        for (int pixel = thread / packs; pixel < pixels; pixel += stride) {
+            const Pack pack = *(const Pack*)(x + (long long)pixel * channels + c);
+#pragma unroll
+            for (int k = 0; k < PACK; ++k) sum[k] += load(pack.v[k]);
+        }
+#pragma unroll
+        for (int k = 0; k < PACK; ++k) atomicAdd(partial + c + k, sum[k]);
+    }
+    __syncthreads();
+    for (int k = threadIdx.x; k < channels; k += blockDim.x)
+        if (partial[k] != 0) atomicAdd(sums + k, partial[k]);
+}
+
 // Backward of `pool`: the gradient of its input, from those of the skip connection and of the mean.
 extern "C" __global__ void pool_backward(const T* __restrict__ grad_wide, const T* __restrict__ wide, int wide_channels,
                                          const T* __restrict__ grad_pooled, int channels, int rows, int columns,
@@ -328,8 +352,10 @@ def program(dtype: torch.dtype) -> str:
 
 
 def definitions(net: UNet, residual: bool) -> tuple[str, ...]:
-    """Compiler options for a network: its fold, its width, and whether it corrects an image."""
+    """Compiler options for a network: its fold, its widths, and whether it corrects an image."""
+    widths = [layer.out_channels for layer in net.modules() if isinstance(layer, nn.Conv2d)]
     return (
+        f"-DMOST_CHANNELS={max(widths)}",
         f"-DR={net.pixel_unshuffle}",
         f"-DWIDTH={net.out.in_channels}",
         f"-DPACK={PACK}",

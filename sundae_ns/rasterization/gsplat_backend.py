@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sundae_ns.errors import BackendError
 from sundae_ns.rasterization.constants import constant
+from sundae_ns.rasterization.gsplat_blending import blend
 from sundae_ns.rasterization.gsplat_colors import harmonic_colors
 from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, TileLists, tile_lists
 from sundae_ns.rasterization.reference import ReferenceBackend, largest_axis, strategy_info
@@ -29,8 +30,6 @@ class GsplatBackend:
         Raises:
             BackendError: The tensors are not float32 on a CUDA device.
         """
-        from gsplat import rasterize_to_pixels
-
         _check_kernels_take(inputs.means)
         if inputs.means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
             return ReferenceBackend().rasterize(inputs)
@@ -48,19 +47,7 @@ class GsplatBackend:
         # Each pass overwrites absgrad with that of its own channels, so absgrad allows one pass only.
         passes = [channels] if inputs.absgrad else channels.split(_CHANNELS_PER_PASS, dim=1)
         blended = [
-            rasterize_to_pixels(
-                means2d,
-                conics,
-                part[None],
-                seen_opacities,
-                width,
-                height,
-                TILE,
-                lists.starts,
-                lists.primitives,
-                masks=lists.drawn,
-                absgrad=inputs.absgrad,
-            )
+            self._blend(means2d, conics, part[None], seen_opacities, lists, width, height, absgrad=inputs.absgrad)
             for part in passes
         ]
         alpha = blended[0][1][0]
@@ -81,6 +68,34 @@ class GsplatBackend:
     ) -> TileLists:
         return TileLists(*square_lists(means2d, radii, depths, width, height))
 
+    def _blend(
+        self,
+        means2d: Tensor,
+        conics: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        lists: TileLists,
+        width: int,
+        height: int,
+        *,
+        absgrad: bool,
+    ) -> tuple[Tensor, Tensor]:
+        from gsplat import rasterize_to_pixels
+
+        return rasterize_to_pixels(
+            means2d,
+            conics,
+            colors,
+            opacities,
+            width,
+            height,
+            TILE,
+            lists.starts,
+            lists.primitives,
+            masks=lists.drawn,
+            absgrad=absgrad,
+        )
+
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``.
 
@@ -98,7 +113,7 @@ class GsplatBackend:
 class RecordableGsplat(GsplatBackend):
     """gsplat with what CUDA graphs need: nothing waits for the GPU, and all work is on torch's current stream.
 
-    Tiles get our own lists, shorter than gsplat's, and colours our own kernels.
+    Tiles get our own lists, shorter than gsplat's. Colours, and blending with gradients, have kernels of our own.
 
     Args:
         capacity: for tile/primitive pairs.
@@ -113,6 +128,23 @@ class RecordableGsplat(GsplatBackend):
         return tile_lists(
             means2d[0], conics[0], opacities[0], depths[0], radii[0], width, height, capacity=self._capacity
         )
+
+    def _blend(
+        self,
+        means2d: Tensor,
+        conics: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        lists: TileLists,
+        width: int,
+        height: int,
+        *,
+        absgrad: bool,
+    ) -> tuple[Tensor, Tensor]:
+        arguments = (means2d, conics, colors, opacities, lists, width, height)
+        if torch.is_grad_enabled() and any(value.requires_grad for value in arguments[:4]):
+            return blend(*arguments, absgrad=absgrad)
+        return super()._blend(*arguments, absgrad=absgrad)  # frames stay gsplat's to the bit
 
     def harmonic_colors(
         self, degree: int, means: Tensor, center: Tensor, features_dc: Tensor, features_rest: Tensor

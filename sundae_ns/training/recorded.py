@@ -184,7 +184,8 @@ class RecordedStep:
             self._warm.add(kind)
         else:
             _copy(inputs, recording.inputs)
-            recording.rates.copy_(torch.tensor(held.rates))
+            # Pinned: copying from other memory would wait until the GPU has finished the last step.
+            recording.rates.copy_(torch.tensor(held.rates, pin_memory=True), non_blocking=True)
             recording.graph.replay()
             result = recording.result
         self._steps += 1

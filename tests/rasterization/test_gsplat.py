@@ -15,7 +15,15 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
-from sundae_ns.rasterization import Rasterization, blending_weights, rasterize, select_backend, spherical_harmonics
+from sundae_ns.rasterization import (
+    Capacity,
+    Rasterization,
+    RecordableGsplat,
+    blending_weights,
+    rasterize,
+    select_backend,
+    spherical_harmonics,
+)
 
 pytestmark = pytest.mark.gpu
 
@@ -91,15 +99,18 @@ def within(record_property: Callable[[str, object], None]) -> Callable[[str, Ten
     [(0.33, False, 16), (0.33, True, 16), (1.0, False, 16), (0.33, False, 35)],
     ids=["faint", "antialiased", "opaque", "35 channels"],
 )
-def test_values_and_gradients(opacity: float, antialiased: bool, channels: int, within: Callable) -> None:
+@pytest.mark.parametrize("recordable", [False, True], ids=["gsplat", "recordable"])
+def test_values_and_gradients(
+    opacity: float, antialiased: bool, channels: int, recordable: bool, within: Callable
+) -> None:
     scene = _scene(opacity, channels)
     rim = opacity > 0.35 and not version("gsplat").startswith("1.4")
     results, leaves = {}, {}
     for name in ("gsplat", "reference"):
-        leaves[name] = _place(scene, name)
-        results[name] = rasterize(
-            **leaves[name], **_view(name), antialiased=antialiased, absgrad=True, render_depth=True
-        )
+        leaves[name], view = _place(scene, name), _view(name)
+        if recordable and name == "gsplat":
+            view["backend"] = RecordableGsplat(Capacity())
+        results[name] = rasterize(**leaves[name], **view, antialiased=antialiased, absgrad=True, render_depth=True)
         results[name].info["means2d"].retain_grad()
         _loss(results[name]).backward()
     ours, theirs = results["gsplat"], results["reference"]

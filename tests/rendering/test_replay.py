@@ -295,5 +295,6 @@ def test_shorter_lists_make_the_same_picture(build: Build, camera: MakeCamera, s
     capacity = Capacity()
     ours = render(model.source, view, background, replace(settings, backend=RecordableGsplat(capacity)))[0]
     assert int(capacity.needed[0]) > 0
-    for name in ("base_rgb", "depth", "accumulation"):
+    for name in ("depth", "accumulation"):
         assert torch.equal(ours[name], theirs[name])
+    torch.testing.assert_close(ours["base_rgb"], theirs["base_rgb"], rtol=0, atol=2e-6)  # harmonics of our own

@@ -1,0 +1,362 @@
+"""Front-to-back blending of gsplat's tile lists, and its gradients: one kernel each way, for training.
+
+The arithmetic and thresholds are gsplat's. Its backward pass sums each value of a primitive over the pixels of a warp by
+five exchanges, and adds the sums one by one. Here the lanes of a warp halve the values while they exchange them: 32 values
+take 31 exchanges in place of 160, and all are added at once. The gradient of alpha needs only the sum of what lies behind,
+already multiplied with the gradient of the pixel, so a thread keeps one number for it in place of one for each channel.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple, cast
+
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import SundaeError
+from sundae_ns.gpu.nvrtc import Argument, Kernel, Launch
+from sundae_ns.rasterization.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
+from sundae_ns.rasterization.gsplat_tiles import TILE, TileLists
+from sundae_ns.rasterization.tiles import MIN_ALPHA
+
+THREADS = TILE * TILE
+"""Threads of a block: one for each pixel of a tile."""
+
+LANES = 32
+"""Threads of a warp."""
+
+SOURCE = r"""
+struct __align__(16) Shape {
+    float x, y, opacity, a, b, c;  // the exponent is a dx^2 + b dx dy + c dy^2
+    int primitive;
+};
+
+// A part of a tile's list, which the threads of a block read together.
+struct Batch {
+    Shape shapes[THREADS];
+    __align__(16) float colors[THREADS][PADDED];
+};
+
+#define LISTS int width, int height, int tiles, int num_lists, int pairs, const int* __restrict__ starts, \
+    const int* __restrict__ list
+#define FIELD const float* __restrict__ means, const float* __restrict__ conics, const float* __restrict__ colors, \
+    const float* __restrict__ opacities
+
+__device__ __forceinline__ void read(Batch& batch, const int* __restrict__ list, int count, FIELD) {
+    for (int k = threadIdx.x; k < count; k += blockDim.x) {
+        const long long i = list[k];
+        const Shape shape = {means[2 * i], means[2 * i + 1], opacities[i], 0.5f * conics[3 * i],
+                             conics[3 * i + 1], 0.5f * conics[3 * i + 2], (int)i};
+        batch.shapes[k] = shape;
+#pragma unroll
+        for (int c = 0; c < CHANNELS; ++c) batch.colors[k][c] = colors[i * CHANNELS + c];
+    }
+}
+
+struct Pixel {
+    float x, y;
+    long long at;  // in the image
+    bool inside;
+};
+
+// A warp has eight by four pixels, because most primitives are as wide as high.
+__device__ __forceinline__ Pixel pixel_of(int tile, int number, int width, int height) {
+    const int columns = (width + TILE - 1) / TILE, block = number / 32, within = number % 32;
+    const int x = tile % columns * TILE + block % (TILE / 8) * 8 + within % 8;
+    const int y = tile / columns * TILE + block / (TILE / 8) * 4 + within / 8;
+    const Pixel pixel = {x + 0.5f, y + 0.5f, (long long)y * width + x, x < width && y < height};
+    return pixel;
+}
+
+// Alpha before it is limited, or 0 where the primitive is too faint to be blended.
+__device__ __forceinline__ float falloff(const Shape& s, float dx, float dy) {
+    const float exponent = s.a * dx * dx + s.c * dy * dy + s.b * dx * dy;
+    return exponent < 0 ? 0 : __expf(-exponent);
+}
+
+// One block blends one tile.
+extern "C" __global__ void blend(LISTS, FIELD, float* __restrict__ image,
+                                 float* __restrict__ alphas, float* __restrict__ lefts,
+                                 int* __restrict__ stops) {
+    __shared__ Batch batch;
+    const int tile = blockIdx.x;
+    if (tile >= tiles) return;
+    const int begin = starts[tile], end = tile + 1 < num_lists ? starts[tile + 1] : pairs;
+    for (int number = threadIdx.x; number < THREADS; number += blockDim.x) {  // once on a GPU
+        const Pixel pixel = pixel_of(tile, number, width, height);
+        float through = 1, sums[CHANNELS] = {};
+        int stop = begin;
+        bool done = !pixel.inside;
+        for (int first = begin; first < end; first += THREADS) {
+            if (__syncthreads_count(done) == blockDim.x) break;
+            const int count = end - first < THREADS ? end - first : THREADS;
+            read(batch, list + first, count, means, conics, colors, opacities);
+            __syncthreads();
+            for (int k = 0; k < count && !done; ++k) {
+                const Shape s = batch.shapes[k];
+                const float alpha = fminf(MAX_ALPHA, s.opacity * falloff(s, s.x - pixel.x, s.y - pixel.y));
+                if (alpha < MIN_ALPHA) continue;
+                const float behind = through * (1 - alpha);
+                if (behind <= MIN_TRANSMITTANCE) {
+                    done = true;
+                    break;
+                }
+                const float weight = alpha * through;
+#pragma unroll
+                for (int c = 0; c < CHANNELS; ++c) sums[c] += weight * batch.colors[k][c];
+                stop = first + k + 1;
+                through = behind;
+            }
+        }
+        if (!pixel.inside) continue;
+#pragma unroll
+        for (int c = 0; c < CHANNELS; ++c) image[pixel.at * CHANNELS + c] = sums[c];
+        alphas[pixel.at] = 1 - through;
+        lefts[pixel.at] = through;
+        stops[pixel.at] = stop;
+    }
+}
+
+// Sums of each value over the lanes of a warp. Lanes exchange and keep half of the values as long as there are two;
+// afterwards lane l holds the sums from l * SLOTS / LANES on.
+template <int OFFSET, int HAVE>
+__device__ __forceinline__ void sum_over_lanes(float* values, int lane) {
+    if constexpr (OFFSET > 0) {
+        if constexpr (HAVE > 1) {
+            const bool upper = lane & OFFSET;
+#pragma unroll
+            for (int k = 0; k < HAVE / 2; ++k) {
+                const float mine = upper ? values[k + HAVE / 2] : values[k];
+                const float other = upper ? values[k] : values[k + HAVE / 2];
+                values[k] = mine + __shfl_xor_sync(0xffffffffu, other, OFFSET);
+            }
+        } else {
+            values[0] += __shfl_xor_sync(0xffffffffu, values[0], OFFSET);
+        }
+        sum_over_lanes<OFFSET / 2, (HAVE > 1 ? HAVE / 2 : 1)>(values, lane);
+    }
+}
+
+#define KEPT (SLOTS > LANES ? SLOTS / LANES : 1)     // sums that a lane holds at the end
+#define SHARERS (LANES > SLOTS ? LANES / SLOTS : 1)  // lanes that hold the same sum
+
+// One block goes through one tile from back to front. Gradients are added to their current values.
+extern "C" __global__ void blend_backward(LISTS, FIELD, const float* __restrict__ lefts,
+                                          const int* __restrict__ stops, const float* __restrict__ grad_image,
+                                          const float* __restrict__ grad_alphas, float* __restrict__ grad_means,
+                                          float* __restrict__ grad_conics, float* __restrict__ grad_colors,
+                                          float* __restrict__ grad_opacities, float* __restrict__ grad_absolute) {
+    __shared__ Batch batch;
+    __shared__ int most;
+    const int tile = blockIdx.x;
+    if (tile >= tiles) return;
+    const int begin = starts[tile];
+    const int lane = threadIdx.x % LANES;
+
+    // Where this lane adds its sums: colours, centre, conic, opacity, absolute gradient of the centre.
+    float* into[KEPT];
+    int stride[KEPT];
+#pragma unroll
+    for (int k = 0; k < KEPT; ++k) {
+        const int value = lane / SHARERS * KEPT + k, shape = value - CHANNELS;
+        into[k] = 0;
+        if (lane % SHARERS != 0 || value >= VALUES) continue;
+        into[k] = value < CHANNELS ? grad_colors + value
+                  : shape < 2      ? grad_means + shape
+                  : shape < 5      ? grad_conics + shape - 2
+                  : shape < 6      ? grad_opacities
+                                   : grad_absolute + shape - 6;
+        stride[k] = value < CHANNELS ? CHANNELS : shape < 2 ? 2 : shape < 5 ? 3 : shape < 6 ? 1 : 2;
+    }
+
+    for (int number = threadIdx.x; number < THREADS; number += blockDim.x) {  // once on a GPU
+        const Pixel pixel = pixel_of(tile, number, width, height);
+        const int stop = pixel.inside ? stops[pixel.at] : begin;
+        int end_of_warp = stop;
+#pragma unroll
+        for (int offset = LANES / 2; offset > 0; offset /= 2) {
+            const int other = __shfl_xor_sync(0xffffffffu, end_of_warp, offset);
+            if (other > end_of_warp) end_of_warp = other;
+        }
+        if (threadIdx.x == 0) most = begin;
+        __syncthreads();
+        if (lane == 0) atomicMax(&most, end_of_warp);
+        __syncthreads();
+        const int end = most;
+
+        float gradient[CHANNELS];
+#pragma unroll
+        for (int c = 0; c < CHANNELS; ++c) gradient[c] = pixel.inside ? grad_image[pixel.at * CHANNELS + c] : 0;
+        const float left = pixel.inside ? lefts[pixel.at] : 0;  // transmittance behind the last primitive
+        const float grad_left = pixel.inside ? -grad_alphas[pixel.at] * left : 0;
+        float through = left, behind = 0;  // what lies behind, multiplied with the gradient of the pixel
+
+        for (int last = end; last > begin; last -= THREADS) {
+            const int first = last - begin > THREADS ? last - THREADS : begin;
+            __syncthreads();
+            read(batch, list + first, last - first, means, conics, colors, opacities);
+            __syncthreads();
+            int k = last - first - 1;
+            if (first + k >= end_of_warp) k = end_of_warp - first - 1;
+            for (; k >= 0; --k) {
+                const Shape s = batch.shapes[k];
+                const float dx = s.x - pixel.x, dy = s.y - pixel.y;
+                const float fall = falloff(s, dx, dy), alpha = fminf(MAX_ALPHA, s.opacity * fall);
+                const bool blended = first + k < stop && !(alpha < MIN_ALPHA);
+                if (!__any_sync(0xffffffffu, blended)) continue;
+                float values[SLOTS] = {};
+                if (blended) {
+                    const float rest = __fdividef(1.0f, 1 - alpha);
+                    through *= rest;
+                    const float weight = alpha * through;
+                    float shade = 0;
+#pragma unroll
+                    for (int c = 0; c < CHANNELS; ++c) {
+                        shade += batch.colors[k][c] * gradient[c];
+                        values[c] = weight * gradient[c];
+                    }
+                    const float grad_alpha = through * shade - rest * (behind + grad_left);
+                    behind += weight * shade;
+                    if (s.opacity * fall <= MAX_ALPHA) {
+                        const float grad_exponent = -s.opacity * fall * grad_alpha;
+                        const float along_x = grad_exponent * (2 * s.a * dx + s.b * dy);
+                        const float along_y = grad_exponent * (s.b * dx + 2 * s.c * dy);
+                        values[CHANNELS] = along_x;
+                        values[CHANNELS + 1] = along_y;
+                        values[CHANNELS + 2] = 0.5f * grad_exponent * dx * dx;
+                        values[CHANNELS + 3] = grad_exponent * dx * dy;
+                        values[CHANNELS + 4] = 0.5f * grad_exponent * dy * dy;
+                        values[CHANNELS + 5] = fall * grad_alpha;
+#if ABSOLUTE
+                        values[CHANNELS + 6] = fabsf(along_x);
+                        values[CHANNELS + 7] = fabsf(along_y);
+#endif
+                    }
+                }
+                sum_over_lanes<LANES / 2, SLOTS>(values, lane);
+#pragma unroll
+                for (int n = 0; n < KEPT; ++n)
+                    if (into[n]) atomicAdd(into[n] + (long long)s.primitive * stride[n], values[n]);
+            }
+        }
+    }
+}
+"""
+
+
+class Launches(NamedTuple):
+    """Both kernels on one device, for one number of channels."""
+
+    blend: Launch
+    blend_backward: Launch
+
+
+def definitions(channels: int, *, absgrad: bool, lanes: int = LANES) -> tuple[str, ...]:
+    """Compiler options of :data:`SOURCE`.
+
+    Args:
+        channels: number of channels to blend.
+        absgrad: whether absolute gradients of the centres are summed too.
+        lanes: threads of a warp.
+    """
+    values = channels + (8 if absgrad else 6)
+    numbers = {
+        "TILE": TILE,
+        "THREADS": THREADS,
+        "LANES": lanes,
+        "CHANNELS": channels,
+        "PADDED": -(-channels // 4) * 4,
+        "VALUES": values,
+        "SLOTS": 1 << (values - 1).bit_length(),
+        "ABSOLUTE": int(absgrad),
+    }
+    limits = {"MAX_ALPHA": MAX_ALPHA, "MIN_ALPHA": MIN_ALPHA, "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE}
+    return (
+        *(f"-D{name}={number}" for name, number in numbers.items()),
+        *(f"-D{name}={limit:.9e}f" for name, limit in limits.items()),
+    )
+
+
+def blend(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    lists: TileLists,
+    width: int,
+    height: int,
+    *,
+    absgrad: bool = False,
+) -> tuple[Tensor, Tensor]:
+    """Blend to an image ``[1, H, W, C]`` and its alpha ``[1, H, W, 1]``; once differentiable in the first four.
+
+    Args:
+        means2d: centres in pixels ``[1, N, 2]``; all float32 on a CUDA device. With ``absgrad`` the backward pass sets
+            ``means2d.absgrad`` ``[1, N, 2]``, the absolute gradients of the pixels, summed (AbsGS).
+        conics: inverse covariances on the screen, upper triangle ``[1, N, 3]``.
+        colors: values to blend ``[1, N, C]``.
+        opacities: ``[1, N]``.
+        lists: of the image's tiles; those of further tiles are ignored.
+        width: image width in pixels.
+        height: image height in pixels.
+        absgrad: see ``means2d``.
+
+    Raises:
+        BackendError: the kernels cannot be compiled or loaded.
+    """
+    launches = _compiled(means2d.device, colors.shape[-1], absgrad)
+    return cast(
+        "tuple[Tensor, Tensor]",
+        _Blended.apply(means2d, conics, colors, opacities, lists, width, height, absgrad, launches),
+    )
+
+
+class _Blended(torch.autograd.Function):
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means2d: Tensor,
+        conics: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        lists: TileLists,
+        width: int,
+        height: int,
+        absgrad: bool,
+        launches: Launches,
+    ) -> tuple[Tensor, Tensor]:
+        field = [value.contiguous() for value in (means2d, conics, colors, opacities)]
+        image = colors.new_empty(1, height, width, colors.shape[-1])
+        alphas = colors.new_empty(1, height, width, 1)
+        lefts = torch.empty_like(alphas)  # 1 - alpha would round them to multiples of 6e-8
+        stops = torch.empty(height, width, dtype=torch.int32, device=colors.device)
+        tiles = -(-width // TILE) * -(-height // TILE)
+        ctx.place = [width, height, tiles, lists.starts.numel(), len(lists.primitives), lists.starts, lists.primitives]
+        launches.blend(tiles * THREADS, [*ctx.place, *field, image, alphas, lefts, stops])
+        ctx.save_for_backward(means2d, *field, lefts, stops)
+        ctx.absgrad, ctx.launches = absgrad, launches
+        return image, alphas
+
+    @staticmethod
+    def backward(ctx: Any, grad_image: Tensor, grad_alphas: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        if torch.is_grad_enabled():  # create_graph=True: the kernel would be missing from that graph
+            raise SundaeError("this blending has no second derivative; use the reference rasteriser")
+        centers, means2d, conics, colors, opacities, lefts, stops = ctx.saved_tensors
+        grad_means, grad_conics, grad_colors, grad_opacities = (
+            torch.zeros_like(value) for value in (means2d, conics, colors, opacities)
+        )
+        absolute = torch.zeros_like(means2d) if ctx.absgrad else None
+        arguments: list[Argument] = [*ctx.place, means2d, conics, colors, opacities, lefts, stops]
+        arguments += [grad_image.contiguous(), grad_alphas.contiguous()]
+        grads = [grad_means, grad_conics, grad_colors, grad_opacities, absolute]
+        ctx.launches.blend_backward(ctx.place[2] * THREADS, [*arguments, *grads])
+        if ctx.absgrad:
+            centers.absgrad = absolute
+        return grad_means, grad_conics, grad_colors, grad_opacities, None, None, None, None, None
+
+
+@functools.cache
+def _compiled(device: torch.device, channels: int, absgrad: bool) -> Launches:
+    options = definitions(channels, absgrad=absgrad)
+    return Launches(*(Kernel(SOURCE, name, device, options, THREADS) for name in Launches._fields))
