@@ -41,6 +41,10 @@ _SHIM = """
 #define __syncthreads()
 #define __syncthreads_count(x) ((x) ? 1 : 0)
 #define __any_sync(mask, x) (x)
+#define __all_sync(mask, x) (x)
+#define __ballot_sync(mask, x) ((x) ? 1u : 0u)
+#define __ffs __builtin_ffs
+#define __clz __builtin_clz
 #define __shfl_xor_sync(mask, x, offset) (x)
 #define __expf expf
 #define __fdividef(a, b) ((a) / (b))

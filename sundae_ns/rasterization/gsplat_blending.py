@@ -17,7 +17,7 @@ from torch import Tensor
 from sundae_ns.errors import SundaeError
 from sundae_ns.gpu.nvrtc import Argument, Kernel, Launch
 from sundae_ns.rasterization.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
-from sundae_ns.rasterization.gsplat_tiles import TILE, TileLists
+from sundae_ns.rasterization.gsplat_tiles import BOX, ROUNDING, TILE, TileLists
 from sundae_ns.rasterization.tiles import MIN_ALPHA
 
 THREADS = TILE * TILE
@@ -26,10 +26,18 @@ THREADS = TILE * TILE
 LANES = 32
 """Threads of a warp."""
 
-SOURCE = r"""
+SOURCE = (
+    BOX
+    + r"""
+#define WIDE 8   // pixels of a warp
+#define HIGH 4
+#define ACROSS (TILE / WIDE)  // warps side by side
+#define ALL 0xffffffffu
+
 struct __align__(16) Shape {
-    float x, y, opacity, a, b, c;  // the exponent is a dx^2 + b dx dy + c dy^2
+    float x, y, opacity, a, b, c;  // the exponent is a dx^2 + 2 b dx dy + c dy^2
     int primitive;
+    unsigned warps;  // a bit for each warp with pixels that may blend the primitive
 };
 
 // A part of a tile's list, which the threads of a block read together.
@@ -43,12 +51,20 @@ struct Batch {
 #define FIELD const float* __restrict__ means, const float* __restrict__ conics, const float* __restrict__ colors, \
     const float* __restrict__ opacities
 
-__device__ __forceinline__ void read(Batch& batch, const int* __restrict__ list, int count, FIELD) {
+__device__ __forceinline__ void read(Batch& batch, const int* __restrict__ list, int count, int tile, int width, FIELD) {
+    const int columns = (width + TILE - 1) / TILE;
     for (int k = threadIdx.x; k < count; k += blockDim.x) {
         const long long i = list[k];
-        const Shape shape = {means[2 * i], means[2 * i + 1], opacities[i], 0.5f * conics[3 * i],
-                             conics[3 * i + 1], 0.5f * conics[3 * i + 2], (int)i};
-        batch.shapes[k] = shape;
+        Shape s = {means[2 * i], means[2 * i + 1], opacities[i], 0.5f * conics[3 * i],
+                   0.5f * conics[3 * i + 1], 0.5f * conics[3 * i + 2], (int)i, 0};
+        const float down = -s.b / s.c, across = -s.b / s.a, reach = logf(s.opacity * 255.0f);
+        const float left = tile % columns * TILE + 0.5f - s.x, up = tile / columns * TILE + 0.5f - s.y;
+#pragma unroll
+        for (int warp = 0; warp < THREADS / (WIDE * HIGH); ++warp) {
+            const float x = left + warp % ACROSS * WIDE, y = up + warp / ACROSS * HIGH;
+            if (!misses_box(s.a, s.b, s.c, down, across, reach, x, x + WIDE - 1, y, y + HIGH - 1)) s.warps |= 1u << warp;
+        }
+        batch.shapes[k] = s;
 #pragma unroll
         for (int c = 0; c < CHANNELS; ++c) batch.colors[k][c] = colors[i * CHANNELS + c];
     }
@@ -60,18 +76,18 @@ struct Pixel {
     bool inside;
 };
 
-// A warp has eight by four pixels, because most primitives are as wide as high.
+// Pixels of a warp form a block, because most primitives are as wide as high.
 __device__ __forceinline__ Pixel pixel_of(int tile, int number, int width, int height) {
-    const int columns = (width + TILE - 1) / TILE, block = number / 32, within = number % 32;
-    const int x = tile % columns * TILE + block % (TILE / 8) * 8 + within % 8;
-    const int y = tile / columns * TILE + block / (TILE / 8) * 4 + within / 8;
+    const int columns = (width + TILE - 1) / TILE, warp = number / (WIDE * HIGH), place = number % (WIDE * HIGH);
+    const int x = tile % columns * TILE + warp % ACROSS * WIDE + place % WIDE;
+    const int y = tile / columns * TILE + warp / ACROSS * HIGH + place / WIDE;
     const Pixel pixel = {x + 0.5f, y + 0.5f, (long long)y * width + x, x < width && y < height};
     return pixel;
 }
 
 // Alpha before it is limited, or 0 where the primitive is too faint to be blended.
 __device__ __forceinline__ float falloff(const Shape& s, float dx, float dy) {
-    const float exponent = s.a * dx * dx + s.c * dy * dy + s.b * dx * dy;
+    const float exponent = s.a * dx * dx + s.c * dy * dy + 2 * s.b * dx * dy;
     return exponent < 0 ? 0 : __expf(-exponent);
 }
 
@@ -82,8 +98,9 @@ extern "C" __global__ void blend(LISTS, FIELD, float* __restrict__ image,
     __shared__ Batch batch;
     const int tile = blockIdx.x;
     if (tile >= tiles) return;
-    const int begin = starts[tile], end = tile + 1 < num_lists ? starts[tile + 1] : pairs;
+    const int lane = threadIdx.x % LANES, begin = starts[tile], end = tile + 1 < num_lists ? starts[tile + 1] : pairs;
     for (int number = threadIdx.x; number < THREADS; number += blockDim.x) {  // once on a GPU
+        const int warp = number / (WIDE * HIGH);
         const Pixel pixel = pixel_of(tile, number, width, height);
         float through = 1, sums[CHANNELS] = {};
         int stop = begin;
@@ -91,22 +108,25 @@ extern "C" __global__ void blend(LISTS, FIELD, float* __restrict__ image,
         for (int first = begin; first < end; first += THREADS) {
             if (__syncthreads_count(done) == blockDim.x) break;
             const int count = end - first < THREADS ? end - first : THREADS;
-            read(batch, list + first, count, means, conics, colors, opacities);
+            read(batch, list + first, count, tile, width, means, conics, colors, opacities);
             __syncthreads();
-            for (int k = 0; k < count && !done; ++k) {
-                const Shape s = batch.shapes[k];
-                const float alpha = fminf(MAX_ALPHA, s.opacity * falloff(s, s.x - pixel.x, s.y - pixel.y));
-                if (alpha < MIN_ALPHA) continue;
-                const float behind = through * (1 - alpha);
-                if (behind <= MIN_TRANSMITTANCE) {
-                    done = true;
-                    break;
-                }
-                const float weight = alpha * through;
+            for (int some = 0; some < count && !__all_sync(ALL, done); some += LANES) {
+                unsigned bits = __ballot_sync(ALL, some + lane < count && batch.shapes[some + lane].warps >> warp & 1);
+                for (; bits != 0; bits &= bits - 1) {
+                    if (done) continue;
+                    const int k = some + __ffs(bits) - 1;
+                    const Shape s = batch.shapes[k];
+                    const float alpha = fminf(MAX_ALPHA, s.opacity * falloff(s, s.x - pixel.x, s.y - pixel.y));
+                    if (alpha < MIN_ALPHA) continue;
+                    const float behind = through * (1 - alpha);
+                    done = behind <= MIN_TRANSMITTANCE;
+                    if (done) continue;
+                    const float weight = alpha * through;
 #pragma unroll
-                for (int c = 0; c < CHANNELS; ++c) sums[c] += weight * batch.colors[k][c];
-                stop = first + k + 1;
-                through = behind;
+                    for (int c = 0; c < CHANNELS; ++c) sums[c] += weight * batch.colors[k][c];
+                    stop = first + k + 1;
+                    through = behind;
+                }
             }
         }
         if (!pixel.inside) continue;
@@ -129,10 +149,10 @@ __device__ __forceinline__ void sum_over_lanes(float* values, int lane) {
             for (int k = 0; k < HAVE / 2; ++k) {
                 const float mine = upper ? values[k + HAVE / 2] : values[k];
                 const float other = upper ? values[k] : values[k + HAVE / 2];
-                values[k] = mine + __shfl_xor_sync(0xffffffffu, other, OFFSET);
+                values[k] = mine + __shfl_xor_sync(ALL, other, OFFSET);
             }
         } else {
-            values[0] += __shfl_xor_sync(0xffffffffu, values[0], OFFSET);
+            values[0] += __shfl_xor_sync(ALL, values[0], OFFSET);
         }
         sum_over_lanes<OFFSET / 2, (HAVE > 1 ? HAVE / 2 : 1)>(values, lane);
     }
@@ -171,12 +191,13 @@ extern "C" __global__ void blend_backward(LISTS, FIELD, const float* __restrict_
     }
 
     for (int number = threadIdx.x; number < THREADS; number += blockDim.x) {  // once on a GPU
+        const int warp = number / (WIDE * HIGH);
         const Pixel pixel = pixel_of(tile, number, width, height);
         const int stop = pixel.inside ? stops[pixel.at] : begin;
         int end_of_warp = stop;
 #pragma unroll
         for (int offset = LANES / 2; offset > 0; offset /= 2) {
-            const int other = __shfl_xor_sync(0xffffffffu, end_of_warp, offset);
+            const int other = __shfl_xor_sync(ALL, end_of_warp, offset);
             if (other > end_of_warp) end_of_warp = other;
         }
         if (threadIdx.x == 0) most = begin;
@@ -195,54 +216,59 @@ extern "C" __global__ void blend_backward(LISTS, FIELD, const float* __restrict_
         for (int last = end; last > begin; last -= THREADS) {
             const int first = last - begin > THREADS ? last - THREADS : begin;
             __syncthreads();
-            read(batch, list + first, last - first, means, conics, colors, opacities);
+            read(batch, list + first, last - first, tile, width, means, conics, colors, opacities);
             __syncthreads();
-            int k = last - first - 1;
-            if (first + k >= end_of_warp) k = end_of_warp - first - 1;
-            for (; k >= 0; --k) {
-                const Shape s = batch.shapes[k];
-                const float dx = s.x - pixel.x, dy = s.y - pixel.y;
-                const float fall = falloff(s, dx, dy), alpha = fminf(MAX_ALPHA, s.opacity * fall);
-                const bool blended = first + k < stop && !(alpha < MIN_ALPHA);
-                if (!__any_sync(0xffffffffu, blended)) continue;
-                float values[SLOTS] = {};
-                if (blended) {
-                    const float rest = __fdividef(1.0f, 1 - alpha);
-                    through *= rest;
-                    const float weight = alpha * through;
-                    float shade = 0;
+            const int count = (last < end_of_warp ? last : end_of_warp) - first;
+            for (int some = (count - 1) / LANES * LANES; some >= 0 && count > 0; some -= LANES) {
+                unsigned bits = __ballot_sync(ALL, some + lane < count && batch.shapes[some + lane].warps >> warp & 1);
+                while (bits != 0) {
+                    const int highest = 31 - __clz(bits), k = some + highest;
+                    bits ^= 1u << highest;
+                    const Shape s = batch.shapes[k];
+                    const float dx = s.x - pixel.x, dy = s.y - pixel.y;
+                    const float fall = falloff(s, dx, dy), alpha = fminf(MAX_ALPHA, s.opacity * fall);
+                    const bool blended = first + k < stop && !(alpha < MIN_ALPHA);
+                    if (!__any_sync(ALL, blended)) continue;
+                    float values[SLOTS] = {};
+                    if (blended) {
+                        const float rest = __fdividef(1.0f, 1 - alpha);
+                        through *= rest;
+                        const float weight = alpha * through;
+                        float shade = 0;
 #pragma unroll
-                    for (int c = 0; c < CHANNELS; ++c) {
-                        shade += batch.colors[k][c] * gradient[c];
-                        values[c] = weight * gradient[c];
-                    }
-                    const float grad_alpha = through * shade - rest * (behind + grad_left);
-                    behind += weight * shade;
-                    if (s.opacity * fall <= MAX_ALPHA) {
-                        const float grad_exponent = -s.opacity * fall * grad_alpha;
-                        const float along_x = grad_exponent * (2 * s.a * dx + s.b * dy);
-                        const float along_y = grad_exponent * (s.b * dx + 2 * s.c * dy);
-                        values[CHANNELS] = along_x;
-                        values[CHANNELS + 1] = along_y;
-                        values[CHANNELS + 2] = 0.5f * grad_exponent * dx * dx;
-                        values[CHANNELS + 3] = grad_exponent * dx * dy;
-                        values[CHANNELS + 4] = 0.5f * grad_exponent * dy * dy;
-                        values[CHANNELS + 5] = fall * grad_alpha;
+                        for (int c = 0; c < CHANNELS; ++c) {
+                            shade += batch.colors[k][c] * gradient[c];
+                            values[c] = weight * gradient[c];
+                        }
+                        const float grad_alpha = through * shade - rest * (behind + grad_left);
+                        behind += weight * shade;
+                        if (s.opacity * fall <= MAX_ALPHA) {
+                            const float grad_exponent = -s.opacity * fall * grad_alpha;
+                            const float along_x = 2 * grad_exponent * (s.a * dx + s.b * dy);
+                            const float along_y = 2 * grad_exponent * (s.b * dx + s.c * dy);
+                            values[CHANNELS] = along_x;
+                            values[CHANNELS + 1] = along_y;
+                            values[CHANNELS + 2] = 0.5f * grad_exponent * dx * dx;
+                            values[CHANNELS + 3] = grad_exponent * dx * dy;
+                            values[CHANNELS + 4] = 0.5f * grad_exponent * dy * dy;
+                            values[CHANNELS + 5] = fall * grad_alpha;
 #if ABSOLUTE
-                        values[CHANNELS + 6] = fabsf(along_x);
-                        values[CHANNELS + 7] = fabsf(along_y);
+                            values[CHANNELS + 6] = fabsf(along_x);
+                            values[CHANNELS + 7] = fabsf(along_y);
 #endif
+                        }
                     }
-                }
-                sum_over_lanes<LANES / 2, SLOTS>(values, lane);
+                    sum_over_lanes<LANES / 2, SLOTS>(values, lane);
 #pragma unroll
-                for (int n = 0; n < KEPT; ++n)
-                    if (into[n]) atomicAdd(into[n] + (long long)s.primitive * stride[n], values[n]);
+                    for (int n = 0; n < KEPT; ++n)
+                        if (into[n]) atomicAdd(into[n] + (long long)s.primitive * stride[n], values[n]);
+                }
             }
         }
     }
 }
 """
+)
 
 
 class Launches(NamedTuple):
@@ -271,7 +297,12 @@ def definitions(channels: int, *, absgrad: bool, lanes: int = LANES) -> tuple[st
         "SLOTS": 1 << (values - 1).bit_length(),
         "ABSOLUTE": int(absgrad),
     }
-    limits = {"MAX_ALPHA": MAX_ALPHA, "MIN_ALPHA": MIN_ALPHA, "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE}
+    limits = {
+        "MAX_ALPHA": MAX_ALPHA,
+        "MIN_ALPHA": MIN_ALPHA,
+        "MIN_TRANSMITTANCE": MIN_TRANSMITTANCE,
+        "ROUNDING": ROUNDING,
+    }
     return (
         *(f"-D{name}={number}" for name, number in numbers.items()),
         *(f"-D{name}={limit:.9e}f" for name, limit in limits.items()),

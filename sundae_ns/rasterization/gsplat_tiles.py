@@ -23,7 +23,42 @@ TILE = 16
 ROUNDING = 1e-5
 """Slack on exponents, relative to the terms of their sum, so that rounding never drops a blended primitive."""
 
-SOURCE = r"""
+BOX = r"""
+__device__ __forceinline__ float nearest(float low, float high) { return low > 0 ? low : high < 0 ? high : 0.0f; }
+
+__device__ __forceinline__ float within(float value, float low, float high) {
+    return value < low ? low : value > high ? high : value;
+}
+
+// Whether a primitive's exponent, a dx^2 + 2 b dx dy + c dy^2, exceeds its reach in all pixels of a box around their centres,
+// relative to its own. The exponent is least at dy = slope_down dx in a column, and at dx = slope_across dy in a row. If the
+// primitive's centre is outside the box, the least exponent lies on an edge that faces the centre. NaN returns false, which
+// leaves the decision to the blending.
+__device__ __forceinline__ bool misses_box(float a, float b, float c, float slope_down, float slope_across, float reach,
+                                           float left, float right, float up, float down) {
+    const float near_x = nearest(left, right), near_y = nearest(up, down);
+    float squares = 0, least = 0;  // in thin primitives large terms cancel: the slack grows with them
+    if (near_x != 0) {
+        const float dy = within(slope_down * near_x, up, down);
+        squares = a * near_x * near_x + c * dy * dy;
+        least = squares + 2 * b * near_x * dy;
+    }
+    if (near_y != 0) {
+        const float dx = within(slope_across * near_y, left, right);
+        const float other = a * dx * dx + c * near_y * near_y, sum = other + 2 * b * dx * near_y;
+        if (near_x == 0 || !(sum >= least)) {
+            squares = other;
+            least = sum;
+        }
+    }
+    return least > reach + ROUNDING * (1 + squares);
+}
+"""
+"""CUDA source of ``misses_box``; needs the macro ``ROUNDING``."""
+
+SOURCE = (
+    BOX
+    + r"""
 struct Footprint {
     float x, y, a, b, c;           // centre in pixels; the exponent is a dx^2 + 2 b dx dy + c dy^2
     float down, across;            // where it is least: dy = down dx in a column, dx = across dy in a row
@@ -35,34 +70,12 @@ __device__ __forceinline__ int clamped(float value, int most) {
     return value > 0 ? value < most ? (int)value : most : 0;
 }
 
-__device__ __forceinline__ float nearest(float low, float high) { return low > 0 ? low : high < 0 ? high : 0.0f; }
-
-__device__ __forceinline__ float within(float value, float low, float high) {
-    return value < low ? low : value > high ? high : value;
-}
-
-// Whether no pixel of a tile blends the primitive. If the centre is outside the box of pixel centres, the least
-// exponent lies on an edge of the box that faces the centre. NaN returns false, which leaves the decision to gsplat.
+// Whether no pixel of a tile blends the primitive.
 __device__ __forceinline__ bool misses(const Footprint& f, int column, int row, int width, int height) {
     const int wide = width - column * TILE, high = height - row * TILE;
     const float left = column * TILE + 0.5f - f.x, right = left + (wide < TILE ? wide : TILE) - 1;
     const float up = row * TILE + 0.5f - f.y, down = up + (high < TILE ? high : TILE) - 1;
-    const float near_x = nearest(left, right), near_y = nearest(up, down);
-    float squares = 0, least = 0;  // in thin primitives large terms cancel: the slack grows with them
-    if (near_x != 0) {
-        const float dy = within(f.down * near_x, up, down);
-        squares = f.a * near_x * near_x + f.c * dy * dy;
-        least = squares + 2 * f.b * near_x * dy;
-    }
-    if (near_y != 0) {
-        const float dx = within(f.across * near_y, left, right);
-        const float other = f.a * dx * dx + f.c * near_y * near_y, sum = other + 2 * f.b * dx * near_y;
-        if (near_x == 0 || !(sum >= least)) {
-            squares = other;
-            least = sum;
-        }
-    }
-    return least > f.reach + ROUNDING * (1 + squares);
+    return misses_box(f.a, f.b, f.c, f.down, f.across, f.reach, left, right, up, down);
 }
 
 // The touched tiles of one row. They are adjacent, because the exponent is convex. Bisect on both sides of the tile
@@ -162,6 +175,7 @@ extern "C" __global__ void list_tiles(FIELD, const int* __restrict__ counts, con
         WALK((int)thread, tiles, primitives, ends[thread] - counts[thread], capacity);
 }
 """
+)
 
 
 @dataclass

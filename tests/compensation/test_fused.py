@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from sundae_ns.compensation import CompensationHead, HeadConfig, fused, kernels
+from sundae_ns.compensation import CompensationHead, HeadConfig, fused, fused_training, kernels
 from sundae_ns.compensation.fused_training import FusedTraining, _Pass, network_backward
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu import nvrtc
@@ -141,6 +141,13 @@ def test_same_gradients(compiled: Compile, mode: str, pixel_unshuffle: int) -> N
             kernel_gradients(head, images, grad_out, training),
             layer_gradients(head, images, grad_out),
         )
+
+
+def test_sums_over_pixels_by_few_threads(compiled: Compile, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fused_training, "MOST_WORKERS", 37)
+    head, images, grad_out = make(), splatted(37, 50, 5), torch.randn(37, 50, 3)
+    training = FusedTraining(head.net, True, compiled(head))
+    assert_same(kernel_gradients(head, images, grad_out, training), layer_gradients(head, images, grad_out))
 
 
 @given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
