@@ -34,6 +34,7 @@ from sundae_ns.scenes.opening import views_to_test
 ARMS: dict[str, list[str]] = {
     "splatfacto": ["splatfacto"],
     "sundae": ["sundae"],
+    "sundae-fast": ["sundae-fast"],
     "sundae-unrecorded": ["sundae", "--record-steps", "False"],
     "sundae-with-head": ["sundae", "--pipeline.model.head.mode", "residual"],
 }

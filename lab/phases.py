@@ -25,9 +25,20 @@ def look(step):
             prof = torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]); prof.__enter__()
         if step == s + 115:
             torch.cuda.synchronize(); prof.__exit__(None, None, None)
-            table = prof.key_averages().table(sort_by="cuda_time_total", row_limit=32, max_name_column_width=90)
+            table = prof.key_averages().table(sort_by="cuda_time_total", row_limit=70, max_name_column_width=90)
             print("KERNELS of 25 steps", n); print("\n".join(line[:92] + line[-60:] for line in table.splitlines()), flush=True)
+alone = {s + 130: n for s, n in spans.items()}
+hosts = []
+def host(step):
+    """Host time of steps while the GPU's queue is short."""
+    for s, n in alone.items():
+        if step == s: torch.cuda.synchronize(); hosts[:] = [time.perf_counter()]
+        elif s < step <= s + 20: hosts.append(time.perf_counter())
+        if step == s + 20:
+            gaps = sorted(b - a for a, b in zip(hosts, hosts[1:]))
+            print("HOST", n, "median %.3f mean %.3f ms" % (1e3 * gaps[len(gaps) // 2], 1e3 * sum(gaps) / len(gaps)), flush=True)
 b.after_step(t, look)
+b.after_step(t, host)
 t0 = time.perf_counter()
 t.train()
 torch.cuda.synchronize()
