@@ -37,7 +37,22 @@ def host(step):
         if step == s + 20:
             gaps = sorted(b - a for a, b in zip(hosts, hosts[1:]))
             print("HOST", n, "median %.3f mean %.3f ms" % (1e3 * gaps[len(gaps) // 2], 1e3 * sum(gaps) / len(gaps)), flush=True)
+spent = {}
+def watch(owner, name):
+    old = getattr(owner, name)
+    def run(*a, **k):
+        c = time.perf_counter(); r = old(*a, **k); e = spent.setdefault(f"{owner.__name__}.{name}", [0, 0.0]); e[0] += 1; e[1] += time.perf_counter() - c; return r
+    setattr(owner, name, run)
+from sundae_ns.training import recorded as rec, densification as den
+from sundae_ns.gpu.nvrtc import Kernel
+for owner, name in ((rec.RecordedStep, "_hold"), (rec.RecordedStep, "_run"), (rec.RecordedStep, "_recorded"), (Kernel, "__init__"), (torch.cuda, "empty_cache")): watch(owner, name)
+for e in t.pipeline.model.extensions:
+    watch(type(e), "after_step")
+def report(step):
+    if step in (0, 10, 500, 1000, 2000, 3000, 5000, 7500) or step == steps - 1:
+        torch.cuda.synchronize(); print("SPENT", step, round(time.perf_counter() - t0, 2), {k: (n, round(s, 2)) for k, (n, s) in spent.items()}, flush=True)
 b.after_step(t, look)
+b.after_step(t, report)
 b.after_step(t, host)
 t0 = time.perf_counter()
 t.train()

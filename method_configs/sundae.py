@@ -114,7 +114,11 @@ def method(
                 **model,
             ),
         ),
-        logging=LoggingConfig(local_writer=LocalWriterConfig(_target=ProgressWriter, enable=True)),
+        logging=LoggingConfig(
+            # TensorBoard waits for the GPU to read the figures of a step.
+            steps_per_log=100 if torch.cuda.is_available() else 10,
+            local_writer=LocalWriterConfig(_target=ProgressWriter, enable=True),
+        ),
         optimizers=optimizers(steps, means_restart=means_restart),
         # A training ends by itself, so that the next command runs; ns-viewer shows the run afterwards.
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, quit_on_train_completion=True),

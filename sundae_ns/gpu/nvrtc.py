@@ -6,6 +6,7 @@ Both libraries come with a CUDA build of torch and its driver; neither nvcc nor 
 from __future__ import annotations
 
 import ctypes
+import functools
 from collections.abc import Callable, Sequence
 from ctypes import byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_void_p
 
@@ -68,19 +69,14 @@ class Kernel:
         Raises:
             BackendError: the kernel cannot be compiled or loaded.
         """
-        major, minor = torch.cuda.get_device_capability(device)
-        code = compile_cubin(source, f"sm_{major}{minor}", options)
         self._driver = _library("cuda")
         self._device = device
         self._block = block
         self._function, self._context = c_void_p(), c_void_p()
-        module = c_void_p()
+        module = _module(source, tuple(options), device)
         with torch.cuda.device(device):
-            # The driver's calls need torch's context on this thread; work on the device creates it.
-            torch.zeros(1, device=device)
-            self._check(self._driver.cuCtxGetCurrent(byref(self._context)))
-            self._check(self._driver.cuModuleLoadData(byref(module), code))
-            self._check(self._driver.cuModuleGetFunction(byref(self._function), module, name.encode()))
+            _check(self._driver, self._driver.cuCtxGetCurrent(byref(self._context)))
+            _check(self._driver, self._driver.cuModuleGetFunction(byref(self._function), module, name.encode()))
 
     def __call__(self, threads: int, arguments: Sequence[Argument]) -> None:
         """Launch the kernel on the current stream.
@@ -99,18 +95,31 @@ class Kernel:
         block = (c_uint(self._block), c_uint(1), c_uint(1))
         with torch.cuda.device(self._device):
             # Autograd's threads may launch kernels before torch has done any work on them.
-            self._check(self._driver.cuCtxSetCurrent(self._context))
+            _check(self._driver, self._driver.cuCtxSetCurrent(self._context))
             stream = c_void_p(torch.cuda.current_stream(self._device).cuda_stream)
-            self._check(
-                self._driver.cuLaunchKernel(self._function, *grid, *block, c_uint(0), stream, pointers, c_void_p())
-            )
+            arguments = (*grid, *block, c_uint(0), stream, pointers, c_void_p())
+            _check(self._driver, self._driver.cuLaunchKernel(self._function, *arguments))
 
-    def _check(self, result: int) -> None:
-        if result != 0:
-            text = c_char_p()
-            self._driver.cuGetErrorString(result, byref(text))
-            reason = text.value.decode() if text.value else f"error {result}"
-            raise BackendError(f"a CUDA kernel does not run ({reason}): update the driver")
+
+@functools.cache
+def _module(source: str, options: tuple[str, ...], device: torch.device) -> c_void_p:
+    """A compiled source, loaded once for all of its kernels: compiling takes up to a second."""
+    major, minor = torch.cuda.get_device_capability(device)
+    code = compile_cubin(source, f"sm_{major}{minor}", options)
+    driver, module = _library("cuda"), c_void_p()
+    with torch.cuda.device(device):
+        # The driver's calls need torch's context on this thread; work on the device creates it.
+        torch.zeros(1, device=device)
+        _check(driver, driver.cuModuleLoadData(byref(module), code))
+    return module
+
+
+def _check(driver: ctypes.CDLL, result: int) -> None:
+    if result != 0:
+        text = c_char_p()
+        driver.cuGetErrorString(result, byref(text))
+        reason = text.value.decode() if text.value else f"error {result}"
+        raise BackendError(f"a CUDA kernel does not run ({reason}): update the driver")
 
 
 def _as_c(argument: Argument, device: torch.device) -> ctypes.c_void_p | ctypes.c_int | ctypes.c_double:
