@@ -32,7 +32,7 @@ from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, is_recording, record, warm_up
 
-MOST_WORKERS = 2**15
+MOST_WORKERS = 2**17
 """Threads that sum a gradient over the pixels; fewer leave the GPU idle, and more wait for each other to add."""
 
 _log = logging.getLogger(__name__)
