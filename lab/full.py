@@ -63,6 +63,8 @@ def load(trainer, path):
         if part == "optimizers": states.pop(FEATURES, None)
         loaded[part] = states
     trainer._restore(loaded)
+    for key, scheduler in trainer.optimizers.schedulers.items():  # the head's is new: it counts steps from the start too
+        if key not in loaded["schedulers"]: scheduler.last_epoch = loaded["step"] + 1
 
 
 trainer = config.setup(local_rank=0, world_size=1)
