@@ -10,7 +10,7 @@ After the prune:
   "shrink": {p: a} multiplies parameter p (or "head", its weights) by 1 - a at each step, applied every tenth
   "smooth": {p: m} every tenth step parameter p goes by a share m towards the weighted mean of 8 neighbours on the pruning graph
   "rates": {p: f}  learning rates times f; "freeze": {p: step} sets them to 0 from a step on
-  "relocate": {"share": s, "every": k, "until": step, "views": v, "power": q}  the share s with the smallest blending weight over v
+  "relocate": {"share": s, "every": k, "until": step, "views": v, "power": q}  the share s with the smallest blending weight over (v)
                    training views moves onto primitives drawn by weight x |error|^q, which are split along their longest axis
   "distil": {"views": v, "share": s, "reach": t}  s of the steps train on v images of the unpruned field, from cameras
                    between two neighbours (t: farthest share of the way, also sideways)
@@ -25,11 +25,11 @@ import random
 from dataclasses import replace
 
 import torch
-import torch.nn.functional as F
 
 import sundae_ns.training.recorded as recorded_module
 import sundae_ns.training.schedules as schedules
 import sundae_ns.training.step as step_module
+from sundae_ns.gaussians.relocation import split_evenly
 from sundae_ns.gaussians.rotations import rotation_matrices
 from sundae_ns.gaussians.surgery import keep, moments_of
 from sundae_ns.pruning import PruningConfig, decide
@@ -185,7 +185,7 @@ class Arm:
         settings, n = model.render_settings(training=False), self.state.field.num_primitives
         weight, error = (torch.zeros(n, device=state.device) for _ in range(2))
         indices = self.dm.train_indices
-        for index in self.random.sample(indices, min(options.get("views", 64), len(indices))):
+        for index in self.random.sample(indices, min(options.get("views", 100000), len(indices))):
             camera, batch = self.dm._view(index)
             view = model.view_of(camera)
             images, _ = render(model.source, view, model.shown_background, settings, depth=False)
@@ -199,21 +199,23 @@ class Arm:
         sources = torch.multinomial(error.clamp_min(0) + 1e-12, count, replacement=False)
         print("RELOCATE", state.step, count, "weight of donors", float(weight[donors].sum() / weight.sum()), "error of sources",
               float(error[sources].sum() / error.sum()), flush=True)
-        # Two children 0.7 standard deviations apart from the middle, as wide as 0.714 of it: the same second moment. Their masks
-        # overlap by 1.43, so each has 0.7 of the optical depth.
+        # MCMC's split, which keeps the image but for 3 to 12%, with the two apart along the longest axis, for 6 to 12%.
         scales = field["scales"].data
         longest = scales[sources].argmax(dim=1)
         axes = rotation_matrices(field["quats"].data[sources])[torch.arange(count, device=longest.device), :, longest]
-        shift = 0.7 * axes * scales[sources, longest].exp()[:, None]
-        depth = 0.7 * F.softplus(field["opacities"].data[sources])
-        opacity = torch.log(torch.expm1(depth).clamp_min(1e-6))
+        opacity, narrower = split_evenly(
+            field["opacities"].data[sources].sigmoid().squeeze(1), scales[sources].exp(), torch.full_like(longest, 2)
+        )
+        shift = 0.35 * axes * narrower.gather(1, longest[:, None])
+        opacity = torch.logit(opacity.clamp(1e-4, 1 - 1e-6))[:, None]
         for name, value in field.items():
             value.data[donors] = value.data[sources]
             for moment in moments_of(state.optimizers, name, value).values():
                 moment[donors] = moment[sources]
         for rows, sign in ((donors, 1.0), (sources, -1.0)):
             field["means"].data[rows] += sign * shift
-            field["scales"].data[rows, longest] += math.log(0.714)
+            field["scales"].data[rows] = narrower.log()
+            field["scales"].data[rows, longest] += math.log(0.95)
             field["opacities"].data[rows] = opacity
             for name in ("means", "scales", "opacities"):
                 moments_of(state.optimizers, name, field[name])["exp_avg"][rows] = 0

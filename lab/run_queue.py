@@ -22,7 +22,7 @@ while True:
             print(time.strftime("%X"), "end", p.returncode, line, flush=True)
     running = running2
     stop = os.path.exists("/tmp/stop_queue")
-    if stop and not running: break
+    if not running and (stop or (os.environ.get("ONCE") and done.issuperset(lines))): break
     for line in lines:
         if line in done or stop: continue
         name, capture, spec = line.split(" ", 2)
