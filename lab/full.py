@@ -1,52 +1,118 @@
-"""A whole run with evaluations on the way: python lab/full.py NAME CAPTURE OUT JSON {"options":{}, "reg": after the prune, "eval": steps}."""
-import json, sys, time
+"""A whole run, or a finish from a saved warm-up: python lab/full.py NAME CAPTURE OUT JSON
+
+Keys of the JSON beside those of lab/arms.py:
+  "options": {option: value}   of ns-train sundae
+  "steps": 30000               steps of this command; 15000 with "warm"
+  "warm": NAME                 start from the checkpoint that the run NAME of this capture has saved: same field, optimizers and
+                               random state. "head": false does without head and features; options may ask for other features
+  "save": step                 save everything after this step
+  "fit": steps                 fit the schedule to a run of so many steps; "images": folder of smaller images, a divisor
+  "eval": [steps]
+A capture called garden16 trains on 16 views of garden and tests on the others.
+"""
+import json, os, sys, time
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 import torch, tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
+
 name, capture, out, spec = sys.argv[1], sys.argv[2], sys.argv[3], json.loads(sys.argv[4])
-steps = spec.get("steps", 30000)
-args = ["sundae", "--data", f"/tmp/scenes/{capture}", "--max-num-iterations", str(steps), "--machine.seed", str(spec.get("seed", 42)),
-        "--output-dir", "/tmp/full", "--experiment-name", name, "--timestamp", capture, "--vis", "tensorboard", "--viewer.quit-on-train-completion", "True",
+place, device = os.environ.get("LAB", "/tmp"), "cuda" if torch.cuda.is_available() else "cpu"
+warm = spec.get("warm")
+steps = spec.get("steps", 15000 if warm else 30000)
+args = ["sundae", "--data", f"{place}/scenes/{capture}", "--max-num-iterations", str(steps), "--machine.seed", str(spec.get("seed", 42)),
+        "--output-dir", f"{place}/full", "--experiment-name", name, "--timestamp", capture, "--vis", "tensorboard", "--viewer.quit-on-train-completion", "True",
         "--pipeline.datamanager.cache-images", "gpu", "--steps-per-save", "10000000", "--steps-per-eval-image", "10000000", "--steps-per-eval-all-images", "10000000",
         "--pipeline.model.evaluate-prune", "False"]
-for k, v in spec.get("options", {}).items(): args += ["--" + k, str(v)]
-args += ["colmap", "--colmap-path", "sparse/0", "--downscale-factor", "1"] + (["--eval-mode", "fraction", "--train-split-fraction", "0.0865"] if "16" in capture else ["--eval-mode", "interval", "--eval-interval", "8"])
-from sundae_ns.model import SundaeModel
+options = dict(spec.get("options", {}))
+if warm or "save" in spec:  # checkpoints of undecided heads cannot be loaded into others
+    options.setdefault("pipeline.model.head.mode", "off" if spec.get("head") is False else "residual")
+for k, v in options.items(): args += ["--" + k, str(v)]
+args += ["colmap", "--colmap-path", "sparse/0", "--downscale-factor", str(spec.get("images", 1))]
+args += ["--eval-mode", "fraction", "--train-split-fraction", "0.0865"] if "16" in capture else ["--eval-mode", "interval", "--eval-interval", "8"]
 from sundae_ns.evaluation import psnr, ssim
+from sundae_ns.gaussians import FEATURES, initial_features
+from sundae_ns.storage.runs import checkpoint
+import arms
+
+arms.patch_losses(spec)
 config = tyro.cli(AnnotatedBaseConfigUnion, args=args)
 config.pipeline.datamanager.data = config.data
+if "fit" in spec:
+    config.schedule_length = spec["fit"]
+    config.make_schedule(args)
 _set_random_seed(config.machine.seed)
 config.save_config()
-trainer = config.setup(local_rank=0, world_size=1); trainer.setup(); trainer.save_checkpoint = lambda step: None
+
+
+def load(trainer, path):
+    """Restore a warm-up of any kind of head: features and head are those of this run, because none has been trained."""
+    loaded, own, prefix = checkpoint.load(path), trainer.pipeline.state_dict(), "_model."
+    model = {k: v for k, v in loaded["pipeline"].items() if not k.startswith(prefix + "networks.")}
+    model |= {k: v for k, v in own.items() if k.startswith(prefix + "networks.")}
+    extra, width = model[prefix + "_extra_state"], trainer.pipeline.model.config.num_features
+    extra["num_features"], key = width, prefix + "gauss_params." + FEATURES
+    colors = model[prefix + "gauss_params.features_dc"]
+    model.pop(key, None)
+    if key in own:
+        model[key] = initial_features(colors, width) if width else colors.new_zeros(len(colors), 0)
+    loaded["pipeline"] = model
+    for part in ("optimizers", "schedulers"):
+        states = {k: v for k, v in loaded[part].items() if k in getattr(trainer.optimizers, part) and k != "compensation"}
+        if part == "optimizers": states.pop(FEATURES, None)
+        loaded[part] = states
+    trainer._restore(loaded)
+    for key, scheduler in trainer.optimizers.schedulers.items():  # the head's is new: it counts steps from the start too
+        if key not in loaded["schedulers"]: scheduler.last_epoch = loaded["step"] + 1
+
+
+trainer = config.setup(local_rank=0, world_size=1)
+if warm:
+    folder = f"{place}/full/{warm}/sundae/{capture}/nerfstudio_models"
+    trainer._load_checkpoint = lambda: load(trainer, checkpoint.checkpoints(__import__("pathlib").Path(folder))[-1])
+trainer.setup()
+save, trainer.save_checkpoint = trainer.save_checkpoint, lambda step: None
 model, dm = trainer.pipeline.model, trainer.pipeline.datamanager
-old_loss = SundaeModel.get_loss_dict
-def loss_dict(self, outputs, batch, metrics_dict=None):
-    losses = old_loss(self, outputs, batch, metrics_dict)
-    r = spec.get("reg", 0)
-    if r and self.state.pruning["num_prunes"]:
-        losses["reg_o"] = r * self.state.field["opacities"].sigmoid().mean(); losses["reg_s"] = r * self.state.field["scales"].exp().mean()
-    return losses
-SundaeModel.get_loss_dict = loss_dict
-def evaluate(step):
-    model.eval()
-    res = {"name": name, "capture": capture, "step": step, "n": model.num_points, "t": round(time.time() - started, 1), "head_there": model.head is not None}
-    views = list(dm.fixed_indices_eval_dataloader); views = views[::max(1, len(views) // 40)]
+end = trainer._start_step + steps
+arm = arms.Arm({"end": end, **spec}, trainer)
+path = f"{out}/{name}-{capture}.jsonl"
+def note(**figures):
+    with open(path, "a") as f: f.write(json.dumps({"name": name, "capture": capture, "t": round(time.time() - started, 1), **figures}) + "\n")
+def quality(views):
     ps = {"head": [], "base": []}; ss = {"head": [], "base": []}
     with torch.no_grad():
         for camera, batch in views:
             o = model.get_outputs_for_camera(camera.to(model.device)); target = model.target(batch["image"].to(model.device), o["background"])
             for label, key in (("head", "rgb"), ("base", "base_rgb")):
                 ps[label].append(float(psnr(o[key], target))); ss[label].append(float(ssim(o[key], target)))
-    for label in ps: res[label] = [round(sum(ps[label]) / len(ps[label]), 3), round(sum(ss[label]) / len(ss[label]), 4)]
+    return {label: [round(sum(ps[label]) / len(ps[label]), 3), round(sum(ss[label]) / len(ss[label]), 4)] for label in ps}
+def evaluate(step, **more):
+    model.eval()
+    views = list(dm.fixed_indices_eval_dataloader); views = views[::max(1, len(views) // 40)]
+    result = quality(views)
+    if step == end - 1:
+        shown = dm.train_indices[:: max(1, len(dm.train_indices) // 12)]
+        result["train"] = quality([dm._view(i) for i in shown])["head"][0]
+        opacities = model.state.field["opacities"].detach().sigmoid()
+        result["faint"] = round(float((opacities < 0.05).float().mean()), 4)
     model.train()
-    with open(f"{out}/{name}-{capture}.jsonl", "a") as f: f.write(json.dumps(res) + "\n")
-at = set(spec.get("eval", [4999, 9999, 14999, 15499, 16499, 17999, 19999, 24999, 29999]))
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-trainer.callbacks.insert(1, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], lambda step: evaluate(step) if step in at else None))
+    note(step=step, n=model.num_points, head_there=model.state.head_enabled, recorded=trainer._recorded is not None, **result, **more)
+at = set(spec.get("eval", [4999, 9999, 14999, 15499, 16499, 17999, 19999, 24999, 29999])) | {end - 1}
+AFTER, BEFORE = TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
+trainer.callbacks.insert(1, TrainingCallback([AFTER], lambda step: evaluate(step) if step in at else None))
+trainer.callbacks.append(TrainingCallback([BEFORE], arm.before))
+trainer.callbacks.append(TrainingCallback([AFTER], arm.after))
+if "save" in spec:
+    trainer.callbacks.append(TrainingCallback([AFTER], lambda step: save(step) if step == spec["save"] else None))
 started = time.time()
 trainer.train()
+seconds = round(time.time() - started, 1)
+if arm.mean is not None:
+    arm.swap(); evaluate(end - 1, average=arm.averaged)
+    if not spec.get("keep_average"): arm.swap()
 record = trainer.base_dir / "trials.json"
-with open(f"{out}/{name}-{capture}.jsonl", "a") as f:
-    f.write(json.dumps({"name": name, "capture": capture, "t": round(time.time() - started, 1), "trials": json.loads(record.read_text()) if record.exists() else None}) + "\n")
-trainer.checkpoint_dir.mkdir(parents=True, exist_ok=True)  # without optimizers: for packing alone
-torch.save({"step": steps - 1, "pipeline": trainer.pipeline.state_dict(), "optimizers": {}, "schedulers": {}, "scalers": {}}, trainer.checkpoint_dir / f"step-{steps - 1:09d}.ckpt")
+note(seconds=seconds, spec=spec, trials=json.loads(record.read_text()) if record.exists() else None)
+if "save" not in spec:
+    trainer.checkpoint_dir.mkdir(parents=True, exist_ok=True)  # without optimizers: for packing alone
+    torch.save({"step": end - 1, "pipeline": trainer.pipeline.state_dict(), "optimizers": {}, "schedulers": {}, "scalers": {}}, trainer.checkpoint_dir / f"step-{end - 1:09d}.ckpt")
