@@ -35,6 +35,9 @@ from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.storage.runs import checkpoint
 import arms
+if "inputs" in spec:  # letters: d for directions, z for inverse distances
+    import inputs
+    inputs.install("d" in spec["inputs"], "z" in spec["inputs"])
 
 arms.patch_losses(spec)
 config = tyro.cli(AnnotatedBaseConfigUnion, args=args)
