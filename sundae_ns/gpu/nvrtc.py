@@ -97,8 +97,8 @@ class Kernel:
             # Autograd's threads may launch kernels before torch has done any work on them.
             _check(self._driver, self._driver.cuCtxSetCurrent(self._context))
             stream = c_void_p(torch.cuda.current_stream(self._device).cuda_stream)
-            arguments = (*grid, *block, c_uint(0), stream, pointers, c_void_p())
-            _check(self._driver, self._driver.cuLaunchKernel(self._function, *arguments))
+            launch = (*grid, *block, c_uint(0), stream, pointers, c_void_p())
+            _check(self._driver, self._driver.cuLaunchKernel(self._function, *launch))
 
 
 @functools.cache
