@@ -208,6 +208,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise ConfigError(f"holdout-every is {config.holdout_every}; give 0 (none) or at least 2")
         if config.dataparser._target is Nerfstudio:
             config.dataparser._target = LightNerfstudioParser
+        self._checked: list[InputDataset] = []
         data = capture_of(config)
         check_capture(
             config.dataparser,
@@ -342,6 +343,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         return loaded
 
     def _check_images(self, dataset: InputDataset) -> None:
+        """Check the files of a dataset once, because undistortion, which comes with loading, crops the cameras."""
+        if any(checked is dataset for checked in self._checked):
+            return
         scale = dataset.scale_factor
         masks: Sequence[Path | None] = dataset._dataparser_outputs.mask_filenames or [None] * len(dataset)
         for index, (path, mask) in enumerate(zip(dataset.image_filenames, masks)):
@@ -356,3 +360,4 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                 )
             if mask is not None and check_image(mask, mask=True) != full:
                 raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")
+        self._checked.append(dataset)

@@ -18,6 +18,9 @@ from types import TracebackType
 
 STOPPED = (130, 143)
 """Exit codes of a training that SIGINT or SIGTERM stopped, and that has saved itself."""
+NOTHING_SAVED = "Stopped before the first step: nothing to save."
+passed_on: list[int] = []
+"""Signals that this process passed on to its ranks, in their order."""
 _REASONS = {
     errno.ENOSPC: "the disk is full; make room",
     errno.EDQUOT: "the disk quota is used up; make room",
@@ -171,6 +174,10 @@ def show_in_one_line() -> None:
         code = getattr(error, "exit_code", None)  # of the rank that ended first; it has said the rest
         if code in STOPPED:
             raise SystemExit(code)
+        ended_by = getattr(error, "signal_name", None)
+        if kind.__name__ == "ProcessExitedException" and passed_on and ended_by in (None, "SIGINT", "SIGTERM"):
+            print(f"\n{NOTHING_SAVED}", file=sys.stderr)
+            raise SystemExit(128 + passed_on[0])
         if kind.__name__ in ("ProcessExitedException", "ProcessRaisedException"):
             error = rank_ended(error)
         if isinstance(error, SundaeError):

@@ -26,7 +26,7 @@ from rich.table import Table
 
 from sundae_ns import distributed
 from sundae_ns.datamanager import SundaeDatamanager, check_before_training, view_index
-from sundae_ns.errors import BackendError, CheckpointError, ConfigError, StorageError, SundaeError
+from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, ConfigError, StorageError, SundaeError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import View
@@ -237,7 +237,7 @@ class SundaeTrainer(Trainer):
         try:
             super().setup(test_mode)
         except KeyboardInterrupt:
-            CONSOLE.print("Stopped before the first step: nothing to save.")
+            CONSOLE.print(NOTHING_SAVED)
             raise SystemExit(130) from None
         if self._recordable():
             self._recorded = RecordedStep(self.model.losses)
@@ -368,7 +368,7 @@ class SundaeTrainer(Trainer):
             CONSOLE.print("Stopped and saved. To train the remaining steps:")
             CONSOLE.print(f"    {command}", markup=False, highlight=False, soft_wrap=True)
         else:
-            CONSOLE.print("Stopped before the first step: nothing to save.")
+            CONSOLE.print(NOTHING_SAVED)
         profiler.PROFILER.clear()  # else nerfstudio's table would hide the command
         raise SystemExit(128 + self._stopped_by)
 

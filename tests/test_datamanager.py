@@ -182,6 +182,15 @@ def test_image_of_another_size_is_named(own_copy: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
+def test_undistorted_test_views_are_not_checked_against_their_cropped_cameras(own_copy: Path) -> None:
+    edit(own_copy, k1=0.3, k2=0.1)
+    made = manager(own_copy)
+    # nerfstudio's viewer loads the test views first.
+    cropped = made.cached_eval[0]["image"].shape
+    assert cropped != (16, 20, 3), "undistortion cuts nothing off"
+    assert len(made.cached_train) == VIEWS
+
+
 def test_images_may_differ_where_each_has_its_own_camera(own_copy: Path) -> None:
     meta = json.loads((own_copy / "transforms.json").read_text())
     for index, frame in enumerate(meta["frames"]):

@@ -261,10 +261,12 @@ def test_one_line_in_nerfstudios_commands_only(
     [
         ("KeyboardInterrupt()", 130),
         ("ProcessExitedException('rank', error_index=1, error_pid=2, exit_code=143)", 143),
+        ("passed_on.append(2) or ProcessExitedException('rank', 1, 2, exit_code=-15, signal_name='SIGTERM')", 130),
     ],
 )
 def test_a_stopped_command_ends_without_a_traceback(error: str, code: int) -> None:
     text = HOOK[: HOOK.index("raise")].format(program="/usr/bin/ns-viewer", error="DataError")
+    text += "from sundae_ns.errors import passed_on\n"
     text += f"from torch.multiprocessing.spawn import ProcessExitedException\nraise {error}"
     result = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=False)
     assert result.returncode == code

@@ -53,7 +53,6 @@ def export(
     from sundae_ns.errors import ConfigError
     from sundae_ns.storage import is_nerfstudio_ply, ply_comments
     from sundae_ns.storage.kinds import kind_of
-    from sundae_ns.storage.packing import read_scene
     from sundae_ns.storage.runs.checkpoint import read_field
     from sundae_ns.storage.runs.config_file import model_options
     from sundae_ns.storage.runs.folder import config_of, files_of
@@ -76,6 +75,8 @@ def export(
             raise ConfigError(f"{scene} is not in nerfstudio's coordinates, which --upright turns; leave it out")
         field, antialiased, sigmoid_colors = _read_primitives(scene), ANTIALIASED in ply_comments(scene), False
     elif kind == "packed" or scene.suffix == ".sundae":
+        from sundae_ns.storage.packing import read_scene  # a decoder that other files do not need
+
         found = read_scene(scene)
         stated = found.meta.get("model")
         model = stated if isinstance(stated, dict) else {}
@@ -99,10 +100,10 @@ def export(
 
 
 def _export_page(scene: Path, out: Path) -> int:
-    from sundae_ns.scenes.page import write_folder, write_page
-
-    write = write_page if out.suffix else write_folder
     with packed_scene(scene) as packed, redirect_stdout(StringIO()):
+        from sundae_ns.scenes.page import write_folder, write_page
+
+        write = write_page if out.suffix else write_folder
         written = write(packed, out, title=out.resolve().stem)
     print(f"{out}: {written:,} bytes; open it in a browser" if out.suffix else f"{out}: {written:,} bytes; serve it")
     return 0
@@ -111,13 +112,16 @@ def _export_page(scene: Path, out: Path) -> int:
 @contextmanager
 def packed_scene(scene: Path) -> Iterator[Path]:
     """A packed scene as it is, or a run packed into a temporary file."""
-    from sundae_ns.scenes.packed import scene_of_run
     from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.packing import write_scene
+    from sundae_ns.storage.runs.config_file import check_run
 
     if kind_of(scene) == "packed" or scene.suffix == ".sundae":
         yield scene
         return
+    check_run(scene)
+    from sundae_ns.scenes.packed import scene_of_run
+
     with TemporaryDirectory() as folder:
         path = Path(folder) / "scene.sundae"
         with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture

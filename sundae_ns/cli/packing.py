@@ -62,6 +62,7 @@ def pack(
 
     from sundae_ns.errors import ConfigError
     from sundae_ns.storage.packing import FINETUNED, PackConfig, fit_scene, write_fitted
+    from sundae_ns.storage.runs.config_file import check_run
     from sundae_ns.storage.runs.folder import files_of
 
     if finetune < 0:
@@ -87,6 +88,7 @@ def pack(
     config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, "block": block})  # type: ignore[arg-type]
     config.validate()
     check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
+    check_run(run)
     # The bar writes to the real stdout while nerfstudio's messages are suppressed.
     with Progress(console=Console(file=sys.stdout), transient=True, disable=json) as progress:
         task = progress.add_task("Reading the run", total=2 + finetune)

@@ -63,6 +63,11 @@ class Project:
         return self.photos if (self.photos / "transforms.json").is_file() else self.out / "capture"
 
     @property
+    def models(self) -> Path:
+        """Folder of COLMAP's models."""
+        return self.capture / "colmap" / "sparse"
+
+    @property
     def run(self) -> Path:
         """Folder of the training, as ns-train names it."""
         return self.out / "runs" / self.name / self.method / "run"
@@ -97,7 +102,10 @@ class Project:
         ]
         if self.capture != self.photos:
             posed = self.capture / "transforms.json"
-            steps.insert(0, Step("camera poses", self.poses, posed.is_file, check=self.check_poses))
+            steps[:0] = [
+                Step("camera poses", self.poses, posed.is_file),
+                Step("largest model", self.poses_of_largest, self.is_largest, check=self.check_poses),
+            ]
         return steps
 
     def poses(self) -> list[str]:
@@ -115,11 +123,37 @@ class Project:
         words = ["ns-process-data", "images", "--data", str(self.photos), "--output-dir", str(self.capture)]
         return [*words, "--matching-method", self.matching, *([] if _colmap_uses_gpu() else ["--no-gpu"])]
 
-    def check_poses(self) -> None:
-        """Raise ``DataError`` if COLMAP placed too few photos."""
+    def largest(self) -> Path:
+        """Folder of the COLMAP model with the most photos; COLMAP makes several if it cannot join them into one."""
+        from sundae_ns.data.colmap import num_images
+
+        models = sorted(path.parent for path in self.models.glob("*/images.bin"))
+        return max(models, key=num_images, default=self.models / "0")
+
+    def is_largest(self) -> bool:
+        """Whether the poses are those of the largest model; ns-process-data takes the first one."""
+        from sundae_ns.data.colmap import num_images
+
+        first = self.models / "0"
+        if self.largest() == first or not (first / "images.bin").is_file():
+            return True
+        return self.placed() != num_images(first)
+
+    def poses_of_largest(self) -> list[str]:
+        """Command that replaces the poses by those of the largest model."""
+        words = ["ns-process-data", "images", "--data", str(self.photos), "--output-dir", str(self.capture)]
+        model = self.largest().relative_to(self.capture)
+        return [*words, "--skip-image-processing", "--skip-colmap", "--colmap-model-path", str(model)]
+
+    def placed(self) -> int:
+        """Number of photos with a pose."""
         from sundae_ns.data.capture import read_json
 
-        placed = len(read_json(self.capture / "transforms.json").get("frames", []))
+        return len(read_json(self.capture / "transforms.json").get("frames", []))
+
+    def check_poses(self) -> None:
+        """Raise ``DataError`` if COLMAP placed too few photos."""
+        placed = self.placed()
         images = len(list((self.capture / "images").iterdir()))
         if placed < max(LEAST_VIEWS, LEAST_SHARE * images):
             raise DataError(

@@ -61,9 +61,9 @@ def view(scene: Annotated[Path, tyro.conf.Positional], port: int = 0, open_brows
         port: port on 127.0.0.1; 0 takes a free one.
         open_browser: open the default browser; otherwise only print the address.
     """
-    from sundae_ns.scenes.page import page_of
-
     with packed_scene(scene) as packed:
+        from sundae_ns.scenes.page import page_of
+
         page = page_of(packed, title=scene.resolve().stem)
     with serve(page, port) as server:
         address = f"http://127.0.0.1:{server.server_port}/"

@@ -122,6 +122,15 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
             raise DataError(f"{model} has no points; start without them with colmap --load-3D-points False")
 
 
+def num_images(model: Path) -> int:
+    """Number of images that a binary COLMAP model states.
+
+    Raises:
+        DataError: its ``images.bin`` cannot be read, or is cut short.
+    """
+    return _BinaryFile(model / "images.bin").count(_IMAGE.size + 1 + _COUNT.size, "images")
+
+
 def _existing(path: Path) -> Path:
     if not path.is_file():
         raise DataError(f"{path} does not exist; copy or export the model again")

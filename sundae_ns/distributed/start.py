@@ -6,12 +6,13 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 from types import FrameType
 from typing import Any
 
 import torch
 
-from sundae_ns.errors import ConfigError
+from sundae_ns.errors import NOTHING_SAVED, ConfigError, passed_on
 
 
 def check_options(config: Any) -> None:
@@ -66,7 +67,12 @@ def forward_signals() -> None:
     """Pass SIGINT and SIGTERM on to the ranks, which save and leave together, and wait for them."""
 
     def forward(number: int, frame: FrameType | None) -> None:
-        for process in multiprocessing.active_children():
+        ranks = multiprocessing.active_children()
+        if not ranks:
+            print(f"\n{NOTHING_SAVED}", file=sys.stderr)
+            raise SystemExit(128 + number)
+        passed_on.append(number)
+        for process in ranks:
             with contextlib.suppress(OSError):
                 # A terminal has sent SIGINT to all of them, and the second would make a rank leave at once.
                 os.kill(process.pid or 0, signal.SIGTERM)

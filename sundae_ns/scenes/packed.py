@@ -34,10 +34,9 @@ from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rendering.source import degree_in_use
 from sundae_ns.scenes import stock
 from sundae_ns.storage.atomic import write_text, writing
-from sundae_ns.storage.kinds import refuse
 from sundae_ns.storage.packing import Scene
 from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.runs.config_file import check_run, load_config
 from sundae_ns.storage.runs.folder import config_of
 
 TIMESTAMP = "unpacked"
@@ -70,11 +69,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
         DataError: its capture is gone, or cannot be used.
     """
-    refuse(
-        run,
-        packed="give the run that was packed, or the one that sundae unpack makes of it",
-        ply="give the folder of a run; sundae export turns a .ply into .spz or .sog",
-    )
+    check_run(run)
     path = config_of(run)
     config = _read_config(path)
     source = checkpoint.newest_whole(path.parent / config.relative_model_dir)[0]

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Literal
 
 from sundae_ns.errors import CheckpointError, regular
-from sundae_ns.storage.packing.container import MAGIC
 
 Kind = Literal["packed", "ply"]
 
-_FIRST_BYTES: dict[bytes, Kind] = {MAGIC: "packed", b"ply\n": "ply", b"ply\r": "ply"}
+PACKED = b"\x89SUNDAE\n"
+"""First bytes of a packed scene."""
+_FIRST_BYTES: dict[bytes, Kind] = {PACKED: "packed", b"ply\n": "ply", b"ply\r": "ply"}
 _NAMES: dict[Kind, str] = {"packed": "a packed scene", "ply": "a .ply file"}
 
 

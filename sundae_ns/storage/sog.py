@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.packing.morton import scene_order
+from sundae_ns.storage.morton import scene_order
 from sundae_ns.storage.spz import checked
 
 MAX_PALETTE = 1 << 16

@@ -200,6 +200,13 @@ def test_refusals_are_one_line(
     assert sorted(tmp_path.iterdir()) == before
 
 
+def without(package: str, words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Runs ``sundae`` in a process where importing a package fails."""
+    code = f"import sys\nsys.modules['{package}'] = None\nfrom sundae_ns.cli import main\nmain(sys.argv[1:])"
+    started = [sys.executable, "-c", code, *words]
+    return subprocess.run(started, cwd=folder, capture_output=True, text=True, check=False)
+
+
 def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> None:
     write_scene(tmp_path / "a.sundae", Scene(field()))
     commands = [
@@ -207,9 +214,24 @@ def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> Non
         ["export", "a.ply", "-o", "a.spz"],
         ["prune", "a.ply", "-o", "pruned.ply"],
     ]
-    code = "import sys\nsys.modules['nerfstudio'] = None  # an import fails\nfrom sundae_ns.cli import main\nmain(sys.argv[1:])"
     for words in commands:
-        started = [sys.executable, "-c", code, *words]
-        done = subprocess.run(started, cwd=tmp_path, capture_output=True, text=True, check=False)
+        done = without("nerfstudio", words, tmp_path)
         assert done.returncode == 0, done.stderr
         assert (tmp_path / words[-1]).stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    "words", [["pack", "a.ply", "-o", "x"], ["view", "a.ply"], ["export", "gone", "-o", "x.html"]], ids=" ".join
+)
+def test_what_is_no_run_is_refused_without_nerfstudio(tmp_path: Path, words: list[str]) -> None:
+    write_ply(tmp_path / "a.ply", field())
+    done = without("nerfstudio", words, tmp_path)
+    assert done.returncode == 2
+    assert "give the folder of a" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_fields_are_pruned_without_a_compiler(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", field())
+    done = without("numba", ["prune", "a.ply", "-o", "pruned.ply"], tmp_path)
+    assert done.returncode == 0, done.stderr

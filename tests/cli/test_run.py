@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
+import struct
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,8 @@ class Commands:
         self.ran: list[list[str]] = []
         self.codes: dict[str, int] = {}
         self.placed = PHOTOS
+        self.models: list[int] = []
+        """Number of photos of each model of COLMAP."""
         self.saved_at = {0: 99, 130: 39}
         """Step of the checkpoint, by the exit code of the training."""
         self.silent = False
@@ -56,9 +59,16 @@ class Commands:
         elif code:
             return
         elif name == "ns-process-data":
-            capture = Path(self.option("--output-dir"))
-            shutil.copytree(self.option("--data"), capture / "images")
-            (capture / "transforms.json").write_text(json.dumps({"frames": [{}] * self.placed}))
+            capture, placed = Path(self.option("--output-dir")), self.placed
+            if "--skip-colmap" in words:
+                placed = self.models[int(Path(self.option("--colmap-model-path")).name)]
+            else:
+                shutil.copytree(self.option("--data"), capture / "images")
+                for index, images in enumerate(self.models):
+                    model = capture / "colmap" / "sparse" / str(index)
+                    model.mkdir(parents=True)
+                    (model / "images.bin").write_bytes(struct.pack("<Q", images) + bytes(100 * images))
+            (capture / "transforms.json").write_text(json.dumps({"frames": [{}] * placed}))
         elif name == "ns-eval":
             Path(self.option("--output-path")).write_text("{}")
         elif name in ("sundae pack", "sundae export"):
@@ -124,7 +134,26 @@ def test_what_is_done_is_skipped(commands: Commands, capsys: pytest.CaptureFixtu
     capsys.readouterr()
     assert run("photos", "-o", "out") == 0
     assert commands.ran == []
-    assert capsys.readouterr().out.count(": done\n") == 6
+    assert capsys.readouterr().out.count(": done\n") == 7
+
+
+def test_the_largest_model_of_colmap_is_trained(commands: Commands) -> None:
+    commands.models, commands.placed = [5, PHOTOS - 1, 2], 5
+    assert run("photos", "-o", "out") == 0
+    assert commands.names == [STEPS[0], *STEPS]
+    assert commands.option("--colmap-model-path", 1) == "colmap/sparse/1"
+    assert "--skip-image-processing" in commands.ran[1]
+    commands.ran.clear()
+    # Frames that a user removes stay removed.
+    Path("out/capture/transforms.json").write_text(json.dumps({"frames": [{}] * 4}))
+    assert run("photos", "-o", "out") == 0
+    assert commands.ran == []
+
+
+def test_one_model_of_colmap_is_left_as_it_is(commands: Commands) -> None:
+    commands.models = [PHOTOS]
+    assert run("photos", "-o", "out") == 0
+    assert commands.names == STEPS
 
 
 @pytest.mark.parametrize(("step", "name"), zip(STEPS, NAMES))

@@ -349,6 +349,61 @@ def test_ranks_stop_together_and_save_when_one_gets_a_signal(folder: Path) -> No
     assert checkpoint.checkpoints(models(folder, "stops"))[-1].name == f"step-{saved['step']:09d}.ckpt"
 
 
+ON_CPUS = """
+import os, sys
+import torch
+import torch.distributed as dist
+import sundae_ns.distributed
+from nerfstudio.scripts import train
+from nerfstudio.utils import comms
+
+def worker(rank, train_loop, ranks, _, __, url, config, *___):
+    torch.set_num_threads(1)
+    dist.init_process_group("gloo", init_method=url, world_size=ranks, rank=rank)
+    comms.LOCAL_PROCESS_GROUP = dist.new_group(list(range(ranks)))
+    train_loop(rank, ranks, config, rank)
+
+# nerfstudio starts several ranks on GPUs only.
+train._distributed_worker = worker
+sundae_ns.distributed.check_machine = lambda *_: None
+if __name__ == "__main__":
+    train.entrypoint()
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "whole_group", "after", "saves"),
+    [
+        # Ctrl-C reaches the ranks too.
+        pytest.param(signal.SIGINT, True, "left at", True, marks=pytest.mark.long),
+        (signal.SIGTERM, False, "Saving config", False),  # there are no ranks yet
+    ],
+)
+def test_signals_to_the_command_of_two_ranks(
+    folder: Path, tmp_path: Path, number: signal.Signals, whole_group: bool, after: str, saves: bool
+) -> None:
+    (tmp_path / "ns-train").write_text(ON_CPUS)
+    options = "--timestamp now --vis tensorboard --machine.num-devices 2 --machine.device-type cpu"
+    words = ["sundae-tiny", "--data", str(folder / "scene"), "--output-dir", str(tmp_path), *options.split()]
+    process = subprocess.Popen(
+        [sys.executable, str(tmp_path / "ns-train"), *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    assert any(after in line for line in process.stdout)
+    (os.killpg if whole_group else os.kill)(process.pid, number)
+    said = process.communicate(timeout=LIMIT)[0]
+    assert process.returncode == 128 + number
+    assert said.count("--load-dir") == (1 if saves else 0)
+    assert "Traceback" not in said
+    saved = list(tmp_path.glob("*/*/now/nerfstudio_models/step-*.ckpt"))
+    assert len(saved) == (1 if saves else 0)
+    # The output ended, so no rank is left that could write to it.
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 def test_ns_train_on_two_gpus(tmp_path: Path) -> None:

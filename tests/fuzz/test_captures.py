@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from colmap_models import write_model
 from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
@@ -29,6 +30,7 @@ from sundae_ns.errors import DataError
 from sundae_ns.model import SundaeModelConfig
 
 VIEWS, WIDTH, HEIGHT = 4, 20, 16
+SIZE = WIDTH, HEIGHT
 
 
 @pytest.fixture(scope="module")
@@ -37,22 +39,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_embedded_capture(
         out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40, samples=1
     )
-
-
-def write_model(folder: Path, names: list[str], *, observations: int = 2) -> None:
-    """Write a binary COLMAP model: cameras on a line, one point per view."""
-    folder.mkdir(parents=True, exist_ok=True)
-    focal = 18.0
-    cameras = struct.pack("<QiiQQ4d", 1, 1, 1, WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2)
-    images = struct.pack("<Q", len(names))
-    points = struct.pack("<Q", len(names))
-    for index, name in enumerate(names):
-        images += struct.pack("<i7di", index + 1, 1, 0, 0, 0, 0.3 * index, 0.1, 3.0, 1) + name.encode() + b"\0"
-        images += struct.pack("<Q", observations) + struct.pack("<ddq", 3.0, 4.0, index) * observations
-        points += struct.pack("<Q3d3Bd", index, 0.1 * index, 0.2, 0.3, 10, 20, 30, 0.5)
-        points += struct.pack("<Q", 2) + struct.pack("<ii", 1, 0) * 2
-    for file, content in (("cameras", cameras), ("images", images), ("points3D", points)):
-        (folder / f"{file}.bin").write_bytes(content)
 
 
 def write_text_model(folder: Path, names: list[str]) -> None:
@@ -71,7 +57,7 @@ def write_text_model(folder: Path, names: list[str]) -> None:
 def capture(scene: Path, tmp_path: Path) -> Path:
     """A copy of the capture for one test, with a transforms.json and a COLMAP model."""
     copy = Path(shutil.copytree(scene, tmp_path / "scene"))
-    write_model(copy / "sparse" / "0", sorted(path.name for path in (copy / "images").iterdir()))
+    write_model(copy / "sparse" / "0", sorted(path.name for path in (copy / "images").iterdir()), SIZE)
     return copy
 
 
@@ -263,7 +249,7 @@ def test_corrupted_text_model(capture: Path, corrupted: Any, verdict: Any, file:
 @pytest.mark.parametrize("file", ["cameras", "images", "points3D"])
 def test_a_model_cut_short_anywhere_is_refused(tmp_path: Path, file: str, text: bool) -> None:
     names = [f"{index}.png" for index in range(3)]
-    (write_text_model if text else write_model)(tmp_path, names)
+    write_text_model(tmp_path, names) if text else write_model(tmp_path, names, SIZE)
     path = tmp_path / f"{file}.{'txt' if text else 'bin'}"
     content = path.read_bytes()
     if text:  # as COLMAP does

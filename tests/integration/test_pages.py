@@ -1,16 +1,20 @@
-"""The commands of ``sundae`` in README and docs run as they stand there, page by page."""
+"""The commands in README and docs run as they stand there, page by page; those of training up to their first step."""
 
 from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from colmap_models import write_model
 
 from sundae_ns.cli import main
+from sundae_ns.trainer import SundaeTrainerConfig
+
+CallHere = Callable[..., str]
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -21,15 +25,19 @@ ELSEWHERE = {
     "bench pape": "needs the archives of the paper's captures; cli/test_bench_quality.py reads its plan",
     "view scene.sundae": "serves until Ctrl-C; cli/test_view.py serves a page, and opens and ends it",
     "report DIR/jobs/": "its runs are those of sundae bench quality; test_report.py reports on several runs",
+    "ns-process-data images": "needs COLMAP; cli/test_run.py reads the same command of sundae run",
+    "ns-train sundae --machine.num-devices 2": "needs two GPUs; distributed/test_whole_runs.py trains on two",
 }
 """Commands that do not run here, by how they start, with the reason and the test that covers them."""
-NAMES = {"$RUN": "RUN", "capture": "CAPTURE", "RUN_OR_PACK_OR_PLY": "other.ply", "...": ""}
+NAMES = {"$RUN": "RUN", "capture": "CAPTURE", "RUN_OR_PACK_OR_PLY": "other.ply", "FILE": "other.ply", "...": ""}
 SHORTER = {"--finetune": "2", "--view": "2", "--width": "32", "--height": "24", "--train-views": "6"}
 """Values that suit a small run and a small scene."""
 
 
-def lines_of(page: Path) -> list[str]:
-    return [line.strip() for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("    sundae ")]
+def lines_of(page: Path, program: str = "sundae ") -> list[str]:
+    """Commands of programs whose name starts so, in indented blocks."""
+    lines = page.read_text(encoding="utf-8").replace("\\\n", " ").splitlines()
+    return [line.strip() for line in lines if line.startswith(f"    {program}")]
 
 
 def elsewhere(line: str) -> list[str]:
@@ -37,10 +45,10 @@ def elsewhere(line: str) -> list[str]:
     return [start for start in ELSEWHERE if line.removeprefix("sundae ").startswith(start)]
 
 
-def commands_of(page: Path) -> Iterator[list[str]]:
-    for line in lines_of(page):
+def commands_of(page: Path, program: str = "sundae ") -> Iterator[list[str]]:
+    for line in lines_of(page, program):
         if not elsewhere(line):
-            words = [NAMES.get(word, word) for word in shlex.split(line, comments=True)]
+            words = [NAMES.get(word, word.replace("$RUN", "RUN")) for word in shlex.split(line, comments=True)]
             for option, value in SHORTER.items():
                 if option in words:
                     words[words.index(option) + 1] = value
@@ -67,10 +75,56 @@ def test_commands_run_as_they_stand(page: Path, tiny: Any, tmp_path: Path, monke
 
 
 def test_nothing_is_left_out_without_need() -> None:
-    left_out = [start for page in PAGES for line in lines_of(page) for start in elsewhere(line)]
+    left_out = [start for page in PAGES for line in lines_of(page, "") for start in elsewhere(line)]
     assert set(left_out) == set(ELSEWHERE)
 
 
 def test_the_readme_has_commands_to_run() -> None:
     found = {words[1] for words in commands_of(PAGES[0])}
     assert {"doctor", "pack", "unpack", "export", "prune", "report", "bench"} <= found
+
+
+@pytest.fixture
+def run_and_capture(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder with the files that the pages name: a run, its capture with a COLMAP model, and a .ply."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(tiny.folder, "RUN")
+    shutil.copytree(tiny.scene, "CAPTURE")
+    images = sorted(path.name for path in Path("CAPTURE/images").iterdir())
+    write_model(Path("CAPTURE/sparse/0"), images, (48, 48))
+    with pytest.raises(SystemExit):
+        main(["export", "RUN", "-o", "other.ply"])
+
+
+@pytest.mark.usefixtures("run_and_capture")
+def test_commands_of_training_start(tiny: Any, call_here: CallHere, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("RUN/nerfstudio_models", tiny.checkpoint(tiny.steps - 1).name).unlink()  # a finished run is not resumed
+    begun: list[SundaeTrainerConfig] = []
+    # Everything but the steps: options, capture, schedule, config.yml.
+    monkeypatch.setattr("nerfstudio.scripts.train.launch", lambda config, **_: begun.append(config))
+    commands = [words for page in PAGES for words in commands_of(page, "ns-train ")]
+    assert len(commands) > 6
+    for words in commands:
+        call_here(*words)
+        config = begun.pop()
+        assert config.method_name == words[1]
+        assert (config.get_base_dir() / "config.yml").is_file(), words
+
+
+@pytest.mark.usefixtures("run_and_capture")
+def test_commands_on_runs_run(call_here: CallHere, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[int] = []
+    # The viewer never ends; test_viewer.py renders in it.
+    monkeypatch.setattr("nerfstudio.scripts.viewer.run_viewer._start_viewer", lambda *run: shown.append(run[2]))
+    commands = [words for page in PAGES for kind in ("ns-eval ", "ns-viewer ") for words in commands_of(page, kind)]
+    assert len(commands) > 3
+    for words in commands:
+        Path("eval.json").unlink(missing_ok=True)
+        call_here(*words)
+        assert Path("eval.json").is_file() == (words[0] == "ns-eval")
+    assert len(shown) == sum(words[0] == "ns-viewer" for words in commands)
+
+
+def test_no_other_program_of_nerfstudio_is_named_in_a_block() -> None:
+    programs = {line.split()[0] for page in PAGES for line in lines_of(page, "ns-")}
+    assert programs == {"ns-train", "ns-eval", "ns-viewer", "ns-process-data"}

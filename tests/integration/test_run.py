@@ -88,4 +88,4 @@ def test_photos_to_a_report_with_an_interruption(
     assert "<canvas" in Path("out/scene.html").read_text(encoding="utf-8")
 
     assert run(*words) == 0
-    assert capfd.readouterr().out.count(": done\n") == 6
+    assert capfd.readouterr().out.count(": done\n") == 7

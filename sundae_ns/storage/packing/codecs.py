@@ -12,10 +12,10 @@ from torch import Tensor
 
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES
+from sundae_ns.storage.morton import scene_order
 from sundae_ns.storage.packing import quantize, transform
 from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array, Coded, Floats
-from sundae_ns.storage.packing.morton import scene_order
 from sundae_ns.storage.packing.quantize import Blocks, Rotations
 
 LOGITS = (-6.0, 8.0)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from sundae_ns.errors import PackError, regular
 from sundae_ns.storage.atomic import replacing
+from sundae_ns.storage.kinds import PACKED
 
-MAGIC = b"\x89SUNDAE\n"
 VERSION = 2
 SPARE, MAX_RATIO = 8 << 20, 32
 MAX_HEADER = 4 << 20
@@ -156,7 +156,7 @@ def write(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, Array], *, u
             f"the header takes {len(header):,} bytes, but readers accept {MAX_HEADER:,}; give fewer cameras"
         )
     with replacing(path) as partial, partial.open("wb") as file:
-        file.write(_PREAMBLE.pack(MAGIC, VERSION, len(header), hashlib.sha256(header).digest()))
+        file.write(_PREAMBLE.pack(PACKED, VERSION, len(header), hashlib.sha256(header).digest()))
         file.write(header)
         for planes in parts.values():
             for part in planes:
@@ -187,7 +187,7 @@ def read_header(path: Path) -> Header:
         with regular(path).open("rb") as file:
             size = path.stat().st_size
             preamble = file.read(_PREAMBLE.size)
-            if preamble[: len(MAGIC)] != MAGIC:
+            if preamble[: len(PACKED)] != PACKED:
                 raise PackError(f"{path} is not a packed scene; give a file that sundae pack wrote")
             if len(preamble) < _PREAMBLE.size:
                 raise _damaged(path, "it ends before its header")

@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sundae_ns.storage.morton import interleave, separate
 from sundae_ns.storage.packing.container import Coded, Floats
 from sundae_ns.storage.packing.entropy import LARGEST
-from sundae_ns.storage.packing.morton import interleave, separate
 
 
 class Blocks(NamedTuple):

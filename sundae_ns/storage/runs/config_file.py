@@ -17,6 +17,8 @@ import yaml
 from yaml.constructor import ConstructorError
 
 from sundae_ns.errors import CheckpointError, regular
+from sundae_ns.storage.kinds import refuse
+from sundae_ns.storage.runs.folder import config_of
 
 _PATHS = {"PosixPath", "WindowsPath", "PurePosixPath", "PureWindowsPath"}
 _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
@@ -146,6 +148,23 @@ def model_options(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise CheckpointError(f"{path} is not a run's config.yml; give the folder of a run")
     return found
+
+
+def check_run(run: Path) -> None:
+    """Refuse what is no run before nerfstudio is imported, which takes seconds.
+
+    Args:
+        run: a folder or ``config.yml``, given by the user.
+
+    Raises:
+        CheckpointError: it is a file of another kind, or has no ``config.yml`` of a run.
+    """
+    refuse(
+        run,
+        packed="give the run that was packed, or the one that sundae unpack makes of it",
+        ply="give the folder of a run; sundae export turns a .ply into .spz or .sog",
+    )
+    model_options(config_of(run))
 
 
 def schedule_length(path: Path) -> int:

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sundae_ns.errors import PackError
+from sundae_ns.storage.morton import interleave
 from sundae_ns.storage.packing import entropy
-from sundae_ns.storage.packing.morton import interleave
 
 LARGEST = entropy.LARGEST
 

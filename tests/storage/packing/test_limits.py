@@ -16,7 +16,8 @@ import torch
 from fields import random_field
 
 from sundae_ns.errors import ConfigError, PackError
-from sundae_ns.storage.packing import PackConfig, Scene, container, morton, read_scene, write_scene
+from sundae_ns.storage import morton
+from sundae_ns.storage.packing import PackConfig, Scene, container, read_scene, write_scene
 
 Json = dict[str, Any]
 LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sundae_ns.storage.packing import morton, quantize, transform
+from sundae_ns.storage import morton
+from sundae_ns.storage.packing import quantize, transform
 from sundae_ns.storage.packing.container import Floats
 
 hard = given(st.sampled_from(KINDS), st.integers(1, 700), st.integers(0, 2**16))
