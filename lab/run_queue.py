@@ -2,7 +2,7 @@
 on all GPUs. A line with "warm" waits for that checkpoint; SCRIPT is lab/full.py (lab/train.py for finishes from /tmp/warm)."""
 import json, os, pathlib, subprocess, sys, time
 import torch
-gpus, per = torch.cuda.device_count(), int(sys.argv[2])
+gpus, per = max(torch.cuda.device_count(), 1), int(sys.argv[2])
 script = sys.argv[3] if len(sys.argv) > 3 else "lab/full.py"
 place = os.environ.get("LAB", "/tmp")
 os.makedirs("/tmp/results", exist_ok=True); os.makedirs("/tmp/logs", exist_ok=True)
