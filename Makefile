@@ -2,8 +2,9 @@
 # make test: install if need be, then what CI runs.   make test-all: every seed, and the viewer's tests in a browser.
 # make coverage: lines that the tests run.   make mutants: small faults that the tests
 # notice, all in half an hour, or make mutants SAMPLE=40.
-# make browser: the viewer and the exported page in a headless Chromium (apt-get install chromium); it needs a quiet
-# machine.   make web: check the page's sources in web/ and build it (Node 20 or newer).
+# make browser: the viewer, the exported page and other viewers in a headless Chromium (apt-get install chromium); it
+# needs a quiet machine.   make browser SCENE=scene.sundae adds a packed capture; by default, that of make demo if any.
+# make web: check the page's sources in web/ and build it (Node 20 or newer).
 PYTHON ?= python3
 WORKERS ?= 2
 VENV := .venv
@@ -46,14 +47,16 @@ types: $(INSTALLED)
 pytest: $(INSTALLED)
 	$(BIN)/python -m pytest -q -m "not browser" $(SIDE_BY_SIDE)
 
-browser: $(INSTALLED)
+# Without npm the checks that need its packages skip themselves.
+browser: export SUNDAE_BROWSER_SCENE := $(abspath $(or $(SCENE),$(wildcard .demo/scene.sundae)))
+browser: $(INSTALLED) $(if $(shell command -v npm),web/node_modules web/tests/node_modules)
 	$(BIN)/python -m pytest -q -m browser
 
 web: web/node_modules
 	cd web && npm run --silent check && npm run --silent build
 
-web/node_modules: web/package-lock.json
-	cd web && npm install --no-save --silent --no-audit --no-fund
+%/node_modules: %/package-lock.json
+	cd $* && npm install --no-save --silent --no-audit --no-fund
 	touch $@
 
 coverage: $(INSTALLED)
@@ -66,4 +69,4 @@ mutants: $(INSTALLED)
 	$(BIN)/python benchmarks/mutants.py $(if $(SAMPLE),--sample $(SAMPLE))
 
 clean:
-	rm -rf $(VENV) web/node_modules .demo build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage*
+	rm -rf $(VENV) web/node_modules web/tests/node_modules .demo build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage*

@@ -1,11 +1,12 @@
 """Compare six cameras of a packed scene in the web page with Python's images, and time the page; print one JSON line.
 
-    python benchmarks/bench_page.py scene.sundae               # cameras at 0.4 of their size
-    python benchmarks/bench_page.py scene.sundae --scale 1
+    python benchmarks/bench_page.py scene.sundae               # images of at most 320 pixels
+    python benchmarks/bench_page.py scene.sundae --side 800 --half
 
 It needs a Chromium, which renders in software here. The cameras and the sizes that the head was trained at are scaled
 together, so both renderers run the head at the size of the image. The page's images are bytes: rounding alone gives 58.9 dB.
-Lines belong in results/page.jsonl.
+With ``--half`` the page's renderer also runs under Node in half precision, on an adapter that has it (``make browser``
+installs what it needs). Lines belong in results/page.jsonl, and ``make browser`` checks them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import argparse
 import base64
 import copy
 import json
+import shutil
+import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -34,14 +37,17 @@ from sundae_ns.storage.packing import Scene, read_scene, write_scene
 SECONDS = 400.0
 """Longest wait for the page: shaders compile in software."""
 CAMERAS = 6
+SIDE = 320
+"""Longest side of an image, pixels."""
+WEB = Path(__file__).parents[1] / "web"
 
 
-def scaled(scene: Scene, scale: float) -> Scene:
-    """The scene with six of its cameras at another size, as if the head had been trained at that size."""
+def scaled(scene: Scene, side: int) -> Scene:
+    """The scene with six of its cameras, no larger than ``side``, as if the head had been trained at that size."""
     cameras = cameras_of(scene)
     picks = torch.linspace(0, len(cameras["poses"]) - 1, CAMERAS).round().long().unique()
     cameras = {name: value[picks].clone() for name, value in cameras.items()}
-    sizes = (cameras["sizes"] * scale).round().clamp_min(1)
+    sizes = (cameras["sizes"] * min(side / int(cameras["sizes"].max()), 1.0)).round().clamp_min(1)
     shares = sizes / cameras["sizes"]
     cameras["intrinsics"] = cameras["intrinsics"] * shares.repeat(1, 2).to(cameras["intrinsics"])
     cameras["sizes"] = sizes.to(cameras["sizes"].dtype)
@@ -74,26 +80,29 @@ def image(page: Any, camera: int, head: bool, scale: float = 1.0) -> NDArray[np.
 
 def psnr(found: NDArray[Any], truth: NDArray[Any]) -> float:
     assert found.shape == truth.shape
-    return float(-10 * np.log10(np.mean((found - truth) ** 2) + 1e-12))
+    return round(float(-10 * np.log10(np.mean((found - truth) ** 2) + 1e-12)), 2)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", type=Path, help="written by sundae pack")
-    parser.add_argument("--scale", type=float, default=0.4, help="of the cameras")
-    options = parser.parse_args()
+def compared(scene: Path, side: int = SIDE, *, half: bool = False) -> dict[str, Any]:
+    """A packed scene in the page: sizes, times, and the PSNR of six images against Python's of the same file.
+
+    Args:
+        scene: written by ``sundae pack``.
+        side: longest side of the images, pixels.
+        half: also render in half precision; ``psnr_half`` is missing where that is impossible.
+    """
     chromium = find_chromium()
     if chromium is None:
         sys.exit("no Chromium here: apt-get install chromium")
     with TemporaryDirectory() as folder:
         packed, html = Path(folder) / "a.sundae", Path(folder) / "a.html"
-        write_scene(packed, scaled(read_scene(options.scene), options.scale))
-        write_page(packed, html, title=options.scene.stem)
-        scene = read_scene(packed)
-        images = truths(scene)
-        width, height = (int(side) for side in cameras_of(scene)["sizes"][0])
-        row = {"scene": options.scene.name, "bytes": options.scene.stat().st_size, "size": f"{width}x{height}"}
-        row |= {"primitives": len(scene.field["means"]), "head": bool(scene.head)}
+        write_scene(packed, scaled(read_scene(scene), side))
+        write_page(packed, html, title=scene.stem)
+        small = read_scene(packed)
+        images = truths(small)
+        width, height = (int(length) for length in cameras_of(small)["sizes"][0])
+        row: dict[str, Any] = {"scene": scene.name, "bytes": scene.stat().st_size, "size": f"{width}x{height}"}
+        row |= {"primitives": len(small.field["means"]), "head": bool(small.head)}
         with Browser(chromium, width, height, WEBGPU) as page:
             began = time.perf_counter()
             page.open(html.as_uri())
@@ -104,10 +113,60 @@ def main() -> None:
             row |= {f"ms_{name}": round(times.get(name, 0)) for name in ("splat", "head")}
             row["psnr_base"], row["psnr_head"] = [], []
             for camera, truth in enumerate(images):
-                row["psnr_base"].append(round(psnr(image(page, camera, False), truth["base_rgb"]), 2))
-                if scene.head:
-                    row["psnr_head"].append(round(psnr(image(page, camera, True), truth["rgb"]), 2))
-    print(json.dumps(row))
+                row["psnr_base"].append(psnr(image(page, camera, False), truth["base_rgb"]))
+                if small.head:
+                    row["psnr_head"].append(psnr(image(page, camera, True), truth["rgb"]))
+        made = half_images(packed) if half and small.head else None
+        if made is not None:
+            row["adapter_half"] = made[0]
+            row["psnr_half"] = [psnr(found, truth["rgb"]) for found, truth in zip(made[1], images, strict=True)]
+    return row
+
+
+def bundled(source: str, out: Path, *options: str) -> Path:
+    """A program of ``web/tests`` with all that it imports, as one module."""
+    esbuild = WEB / "node_modules" / ".bin" / "esbuild"
+    words = [f"tests/{source}", "--bundle", "--format=esm", "--loader:.wgsl=text", "--log-level=error", *options]
+    subprocess.run([esbuild, *words, f"--outfile={out}"], cwd=WEB, check=True)
+    return out
+
+
+def has_packages() -> bool:
+    """Whether the packages of ``web/tests`` are installed, which ``make browser`` does where it finds npm."""
+    folders = (WEB / "node_modules", WEB / "tests" / "node_modules")
+    return shutil.which("node") is not None and all(folder.is_dir() for folder in folders)
+
+
+def half_images(packed: Path) -> tuple[str, list[NDArray[np.float64]]] | None:
+    """Images of all cameras by the page's renderer in half precision, head included; None without such an adapter.
+
+    Returns:
+        The adapter, and images ``[H, W, 3]`` in [0, 1].
+    """
+    if not has_packages():
+        return None
+    # Beside the packages, where Node looks for Dawn.
+    with TemporaryDirectory(dir=WEB / "tests" / "node_modules") as folder:
+        program = bundled("render.ts", Path(folder) / "render.mjs", "--platform=node", "--external:webgpu")
+        copy = Path(folder) / "a.sundae"
+        copy.write_bytes(packed.read_bytes())
+        found = subprocess.run(["node", program, copy], check=True, capture_output=True, text=True)
+        adapter = json.loads(found.stdout.splitlines()[-1])
+        if adapter is None:
+            return None
+        sizes = cameras_of(read_scene(packed))["sizes"].tolist()
+        files = [np.fromfile(f"{copy}.{i}", np.uint8) for i in range(len(sizes))]
+        pixels = [file.reshape(height, width, 4) for file, (width, height) in zip(files, sizes, strict=True)]
+        return adapter, [each[..., :3] / 255 for each in pixels]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, help="written by sundae pack")
+    parser.add_argument("--side", type=int, default=SIDE, help="longest side of the images, pixels")
+    parser.add_argument("--half", action="store_true", help="render in half precision too")
+    options = parser.parse_args()
+    print(json.dumps(compared(options.scene, options.side, half=options.half)))
 
 
 if __name__ == "__main__":

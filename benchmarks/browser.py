@@ -127,8 +127,13 @@ class Browser:
         # Chromium's children write to the folder until they are gone.
         profile = Path(self._stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True)))
         log = self._stack.enter_context(open(profile / "log", "w"))
+        # A killed browser leaves its temporary files behind.
         process = subprocess.Popen(
-            [*self._command, f"--user-data-dir={profile}"], stdout=log, stderr=log, start_new_session=True
+            [*self._command, f"--user-data-dir={profile}"],
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            env={**os.environ, "TMPDIR": str(profile)},
         )
         self._stack.callback(self._end, process)
         address = profile / "DevToolsActivePort"

@@ -1,11 +1,13 @@
 """The exported page in a headless Chromium with a software adapter, against Python's images of the same file.
 
-The page's images are bytes, whose rounding alone gives 58.9 dB.
+The page's images are bytes, whose rounding alone gives 58.9 dB. ``make browser SCENE=scene.sundae`` adds a scene.
 """
 
 from __future__ import annotations
 
 import base64
+import json
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chromium import CHROMIUM, bench_page, browser, needs_chromium
+from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages
 from numpy.typing import NDArray
 from packed_scenes import KINDS, write_kind
 
@@ -30,6 +32,8 @@ image, psnr, truths = bench_page.image, bench_page.psnr, bench_page.truths
 
 LEAST = 57.0
 """Lowest PSNR of an image of the page against Python's; the worst is 58.7."""
+LEAST_HALF = 55.0
+"""The same with the head in half precision; the worst is 57.6."""
 SECONDS = 180.0
 """Shaders compile in software."""
 SIZE = (160, 120)
@@ -87,17 +91,55 @@ def test_every_kind_of_scene(name: str, tmp_path: Path) -> None:
         check(page, packed, [0, 1])
 
 
+@pytest.fixture(params=["a trained capture", "SCENE"])
+def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """A packed capture: the tiny run, and the scene that was given to ``make browser``."""
+    if request.param == "SCENE":
+        given = os.environ.get("SUNDAE_BROWSER_SCENE")
+        return Path(given) if given else pytest.skip("no scene was given (make browser SCENE=scene.sundae)")
+    write_scene(tmp_path / "tiny.sundae", scene_of_run(request.getfixturevalue("tiny").folder))
+    return tmp_path / "tiny.sundae"
+
+
 @pytest.mark.browser
-def test_six_cameras_of_a_trained_scene(tiny: Any, tmp_path: Path) -> None:
-    write_scene(tmp_path / "a.sundae", scene_of_run(tiny.folder))
-    write_page(tmp_path / "a.sundae", tmp_path / "a.html", title="a")
-    with opened((tmp_path / "a.html").as_uri()) as page:
-        count = page.evaluate("sundae.cameras")
-        images = truths(read_scene(tmp_path / "a.sundae"))
-        assert count == len(images) == 12
-        for camera in range(0, count, 2):
-            assert psnr(image(page, camera, False), images[camera]["base_rgb"]) > LEAST
-            assert psnr(image(page, camera, True), images[camera]["rgb"]) > LEAST
+def test_six_cameras_of_a_packed_capture(capture: Path) -> None:
+    row = bench_page.compared(capture, half=True)
+    print(json.dumps(row))
+    assert len(row["psnr_base"]) == 6
+    assert len(row["psnr_head"]) == (6 if row["head"] else 0)
+    assert min(row["psnr_base"] + row["psnr_head"]) > LEAST
+    assert min(row.get("psnr_half", [LEAST])) > LEAST_HALF
+
+
+@needs_packages
+@pytest.mark.browser
+@pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.head])
+def test_the_head_in_half_precision(name: str, tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS[name])
+    made = bench_page.half_images(packed)
+    if made is None:
+        pytest.skip("no adapter has shader-f16 (mesa-vulkan-drivers 25 or newer has one)")
+    images = truths(read_scene(packed))
+    found = [psnr(image, truth["rgb"]) for image, truth in zip(made[1], images, strict=True)]
+    assert min(found) > LEAST_HALF
+
+
+def touch(page: Any, at: tuple[int, int], to: tuple[int, int]) -> None:
+    """Drag one finger."""
+    page.call("Emulation.setTouchEmulationEnabled", {"enabled": True})
+    points = [tuple(a + (b - a) * i / 4 for a, b in zip(at, to, strict=True)) for i in range(5)]
+    for i, (x, y) in enumerate(points):
+        event = {"type": "touchMove" if i else "touchStart", "touchPoints": [{"x": x, "y": y}]}
+        page.call("Input.dispatchTouchEvent", event)
+    page.call("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+def hold(page: Any, code: str) -> None:
+    """Hold a key for two frames."""
+    before = page.evaluate("sundae.frames")
+    page.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": code, "code": code})
+    browser.wait_for(lambda: page.evaluate("sundae.frames") > before + 1, "two frames", SECONDS)
+    page.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": code, "code": code})
 
 
 @pytest.mark.browser
@@ -144,6 +186,23 @@ def test_the_controls(tmp_path: Path) -> None:
             turned, stop = after(page, lambda: page.drag(80, 60, 110, 70))
             assert stop == "free"
             assert np.abs(turned - first).mean() > 1
+            touched, stop = after(page, lambda: touch(page, (80, 60), (40, 60)))
+            assert stop == "free"
+            assert np.abs(touched - turned).mean() > 1
+            assert page.evaluate("document.getElementById('stats').textContent").split()[1] == "fps"
+            # In fly mode the same drag turns the camera in place: the image goes the other way.
+            after(page, press(page, "after"))
+            start, _ = after(page, press(page, "before"))
+            orbited, _ = after(page, lambda: page.drag(80, 60, 86, 60))
+            after(page, press(page, "after"))
+            after(page, press(page, "before"))
+            page.evaluate("document.getElementById('fly').click()")
+            flown, stop = after(page, lambda: page.drag(80, 60, 86, 60))
+            assert stop == "free"
+            assert np.abs(flown - start).mean() > 1
+            assert np.abs(flown - orbited).mean() > 1
+            moved, _ = after(page, lambda: hold(page, "KeyW"))
+            assert np.abs(moved - flown).mean() > 1
             half = "const s = document.getElementById('scale'); s.value = 50; s.dispatchEvent(new Event('input'))"
             after(page, lambda: page.evaluate(f"{{{half}}}"))
             assert page.evaluate("document.getElementById('scale-value').textContent") == "50%"
@@ -171,7 +230,7 @@ def test_a_folder_is_served_and_says_so_when_opened_from_disk(tmp_path: Path) ->
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=tmp_path / "site")) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         with opened(f"http://127.0.0.1:{server.server_port}/") as page:
-            assert psnr(image(page, 0, True), truths(packed)[0]["rgb"]) > LEAST
+            assert psnr(image(page, 0, True), truths(read_scene(packed))[0]["rgb"]) > LEAST
         server.shutdown()
     with browser.Browser(CHROMIUM, *SIZE, browser.WEBGPU) as page:
         page.open((tmp_path / "site" / "index.html").as_uri())
@@ -187,5 +246,15 @@ def test_without_webgpu_the_page_shows_base_colours(tmp_path: Path) -> None:
         assert page.evaluate("sundae.drawn") == "webgl"
         assert "without the compensation head" in page.evaluate("document.getElementById('message').innerText")
         # Quads have no tiles, and their sums are rounded to bytes; the worst is 50.0.
-        for camera, truth in enumerate(truths(packed)):
+        for camera, truth in enumerate(truths(read_scene(packed))):
             assert psnr(image(page, camera, False), truth["base_rgb"]) > 47
+
+
+@pytest.mark.browser
+def test_without_webgl_the_page_shows_an_image(tmp_path: Path) -> None:
+    packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
+    write_page(packed, tmp_path / "a.html", title="a")
+    flags = ["--disable-features=WebGPU", "--disable-3d-apis"]
+    with opened((tmp_path / "a.html").as_uri(), state="failed", flags=flags) as page:
+        assert "neither WebGPU nor WebGL2" in page.evaluate("document.getElementById('message').innerText")
+        assert page.evaluate("[poster.hidden, poster.naturalWidth, poster.naturalHeight]") == [False, 50, 37]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import io
 import json
@@ -94,6 +95,11 @@ def test_a_file_that_is_no_scene_is_refused(packed: Path, tmp_path: Path) -> Non
 
 
 # ------------------------------------------------------------------------------------------------------------- building
+
+
+def test_the_page_adds_little_to_the_scene() -> None:
+    page = (ROOT / "sundae_ns" / "scenes" / "page.html").read_bytes()
+    assert len(gzip.compress(page)) < 100_000
 
 
 @needs_node

@@ -21,6 +21,8 @@ def _script(name: str) -> Any:
 
 browser = _script("browser")
 bench_page = _script("bench_page")  # imports the one before
+bench_viewers = _script("bench_viewers")  # imports both
 
 CHROMIUM = browser.find_chromium()
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (apt-get install chromium)")
+needs_packages = pytest.mark.skipif(not bench_page.has_packages(), reason="web/tests has no packages (make browser)")

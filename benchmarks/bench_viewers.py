@@ -1,0 +1,180 @@
+"""Show an export of a packed scene in other viewers and compare with Python's images; print one JSON line per setting.
+
+    python benchmarks/bench_viewers.py scene.sundae                     # a .ply of all primitives
+    python benchmarks/bench_viewers.py scene.sundae --kind spz --central
+
+The viewers are Spark and GaussianSplats3D, in a Chromium that renders in software; ``make browser`` installs them. Six
+cameras, a black background, base colours. Each setting of a viewer adds to the one before. ``--central`` keeps the
+primitives whose centres lie in all six images: beside the image the viewers project and drop primitives differently.
+Lines belong in results/viewers.jsonl.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import json
+import math
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from bench_page import SECONDS, SIDE, bundled, has_packages, psnr, scaled, truths
+from browser import Browser, find_chromium, wait_for
+from numpy.typing import NDArray
+
+from sundae_ns.gaussians import FEATURES
+from sundae_ns.scenes.packed import cameras_of
+from sundae_ns.storage.packing import Scene, read_scene
+from sundae_ns.storage.viewers import write_for_viewers
+
+PAGE = '<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><script type="module" src="viewers.js"></script>'
+REACH = math.sqrt(2 * math.log(255))
+"""Sigmas to where the alpha of an opaque primitive falls below 1/255."""
+Options = dict[str, dict[str, Any]]
+
+
+def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
+    """Settings of each viewer of a file by name, beginning with its own defaults; each contains those before."""
+    blur = {"preBlurAmount": 0.0, "blurAmount": 0.3} if antialiased else {"preBlurAmount": 0.3, "blurAmount": 0.0}
+    ladders: dict[str, dict[str, Options]] = {
+        "spark": {
+            "default": {},
+            "blur": {"renderer": blur},
+            "order by depth": {"renderer": {"sortRadial": False}},
+            "reach": {"renderer": {"maxStdDev": REACH, "minAlpha": 1 / 255}},
+            "full precision": {"renderer": {"accumExtSplats": True}, "scene": {"extSplats": True}},
+        },
+        "gaussianSplats3D": {
+            "default": {},
+            "harmonics": {"renderer": {"sphericalHarmonicsDegree": 2, "antialiased": antialiased}},
+            "exact order": {"renderer": {"integerBasedSort": False}},
+        },
+    }
+    if kind == "spz":
+        # It reads versions 1 and 2; Spark and we have 3.
+        del ladders["gaussianSplats3D"]
+    for ladder in ladders.values():
+        total: Options = {"renderer": {}, "scene": {}}
+        for name, step in ladder.items():
+            total = {part: {**options, **step.get(part, {})} for part, options in total.items()}
+            ladder[name] = total
+    return ladders
+
+
+def base_colors(scene: Scene) -> Scene:
+    """The scene without its head, on a black background."""
+    model = {**scene.meta["model"], "head": None, "trained_focal": None, "background_color": "black"}
+    field = {name: value for name, value in scene.field.items() if name != FEATURES}
+    return replace(scene, field=field, head={}, meta={**scene.meta, "model": model})
+
+
+def central(scene: Scene) -> Scene:
+    """The scene with the primitives whose centres lie in the images of all cameras."""
+    keep = torch.ones(len(scene.field["means"]), dtype=torch.bool)
+    cameras = cameras_of(scene)
+    for pose, lens, size in zip(*(cameras[name].float() for name in ("poses", "intrinsics", "sizes")), strict=True):
+        x, y, z = ((scene.field["means"] - pose[:, 3]) @ pose[:, :3]).T
+        u, v = lens[0] * x / -z + lens[2], lens[3] - lens[1] * y / -z
+        keep &= (z < 0) & (u > 0) & (u < size[0]) & (v > 0) & (v < size[1])
+    return replace(scene, field={name: value[keep] for name, value in scene.field.items()})
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+        pass
+
+
+class Viewers:
+    """A page with the viewers, and the export and the cameras of a scene."""
+
+    def __init__(self, page: Browser, scene: Scene, file: str) -> None:
+        self._page, self._file = page, file
+        cameras = cameras_of(scene)
+        names = ("fx", "fy", "cx", "cy", "width", "height")
+        self._sizes = cameras["sizes"].tolist()
+        self._cameras = [
+            {"pose": pose.flatten().tolist(), **dict(zip(names, [*lens, *size], strict=True))}
+            for pose, lens, size in zip(cameras["poses"], cameras["intrinsics"].tolist(), self._sizes, strict=True)
+        ]
+
+    def images(self, viewer: str, options: Options) -> list[NDArray[np.float64]]:
+        """Images ``[H, W, 3]`` of all cameras in [0, 1]."""
+        words = ", ".join(json.dumps(word) for word in (viewer, self._file, self._cameras, options))
+        keep = "(found => { window.found = found; }, error => { window.found = String(error); })"
+        # Several minutes in software: the page keeps the images until they are asked for.
+        self._page.evaluate(f"window.found = null; show({words}).then{keep}; 0")
+        wait_for(lambda: bool(self._page.evaluate("found !== null")), f"images of {viewer}", SECONDS)
+        found = self._page.evaluate("found")
+        if isinstance(found, str):
+            raise RuntimeError(f"{viewer}: {found}")
+        pixels = [np.frombuffer(base64.b64decode(image), np.uint8) for image in found]
+        # WebGL begins with the lowest row.
+        shaped = [image.reshape(h, w, 4)[::-1, :, :3] for image, (w, h) in zip(pixels, self._sizes, strict=True)]
+        return [image / 255 for image in shaped]
+
+
+@contextmanager
+def opened(scene: Scene, kind: str) -> Iterator[Viewers]:
+    """The viewers with an export of a scene; ``kind`` is ``ply`` or ``spz``."""
+    chromium = find_chromium()
+    if chromium is None or not has_packages():
+        sys.exit("no Chromium or no viewers here: apt-get install chromium, then make browser")
+    model = scene.meta["model"]
+    width, height = (int(side) for side in cameras_of(scene)["sizes"][0])
+    with TemporaryDirectory() as folder:
+        site = Path(folder)
+        (site / "index.html").write_text(PAGE)
+        bundled("viewers.ts", site / "viewers.js", "--minify")
+        antialiased, logits = model["rasterize_mode"] == "antialiased", model["sh_degree"] == 0
+        write_for_viewers(site / f"a.{kind}", scene.field, antialiased=antialiased, sigmoid_colors=logits)
+        with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=site)) as server:
+            threading.Thread(target=server.serve_forever, daemon=True).start()
+            try:
+                with Browser(chromium, width, height) as page:
+                    page.open(f"http://127.0.0.1:{server.server_port}/")
+                    wait_for(lambda: page.evaluate("typeof show") == "function", "the viewers", SECONDS)
+                    yield Viewers(page, scene, f"a.{kind}")
+            finally:
+                server.shutdown()
+
+
+def rows(scene: Path, *, kind: str = "ply", side: int = SIDE, center: bool = False) -> Iterator[dict[str, Any]]:
+    """A line for each setting of each viewer, with the PSNR of six images against Python's."""
+    shown = base_colors(scaled(read_scene(scene), side))
+    if center:
+        shown = central(shown)
+    images = [truth["base_rgb"] for truth in truths(shown)]
+    height, width, _ = images[0].shape
+    about = {"scene": scene.name, "file": kind, "primitives": len(shown.field["means"]), "central": center}
+    with opened(shown, kind) as viewers:
+        for viewer, ladder in settings(kind, shown.meta["model"]["rasterize_mode"] == "antialiased").items():
+            for name, options in ladder.items():
+                found = viewers.images(viewer, options)
+                each = [psnr(image, truth) for image, truth in zip(found, images, strict=True)]
+                row = {**about, "size": f"{width}x{height}", "viewer": viewer, "setting": name, "psnr": each}
+                yield {**row, "psnr_of_all": psnr(np.stack(found), np.stack(images))}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, help="written by sundae pack")
+    parser.add_argument("--kind", choices=("ply", "spz"), default="ply", help="of the export")
+    parser.add_argument("--side", type=int, default=SIDE, help="longest side of the images, pixels")
+    parser.add_argument("--central", action="store_true", help="only primitives whose centres lie in all images")
+    options = parser.parse_args()
+    for row in rows(options.scene, kind=options.kind, side=options.side, center=options.central):
+        print(json.dumps(row), flush=True)
+
+
+if __name__ == "__main__":
+    main()
