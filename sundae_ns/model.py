@@ -71,6 +71,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """auto takes gsplat on CUDA and compiled loops on a CPU; reference is slow, in plain PyTorch."""
     base_loss_weight: float = 0.2
     """Weight of the loss on the image without the head, which keeps exported .ply files valid."""
+    average_share: float = 0.1
+    """The run ends with the mean of the weights over this share of its schedule; 0 keeps the last weights."""
     warm_start: Path | None = None
     """Start from a finished field without a warm-up: a splatfacto or sundae .ckpt (or its folder), or a 3DGS .ply."""
     warm_start_frame: Literal["auto", "model", "capture"] = "auto"
@@ -127,9 +129,9 @@ class SundaeModel(SplatfactoModel):
         self.lpips = Lpips()  # type: ignore[assignment]
         self.crop_box: OrientedBox | None = None
         # As in splatfacto: training backgrounds are random, shown ones have viser's own colour.
-        random_background = config.background_color == "random"
+        is_random = config.background_color == "random"
         self.background_color = (
-            torch.tensor([0.1490, 0.1647, 0.2157]) if random_background else get_color(config.background_color)
+            torch.tensor([0.1490, 0.1647, 0.2157]) if is_random else get_color(config.background_color)
         )
         self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution)
         self.compensated = True

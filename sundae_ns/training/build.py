@@ -12,6 +12,7 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning import PruningConfig
+from sundae_ns.training.averaging import Averaging
 from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.densification import Densification, GrowthOptions, make_strategy
 from sundae_ns.training.extension import Extension
@@ -33,6 +34,7 @@ class BuildOptions(GrowthOptions, PointOptions, Protocol):
     sh_degree_interval: int
     evaluate_prune: bool
     base_loss_weight: float
+    average_share: float
     use_bilateral_grid: bool
 
 
@@ -45,7 +47,7 @@ class Parts:
     state: FieldState
     """On these parameters and networks."""
     extensions: list[Extension]
-    """Densification, scheduled pruning and, where asked for, budget search or trials, in the order in which they act."""
+    """Densification, scheduled pruning and, where asked for, budget search or trials, and averaging; in the order of acting."""
     start: Start
     """To announce when training starts."""
 
@@ -63,6 +65,10 @@ def check(options: BuildOptions) -> None:
         raise ConfigError(f"mcmc-cap is {options.mcmc_cap}; give the highest number of primitives, at least 1")
     if options.base_loss_weight < 0:
         raise ConfigError(f"base-loss-weight is {options.base_loss_weight}; give 0 or more")
+    if not 0 <= options.average_share <= 1:
+        raise ConfigError(
+            f"average-share is {options.average_share}; give a share of the schedule, 0.1 for the last tenth"
+        )
     if options.warm_start is not None and options.pruning.mode == "continuous":
         raise ConfigError("a warm start is pruned at once, not while it grows: set pruning.mode to one-shot")
     if options.use_bilateral_grid:
@@ -113,4 +119,6 @@ def build(options: BuildOptions, *, num_images: int, points: Points | None, fram
     elif options.head.mode == "auto":
         begins_at = max(state.head_starts_at, pruning.settled_at, state.densify_until)
         extensions.append(Trials(int(begins_at), state))
+    if options.average_share > 0:
+        extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
     return Parts(gauss_params, networks, state, extensions, start)

@@ -57,6 +57,8 @@ class FieldState:
     """Step of the schedule after which the head is enabled."""
     regularised: bool = False
     """Whether the loss keeps opacities and scales down, which pays where views are few."""
+    restored: int = 0
+    """Number of returns to a snapshot in this process."""
     sh_degree_interval: int | None = None
     """Steps after which the next SH degree is enabled; None enables all at once, as after a warm start."""
 
@@ -138,6 +140,7 @@ class FieldState:
 
     def restore(self, saved: Mapping[str, Snapshot]) -> None:
         """Restore a :meth:`snapshot`, with any number of primitives."""
+        self.restored += 1
         restore(self.field, self.optimizers, saved["field"])
         if _HEAD in saved:
             assert self.head is not None

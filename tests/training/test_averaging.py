@@ -1,0 +1,103 @@
+"""The mean of the weights over the last steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import torch
+
+from sundae_ns.errors import ConfigError
+from sundae_ns.training import averaging
+from sundae_ns.training.averaging import Averaging
+from sundae_ns.training.build import check
+from sundae_ns.training.extension import TrainingRun
+
+LAST = 99
+
+
+def run_of(state: Any, *, images: int = 1) -> TrainingRun:
+    return cast(
+        TrainingRun, SimpleNamespace(state=state, last_step=LAST, schedule_length=LAST + 1, images_per_step=images)
+    )
+
+
+@pytest.fixture
+def state(build: Callable[..., Any]) -> Any:
+    return build(n=20).state
+
+
+def train(state: Any, mean: Averaging, steps: range, *, seen: list[torch.Tensor] | None = None) -> None:
+    """Steps that change the weights at random."""
+    for step in steps:
+        state.step = step
+        torch.manual_seed(step)
+        for value in state.field.values():
+            value.data += torch.randn_like(value)
+        if seen is not None and step >= 90 and step % averaging.EVERY == 0:
+            seen.append(state.field["means"].detach().clone())
+        mean.after_step(run_of(state))
+
+
+def test_the_last_weights_become_the_mean(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(averaging, "EVERY", 3)
+    seen: list[torch.Tensor] = []
+    train(state, Averaging(0.09, settled_at=0), range(LAST + 1), seen=seen)
+    assert len(seen) == 4
+    torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+
+
+def test_no_mean_of_fields_that_differ(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a prune, or a return to an earlier field, only the weights since then count."""
+    monkeypatch.setattr(averaging, "EVERY", 3)
+    for change in ("prune", "return"):
+        seen: list[torch.Tensor] = []
+        mean = Averaging(0.3, settled_at=0)
+        train(state, mean, range(91))
+        if change == "prune":
+            for value in state.field.values():
+                value.data = value.data[:10].clone()
+        else:
+            state.restored += 1
+        train(state, mean, range(91, LAST + 1), seen=seen)
+        assert len(seen) == 3
+        torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+
+
+def test_unfinished_schedules_and_growing_fields_keep_their_weights(state: Any) -> None:
+    for mean, length in ((Averaging(0.1, settled_at=1000), LAST + 1), (Averaging(0.1, settled_at=0), LAST + 2)):
+        state.step = LAST
+        before = state.field["means"].detach().clone()
+        mean.after_step(cast(TrainingRun, SimpleNamespace(state=state, last_step=LAST, schedule_length=length)))
+        assert torch.equal(state.field["means"], before)
+
+
+def test_a_resumed_training_ends_with_the_same_mean(state: Any) -> None:
+    start = {name: value.detach().clone() for name, value in state.field.items()}
+    whole = Averaging(0.5, settled_at=0)
+    train(state, whole, range(LAST + 1))
+    expected = state.field["means"].detach().clone()
+    for name, value in state.field.items():
+        value.data.copy_(start[name])
+    first, second = Averaging(0.5, settled_at=0), Averaging(0.5, settled_at=0)
+    train(state, first, range(75))
+    second.load_state_dict(state, first.state_dict())
+    train(state, second, range(75, LAST + 1))
+    assert torch.equal(state.field["means"], expected)
+    assert not second.state_dict()  # the mean is in the field: a checkpoint needs it no more
+
+
+def test_ranks_do_not_save_the_mean_of_their_shard(state: Any) -> None:
+    mean = Averaging(1.0, settled_at=0)
+    mean.before_training(run_of(state, images=2))
+    train(state, mean, range(20))
+    assert not mean.state_dict()
+
+
+def test_a_share_that_cannot_be(build: Callable[..., Any]) -> None:
+    config = build(n=5).config
+    config.average_share = 1.5
+    with pytest.raises(ConfigError, match="average-share is 1.5"):
+        check(config)
