@@ -55,8 +55,6 @@ from sundae_ns.training.losses import StepLosses
 from sundae_ns.training.step import training_image
 from sundae_ns.viewer import ViewerControls
 
-_Outputs = MutableMapping[str, Any]
-
 
 @dataclass
 class SundaeModelConfig(SplatfactoModelConfig):
@@ -250,12 +248,12 @@ class SundaeModel(SplatfactoModel):
         )
 
     @torch.no_grad()
-    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> _Outputs:  # type: ignore[override]
+    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
         """Render a camera, or the primitives in a box; unlike splatfacto's, this leaves the camera on its device."""
         self.set_crop(obb_box)
         return self.get_outputs(camera)
 
-    def get_outputs(self, camera: Cameras) -> _Outputs:  # type: ignore[override]
+    def get_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:  # type: ignore[override]
         """Render a camera.
 
         Args:
@@ -269,7 +267,7 @@ class SundaeModel(SplatfactoModel):
         with naming_full_memory(lambda: self.num_points):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
 
-    def _training_outputs(self, camera: Cameras) -> _Outputs:
+    def _training_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
         background, at = self._get_background_color(), self.resolution(self.step)
         rendered = training_image(
             self.source,
@@ -285,7 +283,7 @@ class SundaeModel(SplatfactoModel):
         )
         return {**rendered.images, "background": background, "window": rendered.window}
 
-    def _shown_outputs(self, camera: Cameras) -> _Outputs:
+    def _shown_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
         background, view = self._get_background_color(), self.view_of(camera)
         crop = None if self.crop_box is None else self.crop_box.within(self.means).squeeze(-1)
         visible = self.viewer_controls.visible(self.source, crop, compensate=self.compensated)
