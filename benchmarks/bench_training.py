@@ -30,6 +30,7 @@ from sundae_ns.cli.bench.job import configure, without_lpips
 from sundae_ns.cli.bench.plan import Job, parser_of
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.opening import views_to_test
+from sundae_ns.storage.runs.fingerprint import fingerprint
 
 ARMS: dict[str, list[str]] = {
     "splatfacto": ["splatfacto"],
@@ -114,6 +115,7 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
         "psnr": round(decibels, 3),
         "ssim": round(similarity, 4),
         "primitives": int(trainer.pipeline.model.num_points),
+        "fingerprint": fingerprint(trainer.config),
         "head": getattr(trainer.pipeline.model, "head", None) is not None,
         "peak_mib": round(peak),
         "curve": curve,

@@ -16,7 +16,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter
-from tables import MB, lines_of, runs
+from tables import MB, default_runs, lines_of
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 MARKERS = {"bonsai": "o", "fox": "s"}
@@ -36,6 +36,8 @@ SHORT = {
     "splatfacto": "splatfacto",
     "sundae-warm-up": "full field",
     "sundae": "sundae",
+    "sundae-fast": "fast",
+    "sundae-auto": "auto",
     "sundae-with-head": "with head",
     "sundae-no-head": "no head",
     "mcmc": "3DGS-MCMC",
@@ -47,7 +49,7 @@ SHORT = {
 def plot_runs() -> Any:
     """PSNR of methods against their bytes, for the captures on which all of them were trained."""
     by_scene: dict[str, list[Any]] = {}
-    for row in runs():
+    for row in default_runs():
         if row["variant"] in SHORT:
             by_scene.setdefault(row["scene"], []).append(row)
     scenes = [scene for scene, rows in by_scene.items() if len(rows) > 3]

@@ -2,9 +2,11 @@
 
     python benchmarks/tables.py            # rewrite every table between its markers
     python benchmarks/tables.py quality    # print one table
+    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what ``sundae bench suite -o DIR`` measured
 
 A page holds the markers ``<!-- table: NAME -->`` and ``<!-- end of table -->``; the lines between them are made here.
-``tests/test_benchmarks.py`` checks that every page is current.
+``tests/test_benchmarks.py`` checks that every page is current. A row whose options are not those that its arm has today
+says "earlier default"; taking over a suite removes such rows.
 """
 
 from __future__ import annotations
@@ -13,10 +15,14 @@ import argparse
 import csv
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
+from sundae_ns.cli.bench.results import spread
+from sundae_ns.cli.bench.today import EARLIER, SHARE, is_of_today
+from sundae_ns.evaluation import COLUMNS, csv_text
 from sundae_ns.evaluation.document import number, table
 
 ROOT = Path(__file__).parents[1]
@@ -28,11 +34,15 @@ MB = 1e6
 METHODS = {
     "splatfacto": "splatfacto, 30,000 steps",
     "splatfacto-7k": "splatfacto, 7,000 steps",
-    "sundae-warm-up": "the full field before the prune",
+    "sundae-warm-up": "full field, not pruned",
     "sundae": "**sundae**",
+    "sundae-fast": "sundae-fast",
+    "sundae-auto": "sundae-auto",
     "sundae-with-head": "sundae, with a head in any case",
     "sundae-no-head": "the same primitives, trained without a head",
+    "sundae-no-head-bytes": "primitives in place of the head's bytes",
     "mcmc": "3DGS-MCMC",
+    "band": "the paper's band rule",
     "random-no-head": "random primitives",
     "contribution-no-head": "highest contribution, as LightGaussian",
 }
@@ -49,14 +59,43 @@ def lines_of(name: str) -> list[dict[str, Any]]:
 
 
 def runs() -> list[dict[str, Any]]:
-    """Rows of runs.csv by capture, in the order of :data:`METHODS`; numbers are numbers, and None is an empty cell."""
-    words = ("scene", "method", "variant", "resolution", "gpu", "command", "lpips_net")
-    rows = [
-        {name: cell if name in words else float(cell) if cell else None for name, cell in row.items()}
-        for row in lines_of("runs.csv")
-        if row["variant"] in METHODS
-    ]
-    return sorted(rows, key=lambda row: (row["scene"], list(METHODS).index(row["variant"])))
+    """Rows of runs.csv by capture, in the order of :data:`METHODS` and of shares, a row for all seeds.
+
+    Numbers are means over the seeds, and None is an empty cell; ``psnr_cell`` and ``ssim_cell`` are texts with the spread.
+    """
+    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in lines_of("runs.csv"):
+        if row["variant"] in METHODS:
+            # What a budget keeps differs from seed to seed.
+            share = SHARE if row["variant"] == "sundae-auto" else float(row["keep_ratio"] or 0)
+            groups.setdefault((row["scene"], list(METHODS).index(row["variant"]), share), []).append(row)
+    return [_mean_of(groups[place]) for place in sorted(groups)]
+
+
+def _mean_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    words = ("scene", "method", "variant", "resolution", "gpu", "fingerprint", "command", "lpips_net")
+    mean: dict[str, Any] = {name: rows[0][name] for name in words}
+    for name in rows[0].keys() - mean.keys():
+        cells = [float(row[name]) if row[name] else None for row in rows]
+        known = [cell for cell in cells if cell is not None]
+        mean[name] = fmean(known) if len(known) == len(cells) else None
+        if name in ("psnr", "ssim"):
+            mean[f"{name}_cell"] = spread(cells, 2 if name == "psnr" else 4)
+    # A mean of equal shares need not be that share.
+    share = None if mean["keep_ratio"] is None else round(mean["keep_ratio"], 4)
+    return {**mean, "keep_ratio": share, "of_today": all(map(is_of_today, rows))}
+
+
+def default_runs() -> list[dict[str, Any]]:
+    """Rows of :func:`runs` without those of other shares than ``sundae`` keeps."""
+    rows = runs()
+    usual = {(row["scene"], row["variant"]) for row in rows if row["keep_ratio"] == SHARE}
+    return [row for row in rows if row["keep_ratio"] == SHARE or (row["scene"], row["variant"]) not in usual]
+
+
+def named(name: str, of_today: bool) -> str:
+    """A name of a method, marked if the row is not of today's default."""
+    return name if of_today else f"{name}, {EARLIER}"
 
 
 def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
@@ -72,7 +111,7 @@ def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
 def headline() -> list[str]:
     """README's table: today's default beside stock splatfacto."""
     heads = ["capture", "method", "primitives", "PSNR", "SSIM", "PSNR head off", "MB", "ms a frame"]
-    rows = [cells_of(row) for row in runs() if row["variant"] in HEADLINE]
+    rows = [cells_of(row) for row in default_runs() if row["variant"] in HEADLINE]
     return table(heads, first_of_each(rows))
 
 
@@ -80,19 +119,40 @@ def quality() -> list[str]:
     """All methods on the captures: quality, size and time of the same rendering."""
     heads = ["capture", "method", "keep", "primitives", "PSNR, dB", "SSIM", "PSNR, head off", "MB", "ms a frame"]
     rows = []
-    for row in runs():
+    for row in default_runs():
         capture, method, *others = cells_of(row)
         keep = "" if row["keep_ratio"] is None else f"{row['keep_ratio']:.0%}"
         rows.append([capture, method, keep, *others])
     return table(heads, first_of_each(rows))
 
 
+def shares() -> list[str]:
+    """PSNR of each method at the shares of the primitives that it keeps, with MB."""
+    rows = [row for row in runs() if 0 < (row["keep_ratio"] or 0) < 1 and row["variant"] != "sundae-auto"]
+    columns = sorted({row["keep_ratio"] for row in rows if row["variant"] == "sundae"})
+    cells = {(row["scene"], row["variant"], row["keep_ratio"]): row for row in rows}
+
+    def cell(scene: str, variant: str, share: float) -> str:
+        row = cells.get((scene, variant, share))
+        return (
+            ""
+            if row is None
+            else named(f"{row['psnr_cell']} ({number(row['bytes_total'] / MB, 1)} MB)", row["of_today"])
+        )
+
+    made = [
+        [scene, METHODS[variant], *(cell(scene, variant, share) for share in columns)]
+        for scene, variant in dict.fromkeys((row["scene"], row["variant"]) for row in rows)
+    ]
+    return table(["capture", "method", *(f"{share:.0%}, dB" for share in columns)], first_of_each(made))
+
+
 def cells_of(row: dict[str, Any]) -> list[str]:
     """Capture, method, number of primitives, metrics, size and time of a row of runs.csv."""
     return [
         f"{row['scene']}, {row['resolution'].replace('x', ' x ')}",
-        METHODS[row["variant"]],
-        *(number(row["primitives"], 0), number(row["psnr"], 2), number(row["ssim"], 4)),
+        named(METHODS[row["variant"]], row["of_today"]),
+        *(number(row["primitives"], 0), row["psnr_cell"], row["ssim_cell"]),
         number(row["psnr_base"], 2) if row["bytes_head"] else "",
         *(number(row["bytes_total"] / MB, 1), number(row["ms_frame"], 2)),
     ]
@@ -103,7 +163,8 @@ def speed() -> list[str]:
     heads = ["field", "size", "head in", "primitives", "frame, ms", "splat, ms", "head, ms", "PSNR, dB", "SSIM", "GPU"]
     rows = [
         [
-            *(line["config"], f"{line['width']} x {line['height']}", line["precision"] if line["ms_head"] else ""),
+            named(line["config"], is_of_today(line)),
+            *(f"{line['width']} x {line['height']}", line["precision"] if line["ms_head"] else ""),
             *(number(line["primitives"], 0), number(line["ms_frame"], 2), number(line["ms_splat"], 2)),
             number(line["ms_head"], 2) if line["ms_head"] else "",
             *(number(line["psnr"], 2), number(line["ssim"], 4), gpu(line["device"])),
@@ -118,7 +179,8 @@ def training_time() -> list[str]:
     heads = ["capture", "method", "steps", "seconds", "ms a step", "primitives", "PSNR, dB", "SSIM", "GPU"]
     rows = [
         [
-            *(line["scene"], line["arm"], number(line["steps"], 0), number(line["train_s"], 0)),
+            *(line["scene"], named(line["arm"], is_of_today({"variant": line["arm"], **line}))),
+            *(number(line["steps"], 0), number(line["train_s"], 0)),
             number(1000 * line["train_s"] / line["steps"], 2),
             number(line["primitives"], 0),
             *(
@@ -127,7 +189,7 @@ def training_time() -> list[str]:
             ),
             gpu(line["gpu"]),
         ]
-        for line in lines_of("training_time.jsonl")
+        for line in {(line["scene"], line["arm"]): line for line in lines_of("training_time.jsonl")}.values()
     ]
     return table(heads, first_of_each(rows))
 
@@ -137,12 +199,13 @@ def packing() -> list[str]:
     heads = ["run", "fine-tuning", "primitives", "MB", "bits", "PSNR of the run", "packed", "SSIM of the run", "packed"]
     rows = []
     for line in lines_of("pack.jsonl"):
-        if line["run"] is not None:
+        if line["run"] is not None and line.get("variant", "sundae") == "sundae":
             steps = line["finetune_steps"]
             bits = 8 * line["bytes"] / line["primitives"]
             rows.append(
                 [
-                    *(line["run"], f"{steps:,} steps" if steps else "", number(line["primitives"], 0)),
+                    named(line["run"], is_of_today({"variant": "sundae", **line})),
+                    *(f"{steps:,} steps" if steps else "", number(line["primitives"], 0)),
                     *(number(line["bytes"] / MB, 2), number(bits, 0)),
                     *(number(line[name], 2) for name in ("psnr", "psnr_packed")),
                     *(number(line[name], 4) for name in ("ssim", "ssim_packed")),
@@ -214,6 +277,7 @@ def gpu(name: str) -> str:
 TABLES: dict[str, Callable[[], list[str]]] = {
     "headline": headline,
     "quality": quality,
+    "shares": shares,
     "speed": speed,
     "training-time": training_time,
     "packing": packing,
@@ -232,10 +296,121 @@ def with_tables(text: str) -> str:
     return MARKED.sub(lambda found: found[1] + "\n".join(TABLES[found["name"]]()) + "\n" + found[3], text)
 
 
+# ------------------------------------------------------------------------------------------------------------- the suite
+
+
+def take_over(results: Path) -> None:
+    """Replace rows of runs.csv, frames, training times and packs by those of ``sundae bench suite``.
+
+    Other rows stay as long as they are of today's default.
+
+    Args:
+        results: ``results.jsonl`` of the suite.
+    """
+    found = [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]
+    measured = [_rounded({**result["measured"], "command": _public(result["measured"]["command"])}) for result in found]
+    rows = list(csv.DictReader(csv_text(measured).splitlines()))
+    places = ("scene", "variant", "keep_ratio", "seed")
+    kept = _merged(lines_of("runs.csv"), rows, places)
+    with (RESULTS / "runs.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(kept)
+    seed = found[0]["job"]["seed"]
+    own = [r for r in map(_rounded, found) if r["job"]["seed"] == seed and (r["job"]["keep_ratio"] or SHARE) == SHARE]
+    for name, lines, places in (
+        ("frames.jsonl", [_frame_line(r) for r in own if r["measured"]["ms_head"] is not None], ("config",)),
+        ("training_time.jsonl", [_training_line(r) for r in own if _is_timed(r)], ("scene", "arm")),
+        ("pack.jsonl", [_pack_line(r) for r in own if r["packed"]], ("run", "variant", "finetune_steps")),
+    ):
+        # Curves are of trainings of their own, beside the suite's.
+        curves = [
+            line for line in lines_of(name) if line.get("curve") and is_of_today({"variant": line["arm"], **line})
+        ]
+        others = [line for line in lines_of(name) if not line.get("curve")]
+        kept = [*curves, *_merged(others, lines, places)]
+        (RESULTS / name).write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
+
+
+def _merged(
+    old: Iterable[dict[str, Any]], new: Sequence[dict[str, Any]], places: Sequence[str]
+) -> list[dict[str, Any]]:
+    """New lines after the old ones that stand at other places and are of today's default."""
+    taken = {tuple(line.get(place) for place in places) for line in new}
+    stays = [
+        line
+        for line in old
+        if tuple(line.get(place) for place in places) not in taken
+        and is_of_today({"variant": line.get("arm", "sundae"), **line})
+    ]
+    return [*stays, *new]
+
+
+def _public(command: str) -> str:
+    """A command without the place of its warm-up on this machine."""
+    return re.sub(r"(--pipeline\.model\.warm-start) .*?nerfstudio_models", r"\1 WARM_UP", command)
+
+
+def _rounded(value: Any) -> Any:
+    """Plain values with four decimals."""
+    if isinstance(value, dict):
+        return {name: _rounded(inner) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_rounded(inner) for inner in value]
+    return round(value, 4) if isinstance(value, float) else value
+
+
+def _is_timed(result: dict[str, Any]) -> bool:
+    return result["job"]["kind"] in ("whole", "mcmc") and result["measured"]["train_s"] is not None
+
+
+def _common(result: dict[str, Any]) -> dict[str, Any]:
+    """Entries of every line of a result."""
+    run = result["measured"]
+    full = run["configurations"][0]["mean"]
+    share = {"keep_ratio": result["job"]["keep_ratio"], "fingerprint": run["fingerprint"]}
+    return {"primitives": run["primitives"], "psnr": full["psnr"], "ssim": full["ssim"], **share}
+
+
+def _frame_line(result: dict[str, Any]) -> dict[str, Any]:
+    run = result["measured"]
+    width, height = (int(side) for side in run["resolution"].split()[0].split("x"))
+    full, base = run["configurations"][0], run["configurations"][-1]
+    return {
+        "config": f"{run['scene']}, {METHODS.get(run['variant'], run['variant']).strip('*')}",
+        "variant": run["variant"],
+        "device": run["gpu"],
+        **{"width": width, "height": height, "precision": run["precision"]},
+        **{"ms_frame": full["ms"], "ms_splat": base["ms"], "ms_head": run["ms_head"]},
+        **_common(result),
+    }
+
+
+def _training_line(result: dict[str, Any]) -> dict[str, Any]:
+    run = result["measured"]
+    return {
+        **{"arm": run["variant"], "scene": run["scene"], "steps": run["steps"], "seed": run["seed"]},
+        **{"train_s": run["train_s"], "peak_mib": run["peak_vram_mib"], "gpu": run["gpu"]},
+        **_common(result),
+    }
+
+
+def _pack_line(result: dict[str, Any]) -> dict[str, Any]:
+    run, packed = result["measured"], result["packed"]
+    return {
+        **{"run": run["scene"], "variant": run["variant"], "finetune_steps": 0, "bytes": packed["bytes"]},
+        **_common(result),
+        **{"psnr_packed": packed["psnr"], "ssim_packed": packed["ssim"]},
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", nargs="?", choices=TABLES, help="print this table, and rewrite nothing")
+    parser.add_argument("--suite", type=Path, metavar="RESULTS", help="results.jsonl of a suite to take over first")
     options = parser.parse_args()
+    if options.suite:
+        take_over(options.suite)
     if options.table:
         print("\n".join(TABLES[options.table]()))
         return

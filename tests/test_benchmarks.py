@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import ast
+import csv
 import json
 import runpy
+import shutil
 import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import tyro
+from bench_jobs import measured
 from csv_rows import read_rows
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+
+from sundae_ns.cli.bench import today
+from sundae_ns.cli.bench.plan import Job
+from sundae_ns.cli.bench.today import fingerprints
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "benchmarks"
@@ -55,7 +63,8 @@ def test_help(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 def test_results_are_small_and_can_be_read() -> None:
     for path in RESULTS.iterdir():
         text = path.read_text()
-        assert len(text) < 10_000, path.name
+        # A row of a run with its command takes some 400 characters, and a suite has two dozen runs a capture.
+        assert len(text) < (40_000 if path.name == "runs.csv" else 10_000), path.name
         if path.suffix == ".jsonl":
             assert all(isinstance(json.loads(line), dict) for line in text.splitlines()), path.name
     assert len(read_rows(RESULTS / "runs.csv")) >= 10
@@ -97,6 +106,90 @@ def test_a_page_changes_between_its_markers_alone(monkeypatch: pytest.MonkeyPatc
     assert tables["with_tables"]("| a |\n") == "| a |\n"
     with pytest.raises(KeyError, match="no-such-table"):
         tables["with_tables"](TABLE.replace("headline", "no-such-table"))
+
+
+def today_of(row: dict[str, Any], arm: str) -> bool:
+    """Whether a line of results has the fingerprint that its arm has today."""
+    return row.get("fingerprint", "") in fingerprints(row.get("variant", arm), float(row.get("keep_ratio") or 0.1))
+
+
+def test_rows_of_earlier_defaults_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    tables = loaded(monkeypatch, "tables.py")
+    runs = list(csv.DictReader((RESULTS / "runs.csv").open(newline="")))
+    lines = {
+        name: [json.loads(line) for line in (RESULTS / f"{name}.jsonl").read_text().splitlines()]
+        for name in ("frames", "training_time", "pack")
+    }
+    shown = {
+        "headline": [today_of(row, "") for row in runs if row["variant"] in tables["HEADLINE"]],
+        "quality": [today_of(row, "") for row in runs],
+        "speed": [today_of(line, "") for line in lines["frames"]],
+        "training-time": [today_of(line, line["arm"]) for line in lines["training_time"]],
+        "packing": [today_of(line, "sundae") for line in lines["pack"] if line["run"]],
+    }
+    marked = 0
+    for name, of_today in shown.items():
+        first, unmarked = "", []
+        for row in tables["TABLES"][name]()[2:]:
+            # An empty first cell is the one above.
+            first = row.split("|")[1].strip() or first
+            unmarked.append("earlier default" not in (row if name in ("headline", "quality") else row + first))
+        assert sorted(unmarked) == sorted(of_today), name
+        marked += of_today.count(False)
+    assert marked < sum(map(len, shown.values()))
+
+
+def test_pages_are_not_current_after_a_default_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Then `python benchmarks/tables.py` marks the rows, until they are measured again."""
+    tables = loaded(monkeypatch, "tables.py")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert tables["with_tables"](readme) == readme
+    monkeypatch.setattr(today, "fingerprints", lambda arm, keep_ratio: frozenset())
+    assert tables["with_tables"](readme) != readme
+    assert all("earlier default" in row for row in tables["headline"]()[2:])
+
+
+def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    tables = loaded(monkeypatch, "tables.py")
+    results = shutil.copytree(RESULTS, tmp_path / "results")
+    monkeypatch.setitem(tables["take_over"].__globals__, "RESULTS", results)
+    written = []
+    for seed, ratio, arm, kind in (
+        *[(42, 0.1, "sundae", "whole"), (43, 0.1, "sundae", "whole"), (42, 0.01, "sundae", "whole")],
+        (42, 0.1, "band", "branch"),
+    ):
+        job = Job(f"fox-{arm}-{ratio}-{seed}", kind, "fox", arm, "/data/fox", "sundae", 30_000, seed, ratio)  # type: ignore[arg-type]
+        (current, *_) = sorted(fingerprints(arm, ratio))
+        command = "ns-train sundae --data fox --pipeline.model.warm-start /home/me/a b/nerfstudio_models colmap"
+        run = replace(measured(job), fingerprint=current, command=command, ms_head=0.0, gpu="NVIDIA X").as_json()
+        packed = {"bytes": 1_000_000, "psnr": 26.5, "ssim": 0.8, "psnr_base": 26.5, "ssim_base": 0.8}
+        written.append({"job": asdict(job), "measured": run, "packed": packed, "alone": True})
+    source = tmp_path / "results.jsonl"
+    source.write_text("".join(json.dumps(line) + "\n" for line in written))
+    before = read_rows(RESULTS / "runs.csv")
+    tables["take_over"](source)
+
+    rows = read_rows(results / "runs.csv")
+    fox = [(row.variant, row.keep_ratio, row.seed) for row in rows if row.scene == "fox" and row.gpu == "NVIDIA X"]
+    assert sorted(fox) == [("band", 0.1, 42), ("sundae", 0.01, 42), ("sundae", 0.1, 42), ("sundae", 0.1, 43)]
+    stayed = [row for row in rows if row.gpu != "NVIDIA X"]
+    expected = [r for r in before if r.fingerprint and (r.scene, r.variant) != ("fox", "sundae")]
+    assert stayed == expected != []
+    text = (results / "runs.csv").read_text()
+    assert "--pipeline.model.warm-start WARM_UP colmap" in text
+    assert "/home/me" not in text
+    assert all("earlier default" not in row for name in ("quality", "packing") for row in tables["TABLES"][name]())
+    page = "\n".join(tables["TABLES"]["quality"]())
+    assert "26.05 ± 0.07" in page  # the mean of two seeds
+    (line,) = [line for line in tables["TABLES"]["shares"]() if line.startswith("| fox | **sundae**")]
+    assert line.split("|")[3].strip() == "26.00 (1.0 MB)"
+    assert "26.05 ± 0.07 (1.0 MB)" in line
+    for name, count in (("speed", 2), ("training-time", 1)):
+        made = [line for line in tables["TABLES"][name]() if "X |" in line]
+        assert len(made) == count, name
+    assert len([line for line in tables["TABLES"]["packing"]() if "| 1.00 |" in line]) == 1
+    for name, make in tables["TABLES"].items():
+        assert make()[2:], name
 
 
 def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -69,6 +69,8 @@ class Measured:
     """With the head, if the field has one, then without it."""
     ms_head: float | None = None
     """Milliseconds of the head alone; 0 without a head."""
+    precision: str = ""
+    """Arithmetic of the head; empty without one."""
     lpips_net: str = ""
     train_s: float | None = None
     prune_s: float | None = None
@@ -76,6 +78,8 @@ class Measured:
     peak_vram_mib: float | None = None
     gpu: str = ""
     """Name of the GPU that rendered; empty for a CPU."""
+    fingerprint: str = ""
+    """Stands for the options of the run; empty if they are unknown."""
     command: str = ""
 
     @property

@@ -11,10 +11,11 @@ COLUMNS = (
     *("scene", "method", "variant", "keep_ratio", "seed", "steps", "primitives"),
     *("psnr", "ssim", "psnr_base", "ssim_base", "lpips", "lpips_net"),
     *("bytes_primitives", "bytes_head", "bytes_total", "ms_frame", "ms_splat", "ms_head"),
-    *("train_s", "prune_s", "peak_primitives", "peak_vram_mib", "gpu", "resolution", "command"),
+    *("train_s", "prune_s", "peak_primitives", "peak_vram_mib", "gpu", "resolution", "fingerprint", "command"),
 )
 """Metrics are means over the test views, ``*_base`` without the head; ``bytes_*`` are bytes, ``ms_*`` milliseconds per
-frame, ``*_s`` seconds, and ``peak_vram_mib`` is the peak that torch allocated during training, MiB."""
+frame, ``*_s`` seconds, and ``peak_vram_mib`` is the peak that torch allocated during training, MiB; ``fingerprint`` stands
+for the options of the run."""
 
 
 def csv_text(runs: Sequence[Mapping[str, Any]]) -> str:

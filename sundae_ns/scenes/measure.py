@@ -212,10 +212,12 @@ def measure_scene(
             for name in ways
         ),
         ms_head=median(times["head"]) if repeats else None,
+        precision=_precision(model) if has_head else "",
         lpips_net=lpips.net if lpips is not None else "",
         prune_s=opened.prune_s,
         peak_primitives=model.state.pruning["peak"] or None,
         gpu=torch.cuda.get_device_name(model.device) if model.device.type == "cuda" else "",
+        fingerprint=opened.fingerprint,
         command=command,
     )
 
@@ -233,6 +235,11 @@ def comparison_of(opened: Opened, index: int) -> ComparisonRow:
     """Ground truth, base colours and complete rendering of one test view."""
     outputs = opened.model.get_outputs_for_camera(opened.cameras[index])
     return ComparisonRow(opened.truths[index], outputs["base_rgb"], outputs["rgb"])
+
+
+def _precision(model: SundaeModel) -> str:
+    """Arithmetic of the head on the model's device."""
+    return "fp32" if model.head is None or model.device.type == "cpu" else model.head.config.precision
 
 
 def _resolution(cameras: Sequence[Cameras]) -> str:

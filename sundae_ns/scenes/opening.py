@@ -24,6 +24,7 @@ from sundae_ns.storage.kinds import kind_of, refuse
 from sundae_ns.storage.packing import read_scene
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.runs.fingerprint import fingerprint
 from sundae_ns.storage.runs.folder import config_of, prunes_of
 
 
@@ -58,6 +59,8 @@ class Opened:
     """The capture's views, training views too."""
     packed_bytes: int | None = None
     """Size of the packed file; None for a run."""
+    fingerprint: str = ""
+    """Of the run's options; empty for a packed scene."""
 
 
 def open_scene(path: Path, *, data: Path | None = None) -> Opened:
@@ -110,6 +113,7 @@ def open_packed(path: Path, *, data: Path | None) -> Opened:
         prune_s=None,
         curves=None,
         packed_bytes=path.stat().st_size,
+        fingerprint="",
     )
 
 
@@ -123,6 +127,8 @@ class OpenedPipeline(NamedTuple):
     step: int
     """Training step of the checkpoint."""
     capture: Path
+    fingerprint: str
+    """Of the run's options."""
 
 
 def open_pipeline(
@@ -149,6 +155,7 @@ def open_pipeline(
         raise CheckpointError(f"{path} is of a method without Gaussians; give runs of sundae or splatfacto")
     if not getattr(pipeline_config.datamanager, "images", True):
         raise no_images_error(path.parent)  # a capture given now would not be parsed as in training
+    options = fingerprint(config)  # before a run of splatfacto becomes one of ours
     folder = path.parent / config.relative_model_dir
     newest, _ = checkpoint.newest_whole(folder)
     foreign = not isinstance(model_config, SundaeModelConfig)
@@ -165,7 +172,7 @@ def open_pipeline(
         pipeline.model.step = int(loaded["step"])
     else:
         pipeline.load_pipeline(loaded["pipeline"], loaded["step"])
-    return OpenedPipeline(config, pipeline, cast(SundaeModel, pipeline.model), int(loaded["step"]), capture)
+    return OpenedPipeline(config, pipeline, cast(SundaeModel, pipeline.model), int(loaded["step"]), capture, options)
 
 
 def open_run(path: Path, *, data: Path | None = None) -> Opened:
@@ -175,7 +182,7 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
         CheckpointError: the run is of another method, or has no whole checkpoint.
         DataError: its capture is missing, or cannot be used.
     """
-    config, pipeline, model, step, capture = open_pipeline(path, data=data)
+    config, pipeline, model, step, capture, options = open_pipeline(path, data=data)
     pipeline.eval()
     cameras, truths = views_to_test(model, pipeline.datamanager)
     if not cameras:
@@ -196,6 +203,7 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
         prune_s=0.0 if unpruned else _seconds(prunes),
         curves=path.parent,
         datamanager=pipeline.datamanager,
+        fingerprint=options,
     )
 
 

@@ -3,72 +3,26 @@
 from __future__ import annotations
 
 import csv
-import json
 import shlex
-from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 import tyro
+from bench_jobs import Runner
 from csv_rows import read_rows
 from rich.console import Console
 
 from sundae_ns.cli.bench.arms import choose_arms
-from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
+from sundae_ns.cli.bench.options import PaperOptions, QualityOptions, SuiteOptions
 from sundae_ns.cli.bench.paper import DATASETS, PRINTED, find_scene
-from sundae_ns.cli.bench.plan import Arm, Job, done_file, jobs_of_shard, parser_of, plan_scene
+from sundae_ns.cli.bench.plan import Arm, Job, jobs_of_shard, parser_of, plan_scene
 from sundae_ns.cli.bench.quality import run_paper, run_quality
 from sundae_ns.cli.bench.results import read_results, spread
-from sundae_ns.errors import ConfigError, DataError, SundaeError
-from sundae_ns.evaluation import COLUMNS, HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality
-
-PSNR = {"sundae-warm-up": 24.0, "sundae": 27.0, "random": 25.0, "mcmc": 26.0, "splatfacto": 28.0}
-
-
-class Runner:
-    """Finishes jobs without training, and can stop as a signal would."""
-
-    def __init__(self, *, stop_after: int | None = None, broken: str = "") -> None:
-        self.ran: list[str] = []
-        self.stop_after, self.broken = stop_after, broken
-
-    def __call__(self, job: Job, out: Path, on_percent: Callable[[float], object]) -> None:
-        if self.stop_after is not None and len(self.ran) >= self.stop_after:
-            raise KeyboardInterrupt
-        if self.broken and self.broken in job.key:
-            raise SundaeError("it broke")
-        self.ran.append(job.key)
-        on_percent(50)
-        path = done_file(out, job.key)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps({"job": asdict(job), "measured": measured(job).as_json()}) + "\n")
-
-
-def measured(job: Job) -> Measured:
-    psnr = PSNR[job.arm.removesuffix("-no-head")] + 0.1 * (job.seed - 42)
-    ways = [Configuration(HEAD_OFF, 2.0, 1_000_000, (ViewQuality(psnr - 1, 0.8, 0.2),))]
-    if job.kind == "branch" and not job.arm.endswith("-no-head"):
-        ways.insert(0, Configuration(HEAD_ON, 3.5, 3_000_000, (ViewQuality(psnr, 0.9, 0.1),)))
-    return Measured(
-        label=job.key,
-        source="runs/a",
-        scene=job.scene,
-        method=job.method,
-        variant=job.arm,
-        keep_ratio=job.keep_ratio,
-        seed=job.seed,
-        steps=job.steps,
-        primitives=1000,
-        bytes_primitives=1_000_000,
-        bytes_head=0,
-        resolution="100x80",
-        configurations=tuple(ways),
-        train_s=10.0,
-        peak_primitives=1500,
-    )
+from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.evaluation import COLUMNS
 
 
 @pytest.fixture
@@ -97,13 +51,15 @@ def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[i
         QualityOptions(scene=Path("a"), out=Path("o"), arms=("random", "my arms.yaml"), steps_scale=0.5, downscale=4),
         PaperOptions(root=Path("a b"), out=Path("out")),
         PaperOptions(root=Path("a"), out=Path("o"), scenes=("garden", "room"), seed=1, method="sundae-tiny"),
+        SuiteOptions(captures=Path("a b"), out=Path("out")),
+        SuiteOptions(captures=Path("a"), out=Path("o"), scenes=("fox",), keep_ratios=(0.01, 0.3), seeds=(1, 2)),
     ],
 )
-def test_a_page_names_the_command_of_the_whole(options: QualityOptions | PaperOptions) -> None:
+def test_a_page_names_the_command_of_the_whole(options: QualityOptions | PaperOptions | SuiteOptions) -> None:
     part = replace(options, shard="2/3", jobs=True)
     assert part.command() == options.command()
     words = shlex.split(part.command())
-    assert words[:3] == ["sundae", "bench", "quality" if isinstance(options, QualityOptions) else "paper"]
+    assert words[:3] == ["sundae", "bench", type(options).__name__.removesuffix("Options").lower()]
     assert tyro.cli(type(options), args=words[3:]) == options
 
 
@@ -135,6 +91,7 @@ def test_seeds_repeat_only_what_is_asked_for(arms: list[Arm]) -> None:
         assert {job.arm: job.steps for job in own if job.kind == "whole"} == {
             "splatfacto": 30_000,
             "splatfacto-7k": 7_000,
+            "sundae-auto": 30_000,
         }
 
 

@@ -17,10 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from sundae_ns.cli import main
 from sundae_ns.cli.bench.arms import choose_arms
-from sundae_ns.cli.bench.job import perform
-from sundae_ns.cli.bench.options import PaperOptions
+from sundae_ns.cli.bench.job import fingerprint_of, perform
+from sundae_ns.cli.bench.options import PaperOptions, SuiteOptions
 from sundae_ns.cli.bench.plan import Job, parser_of, plan_scene
-from sundae_ns.cli.bench.quality import run_paper
+from sundae_ns.cli.bench.quality import run_paper, run_suite
+from sundae_ns.cli.bench.results import read_results
+from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import open_scene
 
 SCALE, WARMUP = 0.02, 12
@@ -73,6 +75,41 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, capsys: pytest.Capture
     assert rows["sundae"].bytes_head > 0 == rows["random-no-head"].bytes_head
     # What was measured is what lies there: the run can be opened and looked at.
     assert open_scene(out / "jobs" / warm_up.key / WARM_UP / "sundae-tiny" / "run").steps == WARMUP
+    # The options in a run's config.yml are those of its job; every arm has others.
+    assert {row.fingerprint for row in rows.values()} == {fingerprint_of(job) for job in jobs}
+    assert len({row.fingerprint for row in rows.values()}) == len(jobs)
+    results = {result["job"]["arm"]: result for result in read_results(out)}
+    assert results[WARM_UP]["packed"] is None
+    for arm in arms:
+        packed, key = results[arm]["packed"], results[arm]["job"]["key"]
+        scene = open_scene(out / "jobs" / key / "scene.sundae", data=tiny.scene)
+        found = measure_scene(scene, label="", repeats=0, with_flip=False)
+        assert packed["bytes"] == scene.packed_bytes == found.bytes_total
+        assert (packed["psnr"], packed["psnr_base"]) == pytest.approx(
+            (found.full.mean("psnr"), found.base.mean("psnr"))
+        )
+        assert packed["bytes"] < 0.7 * results[arm]["measured"]["bytes_total"]
+
+
+def test_the_suite_trains_a_method_as_its_command_does(tiny: Any, tmp_path: Path) -> None:
+    captures = tmp_path / "captures"
+    shutil.copytree(tiny.scene, captures / "still-life")
+    (captures / "torn").mkdir()
+    options = SuiteOptions(
+        captures=captures,
+        out=tmp_path / "out",
+        arms=("sundae",),
+        keep_ratios=(0.5,),
+        method="sundae-tiny",
+        steps_scale=SCALE,
+    )
+    assert run_suite(options, runner=in_process) == 1
+    (row,) = read_rows(tmp_path / "out" / "results.csv")
+    assert (row.scene, row.variant, row.keep_ratio, row.steps) == ("still-life", "sundae", 0.5, 24)
+    assert row.peak_primitives > row.primitives
+    assert "warm-start" not in row.command
+    page = (tmp_path / "out" / "table.md").read_text()
+    assert "- torn: " in page
 
 
 def published(scene: Path, out: Path, *, factor: int) -> None:

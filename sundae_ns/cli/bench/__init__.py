@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sundae_ns.cli.bench.options import PaperOptions, QualityOptions
+from sundae_ns.cli.bench.options import PaperOptions, QualityOptions, SuiteOptions
 
 app = tyro.extras.SubcommandApp()
 INLINE = tyro.conf.arg(name="")
@@ -38,6 +38,20 @@ def quality(options: Annotated[QualityOptions, INLINE]) -> int:
     from sundae_ns.cli.bench.quality import run_quality
 
     return run_quality(options)
+
+
+@app.command
+def suite(options: Annotated[SuiteOptions, INLINE]) -> int:
+    """Measure all methods on every capture of a folder: quality, frames, training times, packed bytes. It resumes.
+
+    Whole methods train from scratch, one job at a time, so that their times are those of their commands. A job that
+    shares its GPU with another one has no times. Several commands may share OUT: its tables are of all their jobs.
+
+    A capture that is missing, damaged or too large for the GPU is named and left out; the exit code is then 1.
+    """
+    from sundae_ns.cli.bench.quality import run_suite
+
+    return run_suite(options)
 
 
 @app.command

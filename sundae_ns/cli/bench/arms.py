@@ -39,13 +39,14 @@ class Entry:
     options: Mapping[str, Words]
 
 
-def choose_arms(words: Sequence[str], method: str, scale: float = 1.0) -> list[Arm]:
+def choose_arms(words: Sequence[str], method: str, scale: float = 1.0, *, from_scratch: bool = False) -> list[Arm]:
     """The arms that a command names, checked, with their lengths.
 
     Args:
         words: names of default arms and files of arms (``.yaml``); none for all default arms.
         method: method of this package that prunes once, for arms without a method.
         scale: factor on all lengths of training.
+        from_scratch: train arms without options whole, as their command of ``ns-train`` does, not from a shared warm-up.
 
     Raises:
         ConfigError: a file, an arm, a method, an option or a length that cannot work.
@@ -62,7 +63,7 @@ def choose_arms(words: Sequence[str], method: str, scale: float = 1.0) -> list[A
         else:
             raise ConfigError(f"{word} is no arm; use some of {', '.join(defaults)}, or a file of arms (.yaml)")
     _refuse_duplicates((entry.name for entry in entries), "--arms")
-    return [_checked(entry, method, scale) for entry in entries]
+    return [_checked(entry, method, scale, from_scratch) for entry in entries]
 
 
 # ----------------------------------------------------------------------------------------------------------------- files
@@ -130,7 +131,7 @@ def _refuse_duplicates(names: Iterable[str], where: str) -> None:
 # ---------------------------------------------------------------------------------------------------------------- checks
 
 
-def _checked(entry: Entry, default: str, scale: float) -> Arm:
+def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Arm:
     """The arm of an entry, its options parsed by its method, its lengths resolved.
 
     Raises:
@@ -150,7 +151,8 @@ def _checked(entry: Entry, default: str, scale: float) -> Arm:
     kind: Kind = "whole"
     if entry.method == MCMC:
         kind = "mcmc"
-    elif mode is not None and config.pipeline.model.pruning.mode == "one-shot":
+    prunes_once = mode is not None and config.pipeline.model.pruning.mode == "one-shot"
+    if prunes_once and kind != "mcmc" and (entry.options or not from_scratch):
         kind = "branch"
     options, ratio = dict(entry.options), None
     own_steps = _scaled(config.max_num_iterations, scale)
@@ -168,7 +170,7 @@ def _checked(entry: Entry, default: str, scale: float) -> Arm:
         options = {"pipeline.model.evaluate-prune": ("False",), **options}
     if options.pop(_STEPS, None) is not None:
         steps = own_steps
-    return Arm(entry.name, kind, method, options, steps, warmup, total, ratio)
+    return Arm(entry.name, kind, method, options, steps, warmup, total, ratio, kind == "whole" and prunes_once)
 
 
 def _scaled(steps: int, scale: float) -> int:

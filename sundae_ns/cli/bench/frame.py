@@ -78,6 +78,7 @@ def _figures(run: Opened, repeats: int, progress: Callable[[], None]) -> dict[st
         "precision": "fp32" if head is None else head.config.precision,
         "phases": 1 if head is None else head.config.phases,
         "views": len(run.cameras),
+        "fingerprint": run.fingerprint,
         **{"ms_frame": full.ms, "ms_splat": base.ms, "ms_head": measured.ms_head},
         # Images smaller than its window have no SSIM.
         **{metric: full.mean(metric) for metric in ("psnr", "ssim")},

@@ -12,7 +12,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,17 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler, writer
 
-from sundae_ns.cli.bench.plan import Job, done_file, job_folder
-from sundae_ns.errors import BackendError, CheckpointError, SundaeError
-from sundae_ns.evaluation import Lpips, lpips_weights_available
+from sundae_ns.cli.bench.alone import watched_gpu
+from sundae_ns.cli.bench.plan import SAID, Job, Words, done_file, job_folder
+from sundae_ns.errors import BackendError, CheckpointError, PackError, SundaeError
+from sundae_ns.evaluation import Lpips, Measured, lpips_weights_available
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.scenes.measure import measure_scene
-from sundae_ns.scenes.opening import open_scene
+from sundae_ns.scenes.opening import Opened, open_scene
+from sundae_ns.scenes.packed import model_of, scene_of_run
 from sundae_ns.storage.atomic import write_text
+from sundae_ns.storage.packing import PackConfig, fit_scene, read_scene, write_fitted
+from sundae_ns.storage.runs.fingerprint import fingerprint
 from sundae_ns.trainer import SundaeTrainerConfig
 
 NEVER = 10**9
@@ -77,18 +81,63 @@ def _locked(path: Path) -> Iterator[None]:
 
 
 def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
-    """Train, save, open the saved run and measure it; return ``{"job", "measured"}`` as plain values.
+    """Train, save, open the saved run, measure it, and pack it.
 
     Nothing is evaluated or saved while training is timed, whatever the method.
+
+    Returns:
+        Plain values: ``job``; ``measured``; ``packed``, see :func:`pack`; ``alone``, whether no other job used the GPU. A
+        job that was not alone has no times.
 
     Raises:
         BackendError: the method needs a CUDA device and there is none.
         CheckpointError: its warm-up is not done.
     """
-    cuda = torch.cuda.is_available()
     config, command = configure(job, out)
-    if not cuda and not isinstance(config.pipeline.model, SundaeModelConfig):
+    ours = isinstance(config.pipeline.model, SundaeModelConfig)
+    if not ours and not torch.cuda.is_available():
         raise BackendError(f"{job.arm} needs a CUDA device and gsplat's kernels; leave it out with --arms here")
+    with watched_gpu() as alone:
+        opened, measured = _measured(job, config, command)
+        small = ours and job.kind != "warm-up"
+        packed = pack(opened, job_folder(out, job.key) / "scene.sundae") if small else None
+        had_gpu = alone()
+    measured = measured if had_gpu else without_times(measured)
+    return {"job": asdict(job), "measured": measured.as_json(), "packed": packed, "alone": had_gpu}
+
+
+def without_times(measured: Measured) -> Measured:
+    """The same measurements without seconds and milliseconds."""
+    timeless = tuple(replace(configuration, ms=None) for configuration in measured.configurations)
+    return replace(measured, configurations=timeless, ms_head=None, train_s=None, prune_s=None)
+
+
+def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
+    """Pack a run by the defaults of ``sundae pack``; the file's bytes and its errors on the test views.
+
+    ``*_base`` are those without the head.
+
+    Args:
+        opened: the run.
+        path: file to write.
+
+    Returns:
+        None for a field that cannot be packed.
+    """
+    try:
+        report = write_fitted(path, *fit_scene(scene_of_run(opened.source), PackConfig()))
+    except PackError as error:
+        print(f"{SAID}not packed: {error}")
+        return None
+    model = model_of(read_scene(path)).to(opened.model.device).eval()
+    found = measure_scene(replace(opened, model=model, packed_bytes=report.bytes), label="", repeats=0, with_flip=False)
+    errors = {name: found.full.mean(name) for name in ("psnr", "ssim")}
+    return {"bytes": report.bytes, **errors, **{f"{name}_base": found.base.mean(name) for name in ("psnr", "ssim")}}
+
+
+def _measured(job: Job, config: TrainerConfig, command: str) -> tuple[Opened, Measured]:
+    """The finished run and its measurements."""
+    cuda = torch.cuda.is_available()
     # Records of an attempt that was stopped would be taken for this one's.
     shutil.rmtree(config.get_base_dir(), ignore_errors=True)
     config.save_config()
@@ -124,7 +173,7 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
     )
     if job.keep_ratio is not None:
         measured = replace(measured, keep_ratio=job.keep_ratio)
-    return {"job": asdict(job), "measured": measured.as_json()}
+    return opened, measured
 
 
 def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
@@ -133,24 +182,40 @@ def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
     Raises:
         CheckpointError: its warm-up is not done.
     """
-    arguments = [job.method, "--data", job.data, "--machine.seed", str(job.seed)]
-    arguments += ["--max-num-iterations", str(job.steps), *job.options]
+    start: Words = ()
     if job.kind == "branch":
-        arguments += ["--pipeline.model.warm-start", str(_run_folder(out, job.needs) / "nerfstudio_models")]
+        start = ("--pipeline.model.warm-start", str(_run_folder(out, job.needs) / "nerfstudio_models"))
     if job.kind == "mcmc":
-        arguments += ["--pipeline.model.mcmc-cap", str(_cap(job, out))]
-    arguments += job.parser
-    config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)  # type: ignore[arg-type]
-    assert isinstance(config, TrainerConfig)
-    config.pipeline.datamanager.data = config.data
+        start = ("--pipeline.model.mcmc-cap", str(_cap(job, out)))
+    arguments = _arguments(job, start)
+    config = parse(arguments)
     config.output_dir = job_folder(out, job.key)
     config.experiment_name, config.timestamp = job.arm, "run"
     config.vis = "tensorboard"
-    if isinstance(config, SundaeTrainerConfig):
-        config.make_schedule(arguments)
     config.steps_per_save = config.steps_per_eval_batch = NEVER
     config.steps_per_eval_image = config.steps_per_eval_all_images = NEVER
     return config, "ns-train " + " ".join(job.scene if word == job.data else word for word in arguments)
+
+
+def fingerprint_of(job: Job) -> str:
+    """Fingerprint of the run that the job makes with today's methods; its warm-up need not be done."""
+    return fingerprint(parse(_arguments(job, ("--pipeline.model.warm-start", "DONE") if job.kind == "branch" else ())))
+
+
+def parse(arguments: Sequence[str]) -> TrainerConfig:
+    """The configuration of a run, its schedule made, as ``ns-train`` parses the words that follow it."""
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=list(arguments))  # type: ignore[arg-type]
+    assert isinstance(config, TrainerConfig)
+    config.pipeline.datamanager.data = config.data
+    if isinstance(config, SundaeTrainerConfig):
+        config.make_schedule(arguments)
+    return config
+
+
+def _arguments(job: Job, start: Words) -> Words:
+    """Words after ``ns-train``, with those of the place that the job starts from."""
+    fixed = ("--data", job.data, "--machine.seed", str(job.seed), "--max-num-iterations", str(job.steps))
+    return (job.method, *fixed, *job.options, *start, *job.parser)
 
 
 def _cap(job: Job, out: Path) -> int:
@@ -214,7 +279,7 @@ def main() -> None:
     try:
         perform(read_job(job_folder(out, key) / "job.json"), out)
     except SundaeError as error:
-        print(f"sundae: {error}", file=sys.stderr)
+        print(f"{SAID}{error}", file=sys.stderr)
         sys.exit(2)
 
 

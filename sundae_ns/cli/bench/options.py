@@ -10,10 +10,16 @@ from typing import Annotated
 
 import tyro
 
+SUITE = (
+    *("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-no-head-bytes"),
+    *("mcmc", "band", "sundae-auto"),
+)
+"""Default arms of ``sundae bench suite``."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonOptions:
-    """Options of both comparisons."""
+    """Options of all comparisons."""
 
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """folder for jobs, results and tables; its finished jobs are not run again."""
@@ -47,8 +53,8 @@ class QualityOptions(ComparisonOptions):
     """folder of a capture: COLMAP layout (sparse/0, images), or with a transforms.json."""
     arms: tuple[str, ...] = ()
     """files of arms (.yaml), and names of default arms: sundae, band (the paper's rule), contribution, random, each also with
-    -no-head; sundae-with-head, sundae-no-head-bytes; mcmc (from scratch to the same count), splatfacto, splatfacto-7k.
-    All default arms if none is given."""
+    -no-head; sundae-with-head, sundae-no-head-bytes; mcmc (from scratch to the same count), sundae-auto, splatfacto,
+    splatfacto-7k. All default arms if none is given."""
     keep_ratios: tuple[float, ...] = (0.01, 0.1)
     """shares of the warm-up's primitives to keep."""
     seeds: tuple[int, ...] = (42, 43, 44)
@@ -61,6 +67,30 @@ class QualityOptions(ComparisonOptions):
     def command(self) -> str:
         """The command that a page names."""
         return self._command("quality", self.scene)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteOptions(ComparisonOptions):
+    """Options of ``sundae bench suite``."""
+
+    captures: Annotated[Path, tyro.conf.Positional]
+    """folder of captures, each in COLMAP layout (sparse/0, images) or with a transforms.json."""
+    scenes: tuple[str, ...] = ()
+    """names of captures to measure; by default every folder in it."""
+    arms: tuple[str, ...] = SUITE
+    """files of arms (.yaml), and names of default arms, as in bench quality; those without options train from scratch."""
+    keep_ratios: tuple[float, ...] = (0.1,)
+    """shares of the primitives to keep."""
+    seeds: tuple[int, ...] = (42,)
+    """the first for every job, the others for the shares of --repeat-at."""
+    repeat_at: tuple[float, ...] = (0.1,)
+    """shares that run with all seeds."""
+    downscale: int = 1
+    """use the images of images_2, images_4 ... (COLMAP layout)."""
+
+    def command(self) -> str:
+        """The command that a page names."""
+        return self._command("suite", self.captures)
 
 
 @dataclass(frozen=True, kw_only=True)

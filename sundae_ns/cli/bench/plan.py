@@ -17,6 +17,8 @@ Words: TypeAlias = tuple[str, ...]
 """Words of a command line."""
 
 WARM_UP = "warm-up"
+SAID = "sundae: "
+"""Start of the line in which a job says why it failed."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class Arm:
     """Length of its method's warm-up and fine-tuning together; 0 for an arm that trains whole."""
     keep_ratio: float | None = None
     """Its own share of the warm-up's primitives, in place of the plan's."""
+    at_every_ratio: bool = False
+    """Whether an arm that trains whole runs at every share of the plan, because it prunes once."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class Job:
     steps: int
     seed: int
     keep_ratio: float | None = None
-    """Share of the warm-up's primitives, for a branch and for MCMC."""
+    """Share of the primitives to keep; None for an arm that has no share, or decides it."""
     needs: str | None = None
     """Key of the warm-up that it starts from, or whose count it takes."""
     options: Words = ()
@@ -128,17 +132,42 @@ def plan_scene(
         branches: list[Job] = []
         wholes: list[Job] = []
         for arm in arms:
-            if arm.kind == "whole":
-                key, words = f"{scene}-{arm.name}-s{seed}", _command(arm.options)
-                names = (scene, arm.name, str(data), arm.method)
-                wholes.append(Job(key, "whole", *names, arm.steps, seed, options=words, parser=parser))
+            if arm.kind == "whole" and not arm.at_every_ratio:
+                wholes.append(_whole(scene, data, parser, arm, seed, None))
                 continue
             for ratio in keep_ratios if arm.keep_ratio is None else (arm.keep_ratio,):
-                if number == 0 or ratio in repeat_at:
+                if number > 0 and ratio not in repeat_at:
+                    continue
+                if arm.kind == "whole":
+                    wholes.append(_whole(scene, data, parser, arm, seed, ratio))
+                else:
                     warmup = warmups.setdefault(arm.method, _warmup(scene, data, parser, arm, seed))
                     branches.append(_branch(warmup, arm, ratio))
         jobs += [*warmups.values(), *branches, *wholes]
     return jobs
+
+
+def _whole(scene: str, data: Path, parser: Words, arm: Arm, seed: int, ratio: float | None) -> Job:
+    """An arm that trains by itself from scratch, as its command does."""
+    share = {} if ratio is None else {"pipeline.model.pruning.keep-ratio": (f"{ratio:g}",)}
+    return Job(
+        key=f"{scene}-{arm.name}-{_percent(ratio)}s{seed}",
+        kind="whole",
+        scene=scene,
+        arm=arm.name,
+        data=str(data),
+        method=arm.method,
+        steps=arm.steps,
+        seed=seed,
+        keep_ratio=ratio,
+        options=_command({**share, **arm.options}),
+        parser=parser,
+    )
+
+
+def _percent(ratio: float | None) -> str:
+    """A share in a key."""
+    return "" if ratio is None else f"{100 * ratio:g}pct-"
 
 
 def _warmup(scene: str, data: Path, parser: Words, arm: Arm, seed: int) -> Job:
@@ -189,7 +218,7 @@ def _branch(warmup: Job, arm: Arm, ratio: float) -> Job:
         }
     return replace(
         warmup,
-        key=f"{warmup.scene}-{arm.name}-{100 * ratio:g}pct-s{warmup.seed}",
+        key=f"{warmup.scene}-{arm.name}-{_percent(ratio)}s{warmup.seed}",
         kind="mcmc" if arm.kind == "mcmc" else "branch",
         arm=arm.name,
         steps=arm.steps,

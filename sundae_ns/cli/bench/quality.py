@@ -1,11 +1,11 @@
-"""``sundae bench quality`` and ``sundae bench paper``: comparisons that can be stopped and resumed."""
+"""``sundae bench quality``, ``suite`` and ``paper``: comparisons that can be stopped and resumed."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -13,17 +13,15 @@ from rich.console import Console
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
 from sundae_ns.cli.bench.arms import choose_arms
-from sundae_ns.cli.bench.options import ComparisonOptions, PaperOptions, QualityOptions
+from sundae_ns.cli.bench.options import ComparisonOptions, PaperOptions, QualityOptions, SuiteOptions
 from sundae_ns.cli.bench.paper import plan_paper
-from sundae_ns.cli.bench.plan import Job, done_file, job_folder, jobs_of_shard, parser_of, plan_scene
-from sundae_ns.cli.bench.results import Result, paper_page, quality_page, read_results, write_results
+from sundae_ns.cli.bench.plan import SAID, Job, done_file, job_folder, jobs_of_shard, parser_of, plan_scene
+from sundae_ns.cli.bench.results import Result, paper_page, quality_page, read_results, suite_page, write_results
+from sundae_ns.cli.bench.suite import plan_suite
 from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.evaluation.document import table
 from sundae_ns.storage.atomic import write_text, writing
-
-SAID = "sundae: "
-"""Start of the line in which a job says why it failed."""
 
 STOPPED = 130
 """Exit code after an interrupt, as in shells."""
@@ -58,10 +56,36 @@ def run_quality(options: QualityOptions, *, runner: Runner | None = None, consol
         repeat_at=options.repeat_at,
     )
 
-    def page(results: Sequence[Result]) -> str:
+    def page(results: Sequence[Result], failed: Mapping[str, str]) -> str:
         return quality_page(results, arms, options.command())
 
     return _list_or_run(jobs_of_shard(plan, options.shard), options, page, runner, console)
+
+
+def run_suite(options: SuiteOptions, *, runner: Runner | None = None, console: Console | None = None) -> int:
+    """Measure all methods on every capture of a folder; the exit code, 1 if a capture or a job is left out.
+
+    Arguments are as in :func:`run_quality`.
+
+    Raises:
+        ConfigError, StorageError: as in :func:`run_quality`.
+        DataError: the folder is none of captures.
+    """
+    console = console or Console()
+    arms = choose_arms(options.arms, options.method, options.steps_scale, from_scratch=True)
+    plan, left_out = plan_suite(options, arms)
+    for scene, reason in left_out.items():
+        console.print(f"[yellow]Left out: {scene}: {reason}", highlight=False, soft_wrap=True)
+
+    jobs = jobs_of_shard(plan, options.shard)
+    captures = {key: scene for scene, key in _first_jobs(jobs).items()}
+
+    def page(results: Sequence[Result], failed: Mapping[str, str]) -> str:
+        reasons = {captures.get(key, key): reason for key, reason in failed.items()}
+        return suite_page(results, arms, {**left_out, **reasons}, options.command())
+
+    code = _list_or_run(jobs, options, page, runner, console, whole_captures=True)
+    return code or int(bool(left_out))
 
 
 def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: Console | None = None) -> int:
@@ -77,7 +101,7 @@ def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: C
     if missing:
         console.print(f"[yellow]Scenes that are missing and left out: {', '.join(missing)}", highlight=False)
 
-    def page(results: Sequence[Result]) -> str:
+    def page(results: Sequence[Result], failed: Mapping[str, str]) -> str:
         return paper_page(results, arms, missing, options.command())
 
     return _list_or_run(jobs_of_shard(plan, options.shard), options, page, runner, console)
@@ -92,8 +116,17 @@ def show_jobs(jobs: Sequence[Job], out: Path, console: Console) -> None:
     console.print(f"{len(jobs)} jobs, {sum(job.key in done for job in jobs)} done", highlight=False)
 
 
-def run_jobs(jobs: Sequence[Job], out: Path, runner: Runner, console: Console) -> dict[str, str]:
-    """Run the jobs that are not done; a job that fails stops only the jobs that need it.
+def run_jobs(
+    jobs: Sequence[Job], out: Path, runner: Runner, console: Console, *, whole_captures: bool = False
+) -> dict[str, str]:
+    """Run the jobs that are not done, one at a time; a job that fails stops only the jobs that need it.
+
+    Args:
+        jobs: in an order in which each comes after the one that it needs.
+        out: folder of the comparison.
+        runner: runs a job.
+        console: for progress and messages.
+        whole_captures: leave a capture out whose first job fails: it is damaged, or too large for this machine.
 
     Returns:
         The reason of each failure, by key.
@@ -109,12 +142,13 @@ def run_jobs(jobs: Sequence[Job], out: Path, runner: Runner, console: Console) -
     # Results may lie here without their runs, and a branch needs the run of its warm-up.
     needed = {job.needs for job in jobs if job.key not in done}
     done = {key: result for key, result in done.items() if key not in needed or done_file(out, key).exists()}
+    first = _first_jobs(jobs) if whole_captures else {}
     failed: dict[str, str] = {}
     columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as progress:
         everything = progress.add_task("Jobs", total=len(jobs))
         for job in jobs:
-            if job.key not in done:
+            if job.key not in done and first.get(job.scene) not in failed:
                 task = progress.add_task(job.key, total=100)
                 try:
                     if job.needs in failed:
@@ -124,9 +158,16 @@ def run_jobs(jobs: Sequence[Job], out: Path, runner: Runner, console: Console) -
                 except SundaeError as error:
                     failed[job.key] = str(error)
                     console.print(f"[red]{job.key} failed:[/red] {error}", highlight=False, soft_wrap=True)
+                    if first.get(job.scene) == job.key:
+                        console.print(f"[yellow]Left out: {job.scene}", highlight=False)
                 progress.remove_task(task)
             progress.advance(everything)
     return failed
+
+
+def _first_jobs(jobs: Sequence[Job]) -> dict[str, str]:
+    """Key of the first job of each capture."""
+    return {job.scene: job.key for job in reversed(jobs)}
 
 
 def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
@@ -173,9 +214,11 @@ def _check_same(job: Job, result: Result, out: Path) -> None:
 def _list_or_run(
     jobs: Sequence[Job],
     options: ComparisonOptions,
-    page: Callable[[Sequence[Result]], str],
+    page: Callable[[Sequence[Result], Mapping[str, str]], str],
     runner: Runner | None,
     console: Console,
+    *,
+    whole_captures: bool = False,
 ) -> int:
     """List the jobs, or run them and write the tables; the exit code."""
     out = options.out
@@ -183,13 +226,13 @@ def _list_or_run(
         show_jobs(jobs, out, console)
         return 0
     try:
-        failed = run_jobs(jobs, out, runner or spawn, console)
+        failed = run_jobs(jobs, out, runner or spawn, console, whole_captures=whole_captures)
     except KeyboardInterrupt:
         console.print("stopped; the same command resumes", highlight=False)
         return STOPPED
     results = read_results(out)
     if results:
-        write_results(out, results, page(results))
+        write_results(out, results, page(results, failed))
         console.print(f"wrote {out / 'table.md'}, results.csv and results.jsonl", highlight=False, soft_wrap=True)
     if failed:
         console.print(f"{len(failed)} jobs failed; the same command runs them again", highlight=False)

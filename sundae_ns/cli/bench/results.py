@@ -86,8 +86,9 @@ def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -
     """
     lines = ["# Comparison of quality", "", f"    {command}", ""]
     lines += [
-        "Mean over the seeds, ± their standard deviation. All arms of a method and a seed share a warm-up. Keep is a share",
-        "of its primitives; its training comes before the arms' own. Time, MB and errors of a line are of one rendering.",
+        "Mean over the seeds, ± their standard deviation. Arms that start from the warm-up of a method and a seed share it;",
+        "its training comes before theirs. Time, MB and errors of a line are of one rendering. Times are of jobs that had",
+        "their GPU to themselves.",
         "",
         *_described(arms),
     ]
@@ -168,3 +169,63 @@ def paper_page(results: Sequence[Result], arms: Sequence[Arm], missing: Sequence
     if missing:
         lines += ["", f"Missing: {', '.join(missing)}."]
     return "\n".join([*lines, "", quality_page(results, arms, command)])
+
+
+def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str], command: str) -> str:
+    """All captures: seconds of trainings, packed bytes, then :func:`quality_page`.
+
+    Args:
+        results: of all jobs.
+        arms: the sides of the comparison, in the order of the lines.
+        left_out: reasons by capture or by job.
+        command: the command that wrote the page.
+    """
+    lines = ["# All methods on every capture", ""]
+    if left_out:
+        lines += ["## Left out", ""]
+        # The output of a training that failed ends with the cause.
+        lines += [*(f"- {name}: {reason.splitlines()[-1]}" for name, reason in left_out.items()), ""]
+    heads = ["capture", "arm", "keep", "seeds", "steps", "training, s", "PSNR, dB", "SSIM"]
+    heads += ["primitives", "MiB at most", "GPU"]
+    lines += [
+        "## Training",
+        "",
+        "Trainings from scratch, each alone on its GPU; nothing is evaluated or saved meanwhile.",
+        "",
+    ]
+    trained = [r for r in results if r["job"]["kind"] in ("whole", "mcmc") and r["measured"]["train_s"] is not None]
+    rows = []
+    for (scene, arm, ratio), own in _group(trained, arms).items():
+        measured, full = [r["measured"] for r in own], [r["measured"]["configurations"][0]["mean"] for r in own]
+        rows.append(
+            [
+                *(scene, arm, _percent(ratio), str(len(own)), f"{measured[0]['steps']:,}"),
+                spread([m["train_s"] for m in measured], 0),
+                *(spread([mean[metric] for mean in full], digits) for metric, digits in METRICS[:2]),
+                spread([m["primitives"] for m in measured], 0),
+                number(_mean([m["peak_vram_mib"] for m in measured]), 0),
+                ", ".join(sorted({m["gpu"] or "CPU" for m in measured})),
+            ]
+        )
+    lines += [
+        *table(heads, rows),
+        "",
+        "## Packing",
+        "",
+        "By the defaults of `sundae pack`; errors on all test views.",
+        "",
+    ]
+    heads = ["capture", "arm", "keep", "seeds", "primitives", "packed, MB", "PSNR of the run", "packed"]
+    heads += ["SSIM of the run", "packed"]
+    rows = []
+    for (scene, arm, ratio), own in _group([r for r in results if r.get("packed")], arms).items():
+        full = [r["measured"]["configurations"][0]["mean"] for r in own]
+        pairs = [
+            spread([figures[metric] for figures in place], digits)
+            for metric, digits in METRICS[:2]
+            for place in (full, [r["packed"] for r in own])
+        ]
+        count = spread([r["measured"]["primitives"] for r in own], 0)
+        size = spread([r["packed"]["bytes"] / MEGABYTE for r in own], 2)
+        rows.append([scene, arm, _percent(ratio), str(len(own)), count, size, *pairs])
+    return "\n".join([*lines, *table(heads, rows), "", quality_page(results, arms, command)])

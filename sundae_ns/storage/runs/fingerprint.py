@@ -1,0 +1,82 @@
+"""The fingerprint of a run's options: rows of equal fingerprints were made by the same method with the same options."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+LEFT_OUT = frozenset(
+    {
+        # Names, places and seeds.
+        *("method_name", "experiment_name", "project_name", "timestamp", "output_dir", "relative_model_dir", "data"),
+        *(
+            "pipeline.datamanager.data",
+            "pipeline.datamanager.train_cameras_sampling_seed",
+            "pipeline.model.pruning.seed",
+        ),
+        # How the capture is read belongs to the capture.
+        *("pipeline.datamanager.dataparser", "pipeline.datamanager.images"),
+        # The machine, and where it keeps images.
+        *("machine", "pipeline.datamanager.cache_images", "pipeline.datamanager.max_thread_workers"),
+        *("pipeline.datamanager.masks_on_gpu", "pipeline.datamanager.images_on_gpu"),
+        # Logs, saves, evaluations, and resuming.
+        *("logging", "log_gradients", "viewer", "vis", "start_paused", "prompt", "save_only_latest_checkpoint"),
+        *("steps_per_save", "steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images"),
+        *("load_dir", "load_step", "load_config", "load_checkpoint", "load_scheduler"),
+        *(f"pipeline.datamanager.eval_{name}" for name in ("image_indices", "num_images_to_sample_from")),
+        *("pipeline.datamanager.eval_num_times_to_repeat_images", "pipeline.model.evaluate_prune"),
+        # A count that comparisons take from the capture; it stands beside the row as its number of primitives.
+        "pipeline.model.mcmc_cap",
+    }
+)
+"""Options of a trainer that decide neither quality nor time of what is trained, by their dotted names."""
+LENGTH = 8
+_LETTERS = str.maketrans("0123456789abcdef", "abcdefghijklmnop")
+
+
+def fingerprint(config: Any) -> str:
+    """Eight letters that stand for the options of a run which decide its results; letters, so that no table reads a number.
+
+    Options that are off (None or False) count as absent, so that a new option that is off by default changes nothing.
+    Classes count by their bare names, so that a class may move.
+
+    Args:
+        config: nerfstudio's configuration of a trainer, made by ``ns-train`` or read from a ``config.yml``.
+    """
+    text = json.dumps(_plain(config, ""), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()[:LENGTH].translate(_LETTERS)
+
+
+def _plain(value: Any, name: str) -> Any:
+    """A value as JSON has it; None for one that is off."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name, None) for field in dataclasses.fields(value)}
+        return {"": type(value).__name__, **_entries(fields, name)}
+    if isinstance(value, Mapping):
+        return _entries(value, name)
+    if isinstance(value, (list, tuple)):
+        return [_plain(inner, name) for inner in value]
+    if isinstance(value, Enum):
+        return _plain(value.value, name)
+    if isinstance(value, Path):
+        return "a path"
+    if isinstance(value, float):
+        # An option may be written as 1 or as 1.0.
+        return int(value) if value.is_integer() else repr(value)
+    return value if isinstance(value, (str, int)) and value is not False else None
+
+
+def _entries(values: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """The entries that count, by name."""
+    found = {}
+    for key, value in values.items():
+        inner = f"{name}.{key}".lstrip(".")
+        plain = None if inner in LEFT_OUT or key == "_target" else _plain(value, inner)
+        if plain is not None:
+            found[str(key)] = plain
+    return found
