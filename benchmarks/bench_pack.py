@@ -77,17 +77,18 @@ def prepared(
     run: Path | None, scene: Scene, config: PackConfig, steps: int, rate: float
 ) -> tuple[Scene, Codecs, list[float]]:
     """The scene to write, fine-tuned for ``steps``, its codecs, and the loss of each step."""
-    losses: list[float] = []
+    losses: list[Tensor] = []
     if run is None or steps == 0:
-        return *fit_scene(scene, config), losses
+        return *fit_scene(scene, config), []
     with Progress(transient=True) as progress:
         task = progress.add_task("Fine-tuning", total=steps)
 
-        def note(loss: float) -> None:
-            losses.append(loss)
+        def note(loss: Tensor) -> None:
+            losses.append(loss.clone())
             progress.advance(task)
 
-        return *finetune(run, scene, config, steps, rate=rate, progress=note), losses
+        scene, codecs = finetune(run, scene, config, steps, rate=rate, progress=note)
+        return scene, codecs, torch.stack(losses).tolist()
 
 
 def seconds(action: Callable[[], Any]) -> tuple[float, float]:

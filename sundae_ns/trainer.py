@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,10 +30,12 @@ from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, Confi
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import View
+from sundae_ns.rendering.render import RenderSettings
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import find_config
+from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
@@ -183,7 +185,7 @@ def recorded_outputs(
     model: SundaeModel,
     camera: Cameras,
     batch: dict[str, Any],
-    step: RecordedStep,
+    step: Callable[[FieldState, StepInputs, RenderSettings], StepResult],
     views: dict[tuple[int | None, int], View],
 ) -> tuple[dict[str, Any], StepResult]:
     """Train a whole step by a recording.
@@ -192,7 +194,7 @@ def recorded_outputs(
         model: in training.
         camera: of shape ``(1,)``.
         batch: with the image, and the mask if there is one.
-        step: makes and replays recordings.
+        step: trains, by a recording where it can.
         views: the views made so far, by index and divisor of their sides; cameras do not move.
 
     Returns:

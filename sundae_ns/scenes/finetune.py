@@ -1,17 +1,16 @@
 """A short fine-tune of a finished run with the packer's rounding in the loop.
 
-The model holds rounded values, the ones that a reader decodes. The optimizer moves exact values beside them, by the gradients
-at the rounded ones (the straight-through estimator of Bengio, Leonard and Courville, 2013). So model, losses and rasteriser
-do not know of rounding. Grids, bases and steps are fitted once before the first step, and the file is written with them:
-what was trained is what is stored.
+Grids, bases and steps are fitted once before the first step, and the file is written with them: what was trained is what is
+stored.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,12 +18,14 @@ from torch import Tensor
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
+from sundae_ns.rendering import View
+from sundae_ns.scenes.finetune_step import Through, TunedStep
 from sundae_ns.scenes.opening import open_pipeline
 from sundae_ns.scenes.packed import is_unpacked
 from sundae_ns.storage.packing import Codecs, PackConfig, Scene, fit_scene
-from sundae_ns.storage.packing.rate import estimated_bits
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import config_of
+from sundae_ns.trainer import recorded_outputs
 from sundae_ns.training.optimizers import NetworkAdamConfig
 
 RATES = {
@@ -60,7 +61,7 @@ def finetune(
     *,
     rate: float = RATE,
     data: Path | None = None,
-    progress: Callable[[float], object] | None = None,
+    progress: Callable[[Tensor], object] | None = None,
 ) -> tuple[Scene, Codecs]:
     """Train the field and head of a run with the rounding of its pack in the loop. The run is only read.
 
@@ -71,7 +72,7 @@ def finetune(
         steps: number of steps, at least 1.
         rate: added to the loss for each bit per stored number, of the field and of the head.
         data: the capture, if it has moved.
-        progress: called after each step with its loss.
+        progress: called after each step with its loss ``[]``, which the next step overwrites; reading it waits for the GPU.
 
     Returns:
         The trained scene, and its codecs for ``storage.packing.write_fitted``.
@@ -102,80 +103,33 @@ def finetune(
     codecs = codecs.to(model.device)
     pipeline.train()
     weights = dict(model.head.named_parameters()) if model.head is not None and scene.head else {}
-    field = _Through.of({name: model.gauss_params[name] for name in codecs.field}, codecs.rounded)
-    head = _Through.of(weights, codecs.rounded_head)
+    field = Through.of({name: model.gauss_params[name] for name in codecs.field}, codecs.rounded)
+    head = Through.of(weights, codecs.rounded_head)
     numbers = sum(value.numel() for value in (*field.exact.values(), *head.exact.values()))
     optimizer = _optimizer(field.exact, head.exact)
-    highest = [group["lr"] for group in optimizer.param_groups]
+    highest = [float(group["lr"]) for group in optimizer.param_groups]
+    step = TunedStep(model, codecs, field, head, optimizer, rate / numbers)
+    views: dict[tuple[int | None, int], View] = {}
     generators = [torch.cuda.current_device()] if model.device.type == "cuda" else []
     with naming_full_memory(lambda: model.num_points), torch.random.fork_rng(generators):
         torch.manual_seed(opened.config.machine.seed)  # of random backgrounds
-        for step in range(steps):
-            for group, peak in zip(optimizer.param_groups, highest, strict=True):
-                group["lr"] = peak * rate_factor(step, steps)
-            field.show()
-            head.show()
-            at = opened.step + 1 + step
+        for i in range(steps):
+            _set_rates(optimizer, [peak * rate_factor(i, steps) for peak in highest])
+            at = opened.step + 1 + i
             if weights:
                 model.step = at  # chooses the window of a large image
-            loss: Tensor = sum(pipeline.get_train_loss_dict(at)[1].values())
-            pipeline.zero_grad(set_to_none=True)
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
-            if rate > 0:
-                bits = estimated_bits(codecs, field.exact, head.exact)
-                (rate / numbers * torch.stack(list(bits.values())).sum()).backward()  # type: ignore[no-untyped-call]
-            field.take_gradients()
-            head.take_gradients()
-            optimizer.step()
+            camera, batch = pipeline.datamanager.next_train(at)
+            result = recorded_outputs(model, camera, batch, step, views)[1]
             if progress is not None:
-                progress(loss.item())
+                progress(result.loss)
     source = {**scene.meta.get("source", {}), "finetuned": steps}
-    trained = Scene(
-        {name: field.exact.get(name, value).detach().cpu() for name, value in scene.field.items()},
-        {name: value.detach().cpu() for name, value in head.exact.items()},
-        scene.cameras,
-        {**scene.meta, "source": source},
+    trained = replace(
+        scene,
+        field={name: field.exact.get(name, value).detach().cpu() for name, value in scene.field.items()},
+        head={name: value.detach().cpu() for name, value in head.exact.items()},
+        meta={**scene.meta, "source": source},
     )
     return trained, codecs.to(torch.device("cpu"))
-
-
-class _Through(NamedTuple):
-    """Parameters of the model, which hold rounded values, and the exact values that are trained."""
-
-    shown: Mapping[str, Tensor]
-    exact: dict[str, Tensor]
-    rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
-
-    @classmethod
-    def of(
-        cls, shown: Mapping[str, Tensor], rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
-    ) -> _Through:
-        """Start with the values of the parameters."""
-        return cls(shown, {name: value.detach().clone().requires_grad_() for name, value in shown.items()}, rounded)
-
-    @torch.no_grad()
-    def show(self) -> None:
-        """Round into the parameters in place, because recorded graphs of the head read them there."""
-        rounded = self.rounded(self.exact)
-        for name, value in self.shown.items():
-            value.copy_(rounded[name])
-
-    @torch.no_grad()
-    def take_gradients(self) -> None:
-        """Add the gradients at the rounded values to those of the exact ones."""
-        for name, value in self.exact.items():
-            gradient = self.shown[name].grad
-            if gradient is not None and name == "quats":
-                # Rounding may have negated a quaternion, which is the same rotation.
-                gradient = gradient * (value * self.shown[name]).sum(dim=1, keepdim=True).sign()
-            if gradient is not None and value.grad is not None:
-                gradient = gradient + value.grad
-            if gradient is not None and name == "features_rest":
-                # Keep view-independent colours so: their coefficients cost next to nothing in the pack.
-                gradient = gradient.masked_fill((value == 0).flatten(1).all(dim=1)[:, None, None], 0.0)
-            if gradient is not None:
-                value.grad = gradient
 
 
 def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
@@ -189,9 +143,24 @@ def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
 
 
 def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> torch.optim.Optimizer:
-    groups = [{"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()]
+    groups: list[dict[str, Any]] = [
+        {"params": [value], "lr": RATES[name], "eps": 1e-15} for name, value in field.items()
+    ]
     if head:
         groups.append(
             {"params": list(head.values()), "lr": RATES["head"], "eps": 1e-8, "betas": NetworkAdamConfig.betas}
         )
-    return torch.optim.Adam(groups, fused=all(value.is_cuda for value in field.values()))
+    on_cuda = next(iter(field.values())).is_cuda
+    if on_cuda:
+        for group in groups:
+            group["lr"] = torch.tensor(group["lr"], device=group["params"][0].device)
+    return torch.optim.Adam(groups, fused=on_cuda, capturable=on_cuda)
+
+
+def _set_rates(optimizer: torch.optim.Optimizer, rates: Iterable[float]) -> None:
+    """Set the rate of each group, in place where a recording reads it."""
+    for group, rate in zip(optimizer.param_groups, rates, strict=True):
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate

@@ -33,6 +33,7 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rendering.source import degree_in_use
 from sundae_ns.scenes import stock
+from sundae_ns.scenes.sensitivity import sensitivity_of
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.packing import Scene
 from sundae_ns.storage.runs import checkpoint
@@ -103,7 +104,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
         "capture": _describe(manager),
     }
     cameras = _cameras(manager, max_cameras) if max_cameras > 0 else None
-    return Scene(field, head, cameras, meta)
+    return Scene(field, head, cameras, meta, sensitivity_of(model, cameras) if cameras else None)
 
 
 def _read_config(path: Path) -> TrainerConfig:

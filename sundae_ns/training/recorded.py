@@ -183,7 +183,7 @@ class RecordedStep:
             result = self._run(state, held, inputs, settings)
             self._warm.add(kind)
         else:
-            _copy(inputs, recording.inputs)
+            copy_inputs(inputs, recording.inputs)
             # Pinned: copying from other memory would wait until the GPU has finished the last step.
             recording.rates.copy_(torch.tensor(held.rates, pin_memory=True), non_blocking=True)
             recording.graph.replay()
@@ -251,7 +251,7 @@ class RecordedStep:
     def _recorded(
         self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings, pairs: int
     ) -> _Recording:
-        device, own = state.device, _clone(inputs)
+        device, own = state.device, clone_inputs(inputs)
         rates = torch.tensor(held.rates, device=device)
 
         def step() -> StepResult:
@@ -381,7 +381,8 @@ def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Ha
     )
 
 
-def _clone(inputs: StepInputs) -> StepInputs:
+def clone_inputs(inputs: StepInputs) -> StepInputs:
+    """Copy the inputs of a step, so that a recording reads them where they stay."""
     view, mask = inputs.view, inputs.mask
     return StepInputs(
         view._replace(viewmat=view.viewmat.clone(), K=view.K.clone()),
@@ -391,7 +392,8 @@ def _clone(inputs: StepInputs) -> StepInputs:
     )
 
 
-def _copy(inputs: StepInputs, into: StepInputs) -> None:
+def copy_inputs(inputs: StepInputs, into: StepInputs) -> None:
+    """Write the inputs of a step into those of a recording."""
     pairs = [(into.view.viewmat, inputs.view.viewmat), (into.view.K, inputs.view.K)]
     pairs += [(into.background, inputs.background), (into.target, inputs.target)]
     if inputs.mask is not None and into.mask is not None:

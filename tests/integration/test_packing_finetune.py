@@ -21,6 +21,7 @@ from sundae_ns.evaluation import psnr
 from sundae_ns.model import SundaeModel
 from sundae_ns.scenes import finetune as packing_finetune
 from sundae_ns.scenes.finetune import finetune, rate_factor
+from sundae_ns.scenes.finetune_step import Through, TunedStep
 from sundae_ns.scenes.opening import load_run
 from sundae_ns.scenes.packed import scene_of_run, write_run
 from sundae_ns.storage.packing import FINETUNED, PackConfig, Scene, fit_scene, read_header, read_scene, write_fitted
@@ -58,18 +59,19 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
     # Ten times the rates for a twentieth of the steps.
     monkeypatch.setattr(packing_finetune, "RATES", {name: 10 * rate for name, rate in packing_finetune.RATES.items()})
     seen: list[dict[str, Tensor]] = []
-    render = SundaeModel.get_outputs
+    train = packing_finetune.recorded_outputs
 
-    def watched(model: SundaeModel, camera: Any) -> Any:
+    def watched(model: SundaeModel, *arguments: Any) -> Any:
+        found = train(model, *arguments)
         seen.append({name: value.detach().clone() for name, value in model.named_parameters()})
-        return render(model, camera)
+        return found
 
     before = digests(tiny.folder)
     scene = scene_of_run(tiny.folder)
-    losses: list[float] = []
-    monkeypatch.setattr(SundaeModel, "get_outputs", watched)
+    losses: list[Tensor] = []
+    monkeypatch.setattr(packing_finetune, "recorded_outputs", watched)
     trained, codecs = finetune(tiny.folder, scene, COARSE, 60, progress=losses.append)
-    monkeypatch.setattr(SundaeModel, "get_outputs", render)
+    monkeypatch.setattr(packing_finetune, "recorded_outputs", train)
     assert digests(tiny.folder) == before
     assert len(losses) == len(seen) == 60
     # Images are made of rounded values: rounding them again changes nothing.
@@ -101,6 +103,9 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
     write_fitted(tmp_path / "c.sundae", *fit_scene(blind, COARSE))
     surprised = quality(tiny, read_scene(tmp_path / "c.sundae"), tmp_path / "blind")
     tuned = quality(tiny, found, tmp_path / "tuned")
+    print(
+        "FIG", tuned, plain, surprised, (tmp_path / "a.sundae").stat().st_size, (tmp_path / "b.sundae").stat().st_size
+    )
     assert tuned > plain + 0.1
     assert tuned > surprised + 0.05
     assert (tmp_path / "a.sundae").stat().st_size < 1.05 * (tmp_path / "b.sundae").stat().st_size
@@ -122,7 +127,12 @@ def test_the_command(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[st
     meta = read_header(file).meta
     assert meta["source"]["finetuned"] == 3
     stored = meta["attributes"]
-    assert (stored["features"]["step"], stored["features_rest"]["step"]) == (0.01, FINETUNED["harmonics_step"])
+    config = PackConfig(**{**FINETUNED, "feature_step": 0.01})  # type: ignore[arg-type]
+    _, codecs = fit_scene(scene_of_run(run, data=tiny.scene), config)
+    for name in codecs.field:
+        assert stored[name]["step"] == codecs.field[name].step, name  # type: ignore[attr-defined]
+    assert stored["scales"]["step"] == FINETUNED["scale_step"]
+    assert 0.01 <= stored["features"]["step"] < 0.01 / 0.02**0.5
 
 
 def test_an_interrupt_leaves_nothing(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,7 +158,7 @@ def test_full_memory_is_one_line(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> 
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 300.00 MiB.")
 
     scene = scene_of_run(tiny.folder, max_cameras=0)
-    monkeypatch.setattr(torch.Tensor, "backward", full)
+    monkeypatch.setattr(torch.autograd, "grad", full)
     count = len(scene.field["means"])
     with pytest.raises(MemoryExhaustedError, match=rf"cannot allocate 300\.00 MiB more with {count:,} primitives"):
         finetune(tiny.folder, scene, PackConfig(), 1)
@@ -205,8 +215,32 @@ def test_rates_rise_and_fall_to_nothing() -> None:
 def test_gradients_follow_a_quaternion_to_its_negative() -> None:
     exact = torch.nn.functional.normalize(torch.tensor([[-1.0, 0.2, 0.3, 0.1], [1.0, 0.2, 0.3, 0.1]]))
     shown = exact * torch.tensor([[-1.0], [1.0]])
-    shown.grad = torch.ones(2, 4)
-    through = packing_finetune._Through({"quats": shown}, {"quats": exact}, dict)
-    through.take_gradients()
+    through = Through({"quats": shown}, {"quats": exact}, dict)
+    through.set_gradients({"quats": torch.ones(2, 4)}, {})
     assert exact.grad is not None
     assert torch.equal(exact.grad, torch.tensor([[-1.0], [1.0]]).expand(2, 4))
+
+
+@pytest.mark.gpu
+def test_replayed_steps_train_the_same_scene(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One training kernel by kernel, one by recordings: the same losses up to the order of sums."""
+    scene = scene_of_run(tiny.folder)
+    steps: list[TunedStep] = []
+    replayed = TunedStep._replayed
+
+    def watched(step: TunedStep, *arguments: Any) -> Any:
+        steps.append(step)
+        return replayed(step, *arguments)
+
+    def losses() -> list[float]:
+        found: list[float] = []
+        finetune(tiny.folder, scene, COARSE, 30, progress=lambda loss: found.append(loss.item()))
+        return found
+
+    monkeypatch.setattr(TunedStep, "_replayed", watched)
+    recorded = losses()
+    assert len(steps) == 30
+    assert steps[-1]._can_record
+    assert steps[-1]._recordings
+    monkeypatch.setattr(TunedStep, "__call__", lambda step, _, *arguments: step._run(*arguments, None))
+    assert recorded == pytest.approx(losses(), rel=0.05)

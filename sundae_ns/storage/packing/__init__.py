@@ -1,6 +1,6 @@
 """Packed scenes: a field, its head and its cameras in one small, checksummed file without executable content."""
 
-from sundae_ns.storage.packing.codecs import Codecs
+from sundae_ns.storage.packing.codecs import Codecs, Sensitivity
 from sundae_ns.storage.packing.config import FINETUNED, PackConfig
 from sundae_ns.storage.packing.container import read_header
 from sundae_ns.storage.packing.scene import (
@@ -18,6 +18,7 @@ __all__ = [
     "PackConfig",
     "PackReport",
     "Scene",
+    "Sensitivity",
     "fit_scene",
     "read_header",
     "read_scene",

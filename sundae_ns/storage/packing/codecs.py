@@ -20,7 +20,19 @@ from sundae_ns.storage.packing.quantize import Blocks, Rotations
 
 LOGITS = (-6.0, 8.0)
 """Opacities outside of these logits look the same as at them: below 1/255 nothing is drawn."""
+_LARGEST_SHARE = 0.5
+"""Step of an output channel of the head, at most, as a share of its largest weight."""
 _NONE = np.zeros((0, 0), np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Sensitivity:
+    """Mean squared change of the images' pixels per unit change of values; see ``sundae_ns.scenes.sensitivity``."""
+
+    rows: dict[str, Tensor]
+    """Positive definite forms ``[C, C]``, float64, for changes of the rows ``[N, C]`` of attributes."""
+    head: dict[str, Tensor]
+    """For the weights of each pair of channels, float64 ``[O, I]``, of each tensor with more than one dimension."""
 
 
 class Codec(Protocol):
@@ -38,10 +50,12 @@ class Codec(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class HeadCodec:
-    """Weights of the head in steps of their output channel. One-dimensional tensors stay float32."""
+    """Weights of the head in steps of their channels. One-dimensional tensors stay float32."""
 
-    steps: dict[str, Tensor]
-    """Steps ``[O]`` of each tensor with more than one dimension."""
+    rows: dict[str, Tensor]
+    """Steps of the output channels ``[O]`` of each tensor with more than one dimension."""
+    columns: dict[str, Tensor]
+    """Factors of the steps for the input channels ``[I]`` of the same tensors."""
 
     def encode(self, head: Mapping[str, Tensor]) -> Coded:
         """Return the stored form, with the levels of all weights in one column.
@@ -55,12 +69,13 @@ class HeadCodec:
             raise PackError("the head has weights that are not finite; go back to an earlier checkpoint")
         weights = [name for name in names if values[name].ndim > 1]
         none = np.zeros(0, np.float32)
-        levels = [quantize.weight_levels(values[name], self.steps[name]).flatten() for name in weights]
+        levels = [quantize.weight_levels(values[name], self.steps(name)).flatten() for name in weights]
         arrays: dict[str, Array] = {
             "plain": np.concatenate(
                 [*(values[name].numpy().reshape(-1) for name in names if name not in weights), none]
             ),
-            "steps": np.concatenate([*(self.steps[name].numpy() for name in weights), none]),
+            "steps": np.concatenate([*(self.rows[name].numpy() for name in weights), none]),
+            "columns": np.concatenate([*(self.columns[name].numpy() for name in weights), none]),
         }
         column = torch.cat([*levels, torch.zeros(0, dtype=torch.float64)])[:, None]
         shapes = [[name, list(values[name].shape)] for name in names]
@@ -71,12 +86,16 @@ class HeadCodec:
         """Return the values that a reader decodes for the tensor ``name``."""
         if values.ndim <= 1:
             return values
-        step = self.steps[name]
+        step = self.steps(name)
         return quantize.weights_at(quantize.weight_levels(values, step), step)
+
+    def steps(self, name: str) -> Tensor:
+        """Return the steps of a tensor ``[O, I]``, float32."""
+        return self.rows[name][:, None] * self.columns[name]
 
     def coefficients(self, name: str, values: Tensor) -> Tensor:
         """Return the weights of a tensor in steps ``[O, ...]``, flattened to ``[O, I]``; gradients flow through them."""
-        return quantize.in_steps(values, self.steps[name]).flatten(1)
+        return quantize.in_steps(values, self.steps(name)).flatten(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +145,10 @@ def _moved(value: Any, device: torch.device) -> Any:
 
 
 def fit(
-    field: Mapping[str, Tensor], head: Mapping[str, Tensor], config: PackConfig
+    field: Mapping[str, Tensor],
+    head: Mapping[str, Tensor],
+    config: PackConfig,
+    sensitivity: Sensitivity | None = None,
 ) -> tuple[dict[str, Tensor], Codecs]:
     """Fit codecs to a field and a head, which may be empty; see :func:`sundae_ns.storage.packing.fit_scene`."""
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in field]
@@ -145,19 +167,46 @@ def fit(
         "features_rest": config.harmonics_step,
         FEATURES: config.feature_step,
     }
+    forms = {} if sensitivity is None else sensitivity.rows
     codecs: dict[str, Codec] = {"quats": Rotations(config.rotation_step)}
     for name, step in steps.items():
         if values.get(name, _NONE).size:
-            codecs[name] = transform.fit(values[name], step, centred=name != "features_rest")
+            codecs[name] = transform.fit(values[name], step, centred=name != "features_rest", form=forms.get(name))
     ordered = {name: torch.from_numpy(values[name]).reshape(field[name].shape) for name in names}
-    return ordered, Codecs(config, blocks, codecs, _fit_head(head, config))
+    of_head = {} if sensitivity is None else sensitivity.head
+    return ordered, Codecs(config, blocks, codecs, _fit_head(head, config.head_step, of_head))
 
 
-def _fit_head(head: Mapping[str, Tensor], config: PackConfig) -> HeadCodec | None:
+def _fit_head(head: Mapping[str, Tensor], share: float, sensitivity: Mapping[str, Tensor]) -> HeadCodec | None:
+    """Steps of ``share`` of each output channel's largest weight, or, with a sensitivity, steps of the same total error.
+
+    Steps in inverse proportion to the root of the sensitivity take the fewest bits for an error. Levels of a head differ
+    most: four times as many pixels depend on a weight of the finer one.
+    """
     if not head:
         return None
     weights = {name: torch.from_numpy(as_array(value)) for name, value in head.items() if value.ndim > 1}
-    return HeadCodec({name: quantize.weight_steps(value, config.head_step) for name, value in weights.items()})
+    rows = {name: quantize.weight_steps(value, share) for name, value in weights.items()}
+    columns = {name: torch.ones(value.shape[1]) for name, value in weights.items()}
+    if weights.keys() != sensitivity.keys():
+        return HeadCodec(rows, columns)
+    error = target = 0.0
+    for name, value in weights.items():
+        found, count = sensitivity[name].clamp_min(1e-3 * float(sensitivity[name].mean())), value[0, 0].numel()
+        target += count * float((found * rows[name].double()[:, None] ** 2).sum())
+        row, column = found.mean(dim=1), found.mean(dim=0) / found.mean()
+        rows[name], columns[name] = (_quarters(side.rsqrt()) for side in (row, column))
+        error += count * float((found * (rows[name][:, None] * columns[name]).double() ** 2).sum())
+    factor = _quarters(torch.tensor((target / error) ** 0.5))
+    for name, value in weights.items():
+        # A derivative says nothing of changes as large as the weights: in an untrained head they all seem useless.
+        rows[name] = torch.minimum(rows[name] * factor, _quarters(quantize.weight_steps(value, _LARGEST_SHARE)))
+    return HeadCodec(rows, columns)
+
+
+def _quarters(values: Tensor) -> Tensor:
+    """Powers of 2^(1/4) near positive values, float32; they take few bytes in a file."""
+    return torch.exp2((4 * values.double().clamp_min(1e-30).log2()).round() / 4).float()
 
 
 def as_array(values: Tensor) -> Floats:

@@ -156,8 +156,9 @@ def rotation_bound(step: float) -> float:
 def _normalized(quats: Tensor) -> Tensor:
     """Unit quaternions ``[N, 4]``, float64, with w at least 0; zero ones become the identity."""
     scale = quats.abs().amax(dim=1, keepdim=True)
-    q = torch.where(scale > 0, quats / torch.where(scale > 0, scale, 1.0), quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
-    w, x, y, z = q.T
+    # No tensor of numbers: it would be copied to the device, which no CUDA graph can record.
+    w, x, y, z = (quats / torch.where(scale > 0, scale, 1.0)).T
+    w = torch.where(scale[:, 0] > 0, w, 1.0)
     length = (w * w + x * x + y * y + z * z).sqrt() * torch.where(w < 0, -1.0, 1.0)
     return torch.stack([part / length for part in (w, x, y, z)], dim=1)
 
@@ -168,16 +169,16 @@ def weight_steps(weight: Tensor, share: float) -> Tensor:
 
 
 def weight_levels(weight: Tensor, step: Tensor) -> Tensor:
-    """Nearest levels of weights ``[O, ...]``, float64; the error is at most half of the channel's step."""
+    """Nearest levels of weights ``[O, I, ...]``, float64; the error is at most half of the channels' step."""
     return in_steps(weight, step).round().clamp(-LARGEST, LARGEST)
 
 
 def in_steps(weight: Tensor, step: Tensor) -> Tensor:
-    """Weights ``[O, ...]`` in steps of their channel ``[O]``, float64; gradients flow through them."""
-    wide = step.reshape(-1, *([1] * (weight.ndim - 1))).double()
+    """Weights ``[O, I, ...]`` in steps ``[O, I]``, float64; gradients flow through them."""
+    wide = step.reshape(*step.shape, *([1] * (weight.ndim - 2))).double()
     return weight.double() / torch.where(wide > 0, wide, 1.0)
 
 
 def weights_at(levels: Tensor, step: Tensor) -> Tensor:
-    """Weights ``[O, ...]``, float32, of levels of any dtype and steps ``[O]``."""
-    return levels.float() * step.reshape(-1, *([1] * (levels.ndim - 1)))
+    """Weights ``[O, I, ...]``, float32, of levels of any dtype and steps ``[O, I]``."""
+    return levels.float() * step.reshape(*step.shape, *([1] * (levels.ndim - 2)))

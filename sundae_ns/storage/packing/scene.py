@@ -21,7 +21,7 @@ from torch import Tensor
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, odd_shapes, sh_degree_of
 from sundae_ns.storage.packing import container, entropy, quantize, transform
-from sundae_ns.storage.packing.codecs import Codecs, as_matrix, fit
+from sundae_ns.storage.packing.codecs import Codecs, Sensitivity, as_matrix, fit
 from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array, Levels
 from sundae_ns.storage.packing.entropy import Near
@@ -46,6 +46,8 @@ class Scene:
     """Cameras by the names of :data:`CAMERAS`."""
     meta: dict[str, Any] = default(default_factory=dict)
     """JSON values: configuration of the model, coordinate frame, and other entries of the caller."""
+    sensitivity: Sensitivity | None = None
+    """What errors do to images; not stored. Without it all errors weigh the same."""
 
 
 class PackReport(NamedTuple):
@@ -112,7 +114,7 @@ def fit_scene(scene: Scene, config: PackConfig | None = None) -> tuple[Scene, Co
     config = config or PackConfig()
     config.validate()
     _check(scene.field)
-    field, codecs = fit(scene.field, scene.head, config)
+    field, codecs = fit(scene.field, scene.head, config, scene.sensitivity)
     return replace(scene, field=field), codecs
 
 
@@ -256,7 +258,9 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
     if "head/levels" not in reader.arrays:
         return {}
     about = reader.about("head", ("steps",))
-    plain, steps = (reader.section(f"head/{part}", ("<f4",), (None,)) for part in ("plain", "steps"))
+    plain, steps, columns = (
+        reader.section(f"head/{part}", ("<f4",), (None,)) for part in ("plain", "steps", "columns")
+    )
     tensors = _tensors(reader, about.get("tensors"))
     sizes = {name: int(np.prod(shape, dtype=object)) for name, shape in tensors}
     count = sum(sizes[name] for name, shape in tensors if len(shape) > 1)
@@ -264,7 +268,7 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
         raise reader.refuse("the head has another number of weights than it states")
     container.check_ratio(reader.path, 4 * count, reader.size)
     levels = reader.decoded("head/levels", entropy.decode, 1, entropy.predecessors(count)).reshape(-1)
-    taken = {"plain": 0, "levels": 0, "steps": 0}
+    taken = {"plain": 0, "levels": 0, "steps": 0, "columns": 0}
 
     def take(name: str, source: Array, count: int) -> Tensor:
         start = taken[name]
@@ -279,7 +283,10 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
             head[name] = take("plain", plain, sizes[name]).reshape(shape)
         else:
             found = take("levels", levels, sizes[name]).reshape(shape)
-            head[name] = quantize.weights_at(found, take("steps", steps, shape[0]))
+            each = take("steps", steps, shape[0])[:, None] * take("columns", columns, shape[1])
+            head[name] = quantize.weights_at(found, each)
+            if not torch.isfinite(head[name]).all():
+                raise reader.refuse("the head has weights beyond float32")
     return head
 
 

@@ -17,6 +17,8 @@ from sundae_ns.storage.packing.entropy import LARGEST
 
 _UNIT = 127
 _CHUNK = 1 << 16
+_LEAST = 0.02
+"""Smallest eigenvalue of a form, as a share of the mean: other views see more of these errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,27 +57,41 @@ class Transform:
         return self.coefficients(rows).round().clamp(-LARGEST, LARGEST)
 
 
-def fit(rows: Floats, step: float, *, centred: bool = True) -> Transform:
+def fit(rows: Floats, step: float, *, centred: bool = True, form: Tensor | None = None) -> Transform:
     """Fit a transform to finite rows ``[N, D]``, N and D at least 1.
 
     Args:
         rows: the values.
         step: positive; a larger one is used where the largest coefficient would not fit.
         centred: subtract the mean row; else rows of zeros stay exact.
+        form: weighs errors e of rows by e' form e, positive definite ``[D, D]``; coefficients are uncorrelated where
+            this is the squared length. None for the identity.
     """
     values = rows.astype(np.float64)
     mean = (values.mean(axis=0) if centred else np.zeros(rows.shape[1])).astype(np.float32)
     values = values - mean
+    root, back = _roots(rows.shape[1], form)
+    values = values @ root
     # Divide rows by the square root of their length, so that a few huge rows do not dominate the basis.
     shrunk = values / np.sqrt(np.maximum(np.linalg.norm(values, axis=1, keepdims=True), step))
-    axes = np.linalg.eigh(shrunk.T @ shrunk)[1][:, ::-1].T
+    axes = np.linalg.eigh(shrunk.T @ shrunk)[1][:, ::-1].T @ back
+    largest = float(np.abs(axes).max()) if form is not None else 1.0
     # In the order of a file: products of other layouts round differently.
-    basis = np.ascontiguousarray(np.rint(axes * _UNIT).astype(np.int8))
+    basis = np.ascontiguousarray(np.rint(axes / largest * _UNIT).astype(np.int8))
     # Invert the stored basis, so that its rounding adds no error.
     inverse = torch.from_numpy(np.linalg.inv(basis / _UNIT))
-    fitted = Transform(torch.from_numpy(mean), torch.from_numpy(basis), inverse, step)
-    largest = float(fitted.coefficients(torch.from_numpy(rows)).abs().max())
-    return replace(fitted, step=step * max(2 * largest / LARGEST, 1.0))
+    fitted = Transform(torch.from_numpy(mean), torch.from_numpy(basis), inverse, step * largest)
+    highest = float(fitted.coefficients(torch.from_numpy(rows)).abs().max())
+    return replace(fitted, step=fitted.step * max(2 * highest / LARGEST, 1.0))
+
+
+def _roots(size: int, form: Tensor | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The symmetric root ``[D, D]`` of a form, scaled to a mean eigenvalue of 1, and its inverse."""
+    if form is None:
+        return np.eye(size), np.eye(size)
+    values, vectors = np.linalg.eigh(form.numpy() * (size / form.trace().item()))
+    roots = np.sqrt(np.maximum(values, _LEAST))
+    return vectors * roots @ vectors.T, vectors / roots @ vectors.T
 
 
 def restore(levels: Levels, mean: Floats, basis: NDArray[np.int8], step: float) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from sundae_ns.storage.packing import (
     write_fitted,
     write_scene,
 )
-from sundae_ns.storage.packing.codecs import HeadCodec
+from sundae_ns.storage.packing.codecs import HeadCodec, Sensitivity
 from sundae_ns.storage.packing.container import Floats
 
 hard = given(
@@ -54,11 +55,13 @@ def test_rotations(n: int, seed: int, step: float) -> None:
 @hard
 def test_weights(kind: str, n: int, seed: int) -> None:
     x, share = hard_values(kind, n, 18, seed).reshape(n, 2, 3, 3), 2.0 ** -(seed % 9)
-    codec = HeadCodec({"w": quantize.weight_steps(torch.from_numpy(x), share)})
+    codec = HeadCodec({"w": quantize.weight_steps(torch.from_numpy(x), share)}, {"w": torch.tensor([1.0, 2.0**0.25])})
     for y in (x, drifted(x, seed)):
         _, levels, arrays = codec.encode({"w": torch.from_numpy(y)})
         codes = torch.from_numpy(levels.reshape(x.shape))
-        found = quantize.weights_at(codes, torch.from_numpy(arrays["steps"]))
+        found = quantize.weights_at(
+            codes, torch.from_numpy(arrays["steps"])[:, None] * torch.from_numpy(arrays["columns"])
+        )
         assert torch.equal(codec.rounded("w", torch.from_numpy(y)), found)
 
 
@@ -156,3 +159,33 @@ def test_rounding_is_the_same_on_a_gpu() -> None:
 
 def _moved(tensors: dict[str, Tensor], device: torch.device) -> dict[str, Tensor]:
     return {name: value.to(device) for name, value in tensors.items()}
+
+
+def test_weights_that_show_less_are_coarser_at_the_same_total_error() -> None:
+    g = torch.Generator().manual_seed(0)
+    head = {name: torch.randn(8, 8, 3, 3, generator=g) for name in ("a.weight", "b.weight")}
+    shown = {name: torch.rand(8, 8, generator=g, dtype=torch.float64) + 0.5 for name in head}
+    shown["b.weight"] /= 64
+    original = Scene(random_field(50), head)
+    errors, sizes = [], []
+    for sensitivity in (None, Sensitivity({}, shown)):
+        _, codecs = fit_scene(replace(original, sensitivity=sensitivity), PackConfig(head_step=0.02))
+        assert codecs.head is not None
+        moved = {name: codecs.head.rounded(name, value) - value for name, value in head.items()}
+        errors.append(sum(float((shown[name] * moved[name].square().sum((2, 3))).sum()) for name in head))
+        levels = codecs.head.encode(head)[1]
+        sizes.append(len(entropy.encode(levels, entropy.predecessors(len(levels)))))
+    assert errors[1] == pytest.approx(errors[0], rel=0.25)
+    assert sizes[1] < 0.9 * sizes[0]
+    share = [float(codecs.head.steps(name).mean()) for name in head]
+    assert share[1] == pytest.approx(8 * share[0], rel=0.25)
+
+
+def test_no_step_is_larger_than_half_of_the_largest_weight() -> None:
+    """Weights behind an output layer of zeros seem useless, but training will need them."""
+    head = {"a.weight": torch.randn(4, 4, 3, 3), "out.weight": torch.full((4, 4, 1, 1), 1e-6)}
+    shown = {"a.weight": torch.full((4, 4), 1e-12).double(), "out.weight": torch.ones(4, 4).double()}
+    _, codecs = fit_scene(Scene(random_field(50), head, sensitivity=Sensitivity({}, shown)), PackConfig())
+    assert codecs.head is not None
+    largest = head["a.weight"].flatten(1).abs().amax(dim=1)
+    assert (codecs.head.rows["a.weight"] <= 0.6 * largest).all()

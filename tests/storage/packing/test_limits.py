@@ -114,7 +114,9 @@ SECTIONS: dict[str, tuple[str, Any]] = {
     "gaps of another dtype": ("means/gaps", np.zeros(9, np.uint16)),
     "a head without its last bias": ("head/plain", np.zeros(3, np.float32)),
     "a head with a step too few": ("head/steps", np.zeros(3, np.float32)),
+    "a head with a column too few": ("head/columns", np.zeros(2, np.float32)),
     "weights that are not finite": ("head/steps", np.full(4, np.nan, np.float32)),
+    "weights beyond float32": ("head/steps", np.full(4, 3e38, np.float32)),
     "too few blocks": ("means/low", np.zeros((0, 3), np.float32)),
 }
 
@@ -156,7 +158,14 @@ def test_a_stream_of_other_numbers_is_refused(tmp_path: Path, name: str) -> None
 
 @pytest.mark.parametrize(
     ("shape", "fits"),
-    [([4, 3, 3, 3], True), ([4, 27], True), ([4, 27, 1, 1, 1], True), ([4, 27, 1, 1, 1, 1], False), ([4, 28], False)],
+    [
+        ([4, 3, 3, 3], True),
+        ([4, 3, 9], True),
+        ([4, 3, 9, 1, 1], True),
+        ([4, 3, 9, 1, 1, 1], False),
+        ([4, 27], False),
+        ([4, 3, 10], False),
+    ],
 )
 def test_shapes_of_the_head(tmp_path: Path, shape: list[int], fits: bool) -> None:
     path = tmp_path / "a.sundae"

@@ -129,9 +129,9 @@ def test_a_quaternion_of_length_zero_is_the_identity() -> None:
 @hard
 def test_weights(kind: str, n: int, seed: int) -> None:
     x = hard_values(kind, n, 18, seed).reshape(n, 2, 3, 3)
-    steps = quantize.weight_steps(torch.from_numpy(x), 1 / 127)
+    steps = quantize.weight_steps(torch.from_numpy(x), 1 / 127)[:, None]
     found = quantize.weights_at(quantize.weight_levels(torch.from_numpy(x), steps), steps)
-    error, step = np.abs(found.double().numpy() - x).reshape(n, -1), steps.numpy()
+    error, step = np.abs(found.double().numpy() - x).reshape(n, -1), steps.numpy()[:, 0]
     assert (error <= step[:, None] / 2 * (1 + 1e-6) + ulp(x.reshape(n, -1))).all()
     assert (step <= np.abs(x.reshape(n, -1)).max(axis=1) / 127 * (1 + 1e-6) + 1e-44).all()
 
@@ -167,3 +167,20 @@ def test_rows_of_zeros_stay_exact() -> None:
     x[::2] = 0
     codec = transform.fit(x, 0.03, centred=False)
     assert not codec.rounded(torch.from_numpy(x))[::2].any()
+
+
+def test_a_form_makes_errors_that_show_smaller() -> None:
+    """At as many bits: the sum of the errors by the form is less than half, and errors of its least direction are larger."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(4000, 6)).astype(np.float32)
+    axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    form = axes * np.array([1, 1, 1, 0.1, 0.1, 0.02]) @ axes.T
+    plain, weighted = transform.fit(x, 0.1), transform.fit(x, 0.1, form=torch.from_numpy(form))
+    errors = [codec.rounded(torch.from_numpy(x)).double().numpy() - x for codec in (plain, weighted)]
+    seen = [np.einsum("ni,ij,nj->n", error, form, error).mean() for error in errors]
+    bits = [np.log2(1 + np.abs(codec.encode(x)[1])).mean() for codec in (plain, weighted)]
+    assert bits[1] < bits[0]
+    assert 0.5 < seen[1] / (0.1**2 / 12 * np.trace(form)) < 1.3
+    assert np.abs(errors[1] @ axes[:, 5]).mean() > 1.5 * np.abs(errors[0] @ axes[:, 5]).mean()
+    identity = transform.fit(x, 0.1, form=torch.eye(6, dtype=torch.float64) * 7)
+    assert np.abs(identity.rounded(torch.from_numpy(x)).numpy() - x).max() < identity.bound * (1 + 1e-5)

@@ -94,6 +94,7 @@ function readTensors(reader: Reader): Map<string, Tensor> {
   const about = reader.about("head", ["steps"]);
   const plain = reader.section("head/plain", ["<f4"], [null]) as Float32Array;
   const steps = reader.section("head/steps", ["<f4"], [null]) as Float32Array;
+  const columns = reader.section("head/columns", ["<f4"], [null]) as Float32Array;
   const shapes = listed(reader, about.tensors);
   const sizeOf = (shape: number[]): number => shape.reduce((product, side) => product * side, 1);
   const weights = shapes.reduce((sum, [, shape]) => sum + (shape.length > 1 ? sizeOf(shape) : 0), 0);
@@ -102,7 +103,7 @@ function readTensors(reader: Reader): Map<string, Tensor> {
   }
   checkRatio(4 * weights, reader.size);
   const found = levels(reader.stream("head/levels"), 1, predecessors(weights));
-  const taken = { plain: 0, levels: 0, steps: 0 };
+  const taken = { plain: 0, levels: 0, steps: 0, columns: 0 };
   const take = <T extends Float32Array | Int32Array>(name: keyof typeof taken, source: T, count: number): T => {
     const start = taken[name];
     taken[name] += count;
@@ -115,8 +116,14 @@ function readTensors(reader: Reader): Map<string, Tensor> {
     const single = shape.length <= 1;
     const values = Float32Array.from(single ? take("plain", plain, count) : take("levels", found, count));
     if (!single) {
-      const each = take("steps", steps, shape[0]!);
-      for (let i = 0; i < count; i++) values[i]! *= each[Math.floor(i / (count / shape[0]!))]!;
+      const [outputs, inputs] = [shape[0]!, shape[1]!];
+      const [rows, factors] = [take("steps", steps, outputs), take("columns", columns, inputs)];
+      const kernel = count / outputs / inputs;
+      for (let i = 0; i < count; i++) {
+        const pair = Math.floor(i / kernel);
+        values[i]! *= Math.fround(rows[Math.floor(pair / inputs)]! * factors[pair % inputs]!);
+      }
+      if (!values.every(Number.isFinite)) throw reader.refuse("the head has weights beyond float32");
     }
     tensors.set(name, { shape, values });
   }

@@ -1,0 +1,213 @@
+"""One step of a fine-tune: rounding, rendering, losses, the rate and Adam, as one CUDA graph where that is possible.
+
+The model holds rounded values, the ones that a reader decodes. Adam moves exact values beside them, by the gradients at the
+rounded ones (the straight-through estimator of Bengio, Leonard and Courville, 2013). So losses and rasteriser do not know of
+rounding.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from sundae_ns.errors import BackendError
+from sundae_ns.gpu.cuda_graphs import record, warm_up
+from sundae_ns.model import SundaeModel
+from sundae_ns.rasterization import Capacity, RecordableGsplat
+from sundae_ns.rendering.render import RenderSettings, compensate, draw
+from sundae_ns.storage.packing import Codecs
+from sundae_ns.storage.packing.rate import estimated_bits
+from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.recorded import SPARE_PAIRS, StepInputs, StepResult, clone_inputs, copy_inputs
+
+_log = logging.getLogger(__name__)
+
+MAX_RECORDINGS = 8
+"""Image sizes that are recorded; others run kernel by kernel."""
+
+
+class Through(NamedTuple):
+    """Parameters of the model, which hold rounded values, and the exact values that are trained."""
+
+    shown: Mapping[str, Tensor]
+    exact: dict[str, Tensor]
+    rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
+
+    @classmethod
+    def of(
+        cls, shown: Mapping[str, Tensor], rounded: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]]
+    ) -> Through:
+        """Start with the values of the parameters."""
+        return cls(shown, {name: value.detach().clone().requires_grad_() for name, value in shown.items()}, rounded)
+
+    @torch.no_grad()
+    def show(self) -> None:
+        """Round into the parameters in place, because recorded graphs read them there."""
+        rounded = self.rounded(self.exact)
+        for name, value in self.shown.items():
+            value.copy_(rounded[name])
+
+    @torch.no_grad()
+    def set_gradients(self, at_rounded: Mapping[str, Tensor | None], of_rate: Mapping[str, Tensor | None]) -> None:
+        """Set the gradients of the exact values: those at the rounded ones and those of the rate."""
+        for name, value in self.exact.items():
+            gradient, second = at_rounded.get(name), of_rate.get(name)
+            if gradient is not None and name == "quats":
+                # Rounding may have negated a quaternion, which is the same rotation.
+                gradient = gradient * (value * self.shown[name]).sum(dim=1, keepdim=True).sign()
+            if second is not None:
+                gradient = second if gradient is None else gradient + second
+            if gradient is not None and name == "features_rest":
+                # Keep view-independent colours so: their coefficients cost next to nothing in the pack.
+                gradient = gradient.masked_fill((value == 0).flatten(1).all(dim=1)[:, None, None], 0.0)
+            value.grad = gradient
+
+
+class _Recording(NamedTuple):
+    graph: torch.cuda.CUDAGraph
+    inputs: StepInputs
+    """The graph reads them here."""
+    result: StepResult
+    pairs: int
+    """Tile/primitive pairs that fit."""
+
+
+class TunedStep:
+    """Steps of a fine-tune. The first step of an image size runs kernel by kernel, later ones replay.
+
+    Args:
+        model: shows the rounded values; its other parameters do not change.
+        codecs: round the values, on the model's device.
+        field: its parameters.
+        head: those of its head; empty without one.
+        optimizer: Adam of the exact values; on CUDA with rates in memory.
+        rate: loss for each bit.
+    """
+
+    def __init__(
+        self,
+        model: SundaeModel,
+        codecs: Codecs,
+        field: Through,
+        head: Through,
+        optimizer: torch.optim.Optimizer,
+        rate: float,
+    ) -> None:
+        self._model, self._codecs, self._field, self._head = model, codecs, field, head
+        self._optimizer, self._rate = optimizer, rate
+        self._can_record = model.device.type == "cuda" and model.backend.name == "gsplat"
+        self._recordings: dict[Hashable, _Recording] = {}
+        self._warm: set[Hashable] = set()
+        self._most: Tensor | None = None
+        """Most pairs that a view has needed, on the device and, some steps later, on the host; int64 ``[]``."""
+        self._most_on_host: Tensor | None = None
+
+    def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        """Train on one image.
+
+        Raises:
+            torch.cuda.OutOfMemoryError: the GPU's memory is full.
+        """
+        if self._can_record:
+            try:
+                return self._replayed(inputs, settings)
+            except BackendError as error:
+                _log.warning("the fine-tune runs kernel by kernel, slower: %s", error)
+                self._can_record = False
+        return self._run(inputs, settings, None)
+
+    def _replayed(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        kind = (inputs.view.width, inputs.view.height, inputs.mask is not None)
+        recording = self._recordings.get(kind)
+        if kind not in self._warm or (recording is None and len(self._recordings) >= MAX_RECORDINGS):
+            self._warm.add(kind)
+            return self._run_once(inputs, settings)
+        assert self._most_on_host is not None
+        most = int(self._most_on_host)
+        if recording is None or most > recording.pairs:
+            recording = self._recordings[kind] = self._recorded(inputs, settings, int(SPARE_PAIRS * most) + 1)
+        copy_inputs(inputs, recording.inputs)
+        recording.graph.replay()
+        return recording.result
+
+    def _run_once(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        """Run kernel by kernel, on the stream of the recordings, and count the pairs."""
+        capacity = Capacity()
+        with warm_up(self._model.device):
+            result = self._run(inputs, replace(settings, backend=RecordableGsplat(capacity)), None)
+        needed = max(int(number) for number in capacity.needed)
+        if self._most is None or self._most_on_host is None:
+            self._most = torch.zeros((), dtype=torch.int64, device=self._model.device)
+            self._most_on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
+        needed = max(needed, int(self._most))
+        self._most.fill_(needed)
+        self._most_on_host.fill_(needed)
+        return result
+
+    def _recorded(self, inputs: StepInputs, settings: RenderSettings, pairs: int) -> _Recording:
+        own = clone_inputs(inputs)
+
+        def step() -> StepResult:
+            capacity = Capacity(pairs)
+            return self._run(own, replace(settings, backend=RecordableGsplat(capacity)), capacity)
+
+        last = next(reversed(self._recordings.values()), None)
+        graph, result = record(step, self._model.device, share_memory_with=None if last is None else last.graph)
+        return _Recording(graph, own, result, pairs)
+
+    def _run(self, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None) -> StepResult:
+        """One step; all of its work is recorded."""
+        model, field, head = self._model, self._field, self._head
+        field.show()
+        head.show()
+        with torch.enable_grad():
+            primitives = model.source.primitives(inputs.view, settings, features=settings.head is not None)
+            images, splatted = draw(primitives, inputs.view, inputs.background, settings, depth=False)
+            if settings.head is not None:
+                base = images["base_rgb"]
+                images["rgb"] = compensate(settings.head, base, splatted, inputs.background, training=True)
+            state = model.state
+            losses = model.losses(state, state.field, images["rgb"], images["base_rgb"], inputs.target, inputs.mask)
+            loss = functools.reduce(torch.add, losses.values())
+        self._set_gradients(loss)
+        # torch's Adam reads this name: it changes nothing where it is 1.
+        self._optimizer.found_inf = self._overflow(capacity)  # type: ignore[attr-defined]
+        self._optimizer.step()
+        shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
+        return StepResult(shown, {name: value.detach() for name, value in losses.items()}, loss.detach())
+
+    @torch.no_grad()
+    def _overflow(self, capacity: Capacity | None) -> Tensor | None:
+        """1 if the lists of tiles were too short, so that the step must change nothing, else 0; float ``[]``."""
+        if capacity is None or capacity.pairs is None:
+            return None
+        assert self._most is not None
+        assert self._most_on_host is not None
+        needed = torch.stack(capacity.needed).amax()
+        torch.maximum(self._most, needed, out=self._most)
+        self._most_on_host.copy_(self._most, non_blocking=True)
+        return (needed > capacity.pairs).float()
+
+    def _set_gradients(self, loss: Tensor) -> None:
+        both = (self._field, self._head)
+        at_rounded = _gradients(loss, [part.shown for part in both])
+        of_rate: list[dict[str, Tensor | None]] = [{}, {}]
+        if self._rate > 0:
+            with torch.enable_grad():
+                bits = estimated_bits(self._codecs, self._field.exact, self._head.exact)
+                total = self._rate * torch.stack(list(bits.values())).sum()
+            of_rate = _gradients(total, [part.exact for part in both])
+        for part, gradients, others in zip(both, at_rounded, of_rate, strict=True):
+            part.set_gradients(gradients, others)
+
+
+def _gradients(loss: Tensor, groups: list[Mapping[str, Tensor]]) -> list[dict[str, Tensor | None]]:
+    """Gradients of a loss by the values of each group; None where it does not depend on them."""
+    found = iter(torch.autograd.grad(loss, [value for group in groups for value in group.values()], allow_unused=True))
+    return [{name: next(found) for name in group} for group in groups]
