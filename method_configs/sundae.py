@@ -176,6 +176,7 @@ sundae_paper = method(
     steps=60000,
     means_restart=None,
     base_loss_weight=0.0,
+    average_share=0.0,
     ssim_lambda=0.25,
 )
 

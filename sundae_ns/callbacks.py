@@ -86,7 +86,7 @@ class NerfstudioRun:
     @property
     def schedule_length(self) -> int | None:
         """Number of steps for which the schedule is made."""
-        return None if self._trainer is None else self._trainer.config.schedule_length or self.num_steps
+        return None if self._trainer is None else self._trainer.config.schedule_length or self._trainer.last_step + 1
 
     @property
     def images_per_step(self) -> int:

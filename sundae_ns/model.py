@@ -69,7 +69,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """auto takes gsplat on CUDA and compiled loops on a CPU; reference is slow, in plain PyTorch."""
     base_loss_weight: float = 0.2
     """Weight of the loss on the image without the head, which keeps exported .ply files valid."""
-    average_share: float = 0.0
+    average_share: float = 0.1
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
     warm_start: Path | None = None
     """Start from a finished field without a warm-up: a splatfacto or sundae .ckpt (or its folder), or a 3DGS .ply."""

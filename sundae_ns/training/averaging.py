@@ -36,20 +36,36 @@ class Averaging(Extension):
         self._count = 0
         self._restored = 0
         """Returns to a snapshot that the field had made when the mean began."""
+        self._replaced: dict[str, Tensor] = {}
+        """Weights of the last step, which the mean has replaced: a longer training goes on from them."""
         self._alone = True
 
     def state_dict(self) -> dict[str, Any]:
-        """The mean so far. Several ranks begin anew after a resume, because each has the mean of its own shard."""
-        return {"mean": self._mean, "count": self._count} if self._alone and self._count else {}
+        """The mean so far, or the weights that it has replaced.
+
+        Several ranks save neither, because each has those of its own shard: resumed, they go on from the mean.
+        """
+        if not self._alone:
+            return {}
+        return {"mean": self._mean, "count": self._count, "replaced": self._replaced}
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`."""
-        self._mean = {name: value.to(state.device) for name, value in saved.get("mean", {}).items()}
+        self._mean, self._replaced = (
+            {name: value.to(state.device) for name, value in saved.get(part, {}).items()}
+            for part in ("mean", "replaced")
+        )
         self._count, self._restored = int(saved.get("count", 0)), state.restored
 
+    @torch.no_grad()
     def before_training(self, run: TrainingRun) -> None:
-        """Note whether this process has the whole field."""
+        """Put back the weights that a mean has replaced, so that two trainings end as one of their length."""
         self._alone = run.images_per_step == 1
+        weights = dict(_weights(run.state))
+        if self._alone and _shapes(weights) == _shapes(self._replaced):
+            for name, value in weights.items():
+                value.copy_(self._replaced[name])
+        self._replaced = {}
 
     @torch.no_grad()
     def after_step(self, run: TrainingRun) -> None:
@@ -63,6 +79,7 @@ class Averaging(Extension):
         if state.step % EVERY == 0:
             self._count_in(state, weights)
         if state.step == last and self._count > 0 and self._fits(state, weights):
+            self._replaced = {name: value.clone() for name, value in weights.items()} if self._alone else {}
             for name, value in weights.items():
                 value.copy_(self._mean[name])
             CONSOLE.log(f"step {state.step}: the weights are the mean of {self._count} of the last steps")
@@ -72,13 +89,18 @@ class Averaging(Extension):
         if not self._fits(state, weights):
             self._mean, self._count = {name: value.clone() for name, value in weights.items()}, 0
             self._restored = state.restored
+        if not weights:  # a rank without primitives
+            return
         self._count += 1
         torch._foreach_lerp_([self._mean[name] for name in weights], list(weights.values()), 1 / self._count)
 
     def _fits(self, state: FieldState, weights: Mapping[str, Tensor]) -> bool:
         """Whether these are weights of the same primitives and the same head as those of the mean."""
-        shapes = {name: value.shape for name, value in self._mean.items()}
-        return state.restored == self._restored and shapes == {name: value.shape for name, value in weights.items()}
+        return state.restored == self._restored and _shapes(self._mean) == _shapes(weights)
+
+
+def _shapes(weights: Mapping[str, Tensor]) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in weights.items()}
 
 
 def _weights(state: FieldState) -> Iterator[tuple[str, Tensor]]:

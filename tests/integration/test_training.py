@@ -256,6 +256,7 @@ def test_memory_does_not_grow_past_the_prune(tiny: Any, trainer_of: Any) -> None
 
     def change(config: Any) -> None:
         config.load_dir, config.load_step, config.max_num_iterations = tiny.checkpoints, 60, steps
+        config.pipeline.model.average_share = 1.0  # from the first step on
 
     trainer = trainer_of(change)
     seen: list[tuple[int, int]] = []

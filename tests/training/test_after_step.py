@@ -23,6 +23,11 @@ N = 60
 """Primitives of a model that is built without a count."""
 
 
+def trainer_of(folder: Path | None = None) -> SimpleNamespace:
+    """What a run of three steps asks of its trainer."""
+    return SimpleNamespace(last_step=2, base_dir=folder, config=SimpleNamespace(schedule_length=None))
+
+
 @pytest.mark.parametrize("score", ["detail-contribution", "response-contribution", "opacity"])
 def test_prune_keeps_the_count_and_training_goes_on(
     build: Build, training_of: TrainingOf, score: str, capsys: pytest.CaptureFixture[str]
@@ -135,7 +140,7 @@ def test_a_run_that_does_not_prune_to_the_end_says_so_in_one_line_before_and_aft
     ending: str,
     tmp_path: Path,
 ) -> None:
-    training = training_of(build(pruning=pruning, head=head), SimpleNamespace(last_step=2, base_dir=tmp_path))
+    training = training_of(build(pruning=pruning, head=head), trainer_of(tmp_path))
     (before,) = said(capsys)
     which = "first prune" if "nothing" in ending else "head" if "it stays" in ending else "last prune"
     assert before.startswith(f"Warning: training ends after 3 steps, and the {which} needs more than " + ending)
@@ -164,7 +169,7 @@ def test_a_run_that_prunes_or_is_not_to_says_nothing(
 ) -> None:
     model = build(**options)
     model._start = Start()  # of a file that need not be there
-    training = training_of(model, SimpleNamespace(last_step=2))
+    training = training_of(model, trainer_of())
     training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 2)
     training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN, 2)
     assert said(capsys) == []
@@ -175,7 +180,7 @@ def test_a_warm_start_counts_from_the_prune(
 ) -> None:
     model = build(pruning={"prune_at": 100}, head={"start_at": 102}, warm_start=Path("anything"))
     model._start = Start()  # of a file that need not be there
-    training_of(model, SimpleNamespace(last_step=2))
+    training_of(model, trainer_of())
     (line,) = said(capsys)
     assert "training ends after 3 steps, and the head needs more than 3 (head.start-at): it stays disabled" in line
 
@@ -185,7 +190,7 @@ def test_a_search_that_never_begins_says_so_once_at_each_end(
 ) -> None:
     model = build(pruning={"mode": "auto", "prune_at": 3})
     monkeypatch.setattr(BudgetSearch, "before_training", lambda *_: None)
-    training = training_of(model, SimpleNamespace(last_step=2))
+    training = training_of(model, trainer_of())
     assert len(said(capsys)) == 1
     training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 2)
     training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN, 2)

@@ -86,7 +86,29 @@ def test_a_resumed_training_ends_with_the_same_mean(state: Any) -> None:
     second.load_state_dict(state, first.state_dict())
     train(state, second, range(75, LAST + 1))
     assert torch.equal(state.field["means"], expected)
-    assert not second.state_dict()  # the mean is in the field: a checkpoint needs it no more
+    assert not second.state_dict()["mean"]  # the mean is in the field: a checkpoint needs it no more
+
+
+def test_a_longer_training_goes_on_from_the_last_weights(state: Any) -> None:
+    """Not from their mean, which does not belong to the state of the optimizers."""
+    mean, again = Averaging(0.5, settled_at=0), Averaging(0.5, settled_at=0)
+    train(state, mean, range(LAST))
+    state.step = LAST
+    last = {name: value.detach().clone() for name, value in state.field.items()}
+    mean.after_step(run_of(state))
+    assert not torch.equal(state.field["means"], last["means"])
+    shown = state.field["means"].detach().clone()
+    again.load_state_dict(state, mean.state_dict())
+    assert torch.equal(state.field["means"], shown)  # who only looks sees the mean
+    again.before_training(run_of(state))
+    assert all(torch.equal(value, last[name]) for name, value in state.field.items())
+    assert not again.state_dict()["replaced"]
+
+
+def test_a_rank_without_primitives(state: Any) -> None:
+    for value in state.field.values():
+        value.data = value.data[:0].clone()
+    train(state, Averaging(1.0, settled_at=0), range(LAST - 9, LAST))
 
 
 def test_ranks_do_not_save_the_mean_of_their_shard(state: Any) -> None:
