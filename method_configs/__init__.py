@@ -14,6 +14,7 @@ from sundae_ns.method_configs.sundae import (
     sundae_100,
     sundae_auto,
     sundae_continuous,
+    sundae_fast,
     sundae_paper,
     sundae_tiny,
 )
@@ -30,6 +31,7 @@ __all__ = [
     "sundae_100",
     "sundae_auto",
     "sundae_continuous",
+    "sundae_fast",
     "sundae_paper",
     "sundae_tiny",
 ]

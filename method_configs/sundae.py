@@ -158,6 +158,21 @@ sundae_auto = method(
     datamanager={"holdout_every": 8},
 )
 
+sundae_fast = method(
+    "sundae-fast",
+    "SUNDAE in the shortest time: 18,000 steps, pruned after a third of them.",
+    pruning=PruningConfig(keep_ratio=0.1, prune_at=6000),
+    head=HeadConfig(mode="auto"),
+    steps=18000,
+    warmup_length=300,
+    refine_every=60,
+    reset_alpha_every=25,
+    stop_split_at=6000,
+    stop_screen_size_at=2400,
+    resolution_schedule=1800,
+    sh_degree_interval=600,
+)
+
 sundae_paper = method(
     "sundae-paper",
     "SUNDAE as the paper's text has it: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",

@@ -14,7 +14,7 @@ from sundae_ns.errors import ConfigError
 DEFAULTS = [
     *("sundae", "sundae-with-head", "band", "contribution", "random"),
     *("sundae-no-head", "sundae-no-head-bytes", "band-no-head", "contribution-no-head", "random-no-head"),
-    *("mcmc", "sundae-auto", "splatfacto", "splatfacto-7k"),
+    *("mcmc", "sundae-fast", "sundae-auto", "splatfacto", "splatfacto-7k"),
 ]
 MINE = """
 - name: gentle  # a comment
@@ -114,7 +114,7 @@ def test_the_default_arms_are_a_file_like_any_other() -> None:
     assert [entry.name for entry in read_entries(DEFAULT_FILE)] == DEFAULTS
     arms = choose_arms([], "sundae")
     assert [arm.name for arm in arms] == DEFAULTS
-    assert {arm.method for arm in arms} == {"sundae", "sundae-auto", "splatfacto"}
+    assert {arm.method for arm in arms} == {"sundae", "sundae-fast", "sundae-auto", "splatfacto"}
     tiny = choose_arms(["random", "mcmc"], "sundae-tiny")
     assert [(arm.name, arm.kind, arm.method) for arm in tiny] == [
         ("random", "branch", "sundae-tiny"),

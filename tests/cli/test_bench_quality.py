@@ -87,7 +87,7 @@ def test_seeds_repeat_only_what_is_asked_for(arms: list[Arm]) -> None:
         own = [job for job in jobs if job.seed == seed]
         expected = {(a, r) for a in names for r in ratios} | (with_own_ratio if seed == 42 else set())
         assert {(job.arm, job.keep_ratio) for job in own if job.needs} == expected
-        assert [job.kind for job in own].count("warm-up") == 1
+        assert [job.method for job in own if job.kind == "warm-up"] == ["sundae", "sundae-fast"]
         assert {job.arm: job.steps for job in own if job.kind == "whole"} == {
             "splatfacto": 30_000,
             "splatfacto-7k": 7_000,
@@ -103,8 +103,9 @@ def test_every_arm_of_a_seed_starts_from_its_warm_up_and_trains_as_long(arms: li
             warm_up = jobs[place[job.needs]]
             assert place[warm_up.key] < place[job.key]
             assert (warm_up.kind, warm_up.seed) == ("warm-up", job.seed)
-            assert job.steps == (30_000 if job.kind == "mcmc" else 15_000)
-            assert (job.steps if job.kind == "mcmc" else warm_up.steps + job.steps) == 30_000
+            total, steps = (18_000, 12_000) if job.arm == "sundae-fast" else (30_000, 15_000)
+            assert job.steps == (total if job.kind == "mcmc" else steps)
+            assert (job.steps if job.kind == "mcmc" else warm_up.steps + job.steps) == total
 
 
 def test_arms_differ_in_their_rule_alone(arms: list[Arm]) -> None:

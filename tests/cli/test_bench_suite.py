@@ -82,7 +82,7 @@ def test_the_default_plan(captures: Path) -> None:
     assert set(own) == {"sundae-warm-up", *SUITE}
     assert {arm: job.kind for arm, job in own.items()} == {
         **{arm: "branch" for arm in SUITE},
-        **{arm: "whole" for arm in ("splatfacto", "sundae", "sundae-auto")},
+        **{arm: "whole" for arm in ("splatfacto", "sundae", "sundae-fast", "sundae-auto")},
         **{"sundae-warm-up": "warm-up", "mcmc": "mcmc"},
     }
     assert [job.key for job in jobs if job.scene == "bonsai"][0] == "bonsai-sundae-warm-up-s42"

@@ -23,6 +23,7 @@ METHODS = {
     "sundae-100": 1.0,
     "sundae-auto": None,
     "sundae-continuous": None,
+    "sundae-fast": 0.1,
     "sundae-paper": 0.1,
     "sundae-tiny": None,
 }

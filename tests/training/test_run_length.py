@@ -32,6 +32,13 @@ def fitted(method: str, length: int, *words: str, **model: Any) -> Any:
     return config
 
 
+def option(config: Any, name: str) -> Any:
+    """The value of an option with a dotted name."""
+    for part in name.split("."):
+        config = config[part] if isinstance(config, dict) else getattr(config, part)
+    return config
+
+
 @pytest.mark.parametrize("method", OURS)
 def test_the_methods_own_length_changes_nothing(method: str) -> None:
     usual = deepcopy(all_methods[method])
@@ -52,11 +59,7 @@ def test_every_option_follows_and_once_is_enough(method: str, share: float) -> N
     for name in step_options(usual):
         if name.endswith(kept_apart):
             continue
-        found, value = config, usual
-        for part in name.split("."):
-            found, value = (
-                owner[part] if isinstance(owner, dict) else getattr(owner, part) for owner in (found, value)
-            )
+        found, value = option(config, name), option(usual, name)
         assert found == (round(share * value) if value else value), name
     for parts in config.optimizers.values():
         rise = getattr(parts["scheduler"], "warmup_steps", 0)
@@ -119,6 +122,18 @@ def test_continuous_pruning_keeps_its_number_of_prunes(length: int) -> None:
         return sum(schedule.due(state, step, 1000) for step in range(config.max_num_iterations))
 
     assert prunes(fitted("sundae-continuous", length)) == prunes(fitted("sundae-continuous", 30000)) == 7
+
+
+def test_the_fast_method_is_the_default_shortened_with_an_earlier_prune() -> None:
+    fast, short = all_methods["sundae-fast"], fitted("sundae", 18000)
+    own = {
+        *("pipeline.model.pruning.prune_at", "pipeline.model.stop_split_at", "pipeline.model.reset_alpha_every"),
+        # The default search, of sundae-auto alone.
+        *("pipeline.model.pruning.start", "pipeline.model.pruning.stop", "pipeline.model.pruning.every"),
+        "pipeline.model.pruning.search_every",
+    }
+    assert {name for name in step_options(fast) if option(fast, name) != option(short, name)} <= own
+    assert fast.pipeline.model.pruning.prune_at == fast.pipeline.model.stop_split_at == 6000
 
 
 @pytest.mark.parametrize(("length", "searched"), [(30000, 13000), (15000, 13000), (3000, 2600)])

@@ -12,7 +12,7 @@ import tyro
 
 SUITE = (
     *("splatfacto", "sundae", "sundae-with-head", "sundae-no-head", "sundae-no-head-bytes"),
-    *("mcmc", "band", "sundae-auto"),
+    *("mcmc", "band", "sundae-fast", "sundae-auto"),
 )
 """Default arms of ``sundae bench suite``."""
 
@@ -53,8 +53,8 @@ class QualityOptions(ComparisonOptions):
     """folder of a capture: COLMAP layout (sparse/0, images), or with a transforms.json."""
     arms: tuple[str, ...] = ()
     """files of arms (.yaml), and names of default arms: sundae, band (the paper's rule), contribution, random, each also with
-    -no-head; sundae-with-head, sundae-no-head-bytes; mcmc (from scratch to the same count), sundae-auto, splatfacto,
-    splatfacto-7k. All default arms if none is given."""
+    -no-head; sundae-with-head, sundae-no-head-bytes; mcmc (from scratch to the same count), sundae-fast, sundae-auto,
+    splatfacto, splatfacto-7k. All default arms if none is given."""
     keep_ratios: tuple[float, ...] = (0.01, 0.1)
     """shares of the warm-up's primitives to keep."""
     seeds: tuple[int, ...] = (42, 43, 44)
