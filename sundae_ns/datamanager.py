@@ -151,6 +151,14 @@ def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
     return None
 
 
+def _fits(cameras: Cameras, device: torch.device) -> bool:
+    """Whether the images of these cameras, three bytes a pixel, leave half of a GPU's free memory for the training."""
+    if device.type != "cuda":
+        return True
+    size = 3 * int((cameras.width * cameras.height).sum())
+    return size <= torch.cuda.mem_get_info(device)[0] / 2
+
+
 class CheckedDataset(InputDataset):
     """nerfstudio's dataset; it names an image that cannot be decoded, and gives grey images if there is no capture."""
 
@@ -332,6 +340,13 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         if cache_images_device == "cpu" and not torch.cuda.is_available():
             # The stock "cpu" cache pins memory, which needs a driver; "gpu" means the model's device.
             cache_images_device = "gpu"
+        elif cache_images_device == "gpu" and not _fits(dataset.cameras, torch.device(self.device)):
+            CONSOLE.print(
+                f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each step "
+                "copies one",
+                soft_wrap=True,
+            )
+            cache_images_device = "cpu"
         loaded = super()._load_images(split, cache_images_device)
         transparent = sum(batch["image"].shape[-1] == 4 for batch in loaded)
         if split == "train" and transparent:

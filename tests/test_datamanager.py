@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from PIL import Image
@@ -165,6 +166,26 @@ def test_cpu_cache_without_cuda(capture: Path, monkeypatch: pytest.MonkeyPatch) 
     assert len(images) == VIEWS + 2
     assert not any(image.is_pinned() for image in images)
     assert made.next_train(0)[1]["image"].shape == (16, 20, 3)
+
+
+def test_images_that_do_not_fit_on_the_gpu_stay_in_main_memory(
+    capture: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places: list[str] = []
+
+    def load(self: Any, split: str, cache_images_device: str) -> list[Any]:
+        places.append(cache_images_device)
+        return []
+
+    monkeypatch.setattr(FullImageDatamanager, "_load_images", load)
+    made = manager(capture)
+    size = 3 * VIEWS * 20 * 16
+    made.device = torch.device("cuda")
+    for free in (2 * size, 2 * size - 1):
+        monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _, free=free: (free, 10 * size))
+        made._load_images("train", "gpu")
+    assert places == ["gpu", "cpu"]
+    assert "the train images need more than half of the free GPU memory" in " ".join(capsys.readouterr().out.split())
 
 
 def test_farthest_point_order_is_refused(capture: Path) -> None:
