@@ -192,6 +192,7 @@ sundae_paper = method(
     means_restart=None,
     base_loss_weight=0.0,
     average_share=0.0,
+    loss_after_prune="l1",
     ssim_lambda=0.25,
 )
 

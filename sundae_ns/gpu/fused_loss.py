@@ -205,7 +205,12 @@ def compiled(device: torch.device) -> Launches:
 
 
 def fused_loss(
-    image: Tensor, target: Tensor, weight: float, base: Tensor | None = None, launches: Launches | None = None
+    image: Tensor,
+    target: Tensor,
+    weight: float,
+    base: Tensor | None = None,
+    launches: Launches | None = None,
+    l1_weight: float | None = None,
 ) -> tuple[Tensor, Tensor | None]:
     """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, and L1 of its base colours; differentiable scalars.
 
@@ -217,6 +222,7 @@ def fused_loss(
         weight: weight of 1 - SSIM, in [0, 1].
         base: base colours to compare with the target, as ``image``, or None.
         launches: kernels to use instead of those compiled for the device.
+        l1_weight: weight of L1; None for ``1 - weight``.
 
     Returns:
         The loss, and the L1 of ``base`` or None; float32 ``[]`` each.
@@ -233,7 +239,8 @@ def fused_loss(
                 f"{list(target.shape)}; pass float32 [H, W, 3] of one size, at least {WINDOW} px per side"
             )
     launches = compiled(image.device) if launches is None else launches
-    return cast("tuple[Tensor, Tensor | None]", _Loss.apply(image, base, target.detach(), weight, launches))
+    weights = (1 - weight if l1_weight is None else l1_weight, weight)
+    return cast("tuple[Tensor, Tensor | None]", _Loss.apply(image, base, target.detach(), weights, launches))
 
 
 def _threads(image: Tensor) -> int:
@@ -245,7 +252,7 @@ def _threads(image: Tensor) -> int:
 class _Loss(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, image: Tensor, base: Tensor | None, target: Tensor, weight: float, launches: Launches
+        ctx: Any, image: Tensor, base: Tensor | None, target: Tensor, weights: tuple[float, float], launches: Launches
     ) -> tuple[Tensor, Tensor | None]:
         image, target = image.contiguous(), target.contiguous()
         base = None if base is None else base.contiguous()
@@ -254,7 +261,7 @@ class _Loss(torch.autograd.Function):
         derivatives = image.new_empty(3 * windows) if any(ctx.needs_input_grad) else None
         losses = image.new_empty(_threads(image) // THREADS)
         base_losses = None if base is None else torch.empty_like(losses)
-        scales = ((1 - weight) / image.numel(), weight / windows, 1 / image.numel())
+        scales = (weights[0] / image.numel(), weights[1] / windows, 1 / image.numel())
         arguments = [height, width, image, base, target, *scales, derivatives, losses, base_losses]
         launches.compare(_threads(image), arguments)
         ctx.save_for_backward(image, base, target, derivatives)

@@ -79,6 +79,11 @@ class FieldState:
         return self.schedule_step < self.densify_until
 
     @property
+    def pruned(self) -> bool:
+        """Whether primitives were pruned and the field has stopped growing."""
+        return self.pruning.get("num_prunes", 0) > 0 and not self.densifying
+
+    @property
     def active_sh_degree(self) -> int | None:
         """Highest SH degree in use; None for the degree of the field."""
         return None if self.sh_degree_interval is None else self.step // max(self.sh_degree_interval, 1)

@@ -6,6 +6,7 @@ import functools
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal, Protocol
 
 import torch
 from pytorch_msssim import SSIM
@@ -19,7 +20,19 @@ from sundae_ns.training.similarity import mean_ssim
 REGULARISER = 0.01
 """Weights of opacities and scales in the loss (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
 
+LEAST_SQUARE = 1e-8
+"""Added to the mean square, so that its root has a gradient for equal images."""
+
 _log = logging.getLogger(__name__)
+
+
+class LossOptions(Protocol):
+    """Options of a model that its losses depend on."""
+
+    ssim_lambda: float
+    base_loss_weight: float
+    warmup: Literal["densify", "mcmc"]
+    loss_after_prune: Literal["l1", "rms"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +47,14 @@ class StepLosses:
     """Weight of the L1 loss of the base colours while the head is enabled."""
     chain: bool
     """Whether the field grows as a Markov chain, whose loss has regularisers."""
+    squares: bool = False
+    """Whether the root of the mean square takes the place of L1 once the field is pruned."""
+
+    @classmethod
+    def of(cls, options: LossOptions, ssim: SSIM) -> StepLosses:
+        """The losses of a model with these options."""
+        chain, squares = options.warmup == "mcmc", options.loss_after_prune == "rms"
+        return cls(ssim, options.ssim_lambda, options.base_loss_weight, chain, squares)
 
     def __call__(
         self,
@@ -57,7 +78,8 @@ class StepLosses:
         if mask is not None:
             target, rgb, base = target * mask, rgb * mask, base * mask
         compared = base if state.head_enabled and self.base_weight > 0 else None
-        main_loss, base_loss = image_losses(rgb, compared, target, self.ssim, self.ssim_weight)
+        squares = self.squares and state.pruned
+        main_loss, base_loss = image_losses(rgb, compared, target, self.ssim, self.ssim_weight, squares=squares)
         losses = {"main_loss": main_loss}
         if base_loss is not None:
             losses["base_loss"] = self.base_weight * base_loss
@@ -71,7 +93,7 @@ class StepLosses:
 
 
 def image_losses(
-    image: Tensor, base: Tensor | None, target: Tensor, ssim: SSIM, weight: float
+    image: Tensor, base: Tensor | None, target: Tensor, ssim: SSIM, weight: float, *, squares: bool = False
 ) -> tuple[Tensor, Tensor | None]:
     """``lambda_1 L1 + lambda_2 (1 - SSIM)`` of the paper for an image, and the L1 loss of its base colours.
 
@@ -84,26 +106,40 @@ def image_losses(
         target: the truth ``[H, W, 3]``.
         ssim: SSIM of images ``[1, 3, H, W]``, with the window and constants of the kernel.
         weight: lambda_2; lambda_1 is ``1 - weight``.
+        squares: whether the image is compared by the root of the mean square in place of L1.
 
     Returns:
         Both losses; the second is None without base colours.
     """
+    if not squares:
+        return _losses(image, base, target, ssim, weight, 1 - weight)
+    root = ((image - target).square().mean() + LEAST_SQUARE).sqrt()
+    if weight == 0 or min(target.shape[:2]) < WINDOW:
+        return root, None if base is None else (base - target).abs().mean()
+    rest, of_base = _losses(image, base, target, ssim, weight, 0.0)
+    return (1 - weight) * root + rest, of_base
+
+
+def _losses(
+    image: Tensor, base: Tensor | None, target: Tensor, ssim: SSIM, weight: float, l1_weight: float
+) -> tuple[Tensor, Tensor | None]:
+    """``l1_weight L1 + weight (1 - SSIM)`` of an image, and the L1 loss of its base colours."""
     single = all(one.dtype == torch.float32 for one in (image, target, base) if one is not None)
     large = min(target.shape[:2]) >= WINDOW
     if weight > 0 and large and single and image.is_cuda and _kernel_runs(image.device):
-        return fused_loss(image, target, weight, base)
+        return fused_loss(image, target, weight, base, l1_weight=l1_weight)
     of_base = None if base is None else (base - target).abs().mean()
     if weight == 0 or not large:
         return (image - target).abs().mean(), of_base
-    return convolved_loss(image, target, ssim, weight), of_base
+    return convolved_loss(image, target, ssim, weight, l1_weight), of_base
 
 
-def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float) -> Tensor:
-    """The first loss of :func:`image_losses` by convolutions, on any device."""
+def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_weight: float) -> Tensor:
+    """``l1_weight L1 + weight (1 - SSIM)`` by convolutions, on any device."""
     ssim.win = ssim.win.to(target.device)  # once; each call would copy it and wait
     # Contiguous planes: convolutions of a large image with interleaved colours take much longer.
     planes, truth = (one.permute(2, 0, 1)[None].contiguous() for one in (image, target))
-    return (1 - weight) * (image - target).abs().mean() + weight * (1 - mean_ssim(planes, truth, ssim))
+    return l1_weight * (image - target).abs().mean() + weight * (1 - mean_ssim(planes, truth, ssim))
 
 
 @functools.cache

@@ -376,7 +376,7 @@ def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Ha
     degree = degree_in_use(state.field.sh_degree, settings.active_sh_degree)
     return (
         (view.width, view.height, inputs.mask is not None, degree, settings.antialiased, settings.absgrad),
-        (state.densifying, state.regularised, state.head_enabled),
+        (state.densifying, state.pruned, state.regularised, state.head_enabled),
         None if head is None else (head.net, *vars(head.config).values()),
     )
 

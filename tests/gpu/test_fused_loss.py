@@ -53,6 +53,13 @@ def found(image: Tensor, target: Tensor, weight: float, launches: Launches) -> t
     return loss.detach(), gradient
 
 
+def test_a_weight_of_its_own_for_l1(launches: Launches) -> None:
+    image, target = images(26, 42)
+    mixed = fused_loss(image, target, 0.2, launches=launches)[0]
+    alone = fused_loss(image, target, 0.2, launches=launches, l1_weight=0.0)[0]
+    torch.testing.assert_close(mixed - alone, 0.8 * (image - target).abs().mean())
+
+
 @pytest.mark.parametrize("weight", [0.2, 1.0])
 @pytest.mark.parametrize("size", SIZES)
 def test_the_loss_and_its_gradient(launches: Launches, size: tuple[int, int], weight: float) -> None:

@@ -11,6 +11,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.model import SundaeModel
+from sundae_ns.training.losses import image_losses
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -54,6 +55,33 @@ def test_masked_pixels_do_not_count(build: Build, perturb: Perturb, camera: Make
     truth = target["image"].float() / 255
     expected = (outputs["rgb"] - truth).abs()[:, :20].sum() / truth.numel()
     torch.testing.assert_close(losses["main_loss"], expected)
+
+
+@pytest.mark.parametrize("term", ["rms", "l1"])
+def test_after_the_prune_the_root_of_the_mean_square_takes_the_place_of_l1(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch, term: str
+) -> None:
+    model = perturb(build(loss_after_prune=term))
+    model.eval()
+    outputs, target = model.get_outputs(camera()), batch()
+    error = outputs["rgb"] - target["image"].float() / 255
+    l1, rms = error.abs().mean(), error.square().mean().sqrt()
+    before = model.get_loss_dict(outputs, target)
+    model.state.pruning["num_prunes"] = 1
+    after = model.get_loss_dict(outputs, target)
+    change = 0.8 * (rms - l1) if term == "rms" else torch.zeros(())
+    torch.testing.assert_close(after["main_loss"] - before["main_loss"], change, atol=1e-5, rtol=0)
+    assert change.abs() > 0.01 or term == "l1"
+    assert torch.equal(after["base_loss"], before["base_loss"])
+    model.state.densify_until = model.state.schedule_step + 1  # continuous pruning, while the field grows
+    assert torch.equal(model.get_loss_dict(outputs, target)["main_loss"], before["main_loss"])
+
+
+def test_equal_images_have_a_gradient_of_zero(build: Build) -> None:
+    image = torch.full((20, 20, 3), 0.5, requires_grad=True)
+    loss, _ = image_losses(image, None, image.detach(), build().ssim, 0.2, squares=True)
+    assert loss < 1e-3
+    assert torch.autograd.grad(loss, image)[0].abs().max() < 1e-6
 
 
 def test_images_smaller_than_the_window_of_ssim(build: Build, camera: MakeCamera, batch: MakeBatch) -> None:
