@@ -69,7 +69,9 @@ class _Loss(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad_loss: Tensor, grad_of_base: Tensor | None) -> tuple[Tensor | None, ...]:
         image, base, target = ctx.saved_tensors
-        grads = [torch.empty_like(image, memory_format=torch.contiguous_format) for _ in range(1 if base is None else 2)]
+        grads = [
+            torch.empty_like(image, memory_format=torch.contiguous_format) for _ in range(1 if base is None else 2)
+        ]
         arrays = [as_array(value) for value in (image, image if base is None else base, target)]
         outputs = [as_array(value) for value in (grads[0], grads[-1])]
         l1_scale, ssim_scale, base_scale = ctx.scales
