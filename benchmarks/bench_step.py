@@ -101,7 +101,7 @@ def loss(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     def convolved(dtype: torch.dtype) -> Callable[[Tensor, Tensor], Tensor]:
         ssim = SSIM(data_range=1.0, channel=3)
         ssim.win = ssim.win.to(options.device, dtype)  # no buffer: moving the module would leave it
-        return lambda image, target: losses.convolved_loss(image, target, ssim, SSIM_WEIGHT, 1 - SSIM_WEIGHT)
+        return lambda image, target: losses.convolved_loss(image, target, ssim, SSIM_WEIGHT)
 
     def graded(way: Callable[[Tensor, Tensor], Tensor], image: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         leaf = image.detach().requires_grad_()

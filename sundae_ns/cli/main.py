@@ -21,6 +21,16 @@ from sundae_ns.cli.train import train
 from sundae_ns.cli.view import view
 from sundae_ns.errors import ConfigError, SundaeError, writing
 
+ENVIRONMENT = {
+    # Where another program takes one of two cores, threads that spin while they wait make a training step on a CPU ten
+    # times as long.
+    "OMP_WAIT_POLICY": "PASSIVE",
+    # glibc would return the memory of a step's images to the system and fetch it again, a thousand pages a step.
+    "MALLOC_MMAP_THRESHOLD_": str(2**25),
+    "MALLOC_TRIM_THRESHOLD_": str(2**28),
+}
+"""Variables of threads and memory; those that the user has set stay."""
+
 app = tyro.extras.SubcommandApp()
 app.command(bench, name="bench", help="Benchmark SUNDAE on this machine.")
 for command in (run, train, pack, unpack, export, view, prune):
@@ -183,9 +193,9 @@ def bands(
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``sundae``; a :class:`SundaeError` is printed on one line, and the exit code is 2."""
     words = sys.argv[1:] if arguments is None else arguments
-    # Before torch is loaded, and for the commands that these run: where another program takes one of two cores, threads
-    # that spin while they wait make a training step on a CPU ten times as long.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Before torch is loaded, and for the commands that these run.
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     try:
         # Commands name the file that they cannot write; this covers the rest, such as a full disk behind stdout.
         with warnings.catch_warnings(), writing(f"{' '.join(words[:1])} ended early"):

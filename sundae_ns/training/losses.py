@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.fused_loss import WINDOW, compiled, fused_loss
+from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.similarity import mean_ssim
 
@@ -97,14 +98,14 @@ def image_losses(
 ) -> tuple[Tensor, Tensor | None]:
     """``lambda_1 L1 + lambda_2 (1 - SSIM)`` of the paper for an image, and the L1 loss of its base colours.
 
-    On CUDA in float32 one kernel computes both (:mod:`sundae_ns.gpu.fused_loss`). Images smaller than the window of SSIM are
-    compared by L1 alone.
+    In float32 one kernel computes both (:mod:`sundae_ns.gpu.fused_loss`), or on a CPU one compiled loop
+    (:mod:`sundae_ns.training.cpu_loss`). Images smaller than the window of SSIM are compared by L1 alone.
 
     Args:
         image: rendered image ``[H, W, 3]``, differentiable.
         base: base colours ``[H, W, 3]``, differentiable; None for none.
         target: the truth ``[H, W, 3]``.
-        ssim: SSIM of images ``[1, 3, H, W]``, with the window and constants of the kernel.
+        ssim: SSIM of images ``[1, 3, H, W]``, with the window and constants of kernel and loop.
         weight: lambda_2; lambda_1 is ``1 - weight``.
         squares: whether the image is compared by the root of the mean square in place of L1.
 
@@ -128,14 +129,19 @@ def _losses(
     large = min(target.shape[:2]) >= WINDOW
     if weight > 0 and large and single and image.is_cuda and _kernel_runs(image.device):
         return fused_loss(image, target, weight, base, l1_weight=l1_weight)
+    if weight > 0 and large and single and image.device.type == "cpu" and numba_problem() is None:
+        from sundae_ns.training.cpu_loss import compiled_loss  # imports numba
+
+        return compiled_loss(image, target, weight, base, l1_weight)
     of_base = None if base is None else (base - target).abs().mean()
     if weight == 0 or not large:
         return (image - target).abs().mean(), of_base
     return convolved_loss(image, target, ssim, weight, l1_weight), of_base
 
 
-def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_weight: float) -> Tensor:
-    """``l1_weight L1 + weight (1 - SSIM)`` by convolutions, on any device."""
+def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_weight: float | None = None) -> Tensor:
+    """``l1_weight L1 + weight (1 - SSIM)`` by convolutions, on any device; ``l1_weight`` is ``1 - weight`` if None."""
+    l1_weight = 1 - weight if l1_weight is None else l1_weight
     ssim.win = ssim.win.to(target.device)  # once; each call would copy it and wait
     # Contiguous planes: convolutions of a large image with interleaved colours take much longer.
     planes, truth = (one.permute(2, 0, 1)[None].contiguous() for one in (image, target))

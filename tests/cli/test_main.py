@@ -102,6 +102,17 @@ def test_threads_of_torch_do_not_spin_unless_the_user_chose(
     assert os.environ["OMP_WAIT_POLICY"] == (chosen or "PASSIVE")
 
 
+def test_commands_keep_the_memory_of_a_step_unless_the_user_chose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "0")
+    monkeypatch.setenv("MALLOC_MMAP_THRESHOLD_", "0")
+    monkeypatch.delenv("MALLOC_MMAP_THRESHOLD_")
+    run("export", tmp_path / "missing", tmp_path / "out.ply")
+    assert os.environ["MALLOC_TRIM_THRESHOLD_"] == "0"
+    assert os.environ["MALLOC_MMAP_THRESHOLD_"] == str(32 * 1024**2)
+
+
 def test_torch_is_not_loaded_before_a_command_starts() -> None:
     code = "import sys, sundae_ns.cli; sys.exit(bool({'torch', 'numpy', 'nerfstudio'} & sys.modules.keys()))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
