@@ -201,6 +201,7 @@ LIES: dict[str, Callable[[Json], None]] = {
     "no attributes": put("attributes", 3),
     "an attribute of another codec": put("attributes.scales.codec", "pickle"),
     "harmonics of an older codec": put("attributes.features_rest.codec", "codebooks"),
+    "a head of an older codec": put("attributes.head.codec", "steps"),
     "too many bits": put("attributes.means.bits", 200),
     "an infinite step": put("attributes.opacities.step", 1e308),
     "a word for a number": put("attributes.opacities.step", "nan"),

@@ -79,7 +79,7 @@ class HeadCodec:
         }
         column = torch.cat([*levels, torch.zeros(0, dtype=torch.float64)])[:, None]
         shapes = [[name, list(values[name].shape)] for name in names]
-        about = {"codec": "steps", "weights": len(column), "tensors": shapes}
+        about = {"codec": "channels", "weights": len(column), "tensors": shapes}
         return about, column.numpy().astype(np.int32), arrays
 
     def rounded(self, name: str, values: Tensor) -> Tensor:
