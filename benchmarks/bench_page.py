@@ -30,8 +30,9 @@ from browser import WEBGPU, Browser, find_chromium, wait_for
 from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 
-from sundae_ns.scenes.packed import cameras_of, model_of
+from sundae_ns.scenes.packed import model_of
 from sundae_ns.scenes.page import write_page
+from sundae_ns.scenes.statement import cameras_of
 from sundae_ns.storage.packing import Scene, container, read_scene
 from sundae_ns.storage.packing.scene import CAMERAS as STORED
 
