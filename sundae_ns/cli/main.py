@@ -195,11 +195,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
             # Warnings of nerfstudio's imports, which users of sundae cannot fix.
             warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
             code = app.cli(prog="sundae", description="SUNDAE for nerfstudio.", args=words)
+            sys.stdout.flush()
     except SundaeError as error:
         if os.environ.get("SUNDAE_TRACEBACK"):
             raise
         print(f"sundae: {error}", file=sys.stderr)
         sys.exit(2)
+    except BrokenPipeError:  # the reader of stdout has left, as head does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
     except KeyboardInterrupt:
         print("sundae: interrupted", file=sys.stderr)
         sys.exit(130)
