@@ -30,9 +30,11 @@ from browser import WEBGPU, Browser, find_chromium, wait_for
 from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 
-from sundae_ns.scenes.packed import cameras_of, model_of
+from sundae_ns.scenes.packed import model_of
 from sundae_ns.scenes.page import write_page
-from sundae_ns.storage.packing import Scene, read_scene, write_scene
+from sundae_ns.scenes.statement import cameras_of
+from sundae_ns.storage.packing import Scene, container, read_scene
+from sundae_ns.storage.packing.scene import CAMERAS as STORED
 
 SECONDS = 400.0
 """Longest wait for the page: shaders compile in software."""
@@ -56,6 +58,18 @@ def scaled(scene: Scene, side: int) -> Scene:
     if focal is not None:
         meta["model"]["trained_focal"] = [value * float(shares.mean()) for value in focal]
     return replace(scene, cameras=cameras, meta=meta)
+
+
+def write_scaled(out: Path, scene: Path, side: int) -> Scene:
+    """Write a file as :func:`scaled` changes it; its levels and steps are copied, so the page decodes those of the file."""
+    small, header = scaled(read_scene(scene), side), container.read_header(scene)
+    meta = {**header.meta, **small.meta}
+    del meta["sections"]
+    assert small.cameras is not None
+    cameras = {f"cameras/{name}": small.cameras[name].numpy().astype(dtype) for name, (dtype, _) in STORED.items()}
+    unpacked = 4 * sum(value.numel() for value in (*small.field.values(), *small.head.values()))
+    container.write(out, meta, {**container.read_sections(scene, header), **cameras}, unpacked=unpacked)
+    return read_scene(out)
 
 
 def truths(scene: Scene) -> list[dict[str, NDArray[np.float32]]]:
@@ -96,9 +110,8 @@ def compared(scene: Path, side: int = SIDE, *, half: bool = False) -> dict[str, 
         sys.exit("no Chromium here: apt-get install chromium")
     with TemporaryDirectory() as folder:
         packed, html = Path(folder) / "a.sundae", Path(folder) / "a.html"
-        write_scene(packed, scaled(read_scene(scene), side))
+        small = write_scaled(packed, scene, side)
         write_page(packed, html, title=scene.stem)
-        small = read_scene(packed)
         images = truths(small)
         width, height = (int(length) for length in cameras_of(small)["sizes"][0])
         row: dict[str, Any] = {"scene": scene.name, "bytes": scene.stat().st_size, "size": f"{width}x{height}"}

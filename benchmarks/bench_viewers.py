@@ -33,7 +33,7 @@ from browser import Browser, find_chromium, wait_for
 from numpy.typing import NDArray
 
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.scenes.packed import cameras_of
+from sundae_ns.scenes.statement import cameras_of
 from sundae_ns.storage.packing import Scene, read_scene
 from sundae_ns.storage.viewers import write_for_viewers
 

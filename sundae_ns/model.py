@@ -17,7 +17,6 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes
 from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig, resize_image
-from nerfstudio.utils.colors import get_color
 from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from torch import Tensor
@@ -45,6 +44,7 @@ from sundae_ns.rendering import (
     late_outputs,
     view_of,
 )
+from sundae_ns.rendering.render import SHOWN_BACKGROUNDS
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.training.build import build
 from sundae_ns.training.extension import Extension
@@ -125,11 +125,7 @@ class SundaeModel(SplatfactoModel):
         self.losses = StepLosses.of(config, self.ssim)
         self.lpips = Lpips()  # type: ignore[assignment]
         self.crop_box: OrientedBox | None = None
-        # As in splatfacto: training backgrounds are random, shown ones have viser's own colour.
-        is_random = config.background_color == "random"
-        self.background_color = (
-            torch.tensor([0.1490, 0.1647, 0.2157]) if is_random else get_color(config.background_color)
-        )
+        self.background_color = torch.tensor(SHOWN_BACKGROUNDS[config.background_color])
         self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution)
         self.compensated = True
         """Whether images outside of a viewer get the head's correction."""

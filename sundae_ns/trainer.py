@@ -435,7 +435,7 @@ class SundaeTrainer(Trainer):
         if saved is None:
             return self.config.load_checkpoint
         if step is not None:
-            return saved / f"step-{step:09d}.ckpt"
+            return checkpoint.folder_of(saved) / f"step-{step:09d}.ckpt"
         path, passed_over = checkpoint.newest_whole(saved)
         for line in passed_over:
             CONSOLE.print(f"[yellow]Warning: skipped a damaged checkpoint: {line}", highlight=False)

@@ -41,7 +41,7 @@ FLOORS = (
 """Rooms from the lowest floor up; each has a floor of its own."""
 SHELL = ("model", "trainer")
 """Only rooms above may know these."""
-BARE = FLOORS[: FLOORS.index("rendering")]
+BARE = FLOORS[: FLOORS.index("training")]
 """Rooms that import neither nerfstudio nor gsplat when they are imported."""
 MAX_MODULES = 6
 """Modules beside the folders in the package's root."""

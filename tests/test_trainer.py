@@ -57,6 +57,15 @@ def test_newest_is_by_step_not_by_letters(tmp_path: Path) -> None:
     assert checkpoint.newest_whole(tmp_path) == (tmp_path / name(1_000_000_000), [])
 
 
+def test_a_run_s_folder_stands_for_its_checkpoints(tmp_path: Path) -> None:
+    models = tmp_path / "nerfstudio_models"
+    saved(models, 7, 8)
+    for place in (tmp_path, models):
+        assert checkpoint.newest_whole(place) == (models / name(8), [])
+        assert checkpoint.newest_step(place) == 8
+        assert checkpoint.folder_of(place) == models
+
+
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -87,7 +96,7 @@ def test_what_is_not_whole_is_passed_over(tmp_path: Path, harm: Any) -> None:
         checkpoint.load(tmp_path / name(30))
     for step in (10, 20):
         harm(tmp_path / name(step))
-    with pytest.raises(CheckpointError, match="no whole checkpoint.*start anew") as caught:
+    with pytest.raises(CheckpointError, match="no whole checkpoint.*give the folder of a run") as caught:
         checkpoint.newest_whole(tmp_path)
     assert "\n" not in str(caught.value)
 

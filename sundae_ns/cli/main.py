@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import warnings
@@ -196,17 +197,23 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # Before torch is loaded, and for the commands that these run.
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
+    # Imports make a million objects that stay; looking for garbage after every 700 takes a sixth of the time to start.
+    gc.set_threshold(100_000)
     try:
         # Commands name the file that they cannot write; this covers the rest, such as a full disk behind stdout.
         with warnings.catch_warnings(), writing(f"{' '.join(words[:1])} ended early"):
             # Warnings of nerfstudio's imports, which users of sundae cannot fix.
             warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
             code = app.cli(prog="sundae", description="SUNDAE for nerfstudio.", args=words)
+            sys.stdout.flush()
     except SundaeError as error:
         if os.environ.get("SUNDAE_TRACEBACK"):
             raise
         print(f"sundae: {error}", file=sys.stderr)
         sys.exit(2)
+    except BrokenPipeError:  # the reader of stdout has left, as head does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
     except KeyboardInterrupt:
         print("sundae: interrupted", file=sys.stderr)
         sys.exit(130)

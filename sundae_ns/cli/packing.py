@@ -142,15 +142,20 @@ def unpack(
 
     from sundae_ns.errors import writing
     from sundae_ns.storage.packing import read_scene
+    from sundae_ns.storage.runs.folder import unpacked_folder
 
+    name = name or scene.stem
+    with writing(f"cannot write to {out}"):
+        unpacked_folder(out, name)
     with Progress(transient=True) as progress:
         task = progress.add_task("Unpacking", total=2)
         found = read_scene(scene)
-        from sundae_ns.scenes.packed import write_run  # takes seconds, which a damaged file should not cost
+        # Takes seconds, which a damaged file or an existing run should not cost.
+        from sundae_ns.scenes.packed import write_run
 
         progress.update(task, advance=1, description="Writing the run")
         with writing(f"cannot write to {out}"):
-            path = write_run(found, out, name or scene.stem, data=data)
+            path = write_run(found, out, name, data=data)
     print(f"{len(found.field['means']):,} primitives, {'with' if found.head else 'without'} a head")
     print(f"View: ns-viewer --load-config {path}")
     if data is not None:

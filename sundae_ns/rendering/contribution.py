@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
-from rich.progress import track
 from torch import Tensor
 
 from sundae_ns.errors import DataError
@@ -70,11 +68,11 @@ def weights_by_batch(
     """
     batches = source.batches(views)
     if progress:
-        batches = iter(
-            track(
-                batches, "Contribution of primitives", total=source.num_batches(views), transient=True, console=CONSOLE
-            )
-        )
+        from nerfstudio.utils.rich_utils import CONSOLE  # programs without nerfstudio show no progress
+        from rich.progress import track
+
+        count = source.num_batches(views)
+        batches = iter(track(batches, "Contribution of primitives", total=count, transient=True, console=CONSOLE))
     for batch in batches:
         view = batch.own.view()
         primitives = source.primitives(view, settings, features=False, colors=keep_ratio is not None)

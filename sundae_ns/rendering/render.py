@@ -15,6 +15,9 @@ from sundae_ns.rasterization import Rasterization, rasterize
 from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, FieldSource, Primitives
 from sundae_ns.rendering.views import View
 
+SHOWN_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+"""Backgrounds of images that are not trained on, by the option ``background_color``. For random it is the viewer's own."""
+
 
 @dataclass(frozen=True)
 class RenderSettings(ColorSettings):

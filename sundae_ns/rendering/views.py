@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import copy
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.compensation import Window
 from sundae_ns.data.camera_axes import world_to_camera, world_to_camera_floats
 from sundae_ns.rasterization.projection import camera_center
+
+if TYPE_CHECKING:
+    from nerfstudio.cameras.cameras import Cameras
 
 
 class View(NamedTuple):

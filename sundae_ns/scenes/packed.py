@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import copy
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, cast, get_args, get_type_hints
+from typing import Any, cast
 
 import torch
 import yaml
@@ -26,7 +25,6 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
-from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, no_images_error
 from sundae_ns.errors import CheckpointError, PackError, regular
 from sundae_ns.gaussians import FEATURES
@@ -34,16 +32,14 @@ from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.rendering.source import degree_in_use
 from sundae_ns.scenes import stock
 from sundae_ns.scenes.sensitivity import sensitivity_of
+from sundae_ns.scenes.statement import HEAD_OPTIONS, cameras_of, choices, is_number, refusal, stated_model
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.packing import Scene
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import check_run, load_config
-from sundae_ns.storage.runs.folder import config_of
+from sundae_ns.storage.runs.folder import UNPACKED, config_of, unpacked_folder
 
-TIMESTAMP = "unpacked"
 _FRAME_FILE = "dataparser_transforms.json"
-_HEAD_OPTIONS = ("mode", "size", "pixel_unshuffle", "num_features", "precision")
-_MOST_UNSHUFFLE = 8
 _PARSERS: dict[str, type[DataParserConfig]] = {
     "colmap": ColmapDataParserConfig,
     "nerfstudio-data": NerfstudioDataParserConfig,
@@ -84,7 +80,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
     if model.head is not None and model.state.head_enabled:
         head = dict(model.head.state_dict())
         # Options of the head itself: a budget search may have chosen a smaller one than the configuration names.
-        kind = {name: getattr(model.head.config, name) for name in _HEAD_OPTIONS}
+        kind = {name: getattr(model.head.config, name) for name in HEAD_OPTIONS}
     else:
         field.pop(FEATURES, None)
     manager = _manager(config)
@@ -221,13 +217,8 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
     from nerfstudio.configs.method_configs import all_methods
 
     config: TrainerConfig = copy.deepcopy(all_methods["sundae"])  # type: ignore[assignment]
-    config.experiment_name = re.sub(r"[^\w.-]+", "-", name).strip(".") or "scene"
-    config.timestamp = TIMESTAMP
-    config.output_dir = output_dir.resolve()
-    folder = config.get_base_dir()
-    path = folder / "config.yml"
-    if path.exists():
-        raise PackError(f"{folder} is a run already; choose another --name or folder, or remove it")
+    folder = unpacked_folder(output_dir, name)
+    config.output_dir, (config.experiment_name, _, config.timestamp) = output_dir.resolve(), folder.parts[-3:]
     model = model_of(scene)
     config.pipeline.model = model.config
     manager = config.pipeline.datamanager
@@ -259,61 +250,34 @@ def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = 
     checkpoint.save(
         {"step": model.step, "pipeline": state}, config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"
     )
-    write_text(path, yaml.dump(config))
-    return path
+    write_text(folder / "config.yml", yaml.dump(config))
+    return folder / "config.yml"
 
 
 def is_unpacked(config: TrainerConfig) -> bool:
     """Whether a run was written by :func:`write_run`; it cannot be trained on."""
-    return config.timestamp == TIMESTAMP
-
-
-def _refusal(reason: str) -> PackError:
-    return PackError(f"the packed scene states {reason}; update this program, or pack it again")
-
-
-def _choices(kind: type, name: str) -> tuple[Any, ...]:
-    """The values that an option may have."""
-    return get_args(get_type_hints(kind)[name])
-
-
-def _one_of(stated: Mapping[str, Any], kind: type, name: str) -> Any:
-    value, choices = stated.get(name), _choices(kind, name)
-    if value not in choices:
-        raise _refusal(f"a {name} that is none of {', '.join(map(str, choices))}")
-    return value
-
-
-def _whole(stated: Mapping[str, Any], name: str, least: int, most: int) -> int:
-    value = stated.get(name)
-    if type(value) is not int or not least <= value <= most:
-        raise _refusal(f"a {name} outside of {least} to {most}")
-    return value
+    return config.timestamp == UNPACKED
 
 
 def model_of(scene: Scene) -> SundaeModel:
     """The model of a scene, on the CPU."""
-    stated = scene.meta.get("model")
-    if not isinstance(stated, dict):
-        raise _refusal("no model")
+    stated = stated_model(scene)
     config = SundaeModelConfig(
-        sh_degree=_whole(stated, "sh_degree", 0, 4),
+        sh_degree=stated.sh_degree,
         sh_degree_interval=1,
-        rasterize_mode=_one_of(stated, SplatfactoModelConfig, "rasterize_mode"),
-        background_color=_one_of(stated, SplatfactoModelConfig, "background_color"),
-        head=_head_config(stated.get("head")),
+        rasterize_mode=stated.rasterize_mode,
+        background_color=stated.background_color,
+        head=stated.head,
     )
     config.camera_optimizer.mode = "off"
     field = dict(scene.field)
     n, found = field["features_rest"].shape[:2]
     wanted = (config.sh_degree + 1) ** 2 - 1
-    if found > wanted:
-        raise _refusal("a lower SH degree than it has")
     field["features_rest"] = torch.cat([field["features_rest"], torch.zeros(n, wanted - found, 3)], dim=1)
     model = _setup(config)
     # A step at which all SH degrees are active and the head is enabled.
     step = max(config.sh_degree, 1)
-    extra = {**model.get_extra_state(), "step": step, "trained_focal": _focal(stated.get("trained_focal"))}
+    extra = {**model.get_extra_state(), "step": step, "trained_focal": stated.trained_focal}
     state: dict[str, Any] = {name: value for name, value in model.state_dict().items() if "." not in name}
     state[checkpoint.EXTRA_STATE] = extra
     state |= {f"gauss_params.{name}": value for name, value in field.items()}
@@ -321,42 +285,15 @@ def model_of(scene: Scene) -> SundaeModel:
     try:
         model.load_state_dict(state)
     except (CheckpointError, RuntimeError) as error:
-        raise _refusal("another head than it has") from error
+        raise refusal("another head than it has") from error
     return model
 
 
-def _head_config(stated: Any) -> HeadConfig:
-    if stated is None:
-        return HeadConfig(mode="off")
-    if not isinstance(stated, dict) or set(stated) != set(_HEAD_OPTIONS):
-        raise _refusal("a head of an unknown kind")
-    return HeadConfig(
-        mode=_one_of(stated, HeadConfig, "mode"),
-        size=_one_of(stated, HeadConfig, "size"),
-        precision=_one_of(stated, HeadConfig, "precision"),
-        pixel_unshuffle=_whole(stated, "pixel_unshuffle", 1, _MOST_UNSHUFFLE),
-        num_features=_whole(stated, "num_features", 1, 256),
-        start_at=0,
-    )
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
-
-
-def _focal(stated: Any) -> list[float] | None:
-    if stated is None:
-        return None
-    if not isinstance(stated, list) or len(stated) != 2 or not all(_is_number(v) and v > 0 for v in stated):
-        raise _refusal("impossible focal lengths")
-    return [float(value) for value in stated]
-
-
 def _is_frame(stated: Any) -> bool:
-    if not isinstance(stated, dict) or not _is_number(stated.get("scale")):
+    if not isinstance(stated, dict) or not is_number(stated.get("scale")):
         return False
     rows = stated.get("transform")
-    return isinstance(rows, list) and all(isinstance(row, list) and all(map(_is_number, row)) for row in rows)
+    return isinstance(rows, list) and all(isinstance(row, list) and all(map(is_number, row)) for row in rows)
 
 
 def _capture(stated: Any) -> tuple[DataParserConfig, float]:
@@ -366,23 +303,23 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
     if kind not in _PARSERS or not isinstance(options, dict):
         raise PackError("the packed scene does not say how its capture is read; unpack it without --data")
     scale = stated.get("scale")
-    if not _is_number(scale) or not 0 < scale <= 1:
-        raise _refusal("an impossible scale of its images")
+    if not is_number(scale) or not 0 < scale <= 1:
+        raise refusal("an impossible scale of its images")
     parser = _PARSERS[kind](load_3D_points=False)  # type: ignore[call-arg]
     known = _options(_PARSERS[kind])
     for name, value in options.items():
         default = known.get(name)
-        choices = _choices(_PARSERS[kind], name) if isinstance(default, str) and name in known else ()
+        known_values = choices(_PARSERS[kind], name) if isinstance(default, str) and name in known else ()
         fits = (
             (isinstance(default, bool) and isinstance(value, bool))
-            or (isinstance(default, float) and _is_number(value))
+            or (isinstance(default, float) and is_number(value))
             or (name in known and default is None and (value is None or (type(value) is int and value > 0)))
             or (type(default) is int and type(value) is int)
-            or value in choices
+            or value in known_values
             or (isinstance(default, Path) and isinstance(value, str) and _FOLDER.fullmatch(value) is not None)
         )
         if not fits:
-            raise _refusal(f"an impossible option {str(name)[:40]!r} of its capture")
+            raise refusal(f"an impossible option {str(name)[:40]!r} of its capture")
         setattr(parser, name, Path(value) if isinstance(default, Path) else value)
     return parser, float(scale)
 
@@ -407,23 +344,3 @@ def _transforms(scene: Scene) -> dict[str, Any]:
             }
         )
     return {"camera_model": "PINHOLE", "frames": frames}
-
-
-def cameras_of(scene: Scene) -> dict[str, Tensor]:
-    """The cameras of a scene by the names of ``storage.packing.CAMERAS``; one in front of it if it has none."""
-    if scene.cameras is None or len(scene.cameras["poses"]) == 0:
-        return _outside_camera(scene.field["means"])
-    return scene.cameras
-
-
-def _outside_camera(means: Tensor) -> dict[str, Tensor]:
-    """A camera in front of a scene without cameras: it looks along y, with z upwards."""
-    center = means.median(dim=0).values
-    away = 3 * (means - center).norm(dim=1).median().clamp_min(1e-6)
-    pose = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
-    pose[:, 3] = center + pose[:, 2] * away
-    return {
-        "poses": pose[None],
-        "intrinsics": torch.tensor([[500.0, 500.0, 320.0, 240.0]]).double(),
-        "sizes": torch.tensor([[640, 480]]),
-    }

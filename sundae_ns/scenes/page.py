@@ -13,12 +13,12 @@ from importlib import resources
 from pathlib import Path
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from PIL import Image
 
 from sundae_ns.errors import writing
-from sundae_ns.rendering.views import zoomed
-from sundae_ns.scenes.packed import cameras_of, model_of
+from sundae_ns.rasterization import select_backend
+from sundae_ns.rendering import LocalField, render
+from sundae_ns.scenes.statement import cameras_of, field_of, head_of, stated_model, stored_view
 from sundae_ns.storage.atomic import replacing, write_text
 from sundae_ns.storage.packing import Scene, read_scene
 
@@ -92,16 +92,20 @@ def _filled(scene: Scene, title: str, *, inline: str = "", source: str = "") -> 
     return page
 
 
+@torch.no_grad()
 def render_first(scene: Scene) -> Image.Image:
-    """The image of the scene's first camera, head included, at most 640 pixels wide and high."""
-    cameras = cameras_of(scene)
-    lens, size = cameras["intrinsics"][0].float(), cameras["sizes"][0]
-    fx, fy, cx, cy = lens.reshape(4, 1, 1)
-    width, height = size.reshape(2, 1, 1)
-    camera = Cameras(cameras["poses"][:1].float(), fx, fy, cx, cy, width, height)
-    model = model_of(scene)
-    model.to(torch.device("cuda" if torch.cuda.is_available() else "cpu"))
-    smaller = zoomed(camera, min(_POSTER_SIDE / int(size.max()), 1.0)).to(model.device)
-    with torch.no_grad():
-        image = model.get_outputs(smaller)["rgb"]
-    return Image.fromarray((image.clamp(0, 1) * 255).round().byte().cpu().numpy())
+    """The image of the scene's first camera, head included, at most 640 pixels wide and high.
+
+    Raises:
+        PackError: the scene states an impossible model.
+    """
+    model, field, head, cameras = stated_model(scene), field_of(scene), head_of(scene), cameras_of(scene)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if head is not None:
+        head.to(device)
+    field = field.replaced({name: value.to(device) for name, value in field.items()})
+    view = stored_view(cameras, 0, device)
+    view = view.zoomed(min(_POSTER_SIDE / max(view.width, view.height), 1.0))
+    settings = model.settings(select_backend("auto", device), head)
+    images, _ = render(LocalField(field), view, model.background.to(device), settings, depth=False)
+    return Image.fromarray((images["rgb"].clamp(0, 1) * 255).round().byte().cpu().numpy())

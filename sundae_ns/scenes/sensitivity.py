@@ -13,13 +13,12 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from sundae_ns.data.camera_axes import world_to_camera
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering.render import render
 from sundae_ns.rendering.source import degree_in_use
-from sundae_ns.rendering.views import View
+from sundae_ns.scenes.statement import stored_view
 from sundae_ns.storage.packing import Sensitivity
 
 _VIEWS = 8
@@ -53,7 +52,7 @@ def _of_harmonics(means: Tensor, cameras: Mapping[str, Tensor], degree: int) -> 
     chosen = means[:: -(-len(means) // _PRIMITIVES)]
     total = torch.zeros((degree + 1) ** 2 - 1, (degree + 1) ** 2 - 1, dtype=torch.float64)
     for i in range(len(cameras["poses"])):
-        view = _view(cameras, i, 1.0)
+        view = stored_view(cameras, i)
         x, y, z = (chosen @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
         across, down = x / z * view.K[0, 0] + view.K[0, 2], y / z * view.K[1, 1] + view.K[1, 2]
         seen = chosen[(z > 0) & (across >= 0) & (across < view.width) & (down >= 0) & (down < view.height)]
@@ -73,8 +72,9 @@ def _of_head(model: SundaeModel, cameras: Mapping[str, Tensor]) -> tuple[Tensor,
     signs = torch.Generator().manual_seed(0)
     count = len(cameras["poses"])
     for i in torch.linspace(0, count - 1, min(_VIEWS, count)).round().int().tolist():
-        width, height = cameras["sizes"][i].tolist()
-        view = _view(cameras, i, min((_PIXELS / (width * height)) ** 0.5, 1.0))
+        view = stored_view(cameras, i)
+        if view.width * view.height > _PIXELS:
+            view = view.zoomed((_PIXELS / (view.width * view.height)) ** 0.5)
         settings = model.render_settings(training=True)
         image = render(model.source, view, model.shown_background, settings, depth=False)[0]["rgb"]
         random = torch.randint(0, 2, image.shape, generator=signs) * 2.0 - 1
@@ -83,12 +83,3 @@ def _of_head(model: SundaeModel, cameras: Mapping[str, Tensor]) -> tuple[Tensor,
         for name, grad in zip(weights, grads, strict=True):
             squares[name] += grad.double().square().flatten(2).mean(dim=2)
     return form, squares
-
-
-def _view(cameras: Mapping[str, Tensor], i: int, factor: float) -> View:
-    """A stored camera in the rasteriser's form, with sides ``factor`` times as long."""
-    fx, fy, cx, cy = cameras["intrinsics"][i].tolist()
-    width, height = cameras["sizes"][i].tolist()
-    K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    view = View(world_to_camera(cameras["poses"][i].float()), K, width, height, (fx + fy) / 2)
-    return view if factor == 1.0 else view.zoomed(factor)

@@ -12,6 +12,8 @@ from collections.abc import Collection, Iterable, Sequence
 from copy import deepcopy
 from typing import Any
 
+from sundae_ns.errors import ConfigError
+
 SCHEDULE = {
     "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval refine_every",
     "pipeline.model.pruning": "prune_at start stop every search_every",
@@ -26,6 +28,8 @@ LEAST_RECOVERY = 1000
 LONGEST_RISE = 12
 """A learning rate rises over at most this fraction of the run."""
 
+_SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle")
+"""Options of the model that the shapes in a checkpoint depend on."""
 _RESETS = "pipeline.model.reset_alpha_every"
 _REFINE = "pipeline.model.refine_every"
 
@@ -91,6 +95,9 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
 
     Returns:
         A line for each option that the run has otherwise.
+
+    Raises:
+        ConfigError: an option would change shapes of the checkpoint.
     """
     config.optimizers = deepcopy(config.optimizers)
     names = [*step_options(usual), *_leaves(usual.pipeline.model, "pipeline.model")]
@@ -101,7 +108,10 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
         if name in free:
             _set(config, name, deepcopy(theirs))
         elif _get(config, name) != theirs:
-            differing.append(f"--{name.replace('_', '-')} is {_get(config, name)}; the run to resume has {theirs}")
+            line = f"--{name.replace('_', '-')} is {_get(config, name)}; the run to resume has {theirs}"
+            if name.removeprefix("pipeline.model.") in _SHAPES:  # refused before config.yml is replaced
+                raise ConfigError(f"{line}, which cannot change; leave the option out")
+            differing.append(line)
     return differing
 
 

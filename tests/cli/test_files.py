@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from packed_scenes import KINDS, write_kind
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
@@ -209,15 +210,27 @@ def without(package: str, words: list[str], folder: Path) -> subprocess.Complete
 
 def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> None:
     write_scene(tmp_path / "a.sundae", Scene(field()))
+    write_kind(tmp_path / "head.sundae", KINDS["residual"])
     commands = [
         ["export", "a.sundae", "-o", "a.ply"],
         ["export", "a.ply", "-o", "a.spz"],
         ["prune", "a.ply", "-o", "pruned.ply"],
+        ["export", "head.sundae", "-o", "head.html"],
     ]
     for words in commands:
         done = without("nerfstudio", words, tmp_path)
         assert done.returncode == 0, done.stderr
         assert (tmp_path / words[-1]).stat().st_size > 0
+
+
+def test_an_existing_run_is_refused_without_nerfstudio(tmp_path: Path) -> None:
+    write_scene(tmp_path / "a.sundae", Scene(field()))
+    run = tmp_path / "outputs" / "a" / "sundae" / "unpacked"
+    run.mkdir(parents=True)
+    (run / "config.yml").touch()
+    done = without("nerfstudio", ["unpack", "a.sundae"], tmp_path)
+    assert done.returncode == 2
+    assert "is a run already" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -228,6 +228,19 @@ def test_a_full_disk_behind_stdout_is_one_line(here: Path) -> None:
     assert "disk is full" in result.stderr
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_of_stdout_that_has_left_is_no_error(here: Path, unbuffered: str) -> None:
+    command = [Path(sys.executable).parent / "sundae", "export", "a.sundae", "-o", "left.ply"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+    assert (here / "left.ply").is_file()
+
+
 @pytest.mark.parametrize(
     "words",
     [

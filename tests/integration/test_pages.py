@@ -22,6 +22,7 @@ ELSEWHERE = {
     "run PHOTOS": "trains 30,000 steps after COLMAP; test_run.py runs it with fewer, and poses from elsewhere",
     "train CAPTURE": "becomes ns-train, in place of this process; cli/test_train.py reads its command",
     "bench quality": "trains a dozen runs; test_bench_quality.py runs it with two short ones",
+    "bench suite": "trains every method on every capture; cli/test_bench_suite.py runs it with jobs of its own",
     "bench pape": "needs the archives of the paper's captures; cli/test_bench_quality.py reads its plan",
     "view scene.sundae": "serves until Ctrl-C; cli/test_view.py serves a page, and opens and ends it",
     "report DIR/jobs/": "its runs are those of sundae bench quality; test_report.py reports on several runs",

@@ -166,7 +166,7 @@ def test_a_resumed_run_ends_like_one_that_never_stopped(tiny: Any, trainer_of: A
 
 def test_a_run_stopped_right_at_the_prune_ends_like_one_that_never_stopped(tiny: Any, trainer_of: Any) -> None:
     def to_the_prune(config: Any) -> None:
-        config.load_dir, config.load_step = tiny.checkpoints, 30
+        config.load_dir, config.load_step = tiny.folder, 30
         config.max_num_iterations = tiny.prune_at - 30
 
     trainer = trainer_of(to_the_prune)
@@ -211,7 +211,7 @@ def test_a_signal_saves_and_the_resumed_run_ends_like_one_that_never_stopped(
     assert last[last.index("--load-dir") + 1] == str(trainer.checkpoint_dir)
 
     def onwards(config: Any) -> None:
-        config.load_dir, config.max_num_iterations = trainer.checkpoint_dir, 10
+        config.load_dir, config.max_num_iterations = trainer.checkpoint_dir.parent, 10  # the run's folder
 
     again = trainer_of(onwards)
     assert writer.GLOBAL_BUFFER["max_iter"] == 61, "progress counts the steps before"

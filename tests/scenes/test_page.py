@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from chromium import bench_page
 from packed_scenes import KINDS, write_kind
 from PIL import Image
 
@@ -64,6 +65,14 @@ def test_a_page_shows_the_first_camera_until_it_draws(packed: Path) -> None:
     truth = np.asarray(render_first(read_scene(packed)), dtype=np.float32)
     assert found.shape == truth.shape == (37, 50, 3)
     assert np.abs(found - truth).mean() < 6  # JPEG
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_first_image_is_that_of_the_model(name: str, tmp_path: Path) -> None:
+    scene = read_scene(write_kind(tmp_path / "a.sundae", KINDS[name]))
+    truth = bench_page.truths(scene)[0]["rgb"]
+    # Rounded to bytes: sums of another order may cross the edge between two.
+    np.testing.assert_allclose(np.asarray(render_first(scene)), np.rint(255 * truth), atol=1)
 
 
 def test_a_folder_has_page_and_scene_apart(packed: Path, tmp_path: Path) -> None:
@@ -201,6 +210,7 @@ LIES: dict[str, Callable[[Json], None]] = {
     "no attributes": put("attributes", 3),
     "an attribute of another codec": put("attributes.scales.codec", "pickle"),
     "harmonics of an older codec": put("attributes.features_rest.codec", "codebooks"),
+    "a head of an older codec": put("attributes.head.codec", "steps"),
     "too many bits": put("attributes.means.bits", 200),
     "an infinite step": put("attributes.opacities.step", 1e308),
     "a word for a number": put("attributes.opacities.step", "nan"),

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.rendering.render import render
-from sundae_ns.scenes import sensitivity
 from sundae_ns.scenes.packed import model_of
 from sundae_ns.scenes.sensitivity import sensitivity_of
+from sundae_ns.scenes.statement import stored_view
 from sundae_ns.storage.packing import Scene
 
 
@@ -58,7 +58,7 @@ def image(model: Any, view: Any) -> Tensor:
 def changed(model: Any, seen: dict[str, Tensor], parameters: list[Tensor], size: float) -> float:
     """Mean squared change of images by random changes of parameters, for a change of length 1 of each number."""
     before = [value.detach().clone() for value in parameters]
-    views = [sensitivity._view(seen, i, 1.0) for i in range(len(seen["poses"]))]
+    views = [stored_view(seen, i) for i in range(len(seen["poses"]))]
     images = [image(model, view) for view in views]
     total, tries = 0.0, 8
     for _ in range(tries):

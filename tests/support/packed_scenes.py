@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage.packing import PackConfig, Scene, write_scene
+from sundae_ns.storage.packing import PackConfig, Scene, Sensitivity, write_scene
 
 WIDTH, HEIGHT = 50, 37
 FOCAL = 45.0
@@ -28,6 +29,8 @@ class Kind:
     focal: float | None = FOCAL
     """Focal length that the head was trained at; None if unknown."""
     config: PackConfig | None = None
+    measured: bool = False
+    """Whether steps follow a sensitivity, a random one here."""
 
 
 def _head(mode: str, fold: int, features: int, size: str = "tiny") -> HeadConfig:
@@ -41,6 +44,7 @@ KINDS = {
     "residual": Kind(degree=2, head=_head("residual", 1, 5)),
     "residual, folded": Kind(degree=1, head=_head("residual", 2, 13, "compact"), focal=None),
     "features": Kind(degree=1, head=_head("features", 2, 8), background="white"),
+    "measured": Kind(degree=2, head=_head("residual", 2, 5), measured=True),
     "trained at a larger scale": Kind(degree=1, head=_head("residual", 2, 4), focal=1.7 * FOCAL),
     "trained at a smaller scale": Kind(degree=1, head=_head("residual", 1, 4), focal=0.6 * FOCAL),
     # More than one workgroup sorts, and the lists of tiles outgrow their first buffers.
@@ -94,8 +98,19 @@ def write_kind(path: Path, kind: Kind) -> Path:
         "head": stated,
         "trained_focal": [kind.focal, kind.focal] if stated and kind.focal else None,
     }
-    write_scene(path, Scene(field, head, _cameras(), {"model": model}), kind.config)
+    sensitivity = _sensitivity(field, head) if kind.measured else None
+    write_scene(path, Scene(field, head, _cameras(), {"model": model}, sensitivity), kind.config)
     return path
+
+
+def _sensitivity(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Sensitivity:
+    """Random positive definite forms, and weights that differ by some powers of ten."""
+    roots = {name: torch.randn(2 * [field[name][0].numel()]).double() for name in ("features_rest", "features")}
+    weights = {name: value for name, value in head.items() if value.ndim > 1}
+    return Sensitivity(
+        {name: root @ root.T + 0.1 * torch.eye(len(root)) for name, root in roots.items()},
+        {name: torch.randn(value.shape[:2]).mul(3).exp().double() for name, value in weights.items()},
+    )
 
 
 def _cameras() -> dict[str, Tensor]:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from nerfstudio.configs.method_configs import all_methods
 
+from sundae_ns.errors import ConfigError
 from sundae_ns.training.run_length import (
     LEAST_IMAGES,
     LEAST_RECOVERY,
@@ -163,6 +164,17 @@ def test_a_resumed_run_keeps_its_schedule() -> None:
     assert config.optimizers["means"]["scheduler"].max_steps == 6000
     assert (config.pipeline.model.pruning.prune_at, config.pipeline.model.sh_degree_interval) == (15000, 9)
     assert all_methods["sundae"] == usual
+
+
+@pytest.mark.parametrize("option", ["sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle"])
+def test_options_that_a_checkpoint_cannot_follow_are_refused(option: str) -> None:
+    run, usual = fitted("sundae", 6000), deepcopy(all_methods["sundae"])
+    place, _, name = option.rpartition(".")
+    setattr(run.pipeline.model.head if place else run.pipeline.model, name, "tiny" if name == "size" else 1)
+    given = given_options([f"--pipeline.model.{option.replace('_', '-')}"])
+    with pytest.raises(ConfigError, match=r"the run to resume has (tiny|1), which cannot change; leave the option out"):
+        take_options(deepcopy(usual), run, usual, given)
+    take_options(deepcopy(usual), run, usual, given_options([]))
 
 
 def test_tables_of_other_kinds() -> None:

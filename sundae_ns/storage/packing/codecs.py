@@ -79,7 +79,7 @@ class HeadCodec:
         }
         column = torch.cat([*levels, torch.zeros(0, dtype=torch.float64)])[:, None]
         shapes = [[name, list(values[name].shape)] for name in names]
-        about = {"codec": "steps", "weights": len(column), "tensors": shapes}
+        about = {"codec": "channels", "weights": len(column), "tensors": shapes}
         return about, column.numpy().astype(np.int32), arrays
 
     def rounded(self, name: str, values: Tensor) -> Tensor:
@@ -188,11 +188,14 @@ def _fit_head(head: Mapping[str, Tensor], share: float, sensitivity: Mapping[str
     weights = {name: torch.from_numpy(as_array(value)) for name, value in head.items() if value.ndim > 1}
     rows = {name: quantize.weight_steps(value, share) for name, value in weights.items()}
     columns = {name: torch.ones(value.shape[1]) for name, value in weights.items()}
-    if weights.keys() != sensitivity.keys():
+    mean = max((float(value.mean()) for value in sensitivity.values()), default=0.0)
+    if weights.keys() != sensitivity.keys() or mean <= 0:
         return HeadCodec(rows, columns)
     error = target = 0.0
     for name, value in weights.items():
-        found, count = sensitivity[name].clamp_min(1e-3 * float(sensitivity[name].mean())), value[0, 0].numel()
+        # All of a layer's derivatives are zero where a later layer is, as in a head that was enabled just now.
+        least = max(1e-3 * float(sensitivity[name].mean()), 1e-9 * mean)
+        found, count = sensitivity[name].clamp_min(least), value[0, 0].numel()
         target += count * float((found * rows[name].double()[:, None] ** 2).sum())
         row, column = found.mean(dim=1), found.mean(dim=0) / found.mean()
         rows[name], columns[name] = (_quarters(side.rsqrt()) for side in (row, column))

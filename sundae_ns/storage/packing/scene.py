@@ -257,7 +257,7 @@ def _decode_rows(reader: _Reader, name: str, near: Near, width: int) -> NDArray[
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:
     if "head/levels" not in reader.arrays:
         return {}
-    about = reader.about("head", ("steps",))
+    about = reader.about("head", ("channels",))
     plain, steps, columns = (
         reader.section(f"head/{part}", ("<f4",), (None,)) for part in ("plain", "steps", "columns")
     )

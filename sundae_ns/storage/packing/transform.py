@@ -65,7 +65,7 @@ def fit(rows: Floats, step: float, *, centred: bool = True, form: Tensor | None 
         step: positive; a larger one is used where the largest coefficient would not fit.
         centred: subtract the mean row; else rows of zeros stay exact.
         form: weighs errors e of rows by e' form e, positive definite ``[D, D]``; coefficients are uncorrelated where
-            this is the squared length. None for the identity.
+            this is the squared length. None or zeros for the identity.
     """
     values = rows.astype(np.float64)
     mean = (values.mean(axis=0) if centred else np.zeros(rows.shape[1])).astype(np.float32)
@@ -87,9 +87,10 @@ def fit(rows: Floats, step: float, *, centred: bool = True, form: Tensor | None 
 
 def _roots(size: int, form: Tensor | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The symmetric root ``[D, D]`` of a form, scaled to a mean eigenvalue of 1, and its inverse."""
-    if form is None:
+    mean = 0.0 if form is None else form.trace().item() / size
+    if form is None or mean <= 0:  # a head whose last layer is still zero sees no feature
         return np.eye(size), np.eye(size)
-    values, vectors = np.linalg.eigh(form.numpy() * (size / form.trace().item()))
+    values, vectors = np.linalg.eigh(form.numpy() / mean)
     roots = np.sqrt(np.maximum(values, _LEAST))
     return vectors * roots @ vectors.T, vectors / roots @ vectors.T
 

@@ -63,13 +63,19 @@ def checkpoints(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: int(found[path][1]))
 
 
+def folder_of(place: Path) -> Path:
+    """The folder of a run's checkpoints, given that folder or the run's."""
+    below = place / "nerfstudio_models"
+    return below if below.is_dir() and not any(place.glob("*.ckpt")) else place
+
+
 def newest_step(place: Path) -> int | None:
     """Step of the newest checkpoint by its name; None if there is none.
 
     Args:
         place: a checkpoint, the folder of checkpoints, or the folder of a run.
     """
-    found = [place] if place.is_file() else checkpoints(place) or checkpoints(place / "nerfstudio_models")
+    found = [place] if place.is_file() else checkpoints(folder_of(place))
     match = _NAME.fullmatch(found[-1].name) if found else None
     return None if match is None else int(match[1])
 
@@ -171,17 +177,20 @@ def load(path: Path) -> dict[str, Any]:
 def newest_whole(folder: Path) -> tuple[Path, list[str]]:
     """The newest whole checkpoint of a folder, and a line for each newer damaged one.
 
+    Args:
+        folder: of checkpoints, or of a run.
+
     Raises:
         CheckpointError: there is none.
     """
     passed_over: list[str] = []
-    for path in reversed(checkpoints(folder)):
+    for path in reversed(checkpoints(folder_of(folder))):
         reason = _damage(path)
         if reason is None:
             return path, passed_over
         passed_over.append(f"{path.name} is not whole ({reason})")
     found = f" ({'; '.join(passed_over)})" if passed_over else ""
-    raise CheckpointError(f"{folder} holds no whole checkpoint{found}; leave --load-dir out to start anew")
+    raise CheckpointError(f"{folder} holds no whole checkpoint{found}; give the folder of a run that saved one")
 
 
 def extra_state(
@@ -328,10 +337,9 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
     """
     path = Path(path)
     if path.is_dir():
-        folder = path if any(path.glob("*.ckpt")) else path / "nerfstudio_models"
-        if not checkpoints(folder):
+        if not checkpoints(folder_of(path)):
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
-        path = newest_whole(folder)[0]
+        path = newest_whole(path)[0]
     refuse(path, packed="sundae unpack makes a run of it: give that, or its checkpoint")
     if kind_of(path) == "ply" or (path.suffix == ".ply" and path.is_file()):
         field = read_ply(path)

@@ -5,22 +5,42 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import socket
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TextIO
 
-from sundae_ns.errors import StorageError, regular, writing
+from sundae_ns.errors import PackError, StorageError, regular, writing
 
 LOCK = "training.lock"
 """Names the process that trains in a folder. The file stays; the system drops its lock when the process ends."""
+UNPACKED = "unpacked"
+"""Timestamp of runs that were unpacked; they cannot be trained on."""
 _held: dict[Path, TextIO] = {}
 
 
 def new_name() -> str:
     """A name for a run: the local time to the microsecond, so that runs of one second differ."""
     return datetime.now().strftime("%Y-%m-%d_%H%M%S_%f")
+
+
+def unpacked_folder(output_dir: Path, name: str) -> Path:
+    """Folder of the run that a packed scene is unpacked to.
+
+    Args:
+        output_dir: folder of runs.
+        name: of the experiment; characters beside letters, digits, ``_``, ``.`` and ``-`` are replaced.
+
+    Raises:
+        PackError: there is a run already.
+    """
+    experiment = re.sub(r"[^\w.-]+", "-", name).strip(".") or "scene"
+    folder = output_dir.resolve() / experiment / "sundae" / UNPACKED
+    if (folder / "config.yml").exists():
+        raise PackError(f"{folder} is a run already; choose another --name or folder, or remove it")
+    return folder
 
 
 def hold(run: Path) -> None:

@@ -189,3 +189,19 @@ def test_no_step_is_larger_than_half_of_the_largest_weight() -> None:
     assert codecs.head is not None
     largest = head["a.weight"].flatten(1).abs().amax(dim=1)
     assert (codecs.head.rows["a.weight"] <= 0.6 * largest).all()
+
+
+@pytest.mark.parametrize("seen", [[], ["b.weight"]], ids=["nothing", "the last layer"])
+def test_a_head_that_does_nothing_yet_is_packed(tmp_path: Path, seen: list[str]) -> None:
+    """The last layer of a head starts at zero, so no feature and no other weight shows."""
+    g = torch.Generator().manual_seed(0)
+    head = {name: torch.randn(8, 8, 3, 3, generator=g) for name in ("a.weight", "b.weight")}
+    shown = {name: torch.full((8, 8), float(name in seen), dtype=torch.float64) for name in head}
+    field = random_field(50)
+    sensitivity = Sensitivity({"features": torch.zeros(2 * field["features"].shape[1:], dtype=torch.float64)}, shown)
+    write_scene(tmp_path / "a.sundae", Scene(field, head, sensitivity=sensitivity), PackConfig(head_step=0.02))
+    found = read_scene(tmp_path / "a.sundae")
+    assert (found.field["features"].std(dim=0) > 0).all()
+    for name, value in head.items():
+        most = value.flatten(1).abs().amax(dim=1)[:, None, None, None]
+        assert ((found.head[name] - value).abs() <= 0.6 * most / 2).all()

@@ -91,7 +91,7 @@ export function readHead(reader: Reader, stated: Json | undefined): Head | null 
 }
 
 function readTensors(reader: Reader): Map<string, Tensor> {
-  const about = reader.about("head", ["steps"]);
+  const about = reader.about("head", ["channels"]);
   const plain = reader.section("head/plain", ["<f4"], [null]) as Float32Array;
   const steps = reader.section("head/steps", ["<f4"], [null]) as Float32Array;
   const columns = reader.section("head/columns", ["<f4"], [null]) as Float32Array;
