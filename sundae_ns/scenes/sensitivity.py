@@ -62,6 +62,7 @@ def _of_harmonics(means: Tensor, cameras: Mapping[str, Tensor], degree: int) -> 
     return total + 1e-6 * (1 + total.trace()) * torch.eye(len(total), dtype=torch.float64)
 
 
+@torch.enable_grad()  # type: ignore[untyped-decorator]
 def _of_head(model: SundaeModel, cameras: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
     """Mean products of the derivatives by pairs of features ``[F, F]``, and mean squares of those by weights."""
     assert model.head is not None
