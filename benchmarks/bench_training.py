@@ -23,6 +23,7 @@ from typing import Any
 
 import torch
 from bench_pack import commit
+from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 
@@ -43,6 +44,11 @@ PROFILED = 100
 """Steps of a profile."""
 
 
+def steps_of(options: argparse.Namespace, arm: str) -> int:
+    """Length of a training: by default that of the method."""
+    return int(options.steps or all_methods[ARMS[arm][0]].max_num_iterations)
+
+
 def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
     """A trainer that is set up."""
     method, *words = ARMS[arm]
@@ -56,7 +62,7 @@ def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:
         arm=arm,
         data=str(options.capture),
         method=method,
-        steps=options.steps,
+        steps=steps_of(options, arm),
         seed=options.seed,
         options=(*words, *options.option),
         parser=parser_of(options.capture),
@@ -123,20 +129,20 @@ def timed(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
 
 
 def busy(options: argparse.Namespace, arm: str, out: str) -> dict[str, Any]:
-    """Shares of time in which a kernel runs: a third into the training, and at its end."""
-    trainer = trainer_of(options, arm, out)
+    """Shares of time in which a kernel runs: a quarter into the training, and at its end."""
+    trainer, steps = trainer_of(options, arm, out), steps_of(options, arm)
     shares: list[float] = []
     profile: Any = None
     began = 0.0
 
     def look(step: int) -> None:
         nonlocal profile, began
-        if step + 1 in (options.steps // 3 + 1, options.steps - PROFILED - 1):
+        if step + 1 in (steps // 4 + 1, steps - PROFILED - 1):
             torch.cuda.synchronize()
             profile = torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA])
             profile.__enter__()
             began = time.perf_counter()
-        elif profile is not None and step + 1 in (options.steps // 3 + 1 + PROFILED, options.steps - 1):
+        elif profile is not None and step + 1 in (steps // 4 + 1 + PROFILED, steps - 1):
             torch.cuda.synchronize()
             span = time.perf_counter() - began
             profile.__exit__(None, None, None)
@@ -166,7 +172,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path, help="folder with images and sparse/0")
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=["splatfacto", "sundae"])
-    parser.add_argument("--steps", type=int, default=30_000)
+    parser.add_argument("--steps", type=int, help="by default those of each method")
     parser.add_argument("--seed", type=int, default=42)
     parser.add_argument(
         "--curve", type=int, nargs="*", default=[], help="steps after which the test views are measured"
@@ -181,9 +187,10 @@ def main() -> None:
             print("ROW " + json.dumps({"timed": timed, "busy": busy}[options.child](options, options.arms[0], out)))
         return
     for arm in options.arms:
-        row: dict[str, Any] = {"arm": arm, "scene": options.capture.name, "steps": options.steps, "seed": options.seed}
+        steps = steps_of(options, arm)
+        row: dict[str, Any] = {"arm": arm, "scene": options.capture.name, "steps": steps, "seed": options.seed}
         for child in ("timed", "busy") if options.profile else ("timed",):
-            words = [sys.executable, __file__, str(options.capture), "--arms", arm, "--steps", str(options.steps)]
+            words = [sys.executable, __file__, str(options.capture), "--arms", arm, "--steps", str(steps)]
             words += ["--seed", str(options.seed), "--child", child, "--curve", *map(str, options.curve)]
             words += [f"--option={word}" for word in options.option]
             done = subprocess.run(words, check=False, capture_output=True, text=True)
