@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import importlib
 import os
 import shutil
@@ -23,6 +24,9 @@ from sundae_ns.gpu.nvrtc import Argument, Launch
 
 CompileKernels = Callable[..., dict[str, Launch]]
 Once = Callable[[str, Callable[[Path], None]], Path]
+
+# Imports leave a million objects. To look for garbage among them as often as usual takes a fifth of the tests' time.
+gc.set_threshold(100_000)
 
 ALL_SEEDS = os.environ.get("SUNDAE_ALL_SEEDS") == "1"
 _FIRST = ("integration", "distributed", "cli")
