@@ -26,7 +26,7 @@ from dataclasses import replace
 
 import torch
 
-import sundae_ns.training.recorded as recorded_module
+import sundae_ns.rendering.render as render_module
 import sundae_ns.training.schedules as schedules
 import sundae_ns.training.step as step_module
 from sundae_ns.gaussians.relocation import split_evenly
@@ -152,14 +152,14 @@ class Arm:
 
         def wrapped(old):
             def draw(primitives, *args, **kwargs):
-                if arm.factor is not None and len(arm.factor) == len(primitives["opacities"]):
+                if args[2].training and arm.factor is not None and len(arm.factor) == len(primitives["opacities"]):
                     o = torch.logit((primitives["opacities"].sigmoid() * arm.factor).clamp(1e-6, 0.999))
                     primitives = Primitives({**primitives, "opacities": o})
                 return old(primitives, *args, **kwargs)
 
             return draw
 
-        recorded_module.draw, step_module.draw = wrapped(recorded_module.draw), wrapped(step_module.draw)
+        render_module.draw, step_module.draw = wrapped(render_module.draw), wrapped(step_module.draw)
 
     # ------------------------------------------------------------------------------------------------------ smoothing
 

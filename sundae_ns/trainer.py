@@ -39,7 +39,8 @@ from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
-from sundae_ns.training.recorded import RecordedStep, StepInputs, StepResult
+from sundae_ns.training.recordable import StepInputs, StepResult
+from sundae_ns.training.recorded import RecordedStep
 from sundae_ns.training.run_length import fit_to_length, given_options, schedule_table, take_options
 from sundae_ns.training.step import training_view
 

@@ -160,7 +160,7 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     ):
         job = Job(f"fox-{arm}-{ratio}-{seed}", kind, "fox", arm, "/data/fox", "sundae", 30_000, seed, ratio)  # type: ignore[arg-type]
         (today, *_) = sorted(fingerprints(arm, ratio))
-        command = "ns-train sundae --data fox --pipeline.model.warm-start /home/me/a b/nerfstudio_models colmap"
+        command = "ns-train sundae --data fox --pipeline.model.warm-start /else where/nerfstudio_models colmap"
         run = replace(measured(job), fingerprint=today, command=command, ms_head=0.0, gpu="NVIDIA X").as_json()
         packed = {"bytes": 1_000_000, "psnr": 26.5, "ssim": 0.8, "psnr_base": 26.5, "ssim_base": 0.8}
         written.append({"job": asdict(job), "measured": run, "packed": packed, "alone": True})
@@ -178,7 +178,7 @@ def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     assert stayed == expected != []
     text = (results / "runs.csv").read_text()
     assert "--pipeline.model.warm-start WARM_UP colmap" in text
-    assert "/home/me" not in text
+    assert "/else where" not in text
     assert all("earlier default" not in row for name in ("quality", "packing") for row in tables["TABLES"][name]())
     page = "\n".join(tables["TABLES"]["quality"]())
     assert "26.05 ± 0.07" in page  # the mean of two seeds

@@ -71,7 +71,7 @@ def scale_plan(view: View, trained_focal: tuple[float, float] | None) -> ScalePl
 def draw(
     primitives: Primitives, view: View, background: Tensor, settings: RenderSettings, *, depth: bool
 ) -> tuple[dict[str, Any], Rasterization]:
-    """Splat colours, features and depth in one pass, and let the head correct the image at its own scale.
+    """Splat colours, features and depth in one pass.
 
     Args:
         primitives: from a :class:`FieldSource`; with ``features`` if the head is enabled.

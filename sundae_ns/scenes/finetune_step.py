@@ -7,7 +7,6 @@ rounding.
 
 from __future__ import annotations
 
-import functools
 import logging
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
@@ -20,11 +19,11 @@ from sundae_ns.errors import BackendError
 from sundae_ns.gpu.cuda_graphs import record, warm_up
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization import Capacity, RecordableGsplat
-from sundae_ns.rendering.render import RenderSettings, compensate, draw
+from sundae_ns.rendering.render import RenderSettings
 from sundae_ns.storage.packing import Codecs
 from sundae_ns.storage.packing.rate import estimated_bits
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.recorded import SPARE_PAIRS, StepInputs, StepResult, clone_inputs, copy_inputs
+from sundae_ns.training.recordable import SPARE_PAIRS, NeededPairs, StepInputs, StepResult, forward
 
 _log = logging.getLogger(__name__)
 
@@ -104,9 +103,7 @@ class TunedStep:
         self._can_record = model.device.type == "cuda" and model.backend.name == "gsplat"
         self._recordings: dict[Hashable, _Recording] = {}
         self._warm: set[Hashable] = set()
-        self._most: Tensor | None = None
-        """Most pairs that a view has needed, on the device and, some steps later, on the host; int64 ``[]``."""
-        self._most_on_host: Tensor | None = None
+        self._pairs = NeededPairs()
 
     def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train on one image.
@@ -128,11 +125,10 @@ class TunedStep:
         if kind not in self._warm or (recording is None and len(self._recordings) >= MAX_RECORDINGS):
             self._warm.add(kind)
             return self._run_once(inputs, settings)
-        assert self._most_on_host is not None
-        most = int(self._most_on_host)
+        most = self._pairs.most
         if recording is None or most > recording.pairs:
             recording = self._recordings[kind] = self._recorded(inputs, settings, int(SPARE_PAIRS * most) + 1)
-        copy_inputs(inputs, recording.inputs)
+        inputs.copy_to(recording.inputs)
         recording.graph.replay()
         return recording.result
 
@@ -141,17 +137,11 @@ class TunedStep:
         capacity = Capacity()
         with warm_up(self._model.device):
             result = self._run(inputs, replace(settings, backend=RecordableGsplat(capacity)), None)
-        needed = max(int(number) for number in capacity.needed)
-        if self._most is None or self._most_on_host is None:
-            self._most = torch.zeros((), dtype=torch.int64, device=self._model.device)
-            self._most_on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
-        needed = max(needed, int(self._most))
-        self._most.fill_(needed)
-        self._most_on_host.fill_(needed)
+        self._pairs.count(capacity, self._model.device)
         return result
 
     def _recorded(self, inputs: StepInputs, settings: RenderSettings, pairs: int) -> _Recording:
-        own = clone_inputs(inputs)
+        own = inputs.clone()
 
         def step() -> StepResult:
             capacity = Capacity(pairs)
@@ -163,36 +153,15 @@ class TunedStep:
 
     def _run(self, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None) -> StepResult:
         """One step; all of its work is recorded."""
-        model, field, head = self._model, self._field, self._head
-        field.show()
-        head.show()
-        with torch.enable_grad():
-            primitives = model.source.primitives(inputs.view, settings, features=settings.head is not None)
-            images, splatted = draw(primitives, inputs.view, inputs.background, settings, depth=False)
-            if settings.head is not None:
-                base = images["base_rgb"]
-                images["rgb"] = compensate(settings.head, base, splatted, inputs.background, training=True)
-            state = model.state
-            losses = model.losses(state, state.field, images["rgb"], images["base_rgb"], inputs.target, inputs.mask)
-            loss = functools.reduce(torch.add, losses.values())
+        self._field.show()
+        self._head.show()
+        state = self._model.state
+        loss, _, result = forward(self._model.source, state, state.field, self._model.losses, inputs, settings)
         self._set_gradients(loss)
         # torch's Adam reads this name: it changes nothing where it is 1.
-        self._optimizer.found_inf = self._overflow(capacity)  # type: ignore[attr-defined]
+        self._optimizer.found_inf = self._pairs.overflow(capacity)  # type: ignore[attr-defined]
         self._optimizer.step()
-        shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
-        return StepResult(shown, {name: value.detach() for name, value in losses.items()}, loss.detach())
-
-    @torch.no_grad()
-    def _overflow(self, capacity: Capacity | None) -> Tensor | None:
-        """1 if the lists of tiles were too short, so that the step must change nothing, else 0; float ``[]``."""
-        if capacity is None or capacity.pairs is None:
-            return None
-        assert self._most is not None
-        assert self._most_on_host is not None
-        needed = torch.stack(capacity.needed).amax()
-        torch.maximum(self._most, needed, out=self._most)
-        self._most_on_host.copy_(self._most, non_blocking=True)
-        return (needed > capacity.pairs).float()
+        return result
 
     def _set_gradients(self, loss: Tensor) -> None:
         both = (self._field, self._head)

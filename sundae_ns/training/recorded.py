@@ -6,7 +6,6 @@ The graph reads the view, the truth, the background and the learning rates where
 
 from __future__ import annotations
 
-import functools
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,13 +19,13 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.cuda_graphs import record, warm_up
 from sundae_ns.gpu.fused_adam import adam
 from sundae_ns.rasterization import Capacity, RecordableGsplat
-from sundae_ns.rendering.render import RenderSettings, compensate, draw
+from sundae_ns.rendering.render import RenderSettings
 from sundae_ns.rendering.source import LocalField, degree_in_use
-from sundae_ns.rendering.views import View
 from sundae_ns.training.buffers import MOMENTS, Buffers, start_moments, trained_parameters
 from sundae_ns.training.densification import COUNTED, count_view, start_counting
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.losses import StepLosses
+from sundae_ns.training.recordable import SPARE_PAIRS, NeededPairs, StepInputs, StepResult, forward
 
 MAX_RECORDINGS = 8
 """Recordings kept at a time: one for each image size and SH degree in use."""
@@ -35,36 +34,8 @@ UNUSED = 1000
 """Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by kernel,
 because recording takes longer than a step."""
 
-SPARE_PAIRS = 2.0
-"""Capacity for tile/primitive pairs, as a multiple of the most that a view has needed."""
-
 HEAD = "compensation"
 """Name of the head's optimizer."""
-
-
-@dataclass(frozen=True)
-class StepInputs:
-    """What a step trains on."""
-
-    view: View
-    target: Tensor
-    """The truth over the background ``[H, W, 3]``."""
-    mask: Tensor | None
-    """Pixels that count, float ``[H, W, 1]``; None for all."""
-    background: Tensor
-    """Colour ``[3]``."""
-
-
-@dataclass(frozen=True)
-class StepResult:
-    """Images and losses of a step; the next step overwrites them."""
-
-    images: dict[str, Tensor]
-    """``rgb``, ``base_rgb`` and ``accumulation``, each ``[H, W, C]``."""
-    losses: dict[str, Tensor]
-    """Terms of the loss ``[]``."""
-    loss: Tensor
-    """Their sum ``[]``."""
 
 
 @dataclass(frozen=True)
@@ -155,9 +126,7 @@ class RecordedStep:
         self._steps = 0
         self._warm: set[Hashable] = set()
         """Kinds of steps that have run kernel by kernel."""
-        self._most: Tensor | None = None
-        """Most pairs that a view has needed, on the device and, some steps later, on the host; int64 ``[]``."""
-        self._most_on_host: Tensor | None = None
+        self._pairs = NeededPairs()
 
     def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train one step.
@@ -183,7 +152,7 @@ class RecordedStep:
             result = self._run(state, held, inputs, settings)
             self._warm.add(kind)
         else:
-            copy_inputs(inputs, recording.inputs)
+            inputs.copy_to(recording.inputs)
             # Pinned: copying from other memory would wait until the GPU has finished the last step.
             recording.rates.copy_(torch.tensor(held.rates, pin_memory=True), non_blocking=True)
             recording.graph.replay()
@@ -218,13 +187,7 @@ class RecordedStep:
             result = self._step(
                 state, held, inputs, replace(settings, backend=RecordableGsplat(capacity)), rates, capacity
             )
-        needed = max(int(number) for number in capacity.needed)
-        if self._most is None or self._most_on_host is None:
-            self._most = torch.zeros((), dtype=torch.int64, device=device)
-            self._most_on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
-        most = max(needed, int(self._most)) if self._warm else needed
-        self._most.fill_(most)
-        self._most_on_host.fill_(most)
+        self._pairs.count(capacity, device, anew=not self._warm)
         return result
 
     def _recording(
@@ -233,8 +196,7 @@ class RecordedStep:
         """The recording of a kind of steps; None if it has to run kernel by kernel."""
         if not self._record:
             return None
-        assert self._most_on_host is not None
-        key, most = (kind, held.addresses), int(self._most_on_host)
+        key, most = (kind, held.addresses), self._pairs.most
         recording = self._recordings.get(key)
         if recording is None and len(self._recordings) >= MAX_RECORDINGS:
             oldest = next(iter(self._recordings))
@@ -251,7 +213,7 @@ class RecordedStep:
     def _recorded(
         self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings, pairs: int
     ) -> _Recording:
-        device, own = state.device, clone_inputs(inputs)
+        device, own = state.device, inputs.clone()
         rates = torch.tensor(held.rates, device=device)
 
         def step() -> StepResult:
@@ -276,37 +238,20 @@ class RecordedStep:
         """One step on the buffers; all of its work is recorded."""
         tensors, head, view = self._buffers.tensors, settings.head, inputs.view
         field = Field({name: tensors[name] for name in held.trained}, state.field.encoding)
-        with torch.enable_grad():
-            primitives = LocalField(_complete(field, state.field)).primitives(view, settings, features=head is not None)
-            images, splatted = draw(primitives, view, inputs.background, settings, depth=False)
-            if head is not None:
-                images["rgb"] = compensate(head, images["base_rgb"], splatted, inputs.background, training=True)
-            losses = self._losses(state, field, images["rgb"], images["base_rgb"], inputs.target, inputs.mask)
-            loss = functools.reduce(torch.add, losses.values())
+        source = LocalField(_complete(field, state.field))
+        loss, splatted, result = forward(source, state, field, self._losses, inputs, settings)
         network = [] if head is None else list(head.parameters())
         counting, centers = state.densifying and "grad2d" in tensors, splatted.info["means2d"]
         wanted = [*field.values(), *network, *([centers] if counting else [])]
         grads = torch.autograd.grad(loss, wanted, allow_unused=True)
         with torch.no_grad():
-            overflow = self._overflow(capacity, loss)
+            overflow = self._pairs.overflow(capacity)
             if counting:
                 of_centers, radii = centers.absgrad if settings.absgrad else grads[-1], splatted.info["radii"]
                 radii = radii if overflow is None else radii * (overflow == 0)
                 count_view(tensors, of_centers[0], radii[0], view.width, view.height)
             self._descend(held, dict(zip([*field.values(), *network], grads, strict=False)), rates, overflow)
-        shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
-        return StepResult(shown, {name: value.detach() for name, value in losses.items()}, loss.detach())
-
-    def _overflow(self, capacity: Capacity | None, loss: Tensor) -> Tensor | None:
-        """1 if the lists of tiles were too short, so that the step must change nothing, else 0; float ``[]``."""
-        if capacity is None or capacity.pairs is None:
-            return None
-        assert self._most is not None
-        assert self._most_on_host is not None
-        needed = torch.stack(capacity.needed).amax()
-        torch.maximum(self._most, needed, out=self._most)
-        self._most_on_host.copy_(self._most, non_blocking=True)
-        return (needed > capacity.pairs).to(loss.dtype)
+        return result
 
     def _descend(
         self, held: _Held, grads: Mapping[Tensor, Tensor | None], rates: Tensor, overflow: Tensor | None
@@ -379,23 +324,3 @@ def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Ha
         (state.densifying, state.pruned, state.regularised, state.head_enabled),
         None if head is None else (head.net, *vars(head.config).values()),
     )
-
-
-def clone_inputs(inputs: StepInputs) -> StepInputs:
-    """Copy the inputs of a step, so that a recording reads them where they stay."""
-    view, mask = inputs.view, inputs.mask
-    return StepInputs(
-        view._replace(viewmat=view.viewmat.clone(), K=view.K.clone()),
-        inputs.target.detach().clone(memory_format=torch.contiguous_format),
-        None if mask is None else mask.clone(memory_format=torch.contiguous_format),
-        inputs.background.clone(),
-    )
-
-
-def copy_inputs(inputs: StepInputs, into: StepInputs) -> None:
-    """Write the inputs of a step into those of a recording."""
-    pairs = [(into.view.viewmat, inputs.view.viewmat), (into.view.K, inputs.view.K)]
-    pairs += [(into.background, inputs.background), (into.target, inputs.target)]
-    if inputs.mask is not None and into.mask is not None:
-        pairs.append((into.mask, inputs.mask))
-    torch._foreach_copy_([own for own, _ in pairs], [value.detach() for _, value in pairs])

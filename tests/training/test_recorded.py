@@ -162,7 +162,7 @@ def test_more_image_sizes_than_recordings(monkeypatch: pytest.MonkeyPatch) -> No
         return SimpleNamespace(pairs=arguments[-1])
 
     monkeypatch.setattr(step, "_recorded", recorded)
-    step._most_on_host = torch.tensor(5)
+    step._pairs._on_host = torch.tensor(5)
     held = SimpleNamespace(addresses=())
 
     def ask(kind: int) -> Any:
@@ -174,7 +174,7 @@ def test_more_image_sizes_than_recordings(monkeypatch: pytest.MonkeyPatch) -> No
         assert all(ask(kind) is not None for kind in range(sizes))
         assert ask(sizes) is None
     assert made == [11] * sizes
-    step._most_on_host.fill_(12)  # a view needed more pairs than fit
+    step._pairs._on_host.fill_(12)  # a view needed more pairs than fit
     assert ask(0).pairs == 25
     step._steps += recorded_module.UNUSED
     assert ask(sizes) is not None
