@@ -8,7 +8,7 @@ Keys of the JSON beside those of lab/arms.py:
   "save": step                 save everything after this step
   "fit": steps                 fit the schedule to a run of so many steps; "images": folder of smaller images, a divisor
   "eval": [steps]
-A capture called garden16 trains on 16 views of garden and tests on the others.
+A capture called garden16 (a link to garden) trains on 16 views of garden and tests on 40 others.
 """
 import json, os, sys, time
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
@@ -30,7 +30,8 @@ if warm or "save" in spec:  # checkpoints of undecided heads cannot be loaded in
     options.setdefault("pipeline.model.head.mode", "off" if spec.get("head") is False else "residual")
 for k, v in options.items(): args += ["--" + k, str(v)]
 args += ["colmap", "--colmap-path", "sparse/0", "--downscale-factor", str(spec.get("images", 1))]
-args += ["--eval-mode", "fraction", "--train-split-fraction", "0.0865"] if "16" in capture else ["--eval-mode", "interval", "--eval-interval", "8"]
+images = len(os.listdir(f"{place}/scenes/{capture}/images"))
+args += ["--eval-mode", "fraction", "--train-split-fraction", str(16 / images - 1e-6)] if capture.endswith("16") else ["--eval-mode", "interval", "--eval-interval", "8"]
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.storage.runs import checkpoint

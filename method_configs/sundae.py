@@ -193,6 +193,7 @@ sundae_paper = method(
     base_loss_weight=0.0,
     average_share=0.0,
     loss_after_prune="l1",
+    prior_after_prune=0.0,
     ssim_lambda=0.25,
 )
 

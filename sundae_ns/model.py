@@ -70,6 +70,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Weight of the loss on the image without the head, which keeps exported .ply files valid."""
     loss_after_prune: Literal["l1", "rms"] = "rms"
     """Term beside SSIM: l1 is the paper's; rms, the root of the mean squared error, gains 0.1 to 0.3 dB."""
+    prior_after_prune: float = 0.5
+    """Weight of opacities and scales in the loss of the pruned field, over the number of training images."""
     average_share: float = 0.1
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""
     warm_start: Path | None = None
@@ -122,7 +124,7 @@ class SundaeModel(SplatfactoModel):
         self.source = LocalField(self.state.field)
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
-        self.losses = StepLosses.of(config, self.ssim)
+        self.losses = StepLosses.of(config, self.ssim, self.num_train_data)
         self.lpips = Lpips()  # type: ignore[assignment]
         self.crop_box: OrientedBox | None = None
         self.background_color = torch.tensor(SHOWN_BACKGROUNDS[config.background_color])

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -182,6 +182,11 @@ class SundaeTrainerConfig(TrainerConfig):
         write_text(path, yaml.dump(self))
 
 
+def _detached(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values without their graphs."""
+    return {name: value.detach() if isinstance(value, torch.Tensor) else value for name, value in values.items()}
+
+
 def recorded_outputs(
     model: SundaeModel,
     camera: Cameras,
@@ -289,13 +294,14 @@ class SundaeTrainer(Trainer):
 
     def train_iteration(self, step: int) -> Any:
         """Train one step; several ranks agree on whether to stop after it."""
-        result = self._recorded_iteration(step) or super().train_iteration(step)
+        loss, *figures = self._recorded_iteration(step) or super().train_iteration(step)
         self._trained = step
         self._foretell(step - self._start_step)
         self._stopped_by = self.team.agreed(self._interruption.number, step)
         if self._stopped_by:
             self.stop_training = True
-        return result
+        # nerfstudio holds them until the next step; trials that resize the head in between need the graph to be gone.
+        return (loss.detach(), *map(_detached, figures))
 
     def _recordable(self) -> bool:
         """Whether options allow to record training steps."""

@@ -34,6 +34,7 @@ class BuildOptions(GrowthOptions, PointOptions, Protocol):
     sh_degree_interval: int
     evaluate_prune: bool
     base_loss_weight: float
+    prior_after_prune: float
     average_share: float
     use_bilateral_grid: bool
 
@@ -65,6 +66,8 @@ def check(options: BuildOptions) -> None:
         raise ConfigError(f"mcmc-cap is {options.mcmc_cap}; give the highest number of primitives, at least 1")
     if options.base_loss_weight < 0:
         raise ConfigError(f"base-loss-weight is {options.base_loss_weight}; give 0 or more")
+    if options.prior_after_prune < 0:
+        raise ConfigError(f"prior-after-prune is {options.prior_after_prune}; give 0 or more")
     if not 0 <= options.average_share <= 1:
         raise ConfigError(
             f"average-share is {options.average_share}; give a share of the schedule, 0.1 for the last tenth"

@@ -55,8 +55,6 @@ class FieldState:
     """Step of the schedule at which densification ends."""
     head_starts_at: float = math.inf
     """Step of the schedule after which the head is enabled."""
-    regularised: bool = False
-    """Whether the loss keeps opacities and scales down, which pays where views are few."""
     restored: int = 0
     """Number of returns to a snapshot in this process."""
     sh_degree_interval: int | None = None

@@ -18,8 +18,8 @@ from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.similarity import mean_ssim
 
-REGULARISER = 0.01
-"""Weights of opacities and scales in the loss (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
+CHAIN_PRIOR = 0.01
+"""Weights of opacities and scales in the loss of a chain (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
 
 LEAST_SQUARE = 1e-8
 """Added to the mean square, so that its root has a gradient for equal images."""
@@ -34,6 +34,7 @@ class LossOptions(Protocol):
     base_loss_weight: float
     warmup: Literal["densify", "mcmc"]
     loss_after_prune: Literal["l1", "rms"]
+    prior_after_prune: float
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,16 @@ class StepLosses:
     """Whether the field grows as a Markov chain, whose loss has regularisers."""
     squares: bool = False
     """Whether the root of the mean square takes the place of L1 once the field is pruned."""
+    prior: float = 0.0
+    """Weight of opacities and scales once the field is pruned."""
 
     @classmethod
-    def of(cls, options: LossOptions, ssim: SSIM) -> StepLosses:
-        """The losses of a model with these options."""
+    def of(cls, options: LossOptions, ssim: SSIM, num_images: int) -> StepLosses:
+        """The losses of a model with these options and so many training images."""
         chain, squares = options.warmup == "mcmc", options.loss_after_prune == "rms"
-        return cls(ssim, options.ssim_lambda, options.base_loss_weight, chain, squares)
+        # A prior counts once, and the loss is of one image: its weight falls with their number.
+        prior = options.prior_after_prune / max(num_images, 1)  # none in an opened run
+        return cls(ssim, options.ssim_lambda, options.base_loss_weight, chain, squares, prior)
 
     def __call__(
         self,
@@ -84,13 +89,16 @@ class StepLosses:
         losses = {"main_loss": main_loss}
         if base_loss is not None:
             losses["base_loss"] = self.base_weight * base_loss
-        if self.regularises(state):
-            losses.update(regularisers(params))
+        weight = self.prior_weight(state)
+        if weight > 0:
+            losses.update(prior_losses(params, weight))
         return losses
 
-    def regularises(self, state: FieldState) -> bool:
-        """Whether opacities and scales are kept down at this step."""
-        return state.regularised or (self.chain and state.densifying)
+    def prior_weight(self, state: FieldState) -> float:
+        """Weight of opacities and scales at this step."""
+        if self.chain and state.densifying:
+            return CHAIN_PRIOR
+        return self.prior if state.pruned else 0.0
 
 
 def image_losses(
@@ -159,12 +167,16 @@ def _kernel_runs(device: torch.device) -> bool:
     return True
 
 
-def regularisers(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def prior_losses(params: Mapping[str, Tensor], weight: float) -> dict[str, Tensor]:
     """Losses that make unused primitives transparent and small (equation 10 of 3DGS-MCMC).
 
-    MCMC moves such primitives; where views are few, they would fit the differences between views.
+    A chain moves such primitives. In a pruned field they would fit what differs between the training images.
+
+    Args:
+        params: trained parameters, with logits ``opacities`` ``[N, 1]`` and logarithms ``scales`` ``[N, 3]``.
+        weight: of both means.
     """
     return {
-        "opacity_loss": REGULARISER * params["opacities"].sigmoid().mean(),
-        "scale_loss": REGULARISER * params["scales"].exp().mean(),
+        "opacity_loss": weight * params["opacities"].sigmoid().mean(),
+        "scale_loss": weight * params["scales"].exp().mean(),
     }

@@ -40,7 +40,7 @@ class NetworkAdamConfig(FusedAdamConfig):
     (``sundae_ns.distributed.ahead.longest_step``). Weights of layers with many inputs get a smaller rate, because their sum
     grows with the inputs (Yang et al. 2022, "Tensor Programs V").
 
-    Rates follow the shapes at setup: a head that a budget search shrinks keeps the rates of the larger one.
+    Rates follow the shapes at setup: a head that is resized in training keeps them.
     """
 
     betas: tuple[float, float] = (0.9, 0.95)

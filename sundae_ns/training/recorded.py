@@ -141,8 +141,8 @@ class RecordedStep:
             BackendError: the step cannot be recorded. Nothing has changed.
             torch.cuda.OutOfMemoryError: the same.
         """
-        # Regularisers are means over all rows, so they allow no spare ones.
-        growing = state.densifying and not self._losses.regularises(state)
+        # A prior is a mean over all rows, so it allows no spare ones.
+        growing = state.densifying and self._losses.prior_weight(state) == 0
         held = self._held
         if held is None or not held.unchanged(state, settings, growing=growing):
             held = self._held = self._hold(state, settings, growing=growing)
@@ -321,6 +321,6 @@ def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Ha
     degree = degree_in_use(state.field.sh_degree, settings.active_sh_degree)
     return (
         (view.width, view.height, inputs.mask is not None, degree, settings.antialiased, settings.absgrad),
-        (state.densifying, state.pruned, state.regularised, state.head_enabled),
+        (state.densifying, state.pruned, state.head_enabled),
         None if head is None else (head.net, *vars(head.config).values()),
     )

@@ -1,9 +1,9 @@
-"""The decision how a field is finished (``head.mode auto``): with a head, regularised, or plain.
+"""The decision how a field is finished (``head.mode auto``): plain, with a head, or with a head of more features.
 
-A head gains where views are many and agree; where they are few or differ, it fits their differences, and regularisers may
-help instead. So some training views are held out from shortly before the prune. From the pruned field, trials of one length
-follow in turn. The held-out views choose one, and it continues on all views; the steps of the others are the cost. Test
-views are never used.
+A head gains where views are many and agree; where they are few or differ, it fits their differences. So some training views
+are held out from shortly before the prune. From the pruned field, trials of one length follow in turn, each of more than the
+one before, until one does not pay. The held-out views choose one, and it continues on all views; the steps of the others are
+the cost. Test views are never used.
 """
 
 from __future__ import annotations
@@ -11,22 +11,30 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
 
+import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import CheckpointError
 from sundae_ns.evaluation import without_nan
+from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.gaussians.snapshot import Snapshot
+from sundae_ns.gaussians.surgery import replace_parameter
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, mean_quality, measure_heldout
 from sundae_ns.training.schedulers import postpone
 
-ARMS = ("plain", "regularised", "head")
-"""What is tried, in this order. The head comes last, so that it continues without a break where it wins."""
+ARMS = ("plain", "head", "features")
+"""What is tried, in this order: no head, the head as configured, and one of more features. Each is dearer than the last."""
+MORE_FEATURES = 29
+"""Features of the last arm: as many as are splatted without padding after the default 13."""
+NAMES = {"plain": "no head", "head": "head", "features": f"head with {MORE_FEATURES} features"}
+"""What the log calls them."""
 TRIAL_SHARE = 0.04
 """Length of a trial as a share of the schedule."""
 HOLD_SHARE = 0.1
@@ -40,11 +48,11 @@ FEWEST_VIEWS = 6
 FEW_VIEWS = 12
 """With fewer training views, two are held out in turn, for trials of half the length."""
 LEAST_GAIN = 0.1
-"""PSNR that an arm must gain over the plain one, dB. Two runs of one seed differ by as much."""
+"""PSNR that an arm must gain over a cheaper one, dB. Two runs of one seed differ by as much."""
 
 
 class Plan(NamedTuple):
-    """The trials of a run: each fold of held-out views tries every arm."""
+    """The trials of a run: each arm is tried with each fold of held-out views."""
 
     folds: list[list[int]]
     """Held-out training views, by index."""
@@ -53,7 +61,7 @@ class Plan(NamedTuple):
 
     @property
     def num_trials(self) -> int:
-        """Number of trials."""
+        """Most trials that there may be."""
         return len(ARMS) * len(self.folds)
 
     @property
@@ -91,6 +99,8 @@ class Progress:
     """Length of the schedule, noted when training starts: a resumed run may be longer or shorter, its trials may not."""
     trial: int = 0
     """Number of the current trial."""
+    folds: int = 1
+    """Number of trials of an arm."""
     began: int = 0
     """Step of the schedule at which the current trial began."""
     measured: list[list[list[float]]] = field(default_factory=list)
@@ -99,22 +109,28 @@ class Progress:
     @property
     def arm(self) -> str:
         """Arm of the current trial; the chosen one after the trials, and plain before them."""
-        return ARMS[self.trial % len(ARMS)] if self.phase == "trials" else self.decision or "plain"
+        return ARMS[self.trial // self.folds] if self.phase == "trials" else self.decision or "plain"
+
+    @property
+    def tried(self) -> tuple[str, ...]:
+        """Arms whose trials have ended."""
+        return ARMS[: len(self.measured) // self.folds]
 
     def qualities(self, arm: str) -> list[HeldOutQuality]:
         """Quality of the held-out views after the trials of an arm, over all folds."""
-        trials = self.measured[ARMS.index(arm) :: len(ARMS)]
+        first = ARMS.index(arm) * self.folds
+        trials = self.measured[first : first + self.folds]
         return [HeldOutQuality(int(pixels), *figures) for trial in trials for pixels, *figures in trial]
 
     def best(self) -> str:
-        """The arm with the highest PSNR among the plain one and those that gain enough over it and lose no SSIM."""
-        plain = mean_quality(self.qualities("plain"))
-        best, highest = "plain", LEAST_GAIN
-        for arm in ARMS[1:]:
-            decibels, similarity = (b - a for a, b in zip(plain, mean_quality(self.qualities(arm)), strict=True))
+        """The dearest tried arm that gains enough over the best cheaper one and loses no SSIM."""
+        best = "plain"
+        for arm in self.tried[1:]:
+            figures = (mean_quality(self.qualities(one)) for one in (best, arm))
+            decibels, similarity = (b - a for a, b in zip(*figures, strict=True))
             # Comparisons with figures that are not finite fail.
-            if math.inf > decibels >= highest and similarity >= 0:
-                best, highest = arm, decibels
+            if math.inf > decibels >= LEAST_GAIN and similarity >= 0:
+                best = arm
         return best
 
 
@@ -131,9 +147,12 @@ class Trials(Extension):
     def __init__(self, begins_at: int, state: FieldState) -> None:
         self.begins_at = begins_at
         self.progress = Progress()
+        assert state.head is not None
+        self._head = state.head.config
+        self._arms = ARMS if self._head.num_features < MORE_FEATURES else ARMS[:2]
         self._plan: Plan | None = None
         self._start: dict[str, Snapshot] | None = None
-        self._ends: dict[str, Snapshot] = {}
+        self._ends: dict[str, dict[str, Snapshot]] = {}
         self._set_arm(state)
 
     # ------------------------------------------------------------------------------------------------- checkpoints
@@ -143,12 +162,18 @@ class Trials(Extension):
         return {"numbers": asdict(self.progress), "start": self._start, "ends": self._ends}
 
     def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
-        """Remove the head if the checkpoint has none.
+        """Give head and features the width that they have in the checkpoint, or remove them.
 
         Raises:
             CheckpointError: the checkpoint carries no decision.
         """
-        if _progress_of(saved).decision not in ("", "head"):
+        progress = _progress_of(saved)
+        if progress.arm == "features":
+            assert state.head is not None
+            state.head.resize(self._wide)
+            features = state.field[FEATURES]
+            features.data = features.data.new_zeros(len(features), MORE_FEATURES)
+        elif progress.decision not in ("", "head"):
             state.remove_head()
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
@@ -159,7 +184,8 @@ class Trials(Extension):
         """
         progress = _progress_of(saved)
         start, ends = saved.get("start"), saved.get("ends")
-        if progress.phase == "trials" and not (isinstance(start, Mapping) and isinstance(ends, Mapping)):
+        complete = isinstance(start, Mapping) and isinstance(ends, Mapping) and "folds" in saved["numbers"]
+        if progress.phase == "trials" and not complete:
             raise CheckpointError("the checkpoint lacks the fields that its trials would return to; give another")
         self.progress, self._start, self._ends = progress, start, dict(ends or {})
         self._set_arm(state)
@@ -174,7 +200,8 @@ class Trials(Extension):
         if progress.phase == "done":
             return
         if run.images_per_step > 1:  # also if one GPU has begun them: its copies are of the whole field
-            self._settle(run, "head", "trials need a single GPU")
+            wide = progress.arm == "features"
+            self._settle(run, "features" if wide else "head", "trials need a single GPU")
         elif views < FEWEST_VIEWS:
             self._settle(run, "plain", f"{views} training views are too few to tell whether a head helps")
         elif progress.phase != "before":
@@ -189,10 +216,10 @@ class Trials(Extension):
         if progress.phase == "holding" and step >= self.begins_at:
             plan = self._planned(run)
             CONSOLE.log(
-                f"step {run.state.step}: is the head worth it? {plan.num_trials} trials of {plan.length:,} steps "
-                f"({', '.join(ARMS)}); {len(plan.views)} of {len(run.view_indices())} training views are held out"
+                f"step {run.state.step}: is the head worth it? Up to {plan.num_trials} trials of {plan.length:,} steps; "
+                f"{len(plan.views)} of {len(run.view_indices())} training views are held out"
             )
-            progress.phase = "trials"
+            progress.phase, progress.folds = "trials", len(plan.folds)
             self._start = run.state.snapshot(head=True)
             self._begin(run)
         elif progress.phase == "trials" and step - progress.began >= self._planned(run).length:
@@ -224,33 +251,55 @@ class Trials(Extension):
     def _hold_out(self, run: TrainingRun) -> None:
         """Serve training views without the held-out ones of this phase."""
         plan, progress = self._planned(run), self.progress
-        run.hold_out(plan.folds[progress.trial // len(ARMS)] if progress.phase == "trials" else plan.views)
+        run.hold_out(plan.folds[progress.trial % progress.folds] if progress.phase == "trials" else plan.views)
 
     def _begin(self, run: TrainingRun) -> None:
         """Begin the current trial from the field as it is."""
         self._hold_out(run)
         self.progress.began = run.state.schedule_step
+        if self.progress.arm == "features":
+            self._widen(run.state)
         self._set_arm(run.state)
+
+    @property
+    def _wide(self) -> HeadConfig:
+        """The head of the last arm."""
+        return replace(self._head, num_features=MORE_FEATURES)
+
+    def _widen(self, state: FieldState) -> None:
+        """Begin anew with features and a head of the last arm."""
+        assert state.head is not None
+        state.head.resize(self._wide)
+        state.optimizers["compensation"].state.clear()
+        colors, generator = state.field["features_dc"].detach(), torch.Generator().manual_seed(0)
+        features = initial_features(colors, MORE_FEATURES, generator)
+        replace_parameter(state.field, state.optimizers, FEATURES, features, {})
+
+    def _return_to(self, state: FieldState, saved: Mapping[str, Snapshot]) -> None:
+        """Restore a field, with the head as configured if it has one."""
+        assert state.head is not None
+        if "head" in saved and state.head.config != self._head:
+            state.head.resize(self._head)
+        state.restore(saved)
 
     def _set_arm(self, state: FieldState) -> None:
         """Let the next steps train the arm of this phase."""
         arm = self.progress.arm
-        state.regularised = arm == "regularised"
         # Not the step at which the arm began: a run that resumes on several GPUs counts other steps.
-        state.head_starts_at = self.begins_at if arm == "head" else math.inf
+        state.head_starts_at = math.inf if arm == "plain" else self.begins_at
 
     def _end(self, run: TrainingRun) -> None:
         """End the current trial; begin the next one from the same field, or decide."""
-        progress, state = self.progress, run.state
+        progress, state, arm = self.progress, run.state, self.progress.arm
         mend = "decide by hand with --pipeline.model.head.mode residual or off"
         progress.measured.append([list(view) for view in measure_heldout(run, mend=mend)])
-        if progress.arm != "head":  # it is the last, so a chosen head needs no copy
-            self._ends[progress.arm] = state.snapshot(head=False)["field"]
-        if progress.trial + 1 == self._planned(run).num_trials:
+        # What does not pay is not tried with more.
+        if arm in progress.tried and arm != "plain" and (arm == self._arms[-1] or progress.best() != arm):
             self._decide(run)
             return
+        self._ends[arm] = state.snapshot(head=arm != "plain")
         assert self._start is not None
-        state.restore(self._start)
+        self._return_to(state, self._start)
         postpone(state.schedulers, state.schedule_step - progress.began)
         progress.trial += 1
         self._begin(run)
@@ -258,24 +307,24 @@ class Trials(Extension):
     def _decide(self, run: TrainingRun) -> None:
         progress, state = self.progress, run.state
         decision = progress.best()
-        figures = {arm: mean_quality(progress.qualities(arm)) for arm in ARMS}
-        texts = [f"{arm} {decibels:.2f} dB, SSIM {similarity:.4f}" for arm, (decibels, similarity) in figures.items()]
-        CONSOLE.log(f"step {state.step}: held-out training views: {'; '.join(texts)}. Continuing with: {decision}")
+        figures = {arm: mean_quality(progress.qualities(arm)) for arm in progress.tried}
+        texts = [f"{NAMES[arm]} {decibels:.2f} dB, SSIM {ssim:.4f}" for arm, (decibels, ssim) in figures.items()]
+        CONSOLE.log(f"step {state.step}: held-out training views: {'; '.join(texts)}. Continuing: {NAMES[decision]}")
         run.log_scalars("Trials", {f"psnr_{arm}": decibels for arm, (decibels, _) in figures.items()})
-        if decision != "head":
-            state.restore({"field": self._ends[decision]})
+        if decision != progress.arm:
+            self._return_to(state, self._ends[decision])
         self._settle(run, decision, "")
 
     def _settle(self, run: TrainingRun, decision: str, reason: str) -> None:
         """Take a decision, and serve all training views from now on."""
         progress = self.progress
         if reason:
-            CONSOLE.log(f"the head is {'enabled' if decision == 'head' else 'removed'} without a trial: {reason}")
+            CONSOLE.log(f"the head is {'removed' if decision == 'plain' else 'enabled'} without a trial: {reason}")
         progress.phase, progress.decision, progress.reason = "done", decision, reason
         self._start, self._ends = None, {}
         run.hold_out([])
         self._set_arm(run.state)
-        if decision != "head":
+        if decision == "plain":
             run.state.remove_head()
         if run.folder is not None:
             run.folder.mkdir(parents=True, exist_ok=True)
@@ -288,7 +337,7 @@ class Trials(Extension):
         if progress.reason:
             return record
         record |= {"held_out_views": self._planned(run).views, "steps_per_trial": self._planned(run).length, "arms": {}}
-        for arm in ARMS:
+        for arm in progress.tried:
             views = progress.qualities(arm)
             decibels, similarity = mean_quality(views)
             record["arms"][arm] = {"psnr": decibels, "ssim": similarity, "views": [view._asdict() for view in views]}

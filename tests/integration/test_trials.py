@@ -28,7 +28,7 @@ STEPS, PRUNE_AT = 100, 40
 LENGTH = 4
 """Steps of a trial: a twenty-fifth of the run. Views are held out from step 30 on."""
 DECIDED = PRUNE_AT + 3 * LENGTH
-"""Step of the decision."""
+"""Step of the decision if all arms are tried."""
 NONE = (0.0, 0.0)
 Make = Callable[..., Trainer]
 
@@ -81,12 +81,15 @@ def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
 def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Fixes what the arms gain on every held-out view: PSNR in dB, SSIM."""
 
-    def fix(head: tuple[float, float] = NONE, regularised: tuple[float, float] = NONE) -> None:
+    def fix(head: tuple[float, float] = NONE, features: tuple[float, float] = NONE) -> None:
         real = trials.measure_heldout
 
         def measured(run: Any, *, mend: str) -> list[HeldOutQuality]:
-            state = run.state
-            decibels, similarity = head if state.head_enabled else regularised if state.regularised else NONE
+            state, width = run.state, run.state.field["features"].shape[1]
+            decibels, similarity = NONE
+            if state.head_enabled:
+                assert state.head.config.num_features == width
+                decibels, similarity = features if width == 29 else head
             views = [view.pixels for view in real(run, mend=mend)]
             return [HeldOutQuality(n, 20 + decibels, 0.5 + similarity) for n in views]
 
@@ -156,9 +159,14 @@ def test_a_head_that_does_not_pay_costs_nothing(make: Make, judge: Any, gains: t
     assert not any(value.numel() for name, value in scene.field.items() if name == "features")
 
 
-@pytest.mark.parametrize(("chosen", "place"), [("plain", 1), ("regularised", 2)])
-def test_the_trials_start_alike_and_the_chosen_field_continues(make: Make, judge: Any, chosen: str, place: int) -> None:
-    judge(head=(-1.0, -0.1), regularised=(0.3 if chosen == "regularised" else 0.0, 0.0))
+@pytest.mark.parametrize(
+    ("chosen", "head", "features", "tried"),
+    [("plain", -1.0, 0.0, 2), ("head", 0.3, 0.35, 3), ("features", 0.3, 0.5, 3)],
+)
+def test_the_trials_start_alike_and_the_chosen_field_continues(
+    make: Make, judge: Any, chosen: str, head: float, features: float, tried: int
+) -> None:
+    judge(head=(head, 0.01), features=(features, 0.02))
     trainer = make()
     model: Any = trainer.pipeline.model
     (trial,) = (extension for extension in model.extensions if extension.name == "trials")
@@ -172,24 +180,36 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(make: Make, judge
 
     trial.after_step = after_step
     trainer.train()
-    starts = [PRUNE_AT + i * LENGTH for i in range(3)]
+    starts = [PRUNE_AT + i * LENGTH for i in range(tried)]
     # All trials start from the field and the rate right after the prune.
     for step in starts[1:]:
         assert torch.equal(seen[starts[0]][0], seen[step][0])
         assert seen[starts[0]][1] == pytest.approx(seen[step][1])
+    decided, place = PRUNE_AT + tried * LENGTH, trials.ARMS.index(chosen) + 1
     end = seen[PRUNE_AT + place * LENGTH - 1][0]
     assert not torch.equal(end, seen[PRUNE_AT][0])
     # The field at the end of the chosen trial is one step away from the last that was seen of it.
-    distances = [(seen[DECIDED][0] - seen[PRUNE_AT + i * LENGTH - 1][0]).abs().max() for i in (1, 2, 3)]
+    distances = [(seen[decided][0] - seen[PRUNE_AT + i * LENGTH - 1][0]).abs().max() for i in range(1, tried + 1)]
     assert min(distances) == distances[place - 1]
-    assert model.state.regularised == (chosen == "regularised")
-    assert _record(trainer)["decision"] == chosen
+    record = _record(trainer)
+    assert (record["decision"], record["step"], len(record["arms"])) == (chosen, decided, tried)
+    width = {"plain": 0, "head": 5, "features": 29}[chosen]
+    assert model.gauss_params["features"].shape[1] == width
+    assert (model.head is None) == (chosen == "plain")
+    opened = eval_setup(trainer.base_dir / "config.yml", test_mode="test")[1].model
+    camera = trainer.pipeline.datamanager.train_dataset.cameras[0:1]
+    with torch.no_grad():
+        images = [one.eval().get_outputs_for_camera(camera)["rgb"] for one in (model, opened)]
+    assert torch.equal(*images)
+    assert scene_of_run(trainer.base_dir).field.get("features", torch.zeros(1, 0)).shape[1] == width
 
 
 @pytest.mark.parametrize("stop", [35, PRUNE_AT + 2, PRUNE_AT + LENGTH + 2, PRUNE_AT + 2 * LENGTH + 2, DECIDED + 3])
-@pytest.mark.parametrize("gain", [0.5, -0.5])
-def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, judge: Any, stop: int, gain: float) -> None:
-    judge(head=(gain, gain / 10), regularised=(0.2, 0.0))
+@pytest.mark.parametrize("gains", [(0.5, 1.0), (0.5, 0.5), (-0.5, 0.0)])
+def test_a_resumed_run_takes_the_same_decision_bit_for_bit(
+    make: Make, judge: Any, stop: int, gains: tuple[float, float]
+) -> None:
+    judge(head=(gains[0], gains[0] / 10), features=(gains[1], gains[1] / 10))
     whole = make(name="whole", save_every=stop)
     whole.train()
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
@@ -199,7 +219,8 @@ def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, judge: An
     same(a["pipeline"], b["pipeline"])
     same(a["optimizers"], b["optimizers"])
     same(a["schedulers"], b["schedulers"])
-    assert _record(whole) == (_record(resumed) if stop < DECIDED else _record(whole))
+    if stop < PRUNE_AT + 2 * LENGTH:  # before the decision
+        assert _record(whole) == _record(resumed)
 
 
 def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None:
@@ -209,11 +230,12 @@ def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None
     trainer.train()
     first, second = _record(trainer)["held_out_views"]
     length = LENGTH // 2
-    folds = [served[PRUNE_AT + 1 + 3 * i * length : PRUNE_AT + 1 + 3 * (i + 1) * length] for i in range(2)]
+    trials_of = [served[PRUNE_AT + 1 + i * length : PRUNE_AT + 1 + (i + 1) * length] for i in range(6)]
     assert _record(trainer)["decision"] == "head"
     assert _record(trainer)["steps_per_trial"] == length
-    assert first not in folds[0]
-    assert second not in folds[1]
+    assert not any(first in trial for trial in trials_of[::2])
+    assert not any(second in trial for trial in trials_of[1::2])
+    assert trainer.pipeline.model.head.config.num_features == 5
 
 
 def test_with_too_few_views_the_head_stays_off(make: Make, capsys: pytest.CaptureFixture[str]) -> None:

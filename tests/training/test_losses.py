@@ -10,8 +10,9 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
+from sundae_ns.errors import ConfigError
 from sundae_ns.model import SundaeModel
-from sundae_ns.training.losses import image_losses
+from sundae_ns.training.losses import StepLosses, image_losses
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -75,6 +76,30 @@ def test_after_the_prune_the_root_of_the_mean_square_takes_the_place_of_l1(
     assert torch.equal(after["base_loss"], before["base_loss"])
     model.state.densify_until = model.state.schedule_step + 1  # continuous pruning, while the field grows
     assert torch.equal(model.get_loss_dict(outputs, target)["main_loss"], before["main_loss"])
+
+
+def test_a_pruned_field_has_a_prior_that_counts_once(
+    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch
+) -> None:
+    """Twice as many training images halve its weight in the loss of one."""
+    model = perturb(build(prior_after_prune=0.6))
+    model.eval()
+    outputs, target = model.get_outputs(camera()), batch()
+    assert "opacity_loss" not in model.get_loss_dict(outputs, target)
+    model.state.pruning["num_prunes"] = 1
+    for count in (1, 2, 4):
+        model.losses = StepLosses.of(model.config, model.ssim, count)
+        found = model.get_loss_dict(outputs, target)
+        opacities, scales = model.gauss_params["opacities"].sigmoid(), model.gauss_params["scales"].exp()
+        torch.testing.assert_close(found["opacity_loss"], 0.6 / count * opacities.mean())
+        torch.testing.assert_close(found["scale_loss"], 0.6 / count * scales.mean())
+    model.losses = StepLosses.of(build(prior_after_prune=0.0).config, model.ssim, 1)
+    assert set(model.get_loss_dict(outputs, target)) == {"main_loss", "base_loss"}
+
+
+def test_a_negative_prior_is_refused(build: Build) -> None:
+    with pytest.raises(ConfigError, match="prior-after-prune is -0.1; give 0 or more"):
+        build(prior_after_prune=-0.1)
 
 
 def test_equal_images_have_a_gradient_of_zero(build: Build) -> None:

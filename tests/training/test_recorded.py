@@ -69,7 +69,8 @@ GROWTH = {
     [
         GROWTH,
         {**GROWTH, "use_absgrad": True},
-        {**GROWTH, "warmup": "mcmc", "mcmc_cap": 90},
+        # With one image the whole prior would leave features gradients of the size of rounding.
+        {**GROWTH, "warmup": "mcmc", "mcmc_cap": 90, "prior_after_prune": 0.05},
         {"pruning": {"mode": "off"}, "head": {"mode": "off"}},
         {"sh_degree": 0, "head": {"mode": "features"}},
     ],

@@ -10,7 +10,7 @@ from models import Training
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.model import SundaeModel
-from sundae_ns.training.trials import MOST_HELD_OUT, Progress, Trials, plan_trials
+from sundae_ns.training.trials import ARMS, MOST_HELD_OUT, Progress, Trials, plan_trials
 
 Build = Callable[..., SundaeModel]
 
@@ -97,30 +97,38 @@ def test_a_checkpoint_without_a_decision_names_the_option(build: Build) -> None:
 
 
 @pytest.mark.parametrize(
-    ("regularised", "head", "best"),
+    ("head", "features", "best"),
     [
-        ((0.05, 0.01), (0.09, 0.01), "plain"),
-        ((0.3, 0.01), (0.2, 0.01), "regularised"),
-        ((0.2, 0.01), (0.3, 0.01), "head"),
-        ((0.2, 0.01), (0.9, -0.001), "regularised"),
-        ((-1.0, -0.1), (0.5, 0.0), "head"),
-        ((float("nan"), 0.01), (float("inf"), 0.01), "plain"),
-        ((0.5, 0.01), (0.5, float("nan")), "regularised"),
+        ((0.09, 0.01), None, "plain"),
+        ((0.2, 0.01), (0.29, 0.02), "head"),
+        ((0.2, 0.01), (0.31, 0.01), "features"),
+        ((0.2, 0.01), (0.9, 0.009), "head"),
+        ((0.5, -0.001), None, "plain"),
+        ((float("inf"), 0.01), None, "plain"),
+        ((0.5, 0.01), (0.9, float("nan")), "head"),
     ],
 )
-def test_an_arm_must_gain_and_must_not_lose_ssim(
-    regularised: tuple[float, float], head: tuple[float, float], best: str
+def test_an_arm_must_gain_over_the_cheaper_ones_and_must_not_lose_ssim(
+    head: tuple[float, float], features: tuple[float, float] | None, best: str
 ) -> None:
     # Two folds; the second view has more pixels and is harder.
     measured = [
         [[float(pixels), decibels + gain[0], 0.7 + gain[1]]]
+        for gain in ((0.0, 0.0), head, *([] if features is None else [features]))
         for pixels, decibels in ((100, 25.0), (300, 20.0))
-        for gain in ((0.0, 0.0), regularised, head)
     ]
-    assert Progress(measured=measured).best() == best
+    progress = Progress(folds=2, measured=measured)
+    assert progress.best() == best
+    assert progress.tried == ARMS[: 2 if features is None else 3]
+
+
+def test_an_arm_counts_when_all_its_folds_have_ended() -> None:
+    plain, head = [[10.0, 20.0, 0.5]], [[10.0, 30.0, 0.9]]
+    assert Progress(folds=2, measured=[plain, plain, head]).best() == "plain"
+    assert Progress(folds=2, measured=[plain, plain, head, head]).best() == "head"
 
 
 def test_views_count_by_their_pixels() -> None:
     # A gain of 1 dB on few pixels does not outweigh a loss on many.
     plain, head = [[10.0, 20.0, 0.5], [990.0, 20.0, 0.5]], [[10.0, 21.0, 0.6], [990.0, 19.99, 0.6]]
-    assert Progress(measured=[plain, plain, head]).best() == "plain"
+    assert Progress(measured=[plain, head]).best() == "plain"
