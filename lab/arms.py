@@ -14,6 +14,8 @@ After the prune:
                    training views moves onto primitives drawn by weight x |error|^q, which are split along their longest axis
   "distil": {"views": v, "share": s, "reach": t}  s of the steps train on v images of the unpruned field, from cameras
                    between two neighbours (t: farthest share of the way, also sideways)
+  "shift": s       the head trains on windows that are s pixels smaller than the image, at a random place of each step
+  "fdrop": p       each feature is left out of a step with probability p, the others are larger by 1 / (1 - p)
   "average": k     mean of field and head over the last k steps; evaluated at the end beside the last state
 Before it:
   "fade": {"from": a, "factor": f}  the decision is made at step a; opacities of the dropped are multiplied by f every 50 steps
@@ -29,6 +31,7 @@ import torch
 import sundae_ns.rendering.render as render_module
 import sundae_ns.training.schedules as schedules
 import sundae_ns.training.step as step_module
+from sundae_ns.compensation import Window
 from sundae_ns.gaussians.relocation import split_evenly
 from sundae_ns.gaussians.rotations import rotation_matrices
 from sundae_ns.gaussians.surgery import keep, moments_of
@@ -80,6 +83,10 @@ class Arm:
             self.model._get_background_color = lambda: self.model.shown_background if self.pruned else old()
         if spec.get("drop"):
             self._patch_draw()
+        if spec.get("shift"):
+            self._patch_window()
+        if spec.get("fdrop"):
+            self._patch_features()
         if "distil" in spec:
             self._patch_views()
         if "fade" in spec:
@@ -144,6 +151,31 @@ class Arm:
             group["lr"] *= factor
         if scheduler is not None:
             scheduler.base_lrs = [rate * factor for rate in scheduler.base_lrs]
+
+    # ----------------------------------------------------------------------------------------------- inputs of the head
+
+    def _patch_window(self):
+        old, arm, s = step_module.training_window, self, self.spec["shift"]
+
+        def window(width, height, max_pixels, seed):
+            if not arm.state.head_enabled or width * height > max_pixels > 0:
+                return old(width, height, max_pixels, seed)
+            draw = random.Random(seed)
+            return Window(draw.randint(0, s), draw.randint(0, s), width - s, height - s)
+
+        step_module.training_window = window
+
+    def _patch_features(self):
+        old, p = render_module.compensate, self.spec["fdrop"]
+
+        def compensate(head, base, splatted, background, *, training):
+            if training:
+                features = splatted.colors[..., 3:]
+                kept = (torch.rand(features.shape[-1], device=features.device) >= p) / (1 - p)
+                splatted = replace(splatted, colors=torch.cat([splatted.colors[..., :3], features * kept], dim=-1))
+            return old(head, base, splatted, background, training=training)
+
+        render_module.compensate = step_module.compensate = compensate
 
     # ------------------------------------------------------------------------------------------------------- dropping
 

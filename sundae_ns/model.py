@@ -70,7 +70,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Weight of the loss on the image without the head, which keeps exported .ply files valid."""
     loss_after_prune: Literal["l1", "rms"] = "rms"
     """Term beside SSIM: l1 is the paper's; rms, the root of the mean squared error, gains 0.1 to 0.3 dB."""
-    prior_after_prune: float = 0.5
+    prior_after_prune: float = 0.3
     """Weight of opacities and scales in the loss of the pruned field, over the number of training images."""
     average_share: float = 0.1
     """The run ends with the mean of the weights over this last share of its schedule; 0.1 gains 0.2 dB."""

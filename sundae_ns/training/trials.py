@@ -23,7 +23,9 @@ from sundae_ns.evaluation import without_nan
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.gaussians.surgery import replace_parameter
+from sundae_ns.storage import accounting, megabytes
 from sundae_ns.storage.atomic import write_text
+from sundae_ns.training.budget.sizes import head_bytes
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, mean_quality, measure_heldout
@@ -48,7 +50,9 @@ FEWEST_VIEWS = 6
 FEW_VIEWS = 12
 """With fewer training views, two are held out in turn, for trials of half the length."""
 LEAST_GAIN = 0.1
-"""PSNR that an arm must gain over a cheaper one, dB. Two runs of one seed differ by as much."""
+"""Least PSNR that an arm must gain over a cheaper one, dB. Two runs of one seed differ by as much."""
+GAIN_PER_DOUBLING = 0.3
+"""PSNR that an arm must gain for each doubling of the stored bytes, dB: about what twice as many primitives gain."""
 
 
 class Plan(NamedTuple):
@@ -101,6 +105,8 @@ class Progress:
     """Number of the current trial."""
     folds: int = 1
     """Number of trials of an arm."""
+    bytes: list[int] = field(default_factory=list)
+    """Stored bytes of the field with each arm's features and head, fp32."""
     began: int = 0
     """Step of the schedule at which the current trial began."""
     measured: list[list[list[float]]] = field(default_factory=list)
@@ -123,13 +129,14 @@ class Progress:
         return [HeldOutQuality(int(pixels), *figures) for trial in trials for pixels, *figures in trial]
 
     def best(self) -> str:
-        """The dearest tried arm that gains enough over the best cheaper one and loses no SSIM."""
+        """The dearest tried arm that gains enough over the best cheaper one for its bytes, and loses no SSIM."""
         best = "plain"
         for arm in self.tried[1:]:
             figures = (mean_quality(self.qualities(one)) for one in (best, arm))
             decibels, similarity = (b - a for a, b in zip(*figures, strict=True))
+            doublings = math.log2(self.bytes[ARMS.index(arm)] / self.bytes[ARMS.index(best)])
             # Comparisons with figures that are not finite fail.
-            if math.inf > decibels >= LEAST_GAIN and similarity >= 0:
+            if math.inf > decibels >= max(LEAST_GAIN, GAIN_PER_DOUBLING * doublings) and similarity >= 0:
                 best = arm
         return best
 
@@ -220,6 +227,7 @@ class Trials(Extension):
                 f"{len(plan.views)} of {len(run.view_indices())} training views are held out"
             )
             progress.phase, progress.folds = "trials", len(plan.folds)
+            progress.bytes = self._stored_bytes(run.state)
             self._start = run.state.snapshot(head=True)
             self._begin(run)
         elif progress.phase == "trials" and step - progress.began >= self._planned(run).length:
@@ -260,6 +268,12 @@ class Trials(Extension):
         if self.progress.arm == "features":
             self._widen(run.state)
         self._set_arm(run.state)
+
+    def _stored_bytes(self, state: FieldState) -> list[int]:
+        """Bytes of the field with each arm's features and head."""
+        plain = accounting.bytes_of({name: value for name, value in state.field.items() if name != FEATURES})
+        a_feature = accounting.BYTES_PER_FLOAT * state.field.num_primitives
+        return [plain, *(plain + a_feature * head.num_features + head_bytes(head) for head in (self._head, self._wide))]
 
     @property
     def _wide(self) -> HeadConfig:
@@ -308,7 +322,10 @@ class Trials(Extension):
         progress, state = self.progress, run.state
         decision = progress.best()
         figures = {arm: mean_quality(progress.qualities(arm)) for arm in progress.tried}
-        texts = [f"{NAMES[arm]} {decibels:.2f} dB, SSIM {ssim:.4f}" for arm, (decibels, ssim) in figures.items()]
+        texts = [
+            f"{NAMES[arm]} {decibels:.2f} dB, SSIM {ssim:.4f}, {megabytes(size)}"
+            for (arm, (decibels, ssim)), size in zip(figures.items(), progress.bytes, strict=False)
+        ]
         CONSOLE.log(f"step {state.step}: held-out training views: {'; '.join(texts)}. Continuing: {NAMES[decision]}")
         run.log_scalars("Trials", {f"psnr_{arm}": decibels for arm, (decibels, _) in figures.items()})
         if decision != progress.arm:
@@ -340,7 +357,10 @@ class Trials(Extension):
         for arm in progress.tried:
             views = progress.qualities(arm)
             decibels, similarity = mean_quality(views)
-            record["arms"][arm] = {"psnr": decibels, "ssim": similarity, "views": [view._asdict() for view in views]}
+            record["arms"][arm] = {
+                **{"psnr": decibels, "ssim": similarity, "bytes": progress.bytes[ARMS.index(arm)]},
+                "views": [view._asdict() for view in views],
+            }
         return record
 
 

@@ -13,6 +13,8 @@ from sundae_ns.model import SundaeModel
 from sundae_ns.training.trials import ARMS, MOST_HELD_OUT, Progress, Trials, plan_trials
 
 Build = Callable[..., SundaeModel]
+SIZES = [100, 110, 120]
+"""Bytes of the arms."""
 
 
 @pytest.mark.parametrize(("views", "held_out"), [(12, 2), (16, 2), (43, 5), (73, 9), (105, 13), (255, 16), (2000, 16)])
@@ -117,18 +119,24 @@ def test_an_arm_must_gain_over_the_cheaper_ones_and_must_not_lose_ssim(
         for gain in ((0.0, 0.0), head, *([] if features is None else [features]))
         for pixels, decibels in ((100, 25.0), (300, 20.0))
     ]
-    progress = Progress(folds=2, measured=measured)
+    progress = Progress(folds=2, measured=measured, bytes=SIZES)
     assert progress.best() == best
     assert progress.tried == ARMS[: 2 if features is None else 3]
 
 
 def test_an_arm_counts_when_all_its_folds_have_ended() -> None:
     plain, head = [[10.0, 20.0, 0.5]], [[10.0, 30.0, 0.9]]
-    assert Progress(folds=2, measured=[plain, plain, head]).best() == "plain"
-    assert Progress(folds=2, measured=[plain, plain, head, head]).best() == "head"
+    assert Progress(folds=2, bytes=SIZES, measured=[plain, plain, head]).best() == "plain"
+    assert Progress(folds=2, bytes=SIZES, measured=[plain, plain, head, head]).best() == "head"
+
+
+@pytest.mark.parametrize(("gain", "size", "best"), [(0.31, 200, "head"), (0.29, 200, "plain"), (0.29, 190, "head")])
+def test_an_arm_that_takes_more_bytes_must_gain_more(gain: float, size: int, best: str) -> None:
+    measured = [[[10.0, 20.0, 0.5]], [[10.0, 20.0 + gain, 0.5]]]
+    assert Progress(bytes=[100, size, 400], measured=measured).best() == best
 
 
 def test_views_count_by_their_pixels() -> None:
     # A gain of 1 dB on few pixels does not outweigh a loss on many.
     plain, head = [[10.0, 20.0, 0.5], [990.0, 20.0, 0.5]], [[10.0, 21.0, 0.6], [990.0, 19.99, 0.6]]
-    assert Progress(measured=[plain, head]).best() == "plain"
+    assert Progress(bytes=SIZES, measured=[plain, head]).best() == "plain"
