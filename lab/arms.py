@@ -24,11 +24,11 @@ Before it:
 """
 import math
 import random
+import sys
 from dataclasses import replace
 
 import torch
 
-import sundae_ns.rendering.render as render_module
 import sundae_ns.training.schedules as schedules
 import sundae_ns.training.step as step_module
 from sundae_ns.compensation import Window
@@ -44,6 +44,7 @@ from sundae_ns.rendering.source import Primitives
 from sundae_ns.training.losses import StepLosses
 
 HEAD = "compensation"
+render_module = sys.modules["sundae_ns.rendering.render"]  # the package has a function of this name
 
 
 def patch_losses(spec):

@@ -207,10 +207,16 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     assert scene_of_run(trainer.base_dir).field.get("features", torch.zeros(1, 0)).shape[1] == width
 
 
-@pytest.mark.parametrize("stop", [35, PRUNE_AT + 2, PRUNE_AT + LENGTH + 2, PRUNE_AT + 2 * LENGTH + 2, DECIDED + 3])
-@pytest.mark.parametrize("gains", [(0.5, 1.0), (0.5, 0.5), (-0.5, 0.0)])
+@pytest.mark.parametrize(
+    ("gains", "stop"),
+    [
+        *(((0.5, 1.0), stop) for stop in (35, PRUNE_AT + 2, *(PRUNE_AT + i * LENGTH + 2 for i in (1, 2)), DECIDED + 3)),
+        *(((0.5, 0.5), stop) for stop in (PRUNE_AT + 2 * LENGTH + 2, DECIDED + 3)),
+        *(((-0.5, 0.0), stop) for stop in (PRUNE_AT + LENGTH + 2, PRUNE_AT + 2 * LENGTH + 2)),
+    ],
+)
 def test_a_resumed_run_takes_the_same_decision_bit_for_bit(
-    make: Make, judge: Any, stop: int, gains: tuple[float, float]
+    make: Make, judge: Any, gains: tuple[float, float], stop: int
 ) -> None:
     judge(head=(gains[0], gains[0] / 10), features=(gains[1], gains[1] / 10))
     whole = make(name="whole", save_every=stop)
