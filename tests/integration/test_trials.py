@@ -292,20 +292,23 @@ def test_a_checkpoint_that_lacks_the_field_to_return_to_is_refused(make: Make, j
         model.load_state_dict(inner)
 
 
-def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any) -> None:
-    judge(head=(-0.5, -0.05))
-    stop = PRUNE_AT + LENGTH + 2
+@pytest.mark.parametrize(("trial", "width"), [(1, 5), (2, 29)])
+def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, trial: int, width: int) -> None:
+    """The head of the trial that one GPU was in."""
+    judge(head=(0.5, 0.05))
+    stop = PRUNE_AT + trial * LENGTH + 2
     whole = make(name="whole", save_every=stop)
     whole.train()
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=3)
     model: Any = resumed.pipeline.model
-    (trial,) = (extension for extension in model.extensions if extension.name == "trials")
-    assert trial.state_dict()["start"] is not None
+    (trials_of_run,) = (extension for extension in model.extensions if extension.name == "trials")
+    assert trials_of_run.state_dict()["start"] is not None
     resumed.pipeline.datamanager.place = (0, 2)
     attributes = TrainingCallbackAttributes(resumed.optimizers, resumed.grad_scaler, resumed.pipeline, resumed)
-    trial.before_training(NerfstudioRun(model, attributes))
+    trials_of_run.before_training(NerfstudioRun(model, attributes))
     resumed.train()
     assert _record(resumed)["reason"] == "trials need a single GPU"
     assert model.state.head_enabled
+    assert model.gauss_params["features"].shape[1] == width
     assert resumed.pipeline.datamanager.holdout_indices == []
-    assert trial.state_dict()["start"] is None
+    assert trials_of_run.state_dict()["start"] is None
