@@ -1,4 +1,6 @@
-"""Flicker of the head along a camera path: python lab/flicker.py RUN DATA
+"""Flicker of the head along a camera path: python lab/flicker.py RUN DATA [OTHER]
+
+With OTHER, a run of the same capture, its images take the place of the compensated ones.
 
 As StopThePop measures popping: frames k = 1 and 7 apart, the earlier warped onto the later, squared error, the per-pixel minimum
 over both methods (base colours, compensated) subtracted. Warps go by the depth of the field, in place of optical flow.
@@ -15,6 +17,7 @@ run, data = Path(sys.argv[1]), Path(sys.argv[2])
 opened = open_scene(run, data=data)
 model, dm = opened.model, opened.datamanager
 model.eval()
+other = open_scene(Path(sys.argv[3]), data=data).model.eval() if len(sys.argv) > 3 else None
 cameras, names = dm.train_dataset.cameras, dm.train_dataset.image_filenames
 order = sorted(range(len(names)), key=lambda i: names[i].name)
 
@@ -34,6 +37,8 @@ def path(place):
 @torch.no_grad()
 def frame(view):
     images, _ = render(model.source, view, model.shown_background, model.render_settings(training=False), depth=True)
+    if other is not None:
+        images["rgb"] = render(other.source, view, other.shown_background, other.render_settings(training=False), depth=False)[0]["rgb"]
     return {k: images[k].float() for k in ("rgb", "base_rgb", "depth", "accumulation")}, view
 
 
