@@ -18,6 +18,7 @@ After the prune:
   "fdrop": p       each feature is left out of a step with probability p, the others are larger by 1 / (1 - p)
   "average": k     mean of field and head over the last k steps; evaluated at the end beside the last state
 Before it:
+  "reg_warm": w    weights of opacities and scales while the field grows
   "fade": {"from": a, "factor": f}  the decision is made at step a; opacities of the dropped are multiplied by f every 50 steps
                    until the prune (prune-at), which then drops them without a merge
   "count": n       number of primitives that the prune keeps; "cap": n  most primitives while the field grows
@@ -52,7 +53,11 @@ def patch_losses(spec):
 
     def losses(self, state, params, rgb, base, target, mask):
         if not state.pruning["num_prunes"]:
-            return old(self, state, params, rgb, base, target, mask)
+            terms = old(self, state, params, rgb, base, target, mask)
+            if spec.get("reg_warm"):
+                terms["reg_o"] = spec["reg_warm"] * params["opacities"].sigmoid().mean()
+                terms["reg_s"] = spec["reg_warm"] * params["scales"].exp().mean()
+            return terms
         own = self if weight is None else replace(self, ssim_weight=weight)
         terms = old(own, state, params, rgb, base, target, mask)
         if r:

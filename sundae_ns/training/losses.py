@@ -48,7 +48,7 @@ class StepLosses:
     base_weight: float
     """Weight of the L1 loss of the base colours while the head is enabled."""
     chain: bool
-    """Whether the field grows as a Markov chain, whose loss has regularisers."""
+    """Whether the field grows as a Markov chain, whose loss has a prior."""
     squares: bool = False
     """Whether the root of the mean square takes the place of L1 once the field is pruned."""
     prior: float = 0.0
