@@ -1,11 +1,11 @@
-"""The mean of the weights over the last steps of a training (stochastic weight averaging, Izmailov et al., UAI 2018).
+"""Means of the weights over steps of a training (stochastic weight averaging, Izmailov et al., UAI 2018).
 
 A step sees one image, so the weights wander around what suits all of them; their mean lies nearer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -17,6 +17,62 @@ from sundae_ns.training.field_state import FieldState
 
 EVERY = 10
 """Steps between two weights that count: neighbours differ by little."""
+
+Weights = Mapping[str, Tensor]
+"""Tensors by name."""
+
+
+class RunningMean:
+    """The mean of weights that are counted in one after another.
+
+    Args:
+        values: the mean so far, by name; empty without one.
+        count: number of weights in it.
+    """
+
+    def __init__(self, values: Weights | None = None, count: int = 0) -> None:
+        self.values, self.count = dict(values or {}), count
+
+    @torch.no_grad()
+    def count_in(self, weights: Weights) -> None:
+        """Count weights in; those of other shapes begin a new mean."""
+        if not self.fits(weights):
+            self.values, self.count = {name: value.clone() for name, value in weights.items()}, 0
+        if not weights:  # a rank without primitives
+            return
+        self.count += 1
+        torch._foreach_lerp_([self.values[name] for name in weights], list(weights.values()), 1 / self.count)
+
+    @torch.no_grad()
+    def replace(self, weights: Weights) -> dict[str, Tensor]:
+        """Put the mean in the place of weights; returns their copies."""
+        copies = {name: value.clone() for name, value in weights.items()}
+        put(self.values, weights)
+        return copies
+
+    def fits(self, weights: Weights) -> bool:
+        """Whether the mean is of weights of these names and shapes."""
+        return same_shapes(self.values, weights)
+
+
+def weights_of(state: FieldState) -> dict[str, Tensor]:
+    """Weights of the field and of the enabled head, by name; changes in place change the field."""
+    weights = {name: value.data for name, value in state.field.items() if value.numel() > 0}
+    if state.head_enabled and state.head is not None:
+        weights |= {f"head.{name}": value.data for name, value in state.head.named_parameters()}
+    return weights
+
+
+@torch.no_grad()
+def put(values: Weights, weights: Weights) -> None:
+    """Copy values into the weights of the same names."""
+    for name, value in weights.items():
+        value.copy_(values[name])
+
+
+def same_shapes(some: Weights, others: Weights) -> bool:
+    """Whether names and shapes are the same."""
+    return some.keys() == others.keys() and all(value.shape == others[name].shape for name, value in some.items())
 
 
 class Averaging(Extension):
@@ -32,8 +88,7 @@ class Averaging(Extension):
     def __init__(self, share: float, settled_at: float) -> None:
         self.share = share
         self.settled_at = settled_at
-        self._mean: dict[str, Tensor] = {}
-        self._count = 0
+        self._mean = RunningMean()
         self._restored = 0
         """Returns to a snapshot that the field had made when the mean began."""
         self._replaced: dict[str, Tensor] = {}
@@ -47,27 +102,25 @@ class Averaging(Extension):
         """
         if not self._alone:
             return {}
-        return {"mean": self._mean, "count": self._count, "replaced": self._replaced}
+        return {"mean": self._mean.values, "count": self._mean.count, "replaced": self._replaced}
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`."""
-        self._mean, self._replaced = (
+        mean, self._replaced = (
             {name: value.to(state.device) for name, value in saved.get(part, {}).items()}
             for part in ("mean", "replaced")
         )
-        self._count, self._restored = int(saved.get("count", 0)), state.restored
+        self._mean, self._restored = RunningMean(mean, int(saved.get("count", 0))), state.restored
 
     @torch.no_grad()
     def before_training(self, run: TrainingRun) -> None:
         """Put back the weights that a mean has replaced, so that two trainings end as one of their length."""
         self._alone = run.images_per_step == 1
-        weights = dict(_weights(run.state))
-        if self._alone and _shapes(weights) == _shapes(self._replaced):
-            for name, value in weights.items():
-                value.copy_(self._replaced[name])
+        weights = weights_of(run.state)
+        if self._alone and same_shapes(weights, self._replaced):
+            put(self._replaced, weights)
         self._replaced = {}
 
-    @torch.no_grad()
     def after_step(self, run: TrainingRun) -> None:
         """Count the weights if their turn has come; after the last step, put the mean in their place."""
         state, length, last = run.state, run.schedule_length, run.last_step
@@ -75,39 +128,12 @@ class Averaging(Extension):
             return
         if state.schedule_step < self.settled_at or state.step < last - self.share * length:
             return
-        weights = dict(_weights(state))
+        if state.restored != self._restored:
+            self._mean, self._restored = RunningMean(), state.restored
+        weights = weights_of(state)
         if state.step % EVERY == 0:
-            self._count_in(state, weights)
-        if state.step == last and self._count > 0 and self._fits(state, weights):
-            self._replaced = {name: value.clone() for name, value in weights.items()} if self._alone else {}
-            for name, value in weights.items():
-                value.copy_(self._mean[name])
-            CONSOLE.log(f"step {state.step}: the weights are the mean of {self._count} of the last steps")
-            self._mean, self._count = {}, 0
-
-    def _count_in(self, state: FieldState, weights: Mapping[str, Tensor]) -> None:
-        if not self._fits(state, weights):
-            self._mean, self._count = {name: value.clone() for name, value in weights.items()}, 0
-            self._restored = state.restored
-        if not weights:  # a rank without primitives
-            return
-        self._count += 1
-        torch._foreach_lerp_([self._mean[name] for name in weights], list(weights.values()), 1 / self._count)
-
-    def _fits(self, state: FieldState, weights: Mapping[str, Tensor]) -> bool:
-        """Whether these are weights of the same primitives and the same head as those of the mean."""
-        return state.restored == self._restored and _shapes(self._mean) == _shapes(weights)
-
-
-def _shapes(weights: Mapping[str, Tensor]) -> dict[str, torch.Size]:
-    return {name: value.shape for name, value in weights.items()}
-
-
-def _weights(state: FieldState) -> Iterator[tuple[str, Tensor]]:
-    """Parameters of the field and of the enabled head, by name."""
-    for name, value in state.field.items():
-        if value.numel() > 0:
-            yield name, value.data
-    if state.head_enabled and state.head is not None:
-        for name, value in state.head.named_parameters():
-            yield f"head.{name}", value.data
+            self._mean.count_in(weights)
+        if state.step == last and self._mean.count > 0 and self._mean.fits(weights):
+            CONSOLE.log(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
+            replaced = self._mean.replace(weights)
+            self._replaced, self._mean = replaced if self._alone else {}, RunningMean()

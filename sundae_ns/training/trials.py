@@ -2,8 +2,9 @@
 
 A head gains where views are many and agree; where they are few or differ, it fits their differences. So some training views
 are held out from shortly before the prune. From the pruned field, trials of one length follow in turn, each of more than the
-one before, until one does not pay. The held-out views choose one, and it continues on all views; the steps of the others are
-the cost. Test views are never used.
+one before, until one does not pay. The held-out views judge the mean of the weights at the end of each: those of a single step
+lean towards the last images. The chosen field continues on all views; the steps of the others are the cost. Test views are
+never used.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.gaussians.surgery import replace_parameter
 from sundae_ns.storage import accounting, megabytes
 from sundae_ns.storage.atomic import write_text
+from sundae_ns.training.averaging import EVERY, RunningMean, put, weights_of
 from sundae_ns.training.budget.sizes import head_bytes
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
@@ -39,6 +41,8 @@ NAMES = {"plain": "no head", "head": "head", "features": f"head with {MORE_FEATU
 """What the log calls them."""
 TRIAL_SHARE = 0.04
 """Length of a trial as a share of the schedule."""
+MEAN_SHARE = 0.25
+"""Share of a trial, at its end, over which weights are averaged for the verdict."""
 HOLD_SHARE = 0.1
 """Share of the schedule for which views are held out before the first trial, so that the field forgets them."""
 HELD_OUT_EVERY = 8
@@ -160,13 +164,15 @@ class Trials(Extension):
         self._plan: Plan | None = None
         self._start: dict[str, Snapshot] | None = None
         self._ends: dict[str, dict[str, Snapshot]] = {}
+        self._mean = RunningMean()
         self._set_arm(state)
 
     # ------------------------------------------------------------------------------------------------- checkpoints
 
     def state_dict(self) -> dict[str, Any]:
-        """Numbers and, during trials, copies of the fields to which they may return."""
-        return {"numbers": asdict(self.progress), "start": self._start, "ends": self._ends}
+        """Numbers and, during trials, the mean of the weights so far and copies of the fields to which they may return."""
+        mean = {"mean": self._mean.values, "count": self._mean.count}
+        return {"numbers": asdict(self.progress), "start": self._start, "ends": self._ends, **mean}
 
     def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Give head and features the width that they have in the checkpoint, or remove them.
@@ -195,6 +201,8 @@ class Trials(Extension):
         if progress.phase == "trials" and not complete:
             raise CheckpointError("the checkpoint lacks the fields that its trials would return to; give another")
         self.progress, self._start, self._ends = progress, start, dict(ends or {})
+        mean = {name: value.to(state.device) for name, value in saved.get("mean", {}).items()}
+        self._mean = RunningMean(mean, int(saved.get("count", 0)))
         self._set_arm(state)
 
     # ---------------------------------------------------------------------------------------------------- training
@@ -230,8 +238,13 @@ class Trials(Extension):
             progress.bytes = self._stored_bytes(run.state)
             self._start = run.state.snapshot(head=True)
             self._begin(run)
-        elif progress.phase == "trials" and step - progress.began >= self._planned(run).length:
-            self._end(run)
+        elif progress.phase == "trials":
+            length = self._planned(run).length
+            left = progress.began + length - step
+            if left < MEAN_SHARE * length and run.state.step % EVERY == 0:
+                self._mean.count_in(weights_of(run.state))
+            if left <= 0:
+                self._end(run)
 
     def finish(self, run: TrainingRun) -> None:
         """Warn if training ended before a decision."""
@@ -305,8 +318,7 @@ class Trials(Extension):
     def _end(self, run: TrainingRun) -> None:
         """End the current trial; begin the next one from the same field, or decide."""
         progress, state, arm = self.progress, run.state, self.progress.arm
-        mend = "decide by hand with --pipeline.model.head.mode residual or off"
-        progress.measured.append([list(view) for view in measure_heldout(run, mend=mend)])
+        progress.measured.append(self._measured(run))
         # What does not pay is not tried with more.
         if arm in progress.tried and arm != "plain" and (arm == self._arms[-1] or progress.best() != arm):
             self._decide(run)
@@ -317,6 +329,17 @@ class Trials(Extension):
         postpone(state.schedulers, state.schedule_step - progress.began)
         progress.trial += 1
         self._begin(run)
+
+    def _measured(self, run: TrainingRun) -> list[list[float]]:
+        """Figures of the held-out views with the mean of the weights, if there is one."""
+        mend = "decide by hand with --pipeline.model.head.mode residual or off"
+        weights, mean = weights_of(run.state), self._mean
+        own = mean.replace(weights) if mean.count > 0 and mean.fits(weights) else {}
+        views = [list(view) for view in measure_heldout(run, mend=mend)]
+        if own:
+            put(own, weights)
+        self._mean = RunningMean()
+        return views
 
     def _decide(self, run: TrainingRun) -> None:
         progress, state = self.progress, run.state
