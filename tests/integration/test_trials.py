@@ -248,8 +248,8 @@ def test_the_verdict_is_on_the_mean_of_the_weights(make: Make, judge: Any, monke
 @pytest.mark.parametrize(
     ("gains", "stop"),
     [
-        *(((0.5, 1.0), stop) for stop in (35, PRUNE_AT + 2, *(PRUNE_AT + i * LENGTH + 2 for i in (1, 2)), DECIDED + 3)),
-        *(((0.5, 0.5), stop) for stop in (PRUNE_AT + 2 * LENGTH + 2, DECIDED + 3)),
+        *(((0.5, 1.0), stop) for stop in (35, PRUNE_AT + 2, PRUNE_AT + 2 * LENGTH + 2, DECIDED + 3)),
+        ((0.5, 0.5), DECIDED + 3),
         *(((-0.5, 0.0), stop) for stop in (PRUNE_AT + LENGTH + 2, PRUNE_AT + 2 * LENGTH + 2)),
     ],
 )
