@@ -23,6 +23,7 @@ from nerfstudio.utils import profiler, writer
 from nerfstudio.utils.misc import step_check
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.table import Table
+from torch import Tensor
 
 from sundae_ns import distributed
 from sundae_ns.datamanager import SundaeDatamanager, check_before_training, view_index
@@ -182,9 +183,16 @@ class SundaeTrainerConfig(TrainerConfig):
         write_text(path, yaml.dump(self))
 
 
-def _detached(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values without their graphs."""
-    return {name: value.detach() if isinstance(value, torch.Tensor) else value for name, value in values.items()}
+def _detached(result: tuple[Tensor, Mapping[str, Any], Mapping[str, Any]]) -> tuple[Any, ...]:
+    """Loss, its terms, and metrics without their graph.
+
+    nerfstudio holds them until the next step. Trials that resize the head in between need the graph to be gone.
+    """
+    loss, *figures = result
+    values = [
+        {name: one.detach() if isinstance(one, Tensor) else one for name, one in part.items()} for part in figures
+    ]
+    return loss.detach(), *values
 
 
 def recorded_outputs(
@@ -294,14 +302,13 @@ class SundaeTrainer(Trainer):
 
     def train_iteration(self, step: int) -> Any:
         """Train one step; several ranks agree on whether to stop after it."""
-        loss, *figures = self._recorded_iteration(step) or super().train_iteration(step)
+        result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
         self._trained = step
         self._foretell(step - self._start_step)
         self._stopped_by = self.team.agreed(self._interruption.number, step)
         if self._stopped_by:
             self.stop_training = True
-        # nerfstudio holds them until the next step; trials that resize the head in between need the graph to be gone.
-        return (loss.detach(), *map(_detached, figures))
+        return result
 
     def _recordable(self) -> bool:
         """Whether options allow to record training steps."""

@@ -33,6 +33,16 @@ class RunningMean:
     def __init__(self, values: Weights | None = None, count: int = 0) -> None:
         self.values, self.count = dict(values or {}), count
 
+    @classmethod
+    def of(cls, saved: Mapping[str, Any], device: torch.device) -> RunningMean:
+        """The mean of a :meth:`state_dict`; a new one if there is none in it."""
+        values = {name: value.to(device) for name, value in saved.get("mean", {}).items()}
+        return cls(values, int(saved.get("count", 0)))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Entries for a checkpoint."""
+        return {"mean": self.values, "count": self.count}
+
     @torch.no_grad()
     def count_in(self, weights: Weights) -> None:
         """Count weights in; those of other shapes begin a new mean."""
@@ -51,8 +61,8 @@ class RunningMean:
         return copies
 
     def fits(self, weights: Weights) -> bool:
-        """Whether the mean is of weights of these names and shapes."""
-        return same_shapes(self.values, weights)
+        """Whether there is a mean, and of weights of these names and shapes."""
+        return self.count > 0 and same_shapes(self.values, weights)
 
 
 def weights_of(state: FieldState) -> dict[str, Tensor]:
@@ -102,17 +112,13 @@ class Averaging(Extension):
         """
         if not self._alone:
             return {}
-        return {"mean": self._mean.values, "count": self._mean.count, "replaced": self._replaced}
+        return {**self._mean.state_dict(), "replaced": self._replaced}
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`."""
-        mean, self._replaced = (
-            {name: value.to(state.device) for name, value in saved.get(part, {}).items()}
-            for part in ("mean", "replaced")
-        )
-        self._mean, self._restored = RunningMean(mean, int(saved.get("count", 0))), state.restored
+        self._mean, self._restored = RunningMean.of(saved, state.device), state.restored
+        self._replaced = {name: value.to(state.device) for name, value in saved.get("replaced", {}).items()}
 
-    @torch.no_grad()
     def before_training(self, run: TrainingRun) -> None:
         """Put back the weights that a mean has replaced, so that two trainings end as one of their length."""
         self._alone = run.images_per_step == 1
@@ -133,7 +139,7 @@ class Averaging(Extension):
         weights = weights_of(state)
         if state.step % EVERY == 0:
             self._mean.count_in(weights)
-        if state.step == last and self._mean.count > 0 and self._mean.fits(weights):
+        if state.step == last and self._mean.fits(weights):
             CONSOLE.log(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")
             replaced = self._mean.replace(weights)
             self._replaced, self._mean = replaced if self._alone else {}, RunningMean()

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from sundae_ns.compensation import CompensationHead
+from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.snapshot import Snapshot, module_snapshot, restore, restore_module, snapshot
@@ -106,6 +106,17 @@ class FieldState:
         for name in ("compensation", FEATURES):
             if name in self.optimizers:
                 self.optimizers[name].state.clear()
+
+    def reshape_head(self, config: HeadConfig) -> None:
+        """Give head and features the shapes of a configuration; values are loaded afterwards. Parameters stay the same objects.
+
+        Args:
+            config: of a field with a head.
+        """
+        assert self.head is not None
+        self.head.resize(config)
+        features = self.field[FEATURES]
+        features.data = features.data.new_zeros(len(features), config.num_features)
 
     def remember_focal(self, focal: float) -> None:
         """Note the focal length of an image that the head is trained on, pixels."""

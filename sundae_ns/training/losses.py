@@ -56,10 +56,16 @@ class StepLosses:
 
     @classmethod
     def of(cls, options: LossOptions, ssim: SSIM, num_images: int) -> StepLosses:
-        """The losses of a model with these options and so many training images."""
+        """The losses of a model.
+
+        Args:
+            options: of the model.
+            ssim: see the attribute.
+            num_images: number of training images.
+        """
         chain, squares = options.warmup == "mcmc", options.loss_after_prune == "rms"
         # A prior counts once, and the loss is of one image: its weight falls with their number.
-        prior = options.prior_after_prune / max(num_images, 1)  # none in an opened run
+        prior = options.prior_after_prune / max(num_images, 1)  # an opened run may have none
         return cls(ssim, options.ssim_lambda, options.base_loss_weight, chain, squares, prior)
 
     def __call__(

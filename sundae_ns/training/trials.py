@@ -1,10 +1,10 @@
 """The decision how a field is finished (``head.mode auto``): plain, with a head, or with a head of more features.
 
 A head gains where views are many and agree; where they are few or differ, it fits their differences. So some training views
-are held out from shortly before the prune. From the pruned field, trials of one length follow in turn, each of more than the
-one before, until one does not pay. The held-out views judge the mean of the weights at the end of each: those of a single step
-lean towards the last images. The chosen field continues on all views; the steps of the others are the cost. Test views are
-never used.
+are held out from shortly before the prune. From the pruned field, trials of one length follow in turn, each of a larger scene
+than the one before, until one does not pay. Its held-out views are rendered with the mean of the weights over its last steps,
+because the weights of a single step fit the last images best. The chosen field continues on all views; the steps of the others
+are the cost. Test views are never used.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from sundae_ns.evaluation import without_nan
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.gaussians.surgery import replace_parameter
-from sundae_ns.storage import accounting, megabytes
+from sundae_ns.storage import megabytes
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.training.averaging import EVERY, RunningMean, put, weights_of
-from sundae_ns.training.budget.sizes import head_bytes
+from sundae_ns.training.budget import bytes_of
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, mean_quality, measure_heldout
 from sundae_ns.training.schedulers import postpone
 
 ARMS = ("plain", "head", "features")
-"""What is tried, in this order: no head, the head as configured, and one of more features. Each is dearer than the last."""
+"""What is tried, in this order: no head, the head as configured, and one of more features. Each is larger than the last."""
 MORE_FEATURES = 29
 """Features of the last arm: as many as are splatted without padding after the default 13."""
 NAMES = {"plain": "no head", "head": "head", "features": f"head with {MORE_FEATURES} features"}
@@ -54,9 +54,9 @@ FEWEST_VIEWS = 6
 FEW_VIEWS = 12
 """With fewer training views, two are held out in turn, for trials of half the length."""
 LEAST_GAIN = 0.1
-"""Least PSNR that an arm must gain over a cheaper one, dB. Two runs of one seed differ by as much."""
+"""Least PSNR that an arm must gain over a smaller one, dB. Two runs of one seed differ by as much."""
 GAIN_PER_DOUBLING = 0.3
-"""PSNR that an arm must gain for each doubling of the stored bytes, dB: about what twice as many primitives gain."""
+"""PSNR that an arm must gain for each doubling of the stored bytes, dB: of the order of what twice as many primitives gain."""
 
 
 class Plan(NamedTuple):
@@ -133,7 +133,7 @@ class Progress:
         return [HeldOutQuality(int(pixels), *figures) for trial in trials for pixels, *figures in trial]
 
     def best(self) -> str:
-        """The dearest tried arm that gains enough over the best cheaper one for its bytes, and loses no SSIM."""
+        """The largest tried arm that gains enough PSNR over the best smaller one for its bytes, and loses no SSIM."""
         best = "plain"
         for arm in self.tried[1:]:
             figures = (mean_quality(self.qualities(one)) for one in (best, arm))
@@ -171,8 +171,8 @@ class Trials(Extension):
 
     def state_dict(self) -> dict[str, Any]:
         """Numbers and, during trials, the mean of the weights so far and copies of the fields to which they may return."""
-        mean = {"mean": self._mean.values, "count": self._mean.count}
-        return {"numbers": asdict(self.progress), "start": self._start, "ends": self._ends, **mean}
+        numbers = asdict(self.progress)
+        return {"numbers": numbers, "start": self._start, "ends": self._ends, **self._mean.state_dict()}
 
     def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Give head and features the width that they have in the checkpoint, or remove them.
@@ -182,10 +182,7 @@ class Trials(Extension):
         """
         progress = _progress_of(saved)
         if progress.arm == "features":
-            assert state.head is not None
-            state.head.resize(self._wide)
-            features = state.field[FEATURES]
-            features.data = features.data.new_zeros(len(features), MORE_FEATURES)
+            state.reshape_head(self._wide)
         elif progress.decision not in ("", "head"):
             state.remove_head()
 
@@ -197,12 +194,12 @@ class Trials(Extension):
         """
         progress = _progress_of(saved)
         start, ends = saved.get("start"), saved.get("ends")
+        # Trials of earlier versions had other arms, and no folds.
         complete = isinstance(start, Mapping) and isinstance(ends, Mapping) and "folds" in saved["numbers"]
         if progress.phase == "trials" and not complete:
             raise CheckpointError("the checkpoint lacks the fields that its trials would return to; give another")
         self.progress, self._start, self._ends = progress, start, dict(ends or {})
-        mean = {name: value.to(state.device) for name, value in saved.get("mean", {}).items()}
-        self._mean = RunningMean(mean, int(saved.get("count", 0)))
+        self._mean = RunningMean.of(saved, state.device)
         self._set_arm(state)
 
     # ---------------------------------------------------------------------------------------------------- training
@@ -284,9 +281,12 @@ class Trials(Extension):
 
     def _stored_bytes(self, state: FieldState) -> list[int]:
         """Bytes of the field with each arm's features and head."""
-        plain = accounting.bytes_of({name: value for name, value in state.field.items() if name != FEATURES})
-        a_feature = accounting.BYTES_PER_FLOAT * state.field.num_primitives
-        return [plain, *(plain + a_feature * head.num_features + head_bytes(head) for head in (self._head, self._wide))]
+        plain = {name: value for name, value in state.field.items() if name != FEATURES}
+        sizes = [bytes_of(plain, None)]
+        for head in (self._head, self._wide):
+            features = torch.empty(state.field.num_primitives, head.num_features, device="meta")
+            sizes.append(bytes_of({**plain, FEATURES: features}, head))
+        return sizes
 
     @property
     def _wide(self) -> HeadConfig:
@@ -334,7 +334,7 @@ class Trials(Extension):
         """Figures of the held-out views with the mean of the weights, if there is one."""
         mend = "decide by hand with --pipeline.model.head.mode residual or off"
         weights, mean = weights_of(run.state), self._mean
-        own = mean.replace(weights) if mean.count > 0 and mean.fits(weights) else {}
+        own = mean.replace(weights) if mean.fits(weights) else {}
         views = [list(view) for view in measure_heldout(run, mend=mend)]
         if own:
             put(own, weights)

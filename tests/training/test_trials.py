@@ -106,6 +106,8 @@ def test_a_checkpoint_without_a_decision_names_the_option(build: Build) -> None:
         ((0.2, 0.01), (0.31, 0.01), "features"),
         ((0.2, 0.01), (0.9, 0.009), "head"),
         ((0.5, -0.001), None, "plain"),
+        ((0.5, 0.0), (0.9, 0.0), "features"),
+        ((float("nan"), 0.01), None, "plain"),
         ((float("inf"), 0.01), None, "plain"),
         ((0.5, 0.01), (0.9, float("nan")), "head"),
     ],

@@ -57,7 +57,4 @@ def reshape(state: FieldState, search: Search, largest: HeadConfig | None) -> No
     if chosen is None:
         state.remove_head()
     elif state.head is not None and state.head.config != chosen:
-        state.head.resize(chosen)
-    if FEATURES in field:
-        features = field[FEATURES]
-        features.data = features.data[:, : 0 if chosen is None else chosen.num_features]
+        state.reshape_head(chosen)
