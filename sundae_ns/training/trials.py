@@ -66,11 +66,13 @@ class Plan(NamedTuple):
     """Held-out training views, by index."""
     length: int
     """Training steps of a trial."""
+    arms: int
+    """Number of arms."""
 
     @property
     def num_trials(self) -> int:
         """Most trials that there may be."""
-        return len(ARMS) * len(self.folds)
+        return self.arms * len(self.folds)
 
     @property
     def views(self) -> list[int]:
@@ -78,19 +80,20 @@ class Plan(NamedTuple):
         return [index for fold in self.folds for index in fold]
 
 
-def plan_trials(indices: Sequence[int], steps: int) -> Plan:
+def plan_trials(indices: Sequence[int], steps: int, arms: int = len(ARMS)) -> Plan:
     """Plan the trials of a run.
 
     Args:
         indices: of the training views, at least two.
         steps: length of the schedule.
+        arms: number of arms.
     """
     few = len(indices) < FEW_VIEWS
     count = 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY))
     # Evenly over the capture, because neighbours in a path look alike.
     chosen = [indices[(2 * i + 1) * len(indices) // (2 * count)] for i in range(count)]
     length = max(round(TRIAL_SHARE * steps / (2 if few else 1)), 1)
-    return Plan([[index] for index in chosen] if few else [chosen], length)
+    return Plan([[index] for index in chosen] if few else [chosen], length, arms)
 
 
 @dataclass
@@ -256,7 +259,7 @@ class Trials(Extension):
 
     def _planned(self, run: TrainingRun) -> Plan:
         if self._plan is None:
-            self._plan = plan_trials(run.view_indices(), self.progress.steps)
+            self._plan = plan_trials(run.view_indices(), self.progress.steps, len(self._arms))
         return self._plan
 
     def _fits(self, run: TrainingRun) -> bool:

@@ -48,6 +48,11 @@ def test_deciding_costs_at_most_a_tenth_of_the_steps(views: int) -> None:
     assert (trials.num_trials - 1) * trials.length <= 0.1 * 30000
 
 
+@pytest.mark.parametrize(("views", "most"), [(6, 4), (43, 2)])
+def test_a_head_of_most_features_has_two_arms(views: int, most: int) -> None:
+    assert plan_trials(range(views), 30000, arms=2).num_trials == most
+
+
 def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
     assert "trials" in {extension.name for extension in build(head={"mode": "auto"}).extensions}
     for mode in ("residual", "features", "off"):
