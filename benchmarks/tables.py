@@ -6,7 +6,7 @@
 
 A page holds the markers ``<!-- table: NAME -->`` and ``<!-- end of table -->``; the lines between them are made here.
 ``tests/test_benchmarks.py`` checks that every page is current. A row whose options are not those that its arm has today
-says "earlier default"; taking over a suite removes such rows.
+says "earlier default"; a suite takes the place of those that it measured again, with all their seeds.
 """
 
 from __future__ import annotations
@@ -264,7 +264,8 @@ def trials() -> list[str]:
             for name, digits in (("psnr", 2), ("ssim", 4)):
                 tried = line[f"{name}_{arm}"]
                 row.append(f"{float(tried) - float(line[f'{name}_{before}']):+.{digits}f}" if tried else "")
-        test = [number(float(line[f"{name}_test"]), digits) for name, digits in (("psnr", 2), ("ssim", 4))]
+        found = ((line[f"{name}_test"], digits) for name, digits in (("psnr", 2), ("ssim", 4)))
+        test = [number(float(value), digits) if value else "-" for value, digits in found]
         rows.append([*row, line["chosen"], *test])
     return table(heads, rows)
 
@@ -302,7 +303,7 @@ def with_tables(text: str) -> str:
 def take_over(results: Path) -> None:
     """Replace rows of runs.csv, frames, training times and packs by those of ``sundae bench suite``.
 
-    Other rows stay as long as they are of today's default.
+    Other rows stay.
 
     Args:
         results: ``results.jsonl`` of the suite.
@@ -324,9 +325,7 @@ def take_over(results: Path) -> None:
         ("pack.jsonl", [_pack_line(r) for r in own if r["packed"]], ("run", "variant", "finetune_steps")),
     ):
         # Curves are of trainings of their own, beside the suite's.
-        curves = [
-            line for line in lines_of(name) if line.get("curve") and is_of_today({"variant": line["arm"], **line})
-        ]
+        curves = [line for line in lines_of(name) if line.get("curve")]
         others = [line for line in lines_of(name) if not line.get("curve")]
         kept = [*curves, *_merged(others, lines, places)]
         (RESULTS / name).write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
@@ -335,13 +334,18 @@ def take_over(results: Path) -> None:
 def _merged(
     old: Iterable[dict[str, Any]], new: Sequence[dict[str, Any]], places: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """New lines after the old ones that stand at other places and are of today's default."""
-    taken = {tuple(line.get(place) for place in places) for line in new}
+    """New lines after the old ones that stand at other places; a mean over seeds mixes no earlier default with today's."""
+
+    def at(line: dict[str, Any], names: Iterable[str]) -> tuple[str, ...]:
+        return tuple(str(line.get(name)) for name in names)
+
+    taken, group = {at(line, places) for line in new}, [place for place in places if place != "seed"]
+    measured = {at(line, group) for line in new}
     stays = [
         line
         for line in old
-        if tuple(line.get(place) for place in places) not in taken
-        and is_of_today({"variant": line.get("arm", "sundae"), **line})
+        if at(line, places) not in taken
+        and (at(line, group) not in measured or is_of_today({"variant": line.get("arm", "sundae"), **line}))
     ]
     return [*stays, *new]
 

@@ -8,7 +8,9 @@ After the prune:
   "drop": r        DropGaussian: a random share of the primitives, growing from 0 to r, is left out of each step, the others are
                    more opaque by 1 / (1 - r)
   "shrink": {p: a} multiplies parameter p (or "head", its weights) by 1 - a at each step, applied every tenth
+  "decay": w       weight decay of the head, decoupled: its weights times 1 - w x rate at each step, applied every tenth
   "smooth": {p: m} every tenth step parameter p goes by a share m towards the weighted mean of 8 neighbours on the pruning graph
+  "course": {p: [a, b]}  rates times a right after the prune, falling or rising exponentially to times b at the end
   "rates": {p: f}  learning rates times f; "freeze": {p: step} sets them to 0 from a step on
   "relocate": {"share": s, "every": k, "until": step, "views": v, "power": q}  the share s with the smallest blending weight over (v)
                    training views moves onto primitives drawn by weight x |error|^q, which are split along their longest axis
@@ -115,6 +117,11 @@ class Arm:
             self.pruned_at = step
             for name, factor in spec.get("rates", {}).items():
                 self._rate(name, factor)
+            self.begun = {name: [group["lr"] for group in self.state.optimizers[name].param_groups] for name in spec.get("course", {})}
+        for name, (a, b) in spec.get("course", {}).items():
+            t = (step - self.pruned_at) / max(self.steps - self.pruned_at, 1)
+            for group, rate in zip(self.state.optimizers[name].param_groups, self.begun[name]):
+                group["lr"] = rate * a ** (1 - t) * b**t
         for name, at in spec.get("freeze", {}).items():
             if step == at:
                 self._rate(name, 0.0)
@@ -143,6 +150,11 @@ class Arm:
                 weights = [v for v in self.model.head.parameters() if v.ndim > 1] if name == "head" else [field[name]]
                 for value in weights if name != "head" or self.state.head_enabled else []:
                     value.data.mul_(1 - 10 * rate)
+            if spec.get("decay") and self.state.head_enabled:
+                rate = self.state.optimizers[HEAD].param_groups[0]["lr"]
+                for value in self.model.head.parameters():
+                    if value.ndim > 1:
+                        value.data.mul_(1 - 10 * rate * spec["decay"])
             if "smooth" in spec:
                 self._smooth(step)
         again = spec.get("relocate")

@@ -29,18 +29,19 @@ def _constant(lr: float) -> dict[str, Any]:
     return {"optimizer": _adam(lr), "scheduler": None}
 
 
-def optimizers(steps: int, *, means_restart: float | None = 1.6e-4) -> dict[str, Any]:
+def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
     """Optimizers for a run: splatfacto's rates, and rates of features and head.
+
+    Right after the prune the rate of the centres restarts, so that kept primitives can fill the gaps.
 
     Args:
         steps: length of the run, at which decaying rates reach their final value.
-        means_restart: rate of the centres right after the prune, where its decay restarts so that kept primitives can fill
-            the gaps; None does not restart it.
+        plain: leave out what is not in the paper: this restart, and weight decay of the head.
     """
     return {
         "means": {
             "optimizer": _adam(1.6e-4),
-            "scheduler": PruneAwareDecayConfig(lr_final=1.6e-6, max_steps=steps, lr_restart=means_restart),
+            "scheduler": PruneAwareDecayConfig(lr_final=1.6e-6, max_steps=steps, lr_restart=None if plain else 1.6e-4),
         },
         "features_dc": _constant(0.0025),
         "features_rest": _constant(0.0025 / 20),
@@ -50,7 +51,7 @@ def optimizers(steps: int, *, means_restart: float | None = 1.6e-4) -> dict[str,
         "features": _constant(0.0025),
         "compensation": {
             # The usual eps: with the tiny one of 3DGS, weights with almost no gradient would take full steps.
-            "optimizer": NetworkAdamConfig(lr=1e-3, eps=1e-8),
+            "optimizer": NetworkAdamConfig(lr=1e-3, eps=1e-8, weight_decay=0.0 if plain else 0.15),
             "scheduler": PruneAwareDecayConfig(
                 lr_final=1e-5,
                 max_steps=steps,
@@ -74,7 +75,7 @@ def method(
     pruning: PruningConfig,
     head: HeadConfig | None = None,
     steps: int = 30000,
-    means_restart: float | None = 1.6e-4,
+    plain_optimizers: bool = False,
     trainer: dict[str, Any] | None = None,
     datamanager: dict[str, Any] | None = None,
     **model: Any,
@@ -87,7 +88,7 @@ def method(
         pruning: options of pruning.
         head: options of the head.
         steps: length of the run.
-        means_restart: see :func:`optimizers`.
+        plain_optimizers: see :func:`optimizers`.
         trainer: other options of the trainer.
         datamanager: other options of the datamanager.
         model: other options of the model.
@@ -119,7 +120,7 @@ def method(
             steps_per_log=100 if torch.cuda.is_available() else 10,
             local_writer=LocalWriterConfig(_target=ProgressWriter, enable=True),
         ),
-        optimizers=optimizers(steps, means_restart=means_restart),
+        optimizers=optimizers(steps, plain=plain_optimizers),
         # A training ends by itself, so that the next command runs; ns-viewer shows the run afterwards.
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, quit_on_train_completion=True),
         vis="viewer",
@@ -189,7 +190,7 @@ sundae_paper = method(
         mode="features", size="regular", pixel_unshuffle=1, num_features=13, precision="fp32", max_train_pixels=0
     ),
     steps=60000,
-    means_restart=None,
+    plain_optimizers=True,
     base_loss_weight=0.0,
     average_share=0.0,
     loss_after_prune="l1",

@@ -18,12 +18,15 @@ class FusedAdamConfig(AdamOptimizerConfig):
 
     betas: tuple[float, float] = (0.9, 0.999)
     """Decay rates of the running means of gradients and of their squares."""
+    decoupled: bool = False
+    """Whether weight decay shrinks the weights beside Adam's step (Loshchilov & Hutter 2019), not through the gradient."""
 
     def setup(self, params: Any) -> torch.optim.Optimizer:
         """Optimizer of one group of parameters."""
         params = list(params)
         options = {name: getattr(self, name) for name in ("eps", "betas", "weight_decay")}
-        return torch.optim.Adam(self._groups(params), fused=all(value.is_cuda for value in params), **options)
+        fused = all(value.is_cuda for value in params)
+        return torch.optim.Adam(self._groups(params), fused=fused, decoupled_weight_decay=self.decoupled, **options)
 
     def _groups(self, params: list[torch.Tensor]) -> list[dict[str, Any]]:
         """Parameter groups by learning rate."""
@@ -38,7 +41,7 @@ class NetworkAdamConfig(FusedAdamConfig):
     mean of squares forgets fast and follows gradients that suddenly grow: with the usual betas a weight moves by 3.2 times
     the rate at the first large gradient after small ones, and by up to 7.3 while they grow; with these by 0.4 and up to 1.2
     (``sundae_ns.distributed.ahead.longest_step``). Weights of layers with many inputs get a smaller rate, because their sum
-    grows with the inputs (Yang et al. 2022, "Tensor Programs V").
+    grows with the inputs (Yang et al. 2022, "Tensor Programs V"). Weight decay shrinks weights, not biases.
 
     Rates follow the shapes at setup: a head that is resized in training keeps them.
     """
@@ -48,10 +51,12 @@ class NetworkAdamConfig(FusedAdamConfig):
     full_rate_inputs: int = 1152
     """Weights with more inputs than this get a proportionally smaller rate. 1152 is 3 x 3 of 128 channels, the most in the
     default head."""
+    decoupled: bool = True
 
     def _groups(self, params: list[torch.Tensor]) -> list[dict[str, Any]]:
-        by_rate: dict[float, list[torch.Tensor]] = {}
+        groups: dict[tuple[float, float], list[torch.Tensor]] = {}
         for value in params:
             inputs = value[0].numel() if value.ndim > 1 else 1
-            by_rate.setdefault(self.lr * min(self.full_rate_inputs / inputs, 1.0), []).append(value)
-        return [{"params": values, "lr": rate} for rate, values in by_rate.items()]
+            rate = self.lr * min(self.full_rate_inputs / inputs, 1.0)
+            groups.setdefault((rate, self.weight_decay if value.ndim > 1 else 0), []).append(value)
+        return [{"params": values, "lr": rate, "weight_decay": decay} for (rate, decay), values in groups.items()]

@@ -296,7 +296,8 @@ def _adam(parts: Sequence[_Update], group: Mapping[str, Any], rate: Tensor, over
         return
     values, grads, means, squares, steps = ([part[column] for part in parts] for column in range(5))
     beta1, beta2 = group["betas"]
-    torch._fused_adam_(
+    update = torch._fused_adamw_ if group.get("decoupled_weight_decay") else torch._fused_adam_
+    update(
         *(values, grads, means, squares, [], steps),
         lr=rate,
         beta1=beta1,

@@ -55,7 +55,7 @@ FEW_VIEWS = 12
 """With fewer training views, two are held out in turn, for trials of half the length."""
 LEAST_GAIN = 0.1
 """Least PSNR that an arm must gain over a smaller one, dB. Two runs of one seed differ by as much."""
-GAIN_PER_DOUBLING = 0.3
+GAIN_PER_DOUBLING = 0.5
 """PSNR that an arm must gain for each doubling of the stored bytes, dB: of the order of what twice as many primitives gain."""
 
 

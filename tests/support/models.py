@@ -89,9 +89,10 @@ class Training:
     def __init__(self, model: SundaeModel, trainer: Any = None) -> None:
         self.model = model
         groups = model.get_param_groups()
-        self.optimizers = Optimizers(
-            {name: {"optimizer": FusedAdamConfig(lr=5e-3), "scheduler": None} for name in groups}, groups
-        )
+        kinds = dict.fromkeys(groups, FusedAdamConfig(lr=5e-3)) | {
+            "compensation": FusedAdamConfig(lr=5e-3, weight_decay=1.0, decoupled=True)
+        }
+        self.optimizers = Optimizers({name: {"optimizer": kinds[name], "scheduler": None} for name in groups}, groups)
         pipeline = SimpleNamespace(datamanager=FakeDatamanager(), model=model)
         self.callbacks = model.get_training_callbacks(
             TrainingCallbackAttributes(self.optimizers, None, pipeline, trainer)  # type: ignore[arg-type]

@@ -67,10 +67,23 @@ def test_weights_of_many_inputs_have_smaller_rates() -> None:
     assert min(rates.values()) == pytest.approx(1e-3 / 6)  # 3 x 3 of 512 + 256 channels
 
 
-def test_the_default_head_has_one_rate() -> None:
+def test_the_default_head_has_one_rate_and_its_biases_do_not_decay() -> None:
     config = sundae.config.optimizers["compensation"]["optimizer"]
     optimizer = config.setup(CompensationHead(HeadConfig()).parameters())
-    assert [(group["lr"], group["betas"]) for group in optimizer.param_groups] == [(1e-3, (0.9, 0.95))]
+    assert {(group["lr"], group["betas"]) for group in optimizer.param_groups} == {(1e-3, (0.9, 0.95))}
+    decays = {value.ndim > 1: group["weight_decay"] for group in optimizer.param_groups for value in group["params"]}
+    assert decays == {True: 0.15, False: 0}
+
+
+def test_a_networks_weights_decay_by_a_share_of_the_rate() -> None:
+    net = torch.nn.Linear(2, 2)
+    before = [value.detach().clone() for value in (net.weight, net.bias)]
+    optimizer = NetworkAdamConfig(lr=0.1, weight_decay=0.5).setup(net.parameters())
+    for value in net.parameters():
+        value.grad = torch.zeros_like(value)
+    optimizer.step()
+    torch.testing.assert_close(net.weight.detach(), 0.95 * before[0])
+    assert torch.equal(net.bias.detach(), before[1])
 
 
 def test_rates_of_all_layers_decay_alike_and_come_back_from_a_checkpoint() -> None:

@@ -99,6 +99,11 @@ def test_both_train_the_same_field(both: Callable[..., tuple[Any, Recorded]], op
         assert moments.keys() == held.keys()
         if moments:
             assert float(moments["step"]) == float(held["step"])
+    for one in (usual.model, recorded.model):
+        assert (one.head is None) == (options.get("head") == {"mode": "off"})
+    networks = (list(one.head.parameters()) if one.head is not None else [] for one in (recorded.model, usual.model))
+    for weights, expected_weights in zip(*networks, strict=True):
+        torch.testing.assert_close(weights, expected_weights, rtol=2e-3, atol=2e-5)
     if options is GROWTH:
         assert max(counts) > counts[0] > counts[-1]  # otherwise nothing grew or nothing was pruned
 

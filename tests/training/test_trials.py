@@ -137,7 +137,7 @@ def test_an_arm_counts_when_all_its_folds_have_ended() -> None:
     assert Progress(folds=2, bytes=SIZES, measured=[plain, plain, head, head]).best() == "head"
 
 
-@pytest.mark.parametrize(("gain", "size", "best"), [(0.31, 200, "head"), (0.29, 200, "plain"), (0.29, 190, "head")])
+@pytest.mark.parametrize(("gain", "size", "best"), [(0.51, 200, "head"), (0.49, 200, "plain"), (0.49, 190, "head")])
 def test_an_arm_that_takes_more_bytes_must_gain_more(gain: float, size: int, best: str) -> None:
     measured = [[[10.0, 20.0, 0.5]], [[10.0, 20.0 + gain, 0.5]]]
     assert Progress(bytes=[100, size, 400], measured=measured).best() == best
