@@ -40,8 +40,8 @@ SHORT = {
     "sundae-auto": "auto",
     "sundae-with-head": "with head",
     "sundae-no-head": "no head",
+    "sundae-no-head-bytes": "13%, no head",
     "mcmc": "3DGS-MCMC",
-    "contribution-no-head": "contribution",
 }
 """Methods of the plot of runs, by the names beside their points."""
 
@@ -58,18 +58,20 @@ def plot_runs() -> Any:
         for row in by_scene[scene]:
             place, full = (row["bytes_total"] / MB, row["psnr"]), row["bytes_total"] > 30 * MB
             ours = row["variant"] == "sundae"
-            panel.plot(*place, "o", color="tab:red" if ours else "gray" if full else "tab:blue")
-            # On captures where sundae chose a head, both lie on one point.
-            left = full or row["variant"] == "sundae-with-head"
-            to_left = {"ha": "right", "xytext": (-7, -3)} if left else {"xytext": (7, -3)}
-            panel.annotate(SHORT[row["variant"]], place, textcoords="offset points", fontsize=9, **to_left)
+            color = "tab:red" if ours else "gray" if full else "tab:blue"
+            panel.plot(*place, "o", color=color, markerfacecolor=color if row["of_today"] else "white")
+            # Where sundae takes the head or none, it lies on that point.
+            left = full or row["variant"] in ("sundae-with-head", "sundae-no-head")
+            height = 3 if ours else -3
+            beside = {"ha": "right", "xytext": (-7, height)} if left else {"xytext": (7, height)}
+            panel.annotate(SHORT[row["variant"]], place, textcoords="offset points", fontsize=9, **beside)
         panel.margins(y=0.1)
         panel.set_xscale("log")
-        panel.set_xlim(3, 300)
+        panel.set_xlim(2, 300)
         panel.set_xticks([3, 10, 30, 100, 300])
         panel.xaxis.set_major_formatter("{x:g}")
         panel.xaxis.set_minor_formatter(NullFormatter())
-        panel.set_title(f"{scene}: 10% of the primitives (gray: all of them)", fontsize=10)
+        panel.set_title(f"{scene}: 10% of the primitives (gray: all; hollow: earlier default)", fontsize=10)
         panel.set_xlabel("MB in fp32, head included (smaller is better)")
         panel.set_ylabel("test PSNR, dB (higher is better)")
         panel.grid(alpha=0.3)

@@ -8,6 +8,7 @@ Keys of the JSON beside those of lab/arms.py:
   "save": step                 save everything after this step
   "fit": steps                 fit the schedule to a run of so many steps; "images": folder of smaller images, a divisor
   "eval": [steps]
+  "texture": T             the last 3 T features are slopes inside each primitive (texture.py)
 A capture called garden16 (a link to garden) trains on 16 views of garden and tests on 40 others.
 """
 import json, os, sys, time
@@ -41,6 +42,9 @@ if "inputs" in spec:  # letters: d for directions, z for inverse distances
     inputs.install("d" in spec["inputs"], "z" in spec["inputs"])
 
 arms.patch_losses(spec)
+if "texture" in spec:
+    import texture
+    texture.install(spec["texture"], spec.get("through", False))
 config = tyro.cli(AnnotatedBaseConfigUnion, args=args)
 config.pipeline.datamanager.data = config.data
 if "fit" in spec:

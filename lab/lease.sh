@@ -20,13 +20,19 @@ case $1 in
 5) # issue 26: RUN is a finished run of bonsai by today's default
   python3 /tmp/benchmarks/bench_pack.py --run "$RUN" --finetune 1500 --keep "$OUT/ft.sundae" | tail -1 | tee -a "$OUT/pack.jsonl"
   python3 /tmp/benchmarks/bench_pack.py --run "$RUN" --finetune 4000 --rate 0.03 | tail -1 | tee -a "$OUT/pack.jsonl" ;;
-6) # issue 24: arms that are missing in runs.csv, three captures at a time, without times. MPS lets small runs share the GPU:
-   # three at 800 x 533 take 1.3 to 2.5 times less than in turn; five with fox among them nothing
+6) # issue 24: what is missing in runs.csv, without times. MPS lets runs share the GPU: with four to six at a time, 22 of
+   # 15,000 to 30,000 steps took 12 minutes. Two parts or more: SCENES, LIMIT
   export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mps OMP_NUM_THREADS=4
   mkdir -p /tmp/mps && nvidia-cuda-mps-control -d
-  for s in ${SCENES:-bonsai garden stone_horse}; do
-    setsid nohup sundae bench suite /tmp/scenes -o /tmp/suite --scenes "$s" \
-      --arms sundae-no-head sundae-no-head-bytes sundae-with-head band mcmc > "/tmp/$s.log" 2>&1 &
+  S="sundae bench suite /tmp/scenes -o /tmp/suite --scenes"
+  for s in ${SCENES:-bonsai garden fox stone_horse}; do
+    case $s in
+    bonsai) jobs="$S bonsai --arms sundae --seeds 44; $S bonsai --arms band" ;;
+    garden) jobs="$S garden --arms sundae-fast; $S garden --arms band" ;;
+    fox) jobs="$S fox --arms sundae; $S fox --arms sundae-with-head mcmc band; $S fox --arms sundae --keep-ratios 0.3 --repeat-at 0.3" ;;
+    stone_horse) jobs="$S stone_horse --arms mcmc band" ;;
+    esac
+    setsid nohup bash -c "$jobs" > "/tmp/$s.log" 2>&1 &
   done
   until [ $SECONDS -gt "${LIMIT:-540}" ]; do sleep 2; pgrep -f "bench suite" > /dev/null || break; done
   cat /tmp/suite/done/*.json > "$OUT/results.jsonl" ;;
