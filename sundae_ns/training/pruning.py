@@ -73,7 +73,8 @@ class ScheduledPruning(Extension):
         settled = state.schedule_step >= config.settled_at
         pruned = settled or (config.ends_growth_at is not None and state.pruning["num_prunes"] > 0)
         if pruned and not self._searching:
-            notify_pruned(state.schedulers, state.step, last=settled and state.schedule_step >= state.head_starts_at)
+            with_head = settled and state.schedule_step >= state.head_starts_at
+            notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
             return
         CONSOLE.log(report.summary())

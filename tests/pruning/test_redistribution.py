@@ -197,9 +197,9 @@ def test_held_learning_rates_wait_for_the_last_prune() -> None:
         return decay, torch.optim.lr_scheduler.LambdaLR(Adam([Parameter(torch.zeros(1))]), decay)
 
     (centres, one), (head, two) = rate(False), rate(True)
-    notify_pruned({"means": one, "compensation": two}, 10, last=False)
+    notify_pruned({"means": one, "compensation": two}, 10, 20_000, last=False)
     assert (centres.pruned_at, head.pruned_at) == (10, None)
-    notify_pruned({"means": one, "compensation": two}, 20)
+    notify_pruned({"means": one, "compensation": two}, 20, 20_000)
     assert (centres.pruned_at, head.pruned_at) == (10, 20)
 
 

@@ -96,7 +96,7 @@ def test_rates_of_all_layers_decay_alike_and_come_back_from_a_checkpoint() -> No
     optimizer, scheduler = made()
     highest = [group["lr"] for group in optimizer.param_groups]
     assert len(highest) > 1
-    notify_pruned({"compensation": scheduler}, 0)
+    notify_pruned({"compensation": scheduler}, 0, 100)
     for _ in range(50):
         optimizer.step()
         scheduler.step()

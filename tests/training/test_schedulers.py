@@ -9,7 +9,7 @@ import torch
 from torch.optim import Adam
 from torch.optim.lr_scheduler import ExponentialLR, LambdaLR
 
-from sundae_ns.training.schedulers import Decay, PruneAwareDecayConfig, notify_pruned
+from sundae_ns.training.schedulers import MOST_FACTOR, SPARSE, Decay, PruneAwareDecayConfig, notify_pruned
 
 
 def scheduler(**options: object) -> LambdaLR:
@@ -20,7 +20,9 @@ def scheduler(**options: object) -> LambdaLR:
     return made
 
 
-def rates(made: LambdaLR, steps: int, prune_at: int | None = None) -> list[float]:
+def rates(
+    made: LambdaLR, steps: int, prune_at: int | None = None, *, name: str = "means", primitives: int = SPARSE
+) -> list[float]:
     """Rate that each step uses, the scheduler stepping after it as in nerfstudio's trainer."""
     found = []
     for step in range(steps):
@@ -28,7 +30,7 @@ def rates(made: LambdaLR, steps: int, prune_at: int | None = None) -> list[float
         made.optimizer.step()
         made.step()
         if step == prune_at:
-            notify_pruned({"means": made}, step)
+            notify_pruned({name: made}, step, primitives)
     return found
 
 
@@ -63,6 +65,21 @@ def test_prune_restarts_the_decay() -> None:
     assert found[100] == pytest.approx(1e-4)
 
 
+@pytest.mark.parametrize(
+    ("primitives", "factor"), [(10 * SPARSE, 1), (SPARSE, 1), (SPARSE // 4, 2), (SPARSE // 9, 3), (1, MOST_FACTOR)]
+)
+def test_centres_of_few_primitives_move_faster_after_the_prune(primitives: int, factor: float) -> None:
+    usual = rates(scheduler(lr_restart=4e-3), 130, prune_at=40)
+    found = rates(scheduler(lr_restart=4e-3), 130, prune_at=40, primitives=primitives)
+    assert found[:41] == usual[:41]
+    # The rate of the first step after the prune was set before it.
+    assert found[42:] == pytest.approx([factor * rate for rate in usual[42:]], rel=1e-3)
+    head = rates(scheduler(lr_restart=4e-3), 130, prune_at=40, name="compensation", primitives=primitives)
+    assert head == usual
+    never = rates(scheduler(), 130, prune_at=40, primitives=primitives)
+    assert never == rates(scheduler(), 130)
+
+
 def test_without_restart_the_prune_changes_nothing() -> None:
     assert rates(scheduler(), 80, prune_at=40) == pytest.approx(rates(scheduler(), 80))
 
@@ -82,8 +99,8 @@ def test_held_until_the_prune_then_rising_and_falling() -> None:
 def test_only_the_first_prune_counts_and_others_are_left_alone() -> None:
     made = scheduler(lr_restart=1e-2)
     stock = ExponentialLR(Adam([torch.nn.Parameter(torch.zeros(1))]), gamma=0.9)
-    notify_pruned({"means": made, "other": stock}, 10)
-    notify_pruned({"means": made, "other": stock}, 20)
+    notify_pruned({"means": made, "other": stock}, 10, SPARSE)
+    notify_pruned({"means": made, "other": stock}, 20, SPARSE)
     (decay,) = made.lr_lambdas
     assert isinstance(decay, Decay)
     assert decay.pruned_at == 10
@@ -94,8 +111,8 @@ def test_only_the_first_prune_counts_and_others_are_left_alone() -> None:
 def test_a_resumed_scheduler_goes_on_the_same(prune_at: int | None, shape: str) -> None:
     options = {"lr_restart": 5e-3, "hold_until_prune": True, "warmup_steps": 20, "shape": shape}
     whole, first, second = scheduler(**options), scheduler(**options), scheduler(**options)
-    expected = rates(whole, 90, prune_at)
-    rates(first, 45, prune_at)
+    expected = rates(whole, 90, prune_at, primitives=SPARSE // 4)
+    rates(first, 45, prune_at, primitives=SPARSE // 4)
     buffer = io.BytesIO()
     torch.save({"scheduler": first.state_dict(), "optimizer": first.optimizer.state_dict()}, buffer)
     buffer.seek(0)

@@ -146,4 +146,4 @@ class SearchedField:
         """Restart the learning rates of the field, or those of the head."""
         schedulers = self.state.schedulers
         restarted = {name: value for name, value in schedulers.items() if (name == "compensation") == head}
-        notify_pruned(restarted, self.state.step)
+        notify_pruned(restarted, self.state.step, self.state.field.num_primitives)
