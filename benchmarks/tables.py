@@ -40,7 +40,7 @@ METHODS = {
     "sundae-auto": "sundae-auto",
     "sundae-with-head": "sundae, with a head in any case",
     "sundae-no-head": "the same primitives, trained without a head",
-    "sundae-no-head-bytes": "primitives in place of the head's bytes",
+    "sundae-no-head-bytes": "more primitives in place of a head",
     "mcmc": "3DGS-MCMC",
     "band": "the paper's band rule",
     "random-no-head": "random primitives",
@@ -303,7 +303,7 @@ def with_tables(text: str) -> str:
 def take_over(results: Path) -> None:
     """Replace rows of runs.csv, frames, training times and packs by those of ``sundae bench suite``.
 
-    Other rows stay.
+    Other rows stay, but for earlier defaults at other seeds of what was measured.
 
     Args:
         results: ``results.jsonl`` of the suite.
@@ -334,20 +334,23 @@ def take_over(results: Path) -> None:
 def _merged(
     old: Iterable[dict[str, Any]], new: Sequence[dict[str, Any]], places: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """New lines after the old ones that stand at other places; a mean over seeds mixes no earlier default with today's."""
+    """New lines after the old ones that stay: those of other places, and today's of other seeds.
 
-    def at(line: dict[str, Any], names: Iterable[str]) -> tuple[str, ...]:
-        return tuple(str(line.get(name)) for name in names)
+    A mean over seeds would mix an earlier default with today's.
+    """
 
-    taken, group = {at(line, places) for line in new}, [place for place in places if place != "seed"]
-    measured = {at(line, group) for line in new}
-    stays = [
-        line
-        for line in old
-        if at(line, places) not in taken
-        and (at(line, group) not in measured or is_of_today({"variant": line.get("arm", "sundae"), **line}))
-    ]
-    return [*stays, *new]
+    def at(line: dict[str, Any], names: Iterable[str]) -> tuple[Any, ...]:
+        return tuple(line.get(name) for name in names)
+
+    all_seeds = [place for place in places if place != "seed"]
+    taken, measured = ({at(line, names) for line in new} for names in (places, all_seeds))
+
+    def stays(line: dict[str, Any]) -> bool:
+        if at(line, all_seeds) not in measured:
+            return True
+        return at(line, places) not in taken and is_of_today({"variant": line.get("arm", "sundae"), **line})
+
+    return [*filter(stays, old), *new]
 
 
 def _public(command: str) -> str:

@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from sundae_ns.training import trials
+
 PAGE = Path(__file__).parents[1] / "docs" / "method.md"
 NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")
 EQUATION = re.compile(r"```math\n(.*?)```\n", re.DOTALL)
@@ -47,6 +49,13 @@ def test_every_equation_has_its_function() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert len(EQUATION.findall(text)) > 15
     assert lonely(text) == []
+
+
+def test_the_pages_state_the_rule_of_the_trials() -> None:
+    rule = rf"\max({trials.LEAST_GAIN:g}, {trials.GAIN_PER_DOUBLING:g} \log_2"
+    assert rule in PAGE.read_text(encoding="utf-8")
+    words = f"gains {trials.LEAST_GAIN:g} dB, and {trials.GAIN_PER_DOUBLING:g} dB for each doubling of the bytes"
+    assert words in (PAGE.parent / "options.md").read_text(encoding="utf-8")
 
 
 def test_the_checks_can_fail() -> None:
