@@ -17,6 +17,9 @@ After the prune:
   "distil": {"views": v, "share": s, "reach": t}  s of the steps train on v images of the unpruned field, from cameras
                    between two neighbours (t: farthest share of the way, also sideways)
   "shift": s       the head trains on windows that are s pixels smaller than the image, at a random place of each step
+  "flip": axes     the head trains on mirrored images: each of these axes (0 rows, 1 columns) is flipped in half of the steps
+  "pdrop": p       the features of each primitive are left out of a step with probability p, those of the others are larger by
+                   1 / (1 - p); colours stay
   "fdrop": p       each feature is left out of a step with probability p, the others are larger by 1 / (1 - p)
   "average": k     mean of field and head over the last k steps; evaluated at the end beside the last state
 Before it:
@@ -35,6 +38,7 @@ import torch
 import sundae_ns.training.schedules as schedules
 import sundae_ns.training.step as step_module
 from sundae_ns.compensation import Window
+from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.relocation import split_evenly
 from sundae_ns.gaussians.rotations import rotation_matrices
 from sundae_ns.gaussians.surgery import keep, moments_of
@@ -43,7 +47,7 @@ from sundae_ns.pruning.edges import field_graph
 from sundae_ns.pruning.scores import for_graph
 from sundae_ns.rasterization import blending_weights
 from sundae_ns.rendering.render import pass_options, render
-from sundae_ns.rendering.source import Primitives
+from sundae_ns.rendering.source import LocalField, Primitives
 from sundae_ns.training.losses import StepLosses
 
 HEAD = "compensation"
@@ -80,7 +84,7 @@ class Arm:
         self.model, self.dm = trainer.pipeline.model, trainer.pipeline.datamanager
         self.state, self.steps = self.model.state, spec.get("end", 30000)
         self.pruned_at, self.factor, self.mask, self.novel = None, None, None, []
-        self.mean, self.averaged = None, 0
+        self.mean, self.averaged, self.there = None, 0, None
         self.random = random.Random(spec.get("seed", 42))
         if "count" in spec:
             schedules.OneShotPruning.target = lambda _, n: min(spec["count"], n)
@@ -95,6 +99,10 @@ class Arm:
             self._patch_window()
         if spec.get("fdrop"):
             self._patch_features()
+        if spec.get("flip"):
+            self._patch_flip()
+        if spec.get("pdrop"):
+            self._patch_primitives()
         if "distil" in spec:
             self._patch_views()
         if "fade" in spec:
@@ -131,6 +139,14 @@ class Arm:
                 self.factor = torch.ones_like(opacities)
             kept = 1 - spec["drop"] * (step - self.pruned_at) / max(self.steps - self.pruned_at, 1)
             self.factor.bernoulli_(kept).div_(kept)
+        if spec.get("pdrop"):
+            opacities = self.state.field["opacities"]
+            if self.there is None or len(self.there) != len(opacities):
+                self.there = torch.ones_like(opacities)
+            self.there.bernoulli_(1 - spec["pdrop"]).div_(1 - spec["pdrop"])
+        if spec.get("flip"):
+            for flag in self.flips.values():
+                flag.fill_(self.random.random() < 0.5)
 
     @torch.no_grad()
     def after(self, step):
@@ -192,6 +208,34 @@ class Arm:
                 kept = (torch.rand(features.shape[-1], device=features.device) >= p) / (1 - p)
                 splatted = replace(splatted, colors=torch.cat([splatted.colors[..., :3], features * kept], dim=-1))
             return old(head, base, splatted, background, training=training)
+
+        render_module.compensate = step_module.compensate = compensate
+
+    def _patch_primitives(self):
+        old, arm = LocalField.primitives, self
+
+        def primitives(source, view, settings, *, features, colors=True, at=None):
+            found = old(source, view, settings, features=features, colors=colors, at=at)
+            if features and settings.training and arm.there is not None and len(arm.there) == len(found[FEATURES]):
+                found[FEATURES] = found[FEATURES] * arm.there
+            return found
+
+        LocalField.primitives = primitives
+
+    def _patch_flip(self):
+        old = render_module.compensate
+        self.flips = {axis: torch.zeros((), dtype=torch.bool, device=self.state.device) for axis in self.spec["flip"]}
+
+        def turn(image):
+            for axis, flag in self.flips.items():
+                image = torch.where(flag, image.flip(axis), image)
+            return image
+
+        def compensate(head, base, splatted, background, *, training):
+            if not training:
+                return old(head, base, splatted, background, training=training)
+            seen = replace(splatted, colors=turn(splatted.colors), alpha=turn(splatted.alpha))
+            return turn(old(head, turn(base), seen, background, training=training))
 
         render_module.compensate = step_module.compensate = compensate
 

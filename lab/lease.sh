@@ -25,12 +25,13 @@ case $1 in
   export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mps OMP_NUM_THREADS=4
   mkdir -p /tmp/mps && nvidia-cuda-mps-control -d
   S="sundae bench suite /tmp/scenes -o /tmp/suite --scenes"
+  N="sundae bench suite /tmp/scenes -o /tmp/suite --arms sundae-no-head --keep-ratios 0.2 --repeat-at 0.2 --scenes"
   for s in ${SCENES:-bonsai garden fox stone_horse}; do
     case $s in
-    bonsai) jobs="$S bonsai --arms sundae --seeds 44; $S bonsai --arms band" ;;
-    garden) jobs="$S garden --arms sundae-fast; $S garden --arms band" ;;
-    fox) jobs="$S fox --arms sundae; $S fox --arms sundae-with-head mcmc band; $S fox --arms sundae --keep-ratios 0.3 --repeat-at 0.3" ;;
-    stone_horse) jobs="$S stone_horse --arms mcmc band" ;;
+    bonsai) jobs="$S bonsai --arms sundae --seeds 42 43 44; $N bonsai" ;;
+    garden) jobs="$S garden --arms sundae-fast; $S garden --arms band; $N garden" ;;
+    fox) jobs="$S fox --arms sundae --keep-ratios 0.3 --repeat-at 0.3" ;;
+    stone_horse) jobs="$S stone_horse --arms band" ;;
     esac
     setsid nohup bash -c "$jobs" > "/tmp/$s.log" 2>&1 &
   done

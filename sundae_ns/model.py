@@ -311,12 +311,14 @@ class SundaeModel(SplatfactoModel):
         return self.resolution(self.step).downscale if self.training else 1
 
     def resolution(self, step: int) -> StepResolution:
-        """Size of the training images at a step; for a later step, as far as it is known now."""
+        """Form of the training images at a step; for a later step, as far as it is known now."""
         config, state = self.config, self.state
         rising = config.num_downscales - step // config.resolution_schedule if config.warm_start is None else 0
         # Densification takes its statistics from whole images.
-        windows = state.head_enabled and not state.densifying
-        return StepResolution(step, int(2 ** max(rising, 0)), config.head.max_train_pixels if windows else 0)
+        parts = state.head_enabled and not state.densifying
+        pixels = config.head.max_train_pixels if parts else 0
+        mirror = parts and state.mirror and config.head.mode != "features"
+        return StepResolution(step, int(2 ** max(rising, 0)), pixels, mirror)
 
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes

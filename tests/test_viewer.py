@@ -99,12 +99,15 @@ def shown(model: SundaeModel, rule: Rule, keep_ratio: float) -> Tensor | None:
     return None if decision is None else decision.mask
 
 
-def picture(model: SundaeModel) -> dict[str, Tensor]:
+def picture(model: SundaeModel) -> dict[str, Any]:
     return model.get_outputs_for_camera(camera())
 
 
-def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
+    def equal(one: Any, other: Any) -> bool:
+        return torch.equal(one, other) if isinstance(one, Tensor) else one == other
+
+    return a.keys() == b.keys() and all(equal(a[name], b[name]) for name in a)
 
 
 def test_the_viewer_finds_slider_and_menu() -> None:

@@ -1,4 +1,5 @@
-"""Random windows of large training images, so that the cost of a step does not grow with the image size."""
+"""What the head sees of a training image: a random window of a large one, so that the cost of a step does not grow with
+the image size, and in half of the steps its mirror image, so that it does not learn the training views by heart."""
 
 from __future__ import annotations
 
@@ -17,10 +18,12 @@ class Window(NamedTuple):
     top: int
     width: int
     height: int
+    mirrored: bool = False
+    """Whether it is seen in a mirror: left and right change places."""
 
 
-def training_window(width: int, height: int, max_pixels: int, seed: int) -> Window | None:
-    """A random window with the image's aspect ratio, or None to train on the whole image.
+def training_window(width: int, height: int, max_pixels: int, seed: int, *, mirror: bool = False) -> Window | None:
+    """A random window with the image's aspect ratio, or None to train on the whole image as it is.
 
     Positions are drawn from beyond the edges too and moved back inside, because uniform ones would rarely include the
     pixels next to the edges.
@@ -30,11 +33,16 @@ def training_window(width: int, height: int, max_pixels: int, seed: int) -> Wind
         height: image height in pixels.
         max_pixels: largest number of pixels of a window; 0 for no limit.
         seed: the window is a function of it, so that a resumed run uses the same windows.
+        mirror: whether one of two windows is mirrored.
     """
-    if max_pixels == 0 or width * height <= max_pixels:
+    whole = max_pixels == 0 or width * height <= max_pixels
+    if whole and not mirror:
         return None
+    u, v, side = torch.rand(3, generator=torch.Generator().manual_seed(seed)).tolist()
+    mirrored = mirror and side < 0.5
+    if whole:
+        return Window(0, 0, width, height, mirrored) if mirrored else None
     share = (max_pixels / (width * height)) ** 0.5
-    w, h = (min(max(int(side * share) // GRID * GRID, GRID), side) for side in (width, height))
-    u, v = torch.rand(2, generator=torch.Generator().manual_seed(seed)).tolist()
-    left, top = int(width * u - w / 2), int(height * v - h / 2)
-    return Window(min(max(left, 0), width - w), min(max(top, 0), height - h), w, h)
+    columns, rows = (min(max(int(length * share) // GRID * GRID, GRID), length) for length in (width, height))
+    left, top = int(width * u - columns / 2), int(height * v - rows / 2)
+    return Window(min(max(left, 0), width - columns), min(max(top, 0), height - rows), columns, rows, mirrored)

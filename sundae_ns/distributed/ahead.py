@@ -59,7 +59,7 @@ class Timetable:
 
     def _row(self, table: _Table, index: int, at: StepResolution) -> Tensor:
         view = table.on_host[index]
-        window = training_window(view.width, view.height, at.window_pixels, seed=at.step)
+        window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
         if window is None:
             return table.rows[index]
         return self._row_of(view.cut(window)).to(self._device, non_blocking=True)

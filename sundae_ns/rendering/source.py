@@ -22,7 +22,7 @@ NEAR_PLANE = 0.01
 
 
 class StepResolution(NamedTuple):
-    """Size of the training images at one step: a function of the step and the options, so the same on all ranks."""
+    """Form of the training images at one step: a function of the step and the options, so the same on all ranks."""
 
     step: int
     """Training step; with several ranks, of a batch of one image a rank."""
@@ -30,6 +30,8 @@ class StepResolution(NamedTuple):
     """Divisor of the sides of the images."""
     window_pixels: int
     """Most pixels of an image; larger images are trained on by a random window. 0 for no limit."""
+    mirror: bool = False
+    """Whether half of the steps see their image in a mirror."""
 
 
 class TrainingView(NamedTuple):

@@ -43,11 +43,15 @@ class View(NamedTuple):
         return View(self.viewmat, K, width, height, self.focal * factor)
 
     def cut(self, window: Window) -> View:
-        """The camera of a window of the image."""
-        K = self.K.clone()
+        """The camera of a window of the image. That of a mirrored one is a reflection: it sees what a mirror would show."""
+        viewmat, K = self.viewmat, self.K.clone()
         K[0, 2] -= window.left
         K[1, 2] -= window.top
-        return View(self.viewmat, K, window.width, window.height, self.focal)
+        if window.mirrored:
+            viewmat = viewmat.clone()
+            viewmat[0].neg_()
+            K[0, 2].neg_().add_(window.width)
+        return View(viewmat, K, window.width, window.height, self.focal)
 
 
 def zoomed(camera: Cameras, factor: float) -> Cameras:
@@ -107,4 +111,5 @@ def cut(image: Tensor, window: Window | None) -> Tensor:
     """A window of an image ``[H, W, C]``; None for the whole image."""
     if window is None:
         return image
-    return image[window.top : window.top + window.height, window.left : window.left + window.width]
+    part = image[window.top : window.top + window.height, window.left : window.left + window.width]
+    return part.flip(1) if window.mirrored else part

@@ -55,6 +55,8 @@ class FieldState:
     """Step of the schedule at which densification ends."""
     head_starts_at: float = math.inf
     """Step of the schedule after which the head is enabled."""
+    mirror: bool = True
+    """Whether a residual head sees half of its training images mirrored."""
     restored: int = 0
     """Number of returns to a snapshot in this process."""
     sh_degree_interval: int | None = None

@@ -41,7 +41,7 @@ def training_view(
     view = source.training_view(at, make_view, index)
     if state.head_enabled and at.downscale == 1:
         state.remember_focal(view.focal)
-    window = training_window(view.width, view.height, at.window_pixels, seed=at.step)
+    window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
     return view if window is None else view.cut(window), window
 
 

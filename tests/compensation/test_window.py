@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sundae_ns.compensation import training_window
+from sundae_ns.compensation import Window, training_window
 
 SIDES = st.integers(1, 5000)
 
@@ -50,3 +50,15 @@ def test_both_edges_are_seen_often() -> None:
         seen[window.left : window.left + window.width] += 1
     assert seen.min() > 0.3 * seen.max()
     assert abs(seen - seen[::-1]).max() < 0.1 * seen.max()
+
+
+def test_half_of_the_windows_are_mirrored_if_asked() -> None:
+    """Whole images and parts, with the same places as without."""
+    for limit in (0, 900):
+        plain = [training_window(40, 30, limit, seed) for seed in range(400)]
+        both = [training_window(40, 30, limit, seed, mirror=True) for seed in range(400)]
+        mirrored = [window for window in both if window is not None and window.mirrored]
+        assert 160 < len(mirrored) < 240
+        for before, after in zip(plain, both, strict=True):
+            whole = Window(0, 0, 40, 30) if before is None else before
+            assert (whole if after is None else after._replace(mirrored=False)) == whole

@@ -93,6 +93,8 @@ def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPa
         StepResolution(1, 2, 0),
         StepResolution(2, 1, 1024),
         StepResolution(3, 1, 1024),
+        StepResolution(4, 1, 1024, mirror=True),
+        StepResolution(5, 1, 0, mirror=True),
     ):
         indices = [(2 * (3 * at.step + rank)) % 5 for rank in range(3)]
         assert timetable.views(at.step) == indices
@@ -103,7 +105,7 @@ def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPa
         assert torch.equal(own.K, expected.K)
         known = timetable.cameras(at)
         for rank, view in enumerate(views):
-            window = training_window(view.width, view.height, at.window_pixels, seed=at.step)
+            window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
             seen = view if window is None else view.cut(window)
             row = camera_row(seen.viewmat, seen.K, seen.width, seen.height, 0.02)
             assert torch.equal(torch.cat([known.centers[rank], known.bounds[rank].flatten()]), row)

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from sundae_ns.evaluation import psnr
 from sundae_ns.model import SundaeModel
+from sundae_ns.rendering.views import cut
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -52,9 +53,10 @@ def test_metrics_of_a_step_cost_nothing_until_they_are_looked_at(
     assert set(metrics) == {"psnr", "psnr_base", "gaussian_count"}
     assert not asked
     rgb, graph = outputs["rgb"].detach().clamp(0, 1), weakref.ref(outputs["rgb"])
+    truth = cut(batch()["image"].float() / 255, outputs["window"])  # as mirrored as the picture
     del outputs  # what the picture was made from goes with it
     assert graph() is None
-    mse = ((rgb - batch()["image"].float() / 255) ** 2).mean()
+    mse = ((rgb - truth) ** 2).mean()
     assert float(metrics["psnr"]) == pytest.approx(float(-10 * mse.log10()), abs=1e-4)
     assert metrics["psnr"] != metrics["psnr_base"]
     assert len(asked) == 2

@@ -11,6 +11,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.model import SundaeModel
+from sundae_ns.rendering import StepResolution
 from sundae_ns.rendering.views import zoomed
 
 Build = Callable[..., SundaeModel]
@@ -54,10 +55,17 @@ def test_lower_resolution_at_first(build: Build, camera: MakeCamera, training_of
     assert model.eval().get_outputs(camera())["rgb"].shape == (32, 40, 3)
 
 
+@pytest.mark.parametrize(("step", "mirrored"), [(10, True), (11, False)])
 def test_a_window_is_a_part_of_the_whole_picture(
-    build: Build, perturb: Perturb, camera: MakeCamera, batch: MakeBatch
+    build: Build,
+    perturb: Perturb,
+    camera: MakeCamera,
+    batch: MakeBatch,
+    monkeypatch: pytest.MonkeyPatch,
+    step: int,
+    mirrored: bool,
 ) -> None:
-    """Pictures, truth and mask of a window are what the whole picture shows there."""
+    """Pictures, truth and mask of a window are what the whole picture shows there, or its mirror image."""
     whole, cut = (perturb(build(head={"max_train_pixels": limit}, background_color="black")) for limit in (0, 600))
     with torch.no_grad():
         # Rasterisers clamp how they linearise large primitives far outside of the picture, and a window is a picture.
@@ -66,29 +74,38 @@ def test_a_window_is_a_part_of_the_whole_picture(
     masked = {**batch(), "mask": torch.rand(32, 40, 1, generator=torch.Generator().manual_seed(4)) > 0.5}
     for model in (whole, cut):
         model.train()
+        model.step = step
+    monkeypatch.setattr(whole, "resolution", lambda step: StepResolution(step, 1, 0))
     outputs = {model: model.get_outputs(camera()) for model in (whole, cut)}
     window = outputs[cut]["window"]
     assert outputs[whole]["window"] is None
     assert window.width * window.height <= 600
-    rows, columns = slice(window.top, window.top + window.height), slice(window.left, window.left + window.width)
+    assert window.mirrored == mirrored
+
+    def part(image: Tensor) -> Tensor:
+        seen = image[window.top : window.top + window.height, window.left : window.left + window.width]
+        return seen.flip(1) if mirrored else seen
+
     for name in ("base_rgb", "accumulation"):
-        torch.testing.assert_close(outputs[cut][name], outputs[whole][name][rows, columns], atol=1e-5, rtol=0)
-    truth = whole.truth(masked, outputs[whole])[rows, columns]
+        torch.testing.assert_close(outputs[cut][name], part(outputs[whole][name]), atol=1e-5, rtol=0)
+    truth = part(whole.truth(masked, outputs[whole]))
     assert torch.equal(cut.truth(masked, outputs[cut]), truth)
     losses = cut.get_loss_dict(outputs[cut], masked, {})
-    expected = ((outputs[cut]["base_rgb"] - truth).abs() * masked["mask"][rows, columns]).mean()
+    expected = ((outputs[cut]["base_rgb"] - truth).abs() * part(masked["mask"])).mean()
     torch.testing.assert_close(losses["base_loss"], cut.config.base_loss_weight * expected)
 
 
 def test_windows_wait_for_the_head_and_for_densification(build: Build, perturb: Perturb, camera: MakeCamera) -> None:
     model = build(head={"max_train_pixels": 600})
     assert not model.state.head_enabled
-    assert model.resolution(0).window_pixels == 0
+    assert model.resolution(0) == StepResolution(0, 1, 0)
     perturb(model)
-    assert model.resolution(0).window_pixels == 600
+    assert model.resolution(0) == StepResolution(0, 1, 600, mirror=True)
     assert model.eval().get_outputs(camera())["rgb"].shape == (32, 40, 3)  # what is shown is whole
     early = perturb(
         build(head={"max_train_pixels": 600, "start_at": 0}, pruning={"mode": "continuous", "start": 5, "stop": 50})
     )
     assert early.state.head_enabled
-    assert early.resolution(0).window_pixels == 0  # densification takes its statistics from whole pictures
+    assert early.resolution(0) == StepResolution(0, 1, 0)  # densification takes its statistics from whole pictures
+    paper = perturb(build(head={"mode": "features"}))
+    assert not paper.resolution(0).mirror

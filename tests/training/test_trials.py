@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 
 import pytest
 from models import Training
@@ -101,6 +102,18 @@ def test_a_checkpoint_without_a_decision_names_the_option(build: Build) -> None:
     (trial,) = (extension for extension in model.extensions if isinstance(extension, Trials))
     with pytest.raises(CheckpointError, match=r"--pipeline.model.head.mode"):
         trial.prepare_loading(model.state, {})
+
+
+def test_only_trials_do_without_mirrored_images(build: Build) -> None:
+    """They are too short to see what mirrored images bring; a run that resumes in a trial goes on with it."""
+    model = build(head={"mode": "auto"})
+    (trial,) = (extension for extension in model.extensions if isinstance(extension, Trials))
+    for phase, mirrored in (("trials", False), ("done", True)):
+        numbers = asdict(Progress(phase=phase, decision="head" if phase == "done" else "", trial=1))
+        trial.load_state_dict(model.state, {"numbers": numbers, "start": {}, "ends": {}})
+        model.step = 10**6
+        assert model.state.head_enabled
+        assert model.resolution(model.step).mirror == mirrored
 
 
 @pytest.mark.parametrize(
