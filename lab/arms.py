@@ -103,6 +103,10 @@ class Arm:
             self._patch_flip()
         if spec.get("pdrop"):
             self._patch_primitives()
+        if spec.get("fnoise"):
+            self._patch_noise()
+        if spec.get("hold"):
+            self._patch_hold()
         if "distil" in spec:
             self._patch_views()
         if "fade" in spec:
@@ -178,6 +182,10 @@ class Arm:
             self._relocate(again)
         if "average" in spec and step % 10 == 0 and step >= self.steps - spec["average"]:
             self._average()
+        if step % 10 == 0:
+            for k in spec.get("means", []):
+                if step >= self.steps - k:
+                    self._average_over(k)
 
     def _rate(self, name, factor):
         optimizer, scheduler = self.state.optimizers[name], self.state.schedulers.get(name)
@@ -221,6 +229,57 @@ class Arm:
             return found
 
         LocalField.primitives = primitives
+
+    def _patch_noise(self):
+        old, p = render_module.compensate, self.spec["fnoise"]
+
+        def compensate(head, base, splatted, background, *, training):
+            if training:
+                features = splatted.colors[..., 3:]
+                spread = features.detach().std(dim=(-3, -2), keepdim=True)
+                noisy = features + p * spread * torch.randn_like(features)
+                splatted = replace(splatted, colors=torch.cat([splatted.colors[..., :3], noisy], dim=-1))
+            return old(head, base, splatted, background, training=training)
+
+        render_module.compensate = step_module.compensate = compensate
+
+    def _patch_hold(self):
+        """hold: {"share": s, "every": k or 0, "only": bool, "until": share of the run after the prune}"""
+        options, arm, indices = self.spec["hold"], self, list(self.dm.train_indices)
+        state = {"set": set(), "drawn": -1}
+        flag = torch.ones((), device=self.state.device)  # 1: the field learns; 0: the head alone
+        headed = torch.ones((), device=self.state.device)
+        old = LocalField.training_view
+
+        def seen(source, at, make, index):
+            step = arm.state.step
+            if arm.pruned_at is None:
+                return old(source, at, make, index)
+            t = (step - arm.pruned_at) / max(arm.steps - arm.pruned_at, 1)
+            turn = (step - arm.pruned_at) // options["every"] if options.get("every") else 0
+            if turn != state["drawn"]:
+                state["drawn"] = turn
+                rest = [i for i in indices if i not in state["set"]] if turn else indices
+                state["set"] = set(arm.random.sample(rest, round(options["share"] * len(indices))))
+            held = index in state["set"] and t < options.get("until", 1.0)
+            flag.fill_(0.0 if held else 1.0)
+            headed.fill_(1.0 if held or not options.get("only") or t >= options.get("until", 1.0) else 0.0)
+            return old(source, at, make, index)
+
+        LocalField.training_view = seen
+        primitives = LocalField.primitives
+
+        def some(source, view, settings, *, features, colors=True, at=None):
+            found = primitives(source, view, settings, features=features, colors=colors, at=at)
+            if settings.training:
+                for key in list(found):
+                    found[key] = torch.lerp(found[key].detach(), found[key], flag) if torch.is_tensor(found[key]) and found[key].requires_grad else found[key]
+            return found
+
+        LocalField.primitives = some
+        if options.get("only"):
+            for p in self.model.head.parameters():
+                p.register_hook(lambda g: g * headed)
 
     def _patch_flip(self):
         old = render_module.compensate
@@ -400,6 +459,14 @@ class Arm:
             self.mean, self.averaged = [v.clone() for v in weights], 0
         self.averaged += 1
         torch._foreach_lerp_(self.mean, weights, 1 / self.averaged)
+
+    def _average_over(self, k):
+        weights = self._weights()
+        self.means = getattr(self, "means", {})
+        if k not in self.means or [v.shape for v in self.means[k][1]] != [v.shape for v in weights]:
+            self.means[k] = [0, [v.clone() for v in weights]]
+        self.means[k][0] += 1
+        torch._foreach_lerp_(self.means[k][1], weights, 1 / self.means[k][0])
 
     def swap(self):
         """Exchange the last state and the mean."""

@@ -119,6 +119,9 @@ seconds = round(time.time() - started, 1)
 if arm.mean is not None:
     arm.swap(); evaluate(end - 1, average=arm.averaged)
     if not spec.get("keep_average"): arm.swap()
+for k, (count, mean) in getattr(arm, "means", {}).items():
+    arm.mean = mean
+    arm.swap(); evaluate(end - 1, average=count, over=k); arm.swap()
 record = trainer.base_dir / "trials.json"
 note(seconds=seconds, spec=spec, trials=json.loads(record.read_text()) if record.exists() else None)
 if "save" not in spec:

@@ -6,6 +6,7 @@ Module path and class names are written into every run's ``config.yml``, so movi
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -242,6 +243,8 @@ class SundaeTrainer(Trainer):
         self._recorded: RecordedStep | None = None
         """Runs whole steps; None where they run kernel by kernel."""
         self._views: dict[tuple[int | None, int], View] = {}
+        self._result: Any = (torch.tensor(math.nan), {}, {})
+        """Loss, its terms and metrics of the last step."""
         self._trained: int | None = None
         """The last step that is trained."""
         self._stopped_by = 0
@@ -302,13 +305,14 @@ class SundaeTrainer(Trainer):
 
     def train_iteration(self, step: int) -> Any:
         """Train one step; several ranks agree on whether to stop after it."""
-        result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
+        if not self.model.state.resting:
+            self._result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
         self._trained = step
         self._foretell(step - self._start_step)
         self._stopped_by = self.team.agreed(self._interruption.number, step)
         if self._stopped_by:
             self.stop_training = True
-        return result
+        return self._result
 
     def _recordable(self) -> bool:
         """Whether options allow to record training steps."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sundae_ns.training import trials
+from sundae_ns.training import stopping, trials
 
 PAGE = Path(__file__).parents[1] / "docs" / "method.md"
 NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")
@@ -56,6 +56,18 @@ def test_the_pages_state_the_rule_of_the_trials() -> None:
     assert rule in PAGE.read_text(encoding="utf-8")
     words = f"gains {trials.LEAST_GAIN:g} dB, and {trials.GAIN_PER_DOUBLING:g} dB for each doubling of the bytes"
     assert words in (PAGE.parent / "options.md").read_text(encoding="utf-8")
+
+
+def test_the_pages_state_when_training_stops() -> None:
+    words = f"fewer than {stopping.MANY_VIEWS} training views"
+    for page, growth in (
+        ("method.md", rf"\ge {1 + stopping.LEAST_LOSS:g}\, \ell_k"),
+        ("options.md", f"{stopping.LEAST_LOSS:.1%}"),
+    ):
+        text = (PAGE.parent / page).read_text(encoding="utf-8")
+        assert words in text
+        assert growth in text
+    assert stopping.WINDOW_SHARE == 1 / 50  # "fiftieth"
 
 
 def test_the_checks_can_fail() -> None:

@@ -20,6 +20,7 @@ from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.initial_field import Frame, PointOptions, Points, Start, initial_field
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.schedules import make_schedule
+from sundae_ns.training.stopping import Stopping
 from sundae_ns.training.trials import Trials
 
 
@@ -36,6 +37,7 @@ class BuildOptions(GrowthOptions, PointOptions, Protocol):
     base_loss_weight: float
     prior_after_prune: float
     average_share: float
+    ssim_lambda: float
     use_bilateral_grid: bool
 
 
@@ -48,7 +50,7 @@ class Parts:
     state: FieldState
     """On these parameters and networks."""
     extensions: list[Extension]
-    """Densification, scheduled pruning and, where asked for, budget search or trials, and averaging; in the order of acting."""
+    """Densification, scheduled pruning and, where asked for, budget search or trials and stopping, and averaging; in order."""
     start: Start
     """To announce when training starts."""
 
@@ -121,7 +123,8 @@ def build(options: BuildOptions, *, num_images: int, points: Points | None, fram
         extensions.append(BudgetSearch(pruning, head, densification, state))
     elif options.head.mode == "auto":
         begins_at = max(state.head_starts_at, pruning.settled_at, state.densify_until)
-        extensions.append(Trials(int(begins_at), state))
+        trials = Trials(int(begins_at), state)
+        extensions += [trials, Stopping(trials, options.ssim_lambda)]
     if options.average_share > 0:
         extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
     return Parts(gauss_params, networks, state, extensions, start)

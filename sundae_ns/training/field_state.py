@@ -57,6 +57,8 @@ class FieldState:
     """Step of the schedule after which the head is enabled."""
     mirror: bool = True
     """Whether a residual head sees half of its training images mirrored."""
+    resting: bool = False
+    """Whether training steps change nothing, because more training would harm."""
     restored: int = 0
     """Number of returns to a snapshot in this process."""
     sh_degree_interval: int | None = None

@@ -255,6 +255,10 @@ class Trials(Extension):
                 soft_wrap=True,
             )
 
+    def held_out(self, run: TrainingRun) -> list[int]:
+        """Indices of the views that the trials hold out; none if there are no trials."""
+        return [] if self.progress.reason else self._planned(run).views
+
     # ------------------------------------------------------------------------------------------------------- trials
 
     def _planned(self, run: TrainingRun) -> Plan:
