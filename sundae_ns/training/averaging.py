@@ -5,7 +5,8 @@ A step sees one image, so the weights wander around what suits all of them; thei
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -59,6 +60,16 @@ class RunningMean:
         copies = {name: value.clone() for name, value in weights.items()}
         put(self.values, weights)
         return copies
+
+    @contextmanager
+    def shown(self, weights: Weights) -> Iterator[None]:
+        """Put the mean, if there is one that fits, in the place of weights for the length of a block."""
+        own = self.replace(weights) if self.fits(weights) else None
+        try:
+            yield
+        finally:
+            if own is not None:
+                put(own, weights)
 
     def fits(self, weights: Weights) -> bool:
         """Whether there is a mean, and of weights of these names and shapes."""

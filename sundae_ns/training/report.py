@@ -6,10 +6,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sundae_ns.evaluation import peak_memory
+from sundae_ns.evaluation import peak_memory, without_nan
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.runs.folder import prunes_before
 from sundae_ns.training.extension import TrainingRun
@@ -47,6 +48,13 @@ class PruneReport:
         if self.sigma is not None and self.tau is not None:
             parts.append(f"sigma {self.sigma:.3g}, tau {self.tau:.3g}, {self.isolated:,} isolated")
         return "; ".join(parts)
+
+
+def write_record(run: TrainingRun, name: str, record: Mapping[str, Any]) -> None:
+    """Write a record as JSON to the run's folder, if there is one; numbers that are not finite become null."""
+    if run.folder is not None:
+        run.folder.mkdir(parents=True, exist_ok=True)
+        write_text(run.folder / name, json.dumps(without_nan(record), indent=2) + "\n")
 
 
 def write_report(

@@ -8,7 +8,6 @@ trains on all views for as many steps as were best. It rests for the remaining o
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -16,13 +15,12 @@ from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sundae_ns.evaluation import without_nan
 from sundae_ns.gaussians.snapshot import Snapshot
-from sundae_ns.storage.atomic import write_text
 from sundae_ns.training.averaging import EVERY, RunningMean, put, weights_of
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import mean_quality, measure_heldout
+from sundae_ns.training.report import write_record
 from sundae_ns.training.schedulers import postpone
 from sundae_ns.training.trials import Trials
 
@@ -155,11 +153,8 @@ class Stopping(Extension):
 
     def _measure(self, run: TrainingRun) -> None:
         """Measure the held-out views with the mean of the window."""
-        weights, mean = weights_of(run.state), self._mean
-        own = mean.replace(weights) if mean.fits(weights) else {}
-        views = measure_heldout(run, mend="choose by hand with --pipeline.model.head.mode")
-        if own:
-            put(own, weights)
+        with self._mean.shown(weights_of(run.state)):
+            views = measure_heldout(run, mend="choose by hand with --pipeline.model.head.mode")
         self._mean = RunningMean()
         decibels, similarity = mean_quality(views)
         self.progress.measured.append([heldout_loss(decibels, similarity, self.ssim_weight), decibels, similarity])
@@ -190,16 +185,14 @@ class Stopping(Extension):
         """Serve all views, and record the watch."""
         self._start, self._mean = None, RunningMean()
         run.hold_out([])
-        if run.folder is not None:
-            run.folder.mkdir(parents=True, exist_ok=True)
-            names = ("loss", "psnr", "ssim")
-            record = {
-                "held_out_views": self._trials.held_out(run),
-                "steps_per_measurement": self._window,
-                "measured": [dict(zip(names, figures, strict=True)) for figures in self.progress.measured],
-                "steps_on_all_views": length,
-            }
-            write_text(run.folder / "stopping.json", json.dumps(without_nan(record), indent=2) + "\n")
+        names = ("loss", "psnr", "ssim")
+        record = {
+            "held_out_views": self._trials.held_out(run),
+            "steps_per_measurement": self._window,
+            "measured": [dict(zip(names, figures, strict=True)) for figures in self.progress.measured],
+            "steps_on_all_views": length,
+        }
+        write_record(run, "stopping.json", record)
 
     def _rest(self, run: TrainingRun) -> None:
         """Take the mean of the last window, and keep it to the end of the schedule."""

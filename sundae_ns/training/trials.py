@@ -9,7 +9,6 @@ are the cost. Test views are never used.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -20,17 +19,16 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import CheckpointError
-from sundae_ns.evaluation import without_nan
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.gaussians.surgery import replace_parameter
 from sundae_ns.storage import megabytes
-from sundae_ns.storage.atomic import write_text
-from sundae_ns.training.averaging import EVERY, RunningMean, put, weights_of
+from sundae_ns.training.averaging import EVERY, RunningMean, weights_of
 from sundae_ns.training.budget import bytes_of
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, mean_quality, measure_heldout
+from sundae_ns.training.report import write_record
 from sundae_ns.training.schedulers import postpone
 
 ARMS = ("plain", "head", "features")
@@ -342,11 +340,8 @@ class Trials(Extension):
     def _measured(self, run: TrainingRun) -> list[list[float]]:
         """Figures of the held-out views with the mean of the weights, if there is one."""
         mend = "decide by hand with --pipeline.model.head.mode residual or off"
-        weights, mean = weights_of(run.state), self._mean
-        own = mean.replace(weights) if mean.fits(weights) else {}
-        views = [list(view) for view in measure_heldout(run, mend=mend)]
-        if own:
-            put(own, weights)
+        with self._mean.shown(weights_of(run.state)):
+            views = [list(view) for view in measure_heldout(run, mend=mend)]
         self._mean = RunningMean()
         return views
 
@@ -375,9 +370,7 @@ class Trials(Extension):
         self._set_arm(run.state)
         if decision == "plain":
             run.state.remove_head()
-        if run.folder is not None:
-            run.folder.mkdir(parents=True, exist_ok=True)
-            write_text(run.folder / "trials.json", json.dumps(without_nan(self._record(run)), indent=2) + "\n")
+        write_record(run, "trials.json", self._record(run))
 
     def _record(self, run: TrainingRun) -> dict[str, Any]:
         """The decision and its figures."""

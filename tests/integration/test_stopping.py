@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator
-from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,12 @@ import pytest
 import torch
 from budget_runs import same, tidy
 from nerfstudio.engine.trainer import Trainer
+from trial_runs import LENGTH, PRUNE_AT, STEPS, tiny_run, tiny_scene
 
-from sundae_ns.data import write_embedded_capture
-from sundae_ns.method_configs import sundae
 from sundae_ns.training import stopping, trials
 from sundae_ns.training.heldout import HeldOutQuality
 
-STEPS, PRUNE_AT = 100, 40
-DECIDED = PRUNE_AT + 2 * 4
+DECIDED = PRUNE_AT + 2 * LENGTH
 """Step of the decision, after trials of no head and of a head."""
 WINDOW = 2
 Make = Callable[..., Trainer]
@@ -29,31 +26,8 @@ Curve = Callable[..., None]
 
 @pytest.fixture
 def make(tmp_path: Path) -> Iterator[Make]:
-    def trainer(*, name: str = "run", save_every: int = 1000, **options: Any) -> Trainer:
-        scene = tmp_path / "scene"
-        if not scene.exists():
-            write_embedded_capture(scene, train_views=16, test_views=2, width=24, height=24, points=200, samples=1)
-        config = deepcopy(sundae.config)
-        config.data = config.pipeline.datamanager.data = scene
-        config.output_dir, config.experiment_name, config.timestamp = tmp_path, name, "now"
-        config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = STEPS, save_every, False
-        config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
-        config.vis, config.viewer.quit_on_train_completion = "tensorboard", True
-        model = config.pipeline.model
-        model.num_downscales, model.sh_degree, model.sh_degree_interval, model.warmup_length = 0, 1, 5, 10**9
-        model.pruning.prune_at, model.evaluate_prune = PRUNE_AT, False
-        model.head.size, model.head.pixel_unshuffle, model.head.num_features = "tiny", 1, 5
-        for option, value in options.items():
-            setattr(config, option, value)
-        torch.manual_seed(7)
-        config.save_config()
-        made: Trainer = config.setup(local_rank=0, world_size=1)
-        made.setup()
-        # The watch must not use test views.
-        made.pipeline.get_average_eval_image_metrics = None
-        return made
-
-    yield trainer
+    scene = tiny_scene(tmp_path, 16)
+    yield lambda **options: tiny_run(scene, tmp_path, **options)
     tidy()
 
 

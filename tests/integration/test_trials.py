@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator
-from copy import deepcopy
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +15,15 @@ from budget_runs import same, tidy
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.eval_utils import eval_setup
+from trial_runs import LENGTH, PRUNE_AT, STEPS, tiny_run, tiny_scene
 
 from sundae_ns.callbacks import NerfstudioRun
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import CheckpointError
-from sundae_ns.method_configs import sundae
 from sundae_ns.scenes.measure import sizes
 from sundae_ns.scenes.packed import scene_of_run
 from sundae_ns.training import trials
 from sundae_ns.training.heldout import HeldOutQuality
 
-STEPS, PRUNE_AT = 100, 40
-LENGTH = 4
-"""Steps of a trial: a twenty-fifth of the run. Views are held out from step 30 on."""
 DECIDED = PRUNE_AT + 3 * LENGTH
 """Step of the decision if all arms are tried."""
 NONE = (0.0, 0.0)
@@ -36,45 +32,13 @@ Make = Callable[..., Trainer]
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Path]:
-    folder, made = tmp_path_factory.mktemp("scenes"), {}
-
-    def scene(views: int) -> Path:
-        if views not in made:
-            made[views] = write_embedded_capture(
-                folder / str(views), train_views=views, test_views=2, width=24, height=24, points=200, samples=1
-            )
-        return made[views]
-
-    return scene
+    folder = tmp_path_factory.mktemp("scenes")
+    return cache(lambda views: tiny_scene(folder, views))
 
 
 @pytest.fixture
 def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
-    def trainer(
-        views: int = 16, *, name: str = "run", save_every: int = 1000, start_at: int | None = None, **options: Any
-    ) -> Trainer:
-        config = deepcopy(sundae.config)
-        config.data = config.pipeline.datamanager.data = scenes(views)
-        config.output_dir, config.experiment_name, config.timestamp = tmp_path, name, "now"
-        config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = STEPS, save_every, False
-        config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
-        config.vis, config.viewer.quit_on_train_completion = "tensorboard", True
-        model = config.pipeline.model
-        model.num_downscales, model.sh_degree, model.sh_degree_interval, model.warmup_length = 0, 1, 5, 10**9
-        model.pruning.prune_at, model.evaluate_prune = PRUNE_AT, False
-        model.head.size, model.head.pixel_unshuffle, model.head.num_features = "tiny", 1, 5
-        model.head.start_at = start_at
-        for option, value in options.items():
-            setattr(config, option, value)
-        torch.manual_seed(7)
-        config.save_config()
-        made: Trainer = config.setup(local_rank=0, world_size=1)
-        made.setup()
-        # The decision must not use test views.
-        made.pipeline.get_average_eval_image_metrics = None
-        return made
-
-    yield trainer
+    yield lambda views=16, **options: tiny_run(scenes(views), tmp_path, **options)
     tidy()
 
 

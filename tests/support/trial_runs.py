@@ -1,0 +1,54 @@
+"""Runs of the default method on a scene of a few pixels, with trials of four steps."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import torch
+from nerfstudio.engine.trainer import Trainer
+
+from sundae_ns.data import write_embedded_capture
+from sundae_ns.method_configs import sundae
+
+STEPS, PRUNE_AT = 100, 40
+LENGTH = 4
+"""Steps of a trial: a twenty-fifth of the run. Views are held out from step 30 on."""
+
+
+def tiny_scene(folder: Path, views: int) -> Path:
+    return write_embedded_capture(
+        folder / str(views), train_views=views, test_views=2, width=24, height=24, points=200, samples=1
+    )
+
+
+def tiny_run(
+    scene: Path,
+    out: Path,
+    *,
+    name: str = "run",
+    save_every: int = 1000,
+    start_at: int | None = None,
+    **options: Any,
+) -> Trainer:
+    config = deepcopy(sundae.config)
+    config.data = config.pipeline.datamanager.data = scene
+    config.output_dir, config.experiment_name, config.timestamp = out, name, "now"
+    config.max_num_iterations, config.steps_per_save, config.save_only_latest_checkpoint = STEPS, save_every, False
+    config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
+    config.vis, config.viewer.quit_on_train_completion = "tensorboard", True
+    model = config.pipeline.model
+    model.num_downscales, model.sh_degree, model.sh_degree_interval, model.warmup_length = 0, 1, 5, 10**9
+    model.pruning.prune_at, model.evaluate_prune = PRUNE_AT, False
+    model.head.size, model.head.pixel_unshuffle, model.head.num_features = "tiny", 1, 5
+    model.head.start_at = start_at
+    for option, value in options.items():
+        setattr(config, option, value)
+    torch.manual_seed(7)
+    config.save_config()
+    made: Trainer = config.setup(local_rank=0, world_size=1)
+    made.setup()
+    # A decision must not use test views.
+    made.pipeline.get_average_eval_image_metrics = None
+    return made
