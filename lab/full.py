@@ -33,7 +33,9 @@ for k, v in options.items(): args += ["--" + k, str(v)]
 args += ["colmap", "--colmap-path", "sparse/0", "--downscale-factor", str(spec.get("images", 1))]
 images = len(os.listdir(f"{place}/scenes/{capture}/images"))
 args += ["--eval-mode", "fraction", "--train-split-fraction", str(16 / images - 1e-6)] if capture.endswith("16") else ["--eval-mode", "interval", "--eval-interval", "8"]
+from sundae_ns.compensation import Window
 from sundae_ns.evaluation import psnr, ssim
+from sundae_ns.rendering.render import render
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.storage.runs import checkpoint
 import arms
@@ -87,18 +89,25 @@ arm = arms.Arm({"end": end, **spec}, trainer)
 path = f"{out}/{name}-{capture}.jsonl"
 def note(**figures):
     with open(path, "a") as f: f.write(json.dumps({"name": name, "capture": capture, "t": round(time.time() - started, 1), **figures}) + "\n")
-def quality(views):
-    ps = {"head": [], "base": []}; ss = {"head": [], "base": []}
+def quality(views, more=False):
+    labels = ("head", "base") + (("x0.8", "x0.9", "x1.1", "both") if more else ())
+    ps = {label: [] for label in labels}; ss = {label: [] for label in labels}
     with torch.no_grad():
         for camera, batch in views:
             o = model.get_outputs_for_camera(camera.to(model.device)); target = model.target(batch["image"].to(model.device), o["background"])
-            for label, key in (("head", "rgb"), ("base", "base_rgb")):
-                ps[label].append(float(psnr(o[key], target))); ss[label].append(float(ssim(o[key], target)))
+            shown = {"head": o["rgb"], "base": o["base_rgb"]}
+            if more:  # the correction weaker or stronger, and the mean with the mirrored image's
+                shown |= {f"x{g}": (o["base_rgb"] + g * (o["rgb"] - o["base_rgb"])).clamp(0, 1) for g in (0.8, 0.9, 1.1)}
+                view = model.view_of(camera)
+                turned, _ = render(model.source, view.cut(Window(0, 0, view.width, view.height, True)), model.shown_background, model.render_settings(training=False), depth=False)
+                shown["both"] = (o["rgb"] + turned["rgb"].flip(1)) / 2
+            for label, image in shown.items():
+                ps[label].append(float(psnr(image, target))); ss[label].append(float(ssim(image, target)))
     return {label: [round(sum(ps[label]) / len(ps[label]), 3), round(sum(ss[label]) / len(ss[label]), 4)] for label in ps}
-def evaluate(step, **more):
+def evaluate(step, wide=False, **more):
     model.eval()
     views = list(dm.fixed_indices_eval_dataloader); views = views[::max(1, len(views) // 40)]
-    result = quality(views)
+    result = quality(views, wide and model.state.head_enabled)
     if step == end - 1:
         shown = dm.train_indices[:: max(1, len(dm.train_indices) // 12)]
         result["train"] = quality([dm._view(i) for i in shown])["head"][0]
@@ -121,7 +130,7 @@ if arm.mean is not None:
     if not spec.get("keep_average"): arm.swap()
 for k, (count, mean) in getattr(arm, "means", {}).items():
     arm.mean = mean
-    arm.swap(); evaluate(end - 1, average=count, over=k); arm.swap()
+    arm.swap(); evaluate(end - 1, average=count, over=k, wide=True); arm.swap()
 record = trainer.base_dir / "trials.json"
 note(seconds=seconds, spec=spec, trials=json.loads(record.read_text()) if record.exists() else None)
 if "save" not in spec:

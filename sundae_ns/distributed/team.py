@@ -142,6 +142,7 @@ class Ranks(OneProcess):
             Source and extensions of the shards.
         """
         shards = self.shards = Shards(state.device)
+        state.images_per_step = shards.ranks
         take_shard(state, shards)
         random.seed(seed)
         cameras = datamanager.train_dataset.cameras

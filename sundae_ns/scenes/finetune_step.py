@@ -120,7 +120,8 @@ class TunedStep:
         return self._run(inputs, settings, None)
 
     def _replayed(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
-        kind = (inputs.view.width, inputs.view.height, inputs.mask is not None)
+        model = self._model
+        kind = (inputs.view.width, inputs.view.height, inputs.mask is not None, model.losses.emphasis(model.state))
         recording = self._recordings.get(kind)
         if kind not in self._warm or (recording is None and len(self._recordings) >= MAX_RECORDINGS):
             self._warm.add(kind)

@@ -55,8 +55,11 @@ class FieldState:
     """Step of the schedule at which densification ends."""
     head_starts_at: float = math.inf
     """Step of the schedule after which the head is enabled."""
-    mirror: bool = True
-    """Whether a residual head sees half of its training images mirrored."""
+    trying: bool = False
+    """Whether this is a trial, too short for what helps a residual head in the long run: mirrored images, and a correction that
+    shrinks."""
+    images_per_step: int = 1
+    """Number of images in the batch of a step."""
     resting: bool = False
     """Whether training steps change nothing, because more training would harm."""
     restored: int = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -20,6 +21,11 @@ from sundae_ns.training.similarity import mean_ssim
 
 CHAIN_PRIOR = 0.01
 """Weights of opacities and scales in the loss of a chain (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
+
+HALF_AFTER = 800
+"""Passes over the training images after which images show half of the correction that the loss asks for."""
+FIRST_PASSES = 8
+"""With fewer passes a head has learnt no image by heart."""
 
 LEAST_SQUARE = 1e-8
 """Added to the mean square, so that its root has a gradient for equal images."""
@@ -53,6 +59,8 @@ class StepLosses:
     """Whether the root of the mean square takes the place of L1 once the field is pruned."""
     prior: float = 0.0
     """Weight of opacities and scales once the field is pruned."""
+    num_images: int = 0
+    """Number of training images; 0 if it is not known."""
 
     @classmethod
     def of(cls, options: LossOptions, ssim: SSIM, num_images: int) -> StepLosses:
@@ -66,7 +74,7 @@ class StepLosses:
         chain, squares = options.warmup == "mcmc", options.loss_after_prune == "rms"
         # A prior counts once, and the loss is of one image: its weight falls with their number.
         prior = options.prior_after_prune / max(num_images, 1)  # an opened run may have none
-        return cls(ssim, options.ssim_lambda, options.base_loss_weight, chain, squares, prior)
+        return cls(ssim, options.ssim_lambda, options.base_loss_weight, chain, squares, prior, num_images)
 
     def __call__(
         self,
@@ -89,6 +97,9 @@ class StepLosses:
         """
         if mask is not None:
             target, rgb, base = target * mask, rgb * mask, base * mask
+        emphasis = self.emphasis(state)
+        if emphasis != 1:
+            rgb = torch.lerp(base, rgb, emphasis)
         compared = base if state.head_enabled and self.base_weight > 0 else None
         squares = self.squares and state.pruned
         main_loss, base_loss = image_losses(rgb, compared, target, self.ssim, self.ssim_weight, squares=squares)
@@ -99,6 +110,26 @@ class StepLosses:
         if weight > 0:
             losses.update(prior_losses(params, weight))
         return losses
+
+    def emphasis(self, state: FieldState) -> float:
+        """How many times as strong as in images a residual head's correction is in the loss at this step.
+
+        With each pass over the training images a head learns more of them by heart, which it corrects in other views too. So
+        its correction shrinks (as an estimate does by James and Stein, 1961), the more the more often images are seen. It
+        shrinks at 8, 16, 32 ... passes, because recorded steps hold the number.
+        """
+        head = state.head
+        if (
+            head is None
+            or head.config.mode != "residual"
+            or state.trying
+            or not (state.head_enabled and self.num_images)
+        ):
+            return 1.0
+        passes = (state.schedule_step - state.head_starts_at) * state.images_per_step / self.num_images
+        if not FIRST_PASSES <= passes < math.inf:  # a budget search knows no step at which its head starts
+            return 1.0
+        return 1 + 2 ** math.floor(math.log2(passes)) / HALF_AFTER
 
     def prior_weight(self, state: FieldState) -> float:
         """Weight of opacities and scales at this step."""

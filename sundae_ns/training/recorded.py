@@ -146,7 +146,7 @@ class RecordedStep:
         held = self._held
         if held is None or not held.unchanged(state, settings, growing=growing):
             held = self._held = self._hold(state, settings, growing=growing)
-        kind = _kind(state, inputs, settings)
+        kind = (_kind(state, inputs, settings), self._losses.emphasis(state))
         recording = self._recording(kind, state, held, inputs, settings) if kind in self._warm else None
         if recording is None:
             result = self._run(state, held, inputs, settings)

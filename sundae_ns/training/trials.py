@@ -319,8 +319,7 @@ class Trials(Extension):
         arm = self.progress.arm
         # Not the step at which the arm began: a run that resumes on several GPUs counts other steps.
         state.head_starts_at = math.inf if arm == "plain" else self.begins_at
-        # Mirrored images slow a head down before they help it, and a trial is too short to see the help.
-        state.mirror = self.progress.phase != "trials"
+        state.trying = self.progress.phase == "trials"
 
     def _end(self, run: TrainingRun) -> None:
         """End the current trial; begin the next one from the same field, or decide."""
