@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from sundae_ns.training import stopping, trials
+from sundae_ns.training import losses, stopping, trials
 
 PAGE = Path(__file__).parents[1] / "docs" / "method.md"
 NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")
@@ -68,6 +68,12 @@ def test_the_pages_state_when_training_stops() -> None:
         assert words in text
         assert growth in text
     assert stopping.WINDOW_SHARE == 1 / 50  # "fiftieth"
+
+
+def test_the_page_states_when_a_correction_shrinks() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    assert rf"$e \ge {losses.FIRST_PASSES}$ passes" in text
+    assert rf"/ {losses.HALF_AFTER})" in text
 
 
 def test_the_checks_can_fail() -> None:
