@@ -127,6 +127,7 @@ class RecordedStep:
         self._warm: set[Hashable] = set()
         """Kinds of steps that have run kernel by kernel."""
         self._pairs = NeededPairs()
+        self._emphasis = 1.0
 
     def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train one step.
@@ -146,7 +147,11 @@ class RecordedStep:
         held = self._held
         if held is None or not held.unchanged(state, settings, growing=growing):
             held = self._held = self._hold(state, settings, growing=growing)
-        kind = (_kind(state, inputs, settings), self._losses.emphasis(state))
+        emphasis = self._losses.emphasis(state)
+        if emphasis != self._emphasis:  # recordings hold the number, and it never returns
+            self._forget_recordings()
+            self._emphasis = emphasis
+        kind = _kind(state, inputs, settings)
         recording = self._recording(kind, state, held, inputs, settings) if kind in self._warm else None
         if recording is None:
             result = self._run(state, held, inputs, settings)
@@ -168,11 +173,14 @@ class RecordedStep:
         if state.densifying:
             start_counting(state.densification, state.field["means"])
         if self._buffers.hold(state, trained, growing=growing):
-            self._recordings.clear()
-            self._used.clear()
+            self._forget_recordings()
             if not growing:  # a pruned field needs far fewer pairs: measure them again
                 self._warm.clear()
         return _Held.of(state, trained, settings.head, growing=growing)
+
+    def _forget_recordings(self) -> None:
+        self._recordings.clear()
+        self._used.clear()
 
     # ------------------------------------------------------------------------------------------------------ running
 
