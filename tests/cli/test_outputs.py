@@ -141,6 +141,7 @@ def test_only_files_and_folders_are_replaced(here: Path) -> None:
         ["report", "in", "-o", "x"],
         ["report", "run", "-o", "x"],
         ["bench", "frame", "--load-config", "in"],
+        ["bench", "flicker", "--load-config", "in"],
     ],
 )
 @pytest.mark.parametrize("kind", ["pipe", "device"])

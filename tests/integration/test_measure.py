@@ -20,6 +20,7 @@ from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import Measured, psnr
 from sundae_ns.rendering import render, zoomed
+from sundae_ns.scenes.flicker import measure_flicker
 from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, rendered_as, sizes
 from sundae_ns.scenes.opening import Opened, load_run
 
@@ -188,6 +189,32 @@ def test_bench_frame_prints_null_for_undefined_figures(tiny: Any, capsys: pytest
     shown = capsys.readouterr().out
     assert "nan" not in shown
     assert "10x" in shown
+
+
+def test_bench_flicker_compares_the_head_with_base_colours(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["bench", "flicker", "--load-config", str(tiny.folder), "--places", "1"]
+    with pytest.raises(SystemExit) as caught:
+        main([*arguments, "--json"])
+    assert caught.value.code == 0
+    near, far = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    assert (near["frames_apart"], far["frames_apart"]) == (1, 7)
+    for line in (near, far):
+        assert 0 < line["seen"] < 1
+        assert 0 < line["excess"] < line["mse"]
+        assert 0 < line["excess_base"] < line["mse_base"]
+        assert line["ratio"] == pytest.approx(line["excess"] / line["excess_base"])
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert "head / base" in capsys.readouterr().out
+
+
+def test_flicker_needs_a_head_and_a_path(tiny: Any) -> None:
+    run = load_run(tiny.config)
+    with pytest.raises(ConfigError, match="at 0 places"):
+        measure_flicker(run, places=0)
+    run.model.state.head_starts_at = 10**9
+    with pytest.raises(ConfigError, match="has no head"):
+        measure_flicker(run)
 
 
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:

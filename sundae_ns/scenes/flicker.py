@@ -1,0 +1,141 @@
+"""Flicker of a scene's compensated images and of its base colours, along paths between training cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.evaluation.flicker import Flicker, Frame
+from sundae_ns.scenes.opening import Opened
+
+FRAMES_APART = (1, 7)
+"""Distances of compared frames, as in StopThePop: flicker from one frame to the next, and what builds up slowly."""
+FRAMES = 15
+"""Frames of a path."""
+FRAMES_BETWEEN = 20
+"""Frames from one training camera to its neighbour; a path goes part of the way."""
+
+
+@dataclass(frozen=True)
+class FlickerFigures:
+    """Flicker of frames at one distance; squared errors of colours in [0, 1]."""
+
+    frames_apart: int
+    mse: float
+    """Mean squared error of warped compensated frames."""
+    mse_base: float
+    """The same of base colours."""
+    excess: float
+    """:attr:`mse` without the least of both at each pixel."""
+    excess_base: float
+    """:attr:`mse_base` without the least of both at each pixel."""
+    seen: float
+    """Share of the pixels that both frames see."""
+
+    @property
+    def ratio(self) -> float:
+        """Flicker of the compensated frames over that of base colours; NaN if neither is left."""
+        if self.excess_base > 0:
+            return self.excess / self.excess_base
+        return float("inf") if self.excess > 0 else float("nan")
+
+
+def neighbours(poses: Tensor, places: int) -> list[tuple[int, int]]:
+    """Cameras evenly over a capture, each with the nearest one that looks the same way, within 45 degrees.
+
+    Args:
+        poses: camera-to-world, OpenGL axes ``[N, 3, 4]``.
+        places: number of pairs; fewer cameras give fewer.
+
+    Raises:
+        DataError: there are fewer than two cameras.
+    """
+    if len(poses) < 2:
+        raise DataError(f"a path needs two training views, and the capture has {len(poses)}")
+    chosen = torch.linspace(0, len(poses) - 1, min(places, len(poses)) + 2).round().long()[1:-1].unique()
+    centres, axes = poses[:, :, 3], poses[:, :, 2]
+    pairs = []
+    for camera in chosen.tolist():
+        far = (centres - centres[camera]).norm(dim=1)
+        # A camera that looks elsewhere comes after all that look the same way.
+        far = far + (axes @ axes[camera] < 0.5**0.5) * (2 * far.max() + 1)
+        far[camera] = torch.inf
+        pairs.append((camera, int(far.argmin())))
+    return pairs
+
+
+def between(first: Tensor, second: Tensor, share: float) -> Tensor:
+    """The pose a share of the way from one to another; a blend of both rotations, made orthogonal.
+
+    Args:
+        first: camera-to-world ``[3, 4]``.
+        second: camera-to-world ``[3, 4]``, less than a half turn away.
+        share: 0 for the first, 1 for the second.
+    """
+    pose = torch.lerp(first, second, share)
+    u, _, v = torch.linalg.svd(pose[:, :3])
+    pose[:, :3] = u @ v
+    return pose
+
+
+@torch.no_grad()
+def measure_flicker(
+    opened: Opened, *, places: int = 3, progress: Callable[[], object] | None = None
+) -> list[FlickerFigures]:
+    """Measure the flicker of compensated images and base colours, for each of :data:`FRAMES_APART`.
+
+    Args:
+        opened: a scene with a head.
+        places: number of paths, each between two neighbouring training cameras.
+        progress: called after each frame.
+
+    Raises:
+        ConfigError: the scene has no head, or there are no places.
+        DataError: there are fewer than two training views.
+    """
+    if not opened.model.state.head_enabled:
+        raise ConfigError(f"{opened.source} has no head, so there is nothing to compare with base colours")
+    if places < 1:
+        raise ConfigError(f"flicker cannot be measured at {places} places; give at least 1")
+    _ = opened.datamanager.cached_train  # undistortion, which comes with loading, changes the cameras
+    cameras = opened.datamanager.train_dataset.cameras
+    totals = {apart: Flicker() for apart in FRAMES_APART}
+    for pair in neighbours(cameras.camera_to_worlds, places):
+        frames: list[Frame] = []
+        for frame in _path(opened, cameras, pair):
+            frames.append(frame)
+            for apart, total in totals.items():
+                if len(frames) > apart:
+                    total.add(frames[-1 - apart], frame)
+            if progress is not None:
+                progress()
+    return [
+        FlickerFigures(apart, *_both(total.errors()), *_both(total.excess()), total.seen)
+        for apart, total in totals.items()
+    ]
+
+
+def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int]) -> Iterator[Frame]:
+    """Frames of a path from the first camera of a pair towards the second."""
+    first, second = (cameras.camera_to_worlds[index].double() for index in pair)
+    model = opened.model
+    for number in range(FRAMES):
+        camera = cameras[pair[0] : pair[0] + 1]
+        camera.camera_to_worlds = between(first, second, number / FRAMES_BETWEEN)[None].to(cameras.camera_to_worlds)
+        camera.metadata = None  # the training view's own, such as its place in a camera optimizer
+        camera = camera.to(model.device)
+        outputs = model.get_outputs_for_camera(camera)
+        images = torch.stack([outputs["rgb"], outputs["base_rgb"]]).float()
+        view = model.view_of(camera)
+        # Clones: a recorded frame draws into the same tensors again.
+        yield Frame(images, outputs["depth"].clone(), outputs["accumulation"].clone(), view.viewmat, view.K)
+
+
+def _both(figures: Sequence[float]) -> tuple[float, float]:
+    compensated, base = figures
+    return compensated, base
