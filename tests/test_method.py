@@ -73,7 +73,7 @@ def test_the_pages_state_when_training_stops() -> None:
 def test_the_page_states_when_a_correction_shrinks() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert rf"$e \ge {losses.FIRST_PASSES}$ passes" in text
-    assert rf"/ ({losses.HALF_AFTER} \sqrt{{HW}}))" in text
+    assert rf"/ {losses.HALF_AFTER})" in text
 
 
 def test_the_checks_can_fail() -> None:

@@ -104,7 +104,7 @@ class TunedStep:
         self._recordings: dict[Hashable, _Recording] = {}
         self._warm: set[Hashable] = set()
         self._pairs = NeededPairs()
-        self._passes = 0
+        self._emphasis = 1.0
 
     def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train on one image.
@@ -121,10 +121,10 @@ class TunedStep:
         return self._run(inputs, settings, None)
 
     def _replayed(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
-        passes = self._model.losses.passes(self._model.state)
-        if passes != self._passes:  # recordings hold the number
+        emphasis = self._model.losses.emphasis(self._model.state)
+        if emphasis != self._emphasis:  # recordings hold the number
             self._recordings.clear()
-            self._passes = passes
+            self._emphasis = emphasis
         kind = (inputs.view.width, inputs.view.height, inputs.mask is not None)
         recording = self._recordings.get(kind)
         if kind not in self._warm or (recording is None and len(self._recordings) >= MAX_RECORDINGS):

@@ -22,9 +22,8 @@ from sundae_ns.training.similarity import mean_ssim
 CHAIN_PRIOR = 0.01
 """Weights of opacities and scales in the loss of a chain (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
 
-HALF_AFTER = 0.6
-"""Passes over the training images after which images show half of the correction that the loss asks for, in sides of the
-image: larger images are harder to learn by heart. The side is the root of the number of pixels."""
+HALF_AFTER = 800
+"""Passes over the training images after which images show half of the correction that the loss asks for."""
 FIRST_PASSES = 8
 """With fewer passes a head has learnt no image by heart."""
 
@@ -98,9 +97,9 @@ class StepLosses:
         """
         if mask is not None:
             target, rgb, base = target * mask, rgb * mask, base * mask
-        passes = self.passes(state)
-        if passes > 0:
-            rgb = torch.lerp(base, rgb, emphasis(passes, *target.shape[:2]))
+        emphasis = self.emphasis(state)
+        if emphasis != 1:
+            rgb = torch.lerp(base, rgb, emphasis)
         compared = base if state.head_enabled and self.base_weight > 0 else None
         squares = self.squares and state.pruned
         main_loss, base_loss = image_losses(rgb, compared, target, self.ssim, self.ssim_weight, squares=squares)
@@ -112,10 +111,12 @@ class StepLosses:
             losses.update(prior_losses(params, weight))
         return losses
 
-    def passes(self, state: FieldState) -> int:
-        """Passes of a residual head over the training images that its correction shrinks for; 0 while it does not.
+    def emphasis(self, state: FieldState) -> float:
+        """How many times as strong as in images a residual head's correction is in the loss at this step.
 
-        A power of two, 8, 16, 32 ..., because recorded steps hold the number.
+        With each pass over the training images a head learns more of them by heart, which it corrects in other views too. So
+        its correction shrinks (as an estimate does by James and Stein, 1961), the more the more often images are seen. It
+        shrinks at 8, 16, 32 ... passes, because recorded steps hold the number.
         """
         head = state.head
         if (
@@ -124,31 +125,17 @@ class StepLosses:
             or state.trying
             or not (state.head_enabled and self.num_images)
         ):
-            return 0
+            return 1.0
         passes = (state.schedule_step - state.head_starts_at) * state.images_per_step / self.num_images
         if not FIRST_PASSES <= passes < math.inf:  # a budget search knows no step at which its head starts
-            return 0
-        return 1 << math.floor(math.log2(passes))
+            return 1.0
+        return 1 + 2 ** math.floor(math.log2(passes)) / HALF_AFTER
 
     def prior_weight(self, state: FieldState) -> float:
         """Weight of opacities and scales at this step."""
         if self.chain and state.densifying:
             return CHAIN_PRIOR
         return self.prior if state.pruned else 0.0
-
-
-def emphasis(passes: int, height: int, width: int) -> float:
-    """How many times as strong as in images a residual head's correction is in the loss.
-
-    With each pass over the training images a head learns more of them by heart, which it corrects in other views too. So
-    its correction shrinks (as an estimate does by James and Stein, 1961), the more the more often images are seen.
-
-    Args:
-        passes: over the training images, see :meth:`StepLosses.passes`.
-        height: of the image in pixels.
-        width: of the image in pixels.
-    """
-    return 1 + passes / (HALF_AFTER * math.sqrt(height * width))
 
 
 def image_losses(

@@ -127,7 +127,7 @@ class RecordedStep:
         self._warm: set[Hashable] = set()
         """Kinds of steps that have run kernel by kernel."""
         self._pairs = NeededPairs()
-        self._passes = 0
+        self._emphasis = 1.0
 
     def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train one step.
@@ -147,10 +147,10 @@ class RecordedStep:
         held = self._held
         if held is None or not held.unchanged(state, settings, growing=growing):
             held = self._held = self._hold(state, settings, growing=growing)
-        passes = self._losses.passes(state)
-        if passes != self._passes:  # recordings hold the number, and it never returns
+        emphasis = self._losses.emphasis(state)
+        if emphasis != self._emphasis:  # recordings hold the number, and it never returns
             self._forget_recordings()
-            self._passes = passes
+            self._emphasis = emphasis
         kind = _kind(state, inputs, settings)
         recording = self._recording(kind, state, held, inputs, settings) if kind in self._warm else None
         if recording is None:
