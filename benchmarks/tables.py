@@ -176,6 +176,18 @@ def speed() -> list[str]:
     return table(heads, first_of_each(rows))
 
 
+def flicker() -> list[str]:
+    """Squared errors of warped frames without the least of head and base colours, and their quotients."""
+    apart, rows = (1, 7), {}
+    for line in lines_of("flicker.jsonl"):
+        cells = rows.setdefault(named(line["config"], is_of_today(line)), {})
+        cells[line["frames_apart"]] = [
+            *(number(1e6 * line["excess"], 1), number(1e6 * line["excess_base"], 1), number(line["ratio"], 1))
+        ]
+    heads = [f"{name}, {frames} apart" for frames in apart for name in ("head", "base", "head / base")]
+    return table(["field", *heads], [[name, *(c for at in apart for c in cells[at])] for name, cells in rows.items()])
+
+
 def training_time() -> list[str]:
     """Seconds of whole trainings, each with the error of what was trained."""
     heads = ["capture", "method", "steps", "seconds", "ms a step", "primitives", "PSNR, dB", "SSIM", "GPU"]
@@ -280,6 +292,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "quality": quality,
     "shares": shares,
     "speed": speed,
+    "flicker": flicker,
     "training-time": training_time,
     "packing": packing,
     "multi-gpu": multi_gpu,

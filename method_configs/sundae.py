@@ -18,7 +18,9 @@ from sundae_ns.pruning import PruningConfig
 from sundae_ns.trainer import SundaeTrainerConfig
 from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.training.progress import ProgressWriter
+from sundae_ns.training.run_length import LONGEST_RISE
 from sundae_ns.training.schedulers import PruneAwareDecayConfig
+from sundae_ns.training.trials import longest_rise
 
 
 def _adam(lr: float, eps: float = 1e-15) -> FusedAdamConfig:
@@ -29,7 +31,7 @@ def _constant(lr: float) -> dict[str, Any]:
     return {"optimizer": _adam(lr), "scheduler": None}
 
 
-def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
+def optimizers(steps: int, *, plain: bool = False, tried: bool = False) -> dict[str, Any]:
     """Optimizers for a run: splatfacto's rates, and rates of features and head.
 
     Right after the prune the rate of the centres restarts, so that kept primitives can fill the gaps.
@@ -37,7 +39,9 @@ def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
     Args:
         steps: length of the run, at which decaying rates reach their final value.
         plain: leave out what is not in the paper: this restart, and weight decay of the head.
+        tried: whether trials decide about the head, so that its rate must rise within one.
     """
+    rise = min(500, steps // LONGEST_RISE, longest_rise(steps) if tried else steps)
     return {
         "means": {
             "optimizer": _adam(1.6e-4),
@@ -57,7 +61,7 @@ def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
                 max_steps=steps,
                 lr_restart=1e-3,
                 hold_until_prune=True,
-                warmup_steps=min(500, steps // 12),
+                warmup_steps=rise,
                 shape="cosine",
             ),
         },
@@ -93,6 +97,7 @@ def method(
         datamanager: other options of the datamanager.
         model: other options of the model.
     """
+    head = head or HeadConfig()
     config = SundaeTrainerConfig(
         method_name=name,
         steps_per_eval_image=500,
@@ -110,7 +115,7 @@ def method(
             ),
             model=SundaeModelConfig(
                 pruning=pruning,
-                head=head or HeadConfig(),
+                head=head,
                 camera_optimizer=CameraOptimizerConfig(mode="off"),
                 **model,
             ),
@@ -120,7 +125,7 @@ def method(
             steps_per_log=100 if torch.cuda.is_available() else 10,
             local_writer=LocalWriterConfig(_target=ProgressWriter, enable=True),
         ),
-        optimizers=optimizers(steps, plain=plain_optimizers),
+        optimizers=optimizers(steps, plain=plain_optimizers, tried=head.mode == "auto"),
         # A training ends by itself, so that the next command runs; ns-viewer shows the run afterwards.
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, quit_on_train_completion=True),
         vis="viewer",

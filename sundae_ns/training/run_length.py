@@ -13,6 +13,7 @@ from copy import deepcopy
 from typing import Any
 
 from sundae_ns.errors import ConfigError
+from sundae_ns.training.trials import longest_rise
 
 SCHEDULE = {
     "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval refine_every",
@@ -62,10 +63,11 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
     if share == 1:
         return
     model, usual_model = config.pipeline.model, usual.pipeline.model
-    steps_share = share
+    steps_share, skipped = share, 0
     if model.warm_start is not None:
         left = usual.max_num_iterations - usual_model.pruning.prune_at
         steps_share = min(config.schedule_length / max(left, 1), 1.0)
+        skipped = round(steps_share * usual_model.pruning.prune_at)
     config.optimizers = deepcopy(config.optimizers)  # methods share them with every configuration that tyro makes
     for name in _free(config, usual, given):
         value = _get(usual, name)
@@ -73,6 +75,8 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
             continue
         if name.endswith(".warmup_steps"):
             scaled = min(value, config.schedule_length // LONGEST_RISE)
+            if model.head.mode == "auto":
+                scaled = min(scaled, longest_rise(config.schedule_length + skipped))
         else:
             scaled = max(round(value * (share if name.startswith("optimizers.") else steps_share)), 1)
         if name == _REFINE and model.warmup == "densify":

@@ -37,8 +37,12 @@ MORE_FEATURES = 29
 """Features of the last arm: as many as are splatted without padding after the default 13."""
 NAMES = {"plain": "no head", "head": "head", "features": f"head with {MORE_FEATURES} features"}
 """What the log calls them."""
-TRIAL_SHARE = 0.04
-"""Length of a trial as a share of the schedule."""
+TRIAL_STEPS = 1200
+"""Length of a trial, if it is among the shares of the schedule below: shorter ones show too little of what a head gains."""
+LEAST_TRIAL, MOST_TRIAL = 0.04, 0.05
+"""Shortest and longest trial as shares of the schedule. All trials but that of the chosen arm cost at most a tenth of it."""
+RISE_SHARE = 5 / 12
+"""Share of a trial, at its beginning, over which the rate of the head may rise."""
 MEAN_SHARE = 0.25
 """Share of a trial, at its end, over which weights are averaged for the verdict."""
 HOLD_SHARE = 0.1
@@ -53,8 +57,9 @@ FEW_VIEWS = 12
 """With fewer training views, two are held out in turn, for trials of half the length."""
 LEAST_GAIN = 0.1
 """Least PSNR that an arm must gain over a smaller one, dB. Two runs of one seed differ by as much."""
-GAIN_PER_DOUBLING = 0.5
-"""PSNR that an arm must gain for each doubling of the stored bytes, dB: of the order of what twice as many primitives gain."""
+GAIN_PER_DOUBLING = 0.4
+"""PSNR that an arm must gain for each doubling of the stored bytes, dB: of the order of what twice as many primitives gain,
+of which a trial shows a part."""
 
 
 class Plan(NamedTuple):
@@ -78,6 +83,24 @@ class Plan(NamedTuple):
         return [index for fold in self.folds for index in fold]
 
 
+def trial_length(steps: int) -> int:
+    """Training steps of a trial.
+
+    Args:
+        steps: length of the schedule.
+    """
+    return max(round(max(LEAST_TRIAL * steps, min(TRIAL_STEPS, MOST_TRIAL * steps))), 1)
+
+
+def longest_rise(steps: int) -> int:
+    """Steps over which the rate of a head may rise, so that its trial shows what it gains.
+
+    Args:
+        steps: length of the schedule.
+    """
+    return round(RISE_SHARE * trial_length(steps))
+
+
 def plan_trials(indices: Sequence[int], steps: int, arms: int = len(ARMS)) -> Plan:
     """Plan the trials of a run.
 
@@ -90,8 +113,9 @@ def plan_trials(indices: Sequence[int], steps: int, arms: int = len(ARMS)) -> Pl
     count = 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY))
     # Evenly over the capture, because neighbours in a path look alike.
     chosen = [indices[(2 * i + 1) * len(indices) // (2 * count)] for i in range(count)]
-    length = max(round(TRIAL_SHARE * steps / (2 if few else 1)), 1)
-    return Plan([[index] for index in chosen] if few else [chosen], length, arms)
+    if few:
+        return Plan([[index] for index in chosen], max(round(LEAST_TRIAL * steps / 2), 1), arms)
+    return Plan([chosen], trial_length(steps), arms)
 
 
 @dataclass

@@ -45,13 +45,16 @@ def trained(trainer_of: MakeTrainer, steps: type[RecordedStep] | None) -> Any:
     return trainer
 
 
+WORST = {"means": 0.0002, "scales": 0.0056, "opacities": 0.066, "features_dc": 0.0073}
+"""Largest differences of quartiles over six seeds: rounding decides about a few primitives at thresholds of densification."""
+
+
 def alike(one: Any, other: Any) -> None:
-    """Rounding decides about a few primitives at the thresholds of densification; the fields are the same otherwise."""
     assert one.num_points == pytest.approx(other.num_points, rel=0.02)
-    for name in ("means", "scales", "opacities", "features_dc"):
+    for name, worst in WORST.items():
         shares = torch.tensor([0.25, 0.5, 0.75])
         found, expected = (model.gauss_params[name].detach().quantile(shares) for model in (one, other))
-        torch.testing.assert_close(found, expected, rtol=0.02, atol=0.03)
+        torch.testing.assert_close(found, expected, rtol=0, atol=3 * worst)
 
 
 def test_a_run_by_recorded_steps_is_the_same(trainer_of: MakeTrainer) -> None:

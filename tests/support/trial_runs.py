@@ -13,8 +13,8 @@ from sundae_ns.data import write_embedded_capture
 from sundae_ns.method_configs import sundae
 
 STEPS, PRUNE_AT = 100, 40
-LENGTH = 4
-"""Steps of a trial: a twenty-fifth of the run. Views are held out from step 30 on."""
+LENGTH = 5
+"""Steps of a trial: a twentieth of so short a run. Views are held out from step 30 on."""
 
 
 def tiny_scene(folder: Path, views: int) -> Path:
