@@ -21,6 +21,7 @@ After the prune:
   "pdrop": p       the features of each primitive are left out of a step with probability p, those of the others are larger by
                    1 / (1 - p); colours stay
   "fdrop": p       each feature is left out of a step with probability p, the others are larger by 1 / (1 - p)
+  "fblur": s       features are blurred by a Gaussian of s pixels, in training and after
   "average": k     mean of field and head over the last k steps; evaluated at the end beside the last state
 Before it:
   "reg_warm": w    weights of opacities and scales while the field grows
@@ -105,6 +106,8 @@ class Arm:
             self._patch_primitives()
         if spec.get("fnoise"):
             self._patch_noise()
+        if spec.get("fblur"):
+            self._patch_blur()
         if spec.get("hold"):
             self._patch_hold()
         if "distil" in spec:
@@ -229,6 +232,24 @@ class Arm:
             return found
 
         LocalField.primitives = primitives
+
+    def _patch_blur(self):
+        old, sigma = render_module.compensate, self.spec["fblur"]
+        x = torch.arange(-3, 4, dtype=torch.float32)
+        kernel = torch.exp(-0.5 * (x / sigma) ** 2)
+        kernel = (kernel / kernel.sum()).to(self.state.device)
+
+        def blurred(features):
+            image = features.permute(2, 0, 1)[:, None]
+            image = torch.nn.functional.conv2d(torch.nn.functional.pad(image, (3, 3, 0, 0), mode="replicate"), kernel.view(1, 1, 1, 7))
+            image = torch.nn.functional.conv2d(torch.nn.functional.pad(image, (0, 0, 3, 3), mode="replicate"), kernel.view(1, 1, 7, 1))
+            return image[:, 0].permute(1, 2, 0)
+
+        def compensate(head, base, splatted, background, *, training):
+            splatted = replace(splatted, colors=torch.cat([splatted.colors[..., :3], blurred(splatted.colors[..., 3:])], dim=-1))
+            return old(head, base, splatted, background, training=training)
+
+        render_module.compensate = step_module.compensate = compensate
 
     def _patch_noise(self):
         old, p = render_module.compensate, self.spec["fnoise"]

@@ -131,6 +131,12 @@ if arm.mean is not None:
 for k, (count, mean) in getattr(arm, "means", {}).items():
     arm.mean = mean
     arm.swap(); evaluate(end - 1, average=count, over=k, wide=True); arm.swap()
+if spec.get("flicker") and model.state.head_enabled:
+    from types import SimpleNamespace
+    from sundae_ns.scenes.flicker import measure_flicker
+    model.eval()
+    found = measure_flicker(SimpleNamespace(model=model, datamanager=dm, source=name))
+    note(flicker=[[f.frames_apart, f.excess, f.excess_base, round(f.ratio, 2)] for f in found])
 record = trainer.base_dir / "trials.json"
 note(seconds=seconds, spec=spec, trials=json.loads(record.read_text()) if record.exists() else None)
 if "save" not in spec:
