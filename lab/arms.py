@@ -16,11 +16,13 @@ After the prune:
                    training views moves onto primitives drawn by weight x |error|^q, which are split along their longest axis
   "distil": {"views": v, "share": s, "reach": t}  s of the steps train on v images of the unpruned field, from cameras
                    between two neighbours (t: farthest share of the way, also sideways)
-  "shift": s       the head trains on windows that are s pixels smaller than the image, at a random place of each step
+  "shift": s       (1: the grid of folded pixels shifts by at most a pixel) the head trains on windows that are s pixels smaller than the image, at a random place of each step
   "flip": axes     the head trains on mirrored images: each of these axes (0 rows, 1 columns) is flipped in half of the steps
   "pdrop": p       the features of each primitive are left out of a step with probability p, those of the others are larger by
                    1 / (1 - p); colours stay
   "fdrop": p       each feature is left out of a step with probability p, the others are larger by 1 / (1 - p)
+  "oblur": s       the correction is blurred by a Gaussian of s pixels (3 x 3), in training and after
+  "grid": true     in training the grid of folded pixels is shifted by 0 or 1 along each side (not for recorded steps)
   "fblur": s       features are blurred by a Gaussian of s pixels, in training and after
   "average": k     mean of field and head over the last k steps; evaluated at the end beside the last state
 Before it:
@@ -108,6 +110,10 @@ class Arm:
             self._patch_noise()
         if spec.get("fblur"):
             self._patch_blur()
+        if spec.get("oblur"):
+            self._patch_output()
+        if spec.get("grid"):
+            self._patch_grid()
         if spec.get("hold"):
             self._patch_hold()
         if "distil" in spec:
@@ -202,11 +208,12 @@ class Arm:
     def _patch_window(self):
         old, arm, s = step_module.training_window, self, self.spec["shift"]
 
-        def window(width, height, max_pixels, seed):
+        def window(width, height, max_pixels, seed, *, mirror=False):
+            found = old(width, height, max_pixels, seed, mirror=mirror)
             if not arm.state.head_enabled or width * height > max_pixels > 0:
-                return old(width, height, max_pixels, seed)
+                return found
             draw = random.Random(seed)
-            return Window(draw.randint(0, s), draw.randint(0, s), width - s, height - s)
+            return Window(draw.randint(0, s), draw.randint(0, s), width - s, height - s, found is not None and found.mirrored)
 
         step_module.training_window = window
 
@@ -248,6 +255,33 @@ class Arm:
         def compensate(head, base, splatted, background, *, training):
             splatted = replace(splatted, colors=torch.cat([splatted.colors[..., :3], blurred(splatted.colors[..., 3:])], dim=-1))
             return old(head, base, splatted, background, training=training)
+
+        render_module.compensate = step_module.compensate = compensate
+
+    def _patch_output(self):
+        old, sigma = render_module.compensate, self.spec["oblur"]
+        side = math.exp(-0.5 / sigma**2)
+        k = torch.tensor([side, 1.0, side])
+        kernel = (k[:, None] * k / k.sum() ** 2).to(self.state.device).view(1, 1, 3, 3)
+
+        def compensate(head, base, splatted, background, *, training):
+            off = old(head, base, splatted, background, training=training) - base
+            image = torch.nn.functional.pad(off.permute(2, 0, 1)[:, None], (1, 1, 1, 1), mode="replicate")
+            return base + torch.nn.functional.conv2d(image, kernel)[:, 0].permute(1, 2, 0)
+
+        render_module.compensate = step_module.compensate = compensate
+
+    def _patch_grid(self):  # kernel by kernel only: a recording would keep one shift
+        old, draw = render_module.compensate, random.Random(7)
+
+        def compensate(head, base, splatted, background, *, training):
+            if not training:
+                return old(head, base, splatted, background, training=training)
+            top, left = draw.randint(0, 1), draw.randint(0, 1)
+            pad = lambda image: torch.nn.functional.pad(image, (0, 0, left, 1 - left, top, 1 - top))
+            seen = replace(splatted, colors=pad(splatted.colors), alpha=pad(splatted.alpha))
+            h, w, _ = base.shape
+            return old(head, pad(base), seen, background, training=True)[top : top + h, left : left + w]
 
         render_module.compensate = step_module.compensate = compensate
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -24,12 +24,24 @@ SIZES: dict[str, tuple[int, int | None]] = {
 }
 """Channels of the finest level, and the maximum of the coarser ones. The last three are the paper's."""
 
-PHASES: dict[int, tuple[tuple[int, int], ...]] = {
-    1: ((0, 0),),
-    2: ((0, 0), (1, 1)),
-    4: ((0, 0), (1, 1), (0, 1), (1, 0)),
+
+class Phase(NamedTuple):
+    """How one of several runs of the head sees the image."""
+
+    rows: int
+    """Shift down, in halves of the head's fold."""
+    columns: int
+    """Shift to the right, in the same unit."""
+    mirrored: bool = False
+    """Whether left and right change places, for heads that train on mirrored images."""
+
+
+PHASES: dict[int, tuple[Phase, ...]] = {
+    1: (Phase(0, 0),),
+    2: (Phase(0, 0), Phase(1, 1)),
+    4: (Phase(0, 0), Phase(1, 1), Phase(0, 1, mirrored=True), Phase(1, 0, mirrored=True)),
 }
-"""Shifts of the image by rows and columns, in halves of the head's fold, by the number of runs of the head."""
+"""Runs of the head for a frame, by their number."""
 
 _log = logging.getLogger(__name__)
 
@@ -59,8 +71,8 @@ class HeadConfig:
     """Train on a random window of at most this many pixels if images are larger, once the head is enabled; 0 for whole
     images."""
     phases: Literal[1, 2, 4] = 1
-    """Without gradients: average the head over this many shifts of its pixel grid. More take proportionally longer, and
-    flicker less when a camera moves."""
+    """Without gradients: average the head over this many shifts of its pixel grid, half of four in a mirror. More take
+    proportionally longer, are a little better, and flicker less when a camera moves."""
     precision: Literal["fp32", "bf16", "fp16"] = "bf16"
     """Arithmetic of the U-Net on CUDA; a CPU always uses fp32. fp16 is for inference: its range is too small for
     training, which uses bf16 instead, or fp32 on GPUs before Ampere."""

@@ -1,7 +1,8 @@
 """Averaging the head over shifted images, so that its output depends less on the position of the pixel grid.
 
 A U-Net that folds and pools pixels is not equivariant to a shift by one pixel, which shows as flicker when the camera
-moves. The mean over shifted images, each shifted back, depends less on their position.
+moves. The mean over shifted images, each shifted back, depends less on their position. A residual head trains on mirrored
+images too, so half of four runs see the image in a mirror: what the head gets wrong differs there.
 """
 
 from __future__ import annotations
@@ -24,9 +25,12 @@ def over_phases(head: CompensationHead, base: Tensor, splatted: Tensor, alpha: T
     height, width, _ = base.shape
     step = max(head.config.pixel_unshuffle // 2, 1)
     total = torch.zeros_like(base)
-    for top, left in ((step * y, step * x) for y, x in shifts):
+    for rows, columns, mirrored in shifts:
+        top, left = step * rows, step * columns
+        mirrored = mirrored and head.config.mode == "residual"
+        seen = [image.flip(1) if mirrored else image for image in (base, splatted, alpha)]
         # Pad by zeros, as the convolutions do; all to one size, since each size is recorded as a graph of its own.
         padding = (0, 0, left, step - left, top, step - top)
-        shifted = head(*(F.pad(image, padding) for image in (base, splatted, alpha)))
-        total += shifted[top : top + height, left : left + width]
+        shifted = head(*(F.pad(image, padding) for image in seen))[top : top + height, left : left + width]
+        total += shifted.flip(1) if mirrored else shifted
     return total / len(shifts)

@@ -56,9 +56,10 @@ def test_one_phase_is_the_head() -> None:
 
 
 @torch.no_grad()
-def test_a_pointwise_head_is_the_same_in_all_phases() -> None:
-    made, inputs = head(1, mode="features", pixel_unshuffle=1), images()
-    made.net = nn.Conv2d(5, 3, 1)  # type: ignore[assignment]
+@pytest.mark.parametrize(("mode", "channels"), [("residual", 9), ("features", 5)])
+def test_a_pointwise_head_is_the_same_in_all_phases(mode: str, channels: int) -> None:
+    made, inputs = head(1, mode=mode, pixel_unshuffle=1), images()
+    made.net = nn.Conv2d(channels, 3, 1)  # type: ignore[assignment]
     alone = made(*inputs)
     for phases in PHASES:
         made.config.phases = phases  # type: ignore[assignment]
@@ -76,6 +77,18 @@ def test_any_size_and_no_correction_where_nothing_was_splatted(phases: int, heig
     assert out.shape == (height, width, 3)
     assert out.isfinite().all()
     assert torch.equal(out[: height // 2], base[: height // 2])
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("mode", "in_a_mirror"), [("residual", 2), ("features", 0)])
+def test_half_of_four_runs_of_a_residual_head_see_a_mirror(mode: str, in_a_mirror: int) -> None:
+    """Only residual heads train on mirrored images."""
+    made, (base, splatted, alpha) = head(4, mode=mode), images()
+    base[:] = torch.linspace(0, 1, 80)[None, :, None]  # grows to the right
+    seen: list[bool] = []
+    made.register_forward_pre_hook(lambda _, given: seen.append(bool(given[0][30, 20, 0] > given[0][30, 60, 0])))
+    over_phases(made, base, splatted, alpha)
+    assert (len(seen), sum(seen)) == (4, in_a_mirror)
 
 
 def test_other_counts_are_refused() -> None:
