@@ -22,7 +22,7 @@ After the prune:
                    1 / (1 - p); colours stay
   "fdrop": p       each feature is left out of a step with probability p, the others are larger by 1 / (1 - p)
   "oblur": s       the correction is blurred by a Gaussian of s pixels (3 x 3), in training and after
-  "grid": true     in training the grid of folded pixels is shifted by 0 or 1 along each side (not for recorded steps)
+  "grid": true     in training the grid of folded pixels is shifted by 0 or 1 along each side
   "fblur": s       features are blurred by a Gaussian of s pixels, in training and after
   "average": k     mean of field and head over the last k steps; evaluated at the end beside the last state
 Before it:
@@ -157,6 +157,9 @@ class Arm:
             if self.there is None or len(self.there) != len(opacities):
                 self.there = torch.ones_like(opacities)
             self.there.bernoulli_(1 - spec["pdrop"]).div_(1 - spec["pdrop"])
+        if spec.get("grid"):
+            for flag in self.moved:
+                flag.fill_(self.random.random() < 0.5)
         if spec.get("flip"):
             for flag in self.flips.values():
                 flag.fill_(self.random.random() < 0.5)
@@ -271,17 +274,22 @@ class Arm:
 
         render_module.compensate = step_module.compensate = compensate
 
-    def _patch_grid(self):  # kernel by kernel only: a recording would keep one shift
-        old, draw = render_module.compensate, random.Random(7)
+    def _patch_grid(self):
+        old = render_module.compensate
+        self.moved = [torch.zeros((), dtype=torch.bool, device=self.state.device) for _ in range(2)]
+
+        def pick(image, axis, first, second):  # by flags on the device, for recorded steps
+            n = image.shape[axis] - 1
+            return torch.where(self.moved[axis], image.narrow(axis, first, n), image.narrow(axis, second, n))
+
+        def pad(image):
+            return pick(pick(torch.nn.functional.pad(image, (0, 0, 1, 1, 1, 1)), 0, 0, 1), 1, 0, 1)
 
         def compensate(head, base, splatted, background, *, training):
             if not training:
                 return old(head, base, splatted, background, training=training)
-            top, left = draw.randint(0, 1), draw.randint(0, 1)
-            pad = lambda image: torch.nn.functional.pad(image, (0, 0, left, 1 - left, top, 1 - top))
             seen = replace(splatted, colors=pad(splatted.colors), alpha=pad(splatted.alpha))
-            h, w, _ = base.shape
-            return old(head, pad(base), seen, background, training=True)[top : top + h, left : left + w]
+            return pick(pick(old(head, pad(base), seen, background, training=True), 0, 1, 0), 1, 1, 0)
 
         render_module.compensate = step_module.compensate = compensate
 

@@ -8,6 +8,9 @@ Keys of the JSON beside those of lab/arms.py:
   "save": step                 save everything after this step
   "fit": steps                 fit the schedule to a run of so many steps; "images": folder of smaller images, a divisor
   "eval": [steps]
+  "tied": true             the head is equivariant to mirroring (symmetry.py)
+  "net": [KIND, OPTIONS]   another network (nets.py)
+  "flicker": true          measure flicker at the end
   "texture": T             the last 3 T features are slopes inside each primitive (texture.py)
 A capture called garden16 (a link to garden) trains on 16 views of garden and tests on 40 others.
 """
@@ -44,6 +47,13 @@ if "inputs" in spec:  # letters: d for directions, z for inverse distances
     inputs.install("d" in spec["inputs"], "z" in spec["inputs"])
 
 arms.patch_losses(spec)
+if spec.get("tied"):  # mirror-equivariant weights
+    import symmetry
+    symmetry.install()
+if "net" in spec:  # heads at full resolution
+    import nets
+    nets.install(*spec["net"])
+    args[1:1] = ["--pipeline.model.head.fused", "False"]
 if "texture" in spec:
     import texture
     texture.install(spec["texture"], spec.get("through", False))

@@ -58,8 +58,8 @@ FEW_VIEWS = 12
 LEAST_GAIN = 0.1
 """Least PSNR that an arm must gain over a smaller one, dB. Two runs of one seed differ by as much."""
 GAIN_PER_DOUBLING = 0.4
-"""PSNR that an arm must gain for each doubling of the stored bytes, dB: of the order of what twice as many primitives gain,
-of which a trial shows a part."""
+"""PSNR that an arm must gain for each doubling of the stored bytes, dB. Twice as many primitives gain about twice this at the
+end of a run, and a trial shows a part of a gain."""
 
 
 class Plan(NamedTuple):
