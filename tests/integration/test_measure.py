@@ -194,11 +194,13 @@ def test_bench_frame_prints_null_for_undefined_figures(tiny: Any, capsys: pytest
 def test_bench_flicker_compares_the_head_with_base_colours(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["bench", "flicker", "--load-config", str(tiny.folder), "--places", "1"]
     with pytest.raises(SystemExit) as caught:
-        main([*arguments, "--json"])
+        main([*arguments, "--phases", "1", "4", "--json"])
     assert caught.value.code == 0
-    near, far = (json.loads(line) for line in capsys.readouterr().out.splitlines())
-    assert (near["frames_apart"], far["frames_apart"]) == (1, 7)
-    for line in (near, far):
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(line["phases"], line["frames_apart"]) for line in lines] == [(1, 1), (1, 7), (4, 1), (4, 7)]
+    assert lines[0]["mse_base"] == lines[2]["mse_base"]
+    assert lines[0]["mse"] != lines[2]["mse"]
+    for line in lines:
         assert 0 < line["seen"] < 1
         assert 0 < line["excess"] < line["mse"]
         assert 0 < line["excess_base"] < line["mse_base"]

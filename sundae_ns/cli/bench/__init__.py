@@ -94,7 +94,7 @@ def frame(
 
 
 @app.command
-def flicker(load_config: Path, places: int = 3, json: bool = False) -> int:
+def flicker(load_config: Path, places: int = 3, phases: tuple[Literal[1, 2, 4], ...] = (), json: bool = False) -> int:
     """Measure the flicker of the head along camera paths, over that of base colours, as StopThePop measures popping.
 
     Frames 1 and 7 apart are compared, the earlier warped onto the later by the field's depth. A sharper image shows more
@@ -103,11 +103,12 @@ def flicker(load_config: Path, places: int = 3, json: bool = False) -> int:
     Args:
         load_config: the folder of a run with a head, or its config.yml.
         places: number of paths, each between two neighbouring training cameras.
-        json: print one line of JSON for each distance of frames, instead of a table.
+        phases: passes of the head for a frame, as in bench frame; by default those of the run.
+        json: print one line of JSON for each of these and each distance of frames, instead of a table.
     """
     from sundae_ns.cli.bench.flicker import run_flicker
 
-    return run_flicker(load_config, places=places, json=json)
+    return run_flicker(load_config, places=places, phases=phases, json=json)
 
 
 __all__ = ["app"]
