@@ -18,9 +18,8 @@ from sundae_ns.pruning import PruningConfig
 from sundae_ns.trainer import SundaeTrainerConfig
 from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.training.progress import ProgressWriter
-from sundae_ns.training.run_length import LONGEST_RISE
+from sundae_ns.training.run_length import shortened_rise
 from sundae_ns.training.schedulers import PruneAwareDecayConfig
-from sundae_ns.training.trials import longest_rise
 
 
 def _adam(lr: float, eps: float = 1e-15) -> FusedAdamConfig:
@@ -41,7 +40,6 @@ def optimizers(steps: int, *, plain: bool = False, tried: bool = False) -> dict[
         plain: leave out what is not in the paper: this restart, and weight decay of the head.
         tried: whether trials decide about the head, so that its rate must rise within one.
     """
-    rise = min(500, steps // LONGEST_RISE, longest_rise(steps) if tried else steps)
     return {
         "means": {
             "optimizer": _adam(1.6e-4),
@@ -61,7 +59,7 @@ def optimizers(steps: int, *, plain: bool = False, tried: bool = False) -> dict[
                 max_steps=steps,
                 lr_restart=1e-3,
                 hold_until_prune=True,
-                warmup_steps=rise,
+                warmup_steps=shortened_rise(500, steps, trials_of=steps if tried else None),
                 shape="cosine",
             ),
         },

@@ -74,9 +74,8 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
         if name == _RESETS or not value:
             continue
         if name.endswith(".warmup_steps"):
-            scaled = min(value, config.schedule_length // LONGEST_RISE)
-            if model.head.mode == "auto":
-                scaled = min(scaled, longest_rise(config.schedule_length + skipped))
+            trials = config.schedule_length + skipped if model.head.mode == "auto" else None
+            scaled = shortened_rise(value, config.schedule_length, trials_of=trials)
         else:
             scaled = max(round(value * (share if name.startswith("optimizers.") else steps_share)), 1)
         if name == _REFINE and model.warmup == "densify":
@@ -86,6 +85,17 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
         period = round(usual_model.reset_alpha_every * usual_model.refine_every * steps_share)
         never = model.stop_split_at // model.refine_every + 1
         model.reset_alpha_every = max(round(period / model.refine_every), 1) if period >= LEAST_RECOVERY else never
+
+
+def shortened_rise(rise: int, steps: int, *, trials_of: int | None) -> int:
+    """Steps over which a learning rate rises in a run.
+
+    Args:
+        rise: such steps in a run that is long enough.
+        steps: length of the run.
+        trials_of: length of the schedule whose trials decide about the head; None without trials.
+    """
+    return min(rise, steps // LONGEST_RISE, rise if trials_of is None else longest_rise(trials_of))
 
 
 def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> list[str]:
