@@ -27,7 +27,7 @@ case $1 in
    PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider -o "addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload" \
      --ignore tests/evaluation/test_video.py --ignore tests/integration/test_report.py tests) > "$OUT/g1.log" 2>&1 &
   until [ $SECONDS -gt "${LIMIT:-540}" ]; do sleep 2; jobs -r | grep -q . || break; done
-  tail -n 8 "$OUT"/g?.log | cut -c1-400; cat "$OUT"/t?.jsonl ;;
+  grep -h Continuing -A2 "$OUT"/g?.log; tail -n 12 "$OUT"/g?.log | cut -c1-400; cat "$OUT"/t?.jsonl ;;
 4) # whole runs for runs.csv (20 s to start; six at a time end after 3 to 5 minutes): SCENE, ARM, SEED
   alone; sundae bench suite /tmp/scenes -o /tmp/suite --scenes "$SCENE" --arms "$ARM" --seeds "${SEED:-42}"
   cat /tmp/suite/done/*.json > "$OUT/results.jsonl" ;;
