@@ -22,7 +22,8 @@ After the prune:
                    1 / (1 - p); colours stay
   "fdrop": p       each feature is left out of a step with probability p, the others are larger by 1 / (1 - p)
   "oblur": s       the correction is blurred by a Gaussian of s pixels (3 x 3), in training and after
-  "grid": true     in training the grid of folded pixels is shifted by 0 or 1 along each side
+  "grid": u        in training the grid of folded pixels is shifted by 0 or 1 along each side, up to the share u of the steps after
+                   the prune (true: all), in the share "grid_share" of these; "mirror_until": u  mirrored images up to a share
   "fblur": s       features are blurred by a Gaussian of s pixels, in training and after
   "average": k     mean of field and head over the last k steps; evaluated at the end beside the last state
 Before it:
@@ -114,6 +115,10 @@ class Arm:
             self._patch_output()
         if spec.get("grid"):
             self._patch_grid()
+        if "mirror_until" in spec:
+            old_at = self.model.resolution
+            until = lambda: (self.pruned_at or 0) + spec["mirror_until"] * (self.steps - (self.pruned_at or 0))
+            self.model.resolution = lambda step: old_at(step) if step < until() else old_at(step)._replace(mirror=False)
         if spec.get("hold"):
             self._patch_hold()
         if "distil" in spec:
@@ -158,8 +163,10 @@ class Arm:
                 self.there = torch.ones_like(opacities)
             self.there.bernoulli_(1 - spec["pdrop"]).div_(1 - spec["pdrop"])
         if spec.get("grid"):
+            left = step < self.pruned_at + float(spec["grid"]) * (self.steps - self.pruned_at)
+            free = left and self.random.random() < spec.get("grid_share", 1)
             for flag in self.moved:
-                flag.fill_(self.random.random() < 0.5)
+                flag.fill_(free and self.random.random() < 0.5)
         if spec.get("flip"):
             for flag in self.flips.values():
                 flag.fill_(self.random.random() < 0.5)

@@ -13,11 +13,12 @@ case $1 in
   export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mps
   mkdir -p /tmp/mps && nvidia-cuda-mps-control -d
   cp lab/queue.txt /tmp/queue.txt; cd /tmp || exit
-  setsid nohup python3 /tmp/lab/run_queue.py /tmp/queue.txt "${PER:-3}" /tmp/lab/full.py > /tmp/queue.log 2>&1 & sleep 1 ;;
+  setsid nohup python3 /tmp/lab/run_queue.py /tmp/queue.txt "${PER:-4}" /tmp/lab/full.py > /tmp/queue.log 2>&1 & sleep 1 ;;
 2) # the other captures; wait for the queue (14 finishes with a head and 4 warm-ups: 400 s on two H100s)
   cp -r .gpu/scenes/* /tmp/scenes/
   until [ $SECONDS -gt "${LIMIT:-500}" ]; do sleep 2
     [ "$(grep -c ' end ' /tmp/queue.log)" -ge "$(grep -vc '^#' /tmp/queue.txt)" ] && break; done
+  tail -n 15 /tmp/pytest.log | cut -c1-300; cp /tmp/pytest.log "$OUT" 2>/dev/null
   cat /tmp/results/*.jsonl > "$OUT/results.jsonl"; grep -l Traceback /tmp/logs/* | xargs -r tail -n 5
   python3 lab/table.py "$OUT/results.jsonl" ;;
 3) # times alone: stock beside ours on GPU 0 (6 min on an H100), sundae-fast and the tests of the GPU on GPU 1
@@ -28,6 +29,11 @@ case $1 in
      --ignore tests/evaluation/test_video.py --ignore tests/integration/test_report.py tests) > "$OUT/g1.log" 2>&1 &
   until [ $SECONDS -gt "${LIMIT:-540}" ]; do sleep 2; jobs -r | grep -q . || break; done
   grep -h Continuing -A2 "$OUT"/g?.log; tail -n 12 "$OUT"/g?.log | cut -c1-400; cat "$OUT"/t?.jsonl ;;
+5) # start the tests of the GPU, beside the queue
+  cp -r docs README.md method_configs web /tmp/; cd /tmp || exit
+  (unset CUDA_MPS_PIPE_DIRECTORY; export CUDA_VISIBLE_DEVICES=1,0; setsid nohup env PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider \
+    -o "addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload" \
+    $(grep -rlE --include="*.py" "mark.gpu|pytestmark.*gpu" tests) > /tmp/pytest.log 2>&1 &) ;;
 4) # whole runs for runs.csv (20 s to start; six at a time end after 3 to 5 minutes): SCENE, ARM, SEED
   alone; sundae bench suite /tmp/scenes -o /tmp/suite --scenes "$SCENE" --arms "$ARM" --seeds "${SEED:-42}"
   cat /tmp/suite/done/*.json > "$OUT/results.jsonl" ;;
