@@ -18,7 +18,6 @@ from sundae_ns.pruning import PruningConfig
 from sundae_ns.trainer import SundaeTrainerConfig
 from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.training.progress import ProgressWriter
-from sundae_ns.training.run_length import shortened_rise
 from sundae_ns.training.schedulers import PruneAwareDecayConfig
 
 
@@ -30,7 +29,7 @@ def _constant(lr: float) -> dict[str, Any]:
     return {"optimizer": _adam(lr), "scheduler": None}
 
 
-def optimizers(steps: int, *, plain: bool = False, tried: bool = False) -> dict[str, Any]:
+def optimizers(steps: int, *, plain: bool = False) -> dict[str, Any]:
     """Optimizers for a run: splatfacto's rates, and rates of features and head.
 
     Right after the prune the rate of the centres restarts, so that kept primitives can fill the gaps.
@@ -38,7 +37,6 @@ def optimizers(steps: int, *, plain: bool = False, tried: bool = False) -> dict[
     Args:
         steps: length of the run, at which decaying rates reach their final value.
         plain: leave out what is not in the paper: this restart, and weight decay of the head.
-        tried: whether trials decide about the head, so that its rate must rise within one.
     """
     return {
         "means": {
@@ -59,7 +57,7 @@ def optimizers(steps: int, *, plain: bool = False, tried: bool = False) -> dict[
                 max_steps=steps,
                 lr_restart=1e-3,
                 hold_until_prune=True,
-                warmup_steps=shortened_rise(500, steps, trials_of=steps if tried else None),
+                warmup_steps=min(500, steps // 12),
                 shape="cosine",
             ),
         },
@@ -123,7 +121,7 @@ def method(
             steps_per_log=100 if torch.cuda.is_available() else 10,
             local_writer=LocalWriterConfig(_target=ProgressWriter, enable=True),
         ),
-        optimizers=optimizers(steps, plain=plain_optimizers, tried=head.mode == "auto"),
+        optimizers=optimizers(steps, plain=plain_optimizers),
         # A training ends by itself, so that the next command runs; ns-viewer shows the run afterwards.
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, quit_on_train_completion=True),
         vis="viewer",

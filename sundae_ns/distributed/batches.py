@@ -71,7 +71,7 @@ def shorten(config: Any, ranks: int) -> Any:
     config = deepcopy(config)
     model = config.pipeline.model
     steps: tuple[tuple[Any, str], ...] = (
-        (config, "max_num_iterations steps_per_save steps_per_eval_image steps_per_eval_all_images"),
+        (config, "max_num_iterations schedule_length steps_per_save steps_per_eval_image steps_per_eval_all_images"),
         (model.pruning, "prune_at start stop every"),
         (model.head, "start_at"),
         (model, "warmup_length refine_every resolution_schedule sh_degree_interval stop_screen_size_at stop_split_at"),

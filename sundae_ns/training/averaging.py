@@ -144,6 +144,7 @@ class Averaging(Extension):
         if length is None or last is None or last + 1 < length:  # the first part of a run ends with its own weights
             return
         if state.schedule_step < self.settled_at or state.step < last - self.share * length:
+            self._mean = RunningMean()  # a run that was stopped in its last part may be resumed for a longer one
             return
         if state.restored != self._restored:
             self._mean, self._restored = RunningMean(), state.restored

@@ -58,12 +58,14 @@ class FieldState:
     trying: bool = False
     """Whether this is a trial, too short for what helps a residual head in the long run: mirrored images, and a correction that
     shrinks."""
+    undone: int = 0
+    """Images trained on since the head could begin that do not count, because the field went back to before them."""
     images_per_step: int = 1
     """Number of images in the batch of a step."""
     resting: bool = False
     """Whether training steps change nothing, because more training would harm."""
     restored: int = 0
-    """Number of returns to a snapshot in this process."""
+    """Number of times in this process that other weights took the place of the trained ones."""
     sh_degree_interval: int | None = None
     """Steps after which the next SH degree is enabled; None enables all at once, as after a warm start."""
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import DataError
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.evaluation.metrics import SSIM_WINDOW
 from sundae_ns.rendering.render import render
@@ -31,16 +30,12 @@ class HeldOutQuality(NamedTuple):
 
 
 @torch.no_grad()
-def measure_heldout(run: TrainingRun, *, mend: str, with_ssim: bool = True) -> list[HeldOutQuality]:
+def measure_heldout(run: TrainingRun, *, with_ssim: bool = True) -> list[HeldOutQuality]:
     """Quality of the held-out views as the field is now, with the head if it is enabled; without fully masked views.
 
     Args:
         run: the training.
-        mend: what the user can do if masks leave no pixel, for the error.
         with_ssim: whether to compute SSIM.
-
-    Raises:
-        DataError: masks leave no pixel.
     """
     qualities = []
     for view, target, mask in run.heldout_views():
@@ -48,8 +43,6 @@ def measure_heldout(run: TrainingRun, *, mend: str, with_ssim: bool = True) -> l
         quality = view_quality(images["rgb"], target, mask, with_ssim=with_ssim)
         if quality.pixels:
             qualities.append(quality)
-    if not qualities:
-        raise DataError(f"masks leave no pixel of the held-out views; mend the masks, or {mend}")
     return qualities
 
 
@@ -77,8 +70,10 @@ def view_quality(image: Tensor, target: Tensor, mask: Tensor | None, *, with_ssi
 
 
 def mean_quality(views: Sequence[HeldOutQuality]) -> tuple[float, float]:
-    """PSNR (dB) and SSIM, each the mean over views weighted by the pixels that count."""
+    """PSNR (dB) and SSIM, each the mean over views weighted by the pixels that count; NaN without any."""
     total = sum(view.pixels for view in views)
+    if not total:
+        return math.nan, math.nan
     decibels = sum(view.pixels * view.psnr for view in views) / total
     similarity = sum(view.pixels * view.ssim for view in views) / total
     return decibels, similarity

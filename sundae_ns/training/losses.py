@@ -126,7 +126,8 @@ class StepLosses:
             or not (state.head_enabled and self.num_images)
         ):
             return 1.0
-        passes = (state.schedule_step - state.head_starts_at) * state.images_per_step / self.num_images
+        images = (state.schedule_step - state.head_starts_at) * state.images_per_step - state.undone
+        passes = images / self.num_images
         if not FIRST_PASSES <= passes < math.inf:  # a budget search knows no step at which its head starts
             return 1.0
         return 1 + 2 ** math.floor(math.log2(passes)) / HALF_AFTER

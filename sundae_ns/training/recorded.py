@@ -148,7 +148,7 @@ class RecordedStep:
         if held is None or not held.unchanged(state, settings, growing=growing):
             held = self._held = self._hold(state, settings, growing=growing)
         emphasis = self._losses.emphasis(state)
-        if emphasis != self._emphasis:  # recordings hold the number, and it never returns
+        if emphasis != self._emphasis:  # recordings hold the number
             self._forget_recordings()
             self._emphasis = emphasis
         kind = _kind(state, inputs, settings)

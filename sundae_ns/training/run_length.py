@@ -13,7 +13,6 @@ from copy import deepcopy
 from typing import Any
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.training.trials import longest_rise
 
 SCHEDULE = {
     "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval refine_every",
@@ -63,19 +62,17 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
     if share == 1:
         return
     model, usual_model = config.pipeline.model, usual.pipeline.model
-    steps_share, skipped = share, 0
+    steps_share = share
     if model.warm_start is not None:
         left = usual.max_num_iterations - usual_model.pruning.prune_at
         steps_share = min(config.schedule_length / max(left, 1), 1.0)
-        skipped = round(steps_share * usual_model.pruning.prune_at)
     config.optimizers = deepcopy(config.optimizers)  # methods share them with every configuration that tyro makes
     for name in _free(config, usual, given):
         value = _get(usual, name)
         if name == _RESETS or not value:
             continue
         if name.endswith(".warmup_steps"):
-            trials = config.schedule_length + skipped if model.head.mode == "auto" else None
-            scaled = shortened_rise(value, config.schedule_length, trials_of=trials)
+            scaled = min(value, config.schedule_length // LONGEST_RISE)
         else:
             scaled = max(round(value * (share if name.startswith("optimizers.") else steps_share)), 1)
         if name == _REFINE and model.warmup == "densify":
@@ -85,17 +82,6 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
         period = round(usual_model.reset_alpha_every * usual_model.refine_every * steps_share)
         never = model.stop_split_at // model.refine_every + 1
         model.reset_alpha_every = max(round(period / model.refine_every), 1) if period >= LEAST_RECOVERY else never
-
-
-def shortened_rise(rise: int, steps: int, *, trials_of: int | None) -> int:
-    """Steps over which a learning rate rises in a run.
-
-    Args:
-        rise: such steps in a run that is long enough.
-        steps: length of the run.
-        trials_of: length of the schedule whose trials decide about the head; None without trials.
-    """
-    return min(rise, steps // LONGEST_RISE, rise if trials_of is None else longest_rise(trials_of))
 
 
 def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> list[str]:

@@ -115,18 +115,44 @@ def notify_pruned(schedulers: Mapping[str, LRScheduler], step: int, primitives: 
         last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
     """
     for name, scheduler in schedulers.items():
-        for multiplier in getattr(scheduler, "lr_lambdas", []):
-            if not isinstance(multiplier, Decay) or multiplier.pruned_at is not None:
+        for decay in _decays(scheduler):
+            if decay.pruned_at is not None or not (last or not decay.hold_until_prune):
                 continue
-            if last or not multiplier.hold_until_prune:
-                multiplier.pruned_at = step
-                if name == "means":
-                    multiplier.after_prune = min(max(1.0, math.sqrt(SPARSE / max(primitives, 1))), MOST_FACTOR)
+            decay.pruned_at = step
+            if name == "means":
+                decay.after_prune = min(max(1.0, math.sqrt(SPARSE / max(primitives, 1))), MOST_FACTOR)
+            _apply(scheduler)
 
 
 def postpone(schedulers: Mapping[str, LRScheduler], steps: int) -> None:
     """Let every :class:`Decay` that has restarted begin this many steps later, as for a trial that starts again."""
     for scheduler in schedulers.values():
-        for multiplier in getattr(scheduler, "lr_lambdas", []):
-            if isinstance(multiplier, Decay) and multiplier.pruned_at is not None:
-                multiplier.pruned_at += steps
+        for decay in _decays(scheduler):
+            if decay.pruned_at is not None:
+                decay.pruned_at += steps
+                _apply(scheduler)
+
+
+def limit_rise(schedulers: Mapping[str, LRScheduler], steps: int) -> None:
+    """Let every :class:`Decay` that has not restarted rise over at most this many steps when it does."""
+    for scheduler in schedulers.values():
+        for decay in _decays(scheduler):
+            if decay.pruned_at is None:
+                decay.warmup_steps = min(decay.warmup_steps, steps)
+
+
+def _decays(scheduler: LRScheduler) -> list[Decay]:
+    """The multipliers of a scheduler, each once: torch lists one for each group of parameters, and the groups share theirs."""
+    found = [one for one in getattr(scheduler, "lr_lambdas", []) if isinstance(one, Decay)]
+    return list({id(one): one for one in found}.values())
+
+
+def _apply(scheduler: LRScheduler) -> None:
+    """Give the optimizer the rate of the next step anew; it has one from before its multiplier changed."""
+    rates = [
+        base * multiplier(scheduler.last_epoch)
+        for base, multiplier in zip(scheduler.base_lrs, scheduler.lr_lambdas, strict=True)  # type: ignore[attr-defined]
+    ]
+    for group, rate in zip(scheduler.optimizer.param_groups, rates, strict=True):
+        group["lr"] = rate
+    scheduler._last_lr = rates

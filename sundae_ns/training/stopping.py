@@ -21,7 +21,6 @@ from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import mean_quality, measure_heldout
 from sundae_ns.training.report import write_record
-from sundae_ns.training.schedulers import postpone
 from sundae_ns.training.trials import Trials
 
 MANY_VIEWS = 32
@@ -154,7 +153,7 @@ class Stopping(Extension):
     def _measure(self, run: TrainingRun) -> None:
         """Measure the held-out views with the mean of the window."""
         with self._mean.shown(weights_of(run.state)):
-            views = measure_heldout(run, mend="choose by hand with --pipeline.model.head.mode")
+            views = measure_heldout(run)
         self._mean = RunningMean()
         decibels, similarity = mean_quality(views)
         self.progress.measured.append([heldout_loss(decibels, similarity, self.ssim_weight), decibels, similarity])
@@ -171,7 +170,7 @@ class Stopping(Extension):
         )
         assert self._start is not None
         state.restore(self._start)
-        postpone(state.schedulers, step - progress.began)
+        self._trials.undo(state, step - progress.began)
         progress.phase, progress.began, progress.ends = "repeating", step, step + length
         self._release(run, length)
 
@@ -201,6 +200,7 @@ class Stopping(Extension):
             put(self._mean.values, weights)
         self._mean = RunningMean()
         self.progress.phase, run.state.resting = "resting", True
+        run.state.restored += 1  # what another mean has counted in since is no part of this one
         CONSOLE.log(f"step {run.state.step}: more training would harm other views; the remaining steps change nothing")
 
     def _wake(self, state: FieldState) -> None:

@@ -29,7 +29,7 @@ from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, mean_quality, measure_heldout
 from sundae_ns.training.report import write_record
-from sundae_ns.training.schedulers import postpone
+from sundae_ns.training.schedulers import limit_rise, notify_pruned, postpone
 
 ARMS = ("plain", "head", "features")
 """What is tried, in this order: no head, the head as configured, and one of more features. Each is larger than the last."""
@@ -42,7 +42,7 @@ TRIAL_STEPS = 1200
 LEAST_TRIAL, MOST_TRIAL = 0.04, 0.05
 """Shortest and longest trial as shares of the schedule. All trials but that of the chosen arm cost at most a tenth of it."""
 RISE_SHARE = 5 / 12
-"""Share of a trial, at its beginning, over which the rate of the head may rise."""
+"""Share of a trial, at its beginning, over which the rate of the head may rise, so that the trial shows what it gains."""
 MEAN_SHARE = 0.25
 """Share of a trial, at its end, over which weights are averaged for the verdict."""
 HOLD_SHARE = 0.1
@@ -60,6 +60,9 @@ LEAST_GAIN = 0.1
 GAIN_PER_DOUBLING = 0.4
 """PSNR that an arm must gain for each doubling of the stored bytes, dB. Twice as many primitives gain about twice this at the
 end of a run, and a trial shows a part of a gain."""
+
+
+_DISABLED = "so it stays disabled; train longer, or force it with --pipeline.model.head.mode residual"
 
 
 class Plan(NamedTuple):
@@ -90,15 +93,6 @@ def trial_length(steps: int) -> int:
         steps: length of the schedule.
     """
     return max(round(max(LEAST_TRIAL * steps, min(TRIAL_STEPS, MOST_TRIAL * steps))), 1)
-
-
-def longest_rise(steps: int) -> int:
-    """Steps over which the rate of a head may rise, so that its trial shows what it gains.
-
-    Args:
-        steps: length of the schedule.
-    """
-    return round(RISE_SHARE * trial_length(steps))
 
 
 def plan_trials(indices: Sequence[int], steps: int, arms: int = len(ARMS)) -> Plan:
@@ -140,6 +134,8 @@ class Progress:
     """Step of the schedule at which the current trial began."""
     measured: list[list[list[float]]] = field(default_factory=list)
     """For each finished trial and held-out view: pixels, PSNR (dB), SSIM."""
+    undone: int = 0
+    """Steps since the first trial began that were taken back."""
 
     @property
     def arm(self) -> str:
@@ -243,6 +239,9 @@ class Trials(Extension):
             self._settle(run, "plain", f"{views} training views are too few to tell whether a head helps")
         elif progress.phase != "before":
             self._hold_out(run)
+        elif run.last_step is not None and not self._fits(run):
+            text = "training ends before the head can be tried"
+            CONSOLE.print(f"[yellow]Warning: {text}, {_DISABLED}", soft_wrap=True)
 
     def after_step(self, run: TrainingRun) -> None:
         """Hold out views, begin and end trials, decide."""
@@ -258,6 +257,7 @@ class Trials(Extension):
             )
             progress.phase, progress.folds = "trials", len(plan.folds)
             progress.bytes = self._stored_bytes(run.state)
+            limit_rise(run.state.schedulers, round(RISE_SHARE * plan.length))
             self._start = run.state.snapshot(head=True)
             self._begin(run)
         elif progress.phase == "trials":
@@ -270,16 +270,19 @@ class Trials(Extension):
 
     def finish(self, run: TrainingRun) -> None:
         """Warn if training ended before a decision."""
-        if self.progress.phase != "done":
-            CONSOLE.print(
-                "[yellow]Warning: training ended before the head could be tried, so it stays disabled; train longer, or "
-                "force it with --pipeline.model.head.mode residual",
-                soft_wrap=True,
-            )
+        if self.progress.phase != "done" and run.last_step is not None and run.last_step + 1 >= self._end_of(run):
+            text = "training ended before the head could be tried"
+            CONSOLE.print(f"[yellow]Warning: {text}, {_DISABLED}", soft_wrap=True)
 
     def held_out(self, run: TrainingRun) -> list[int]:
-        """Indices of the views that the trials hold out; none if there are no trials."""
-        return [] if self.progress.reason else self._planned(run).views
+        """Indices of the views that the chosen field has not seen since before its trial; none if there were no trials."""
+        return [] if self.progress.reason else self._planned(run).folds[-1]
+
+    def undo(self, state: FieldState, steps: int) -> None:
+        """Let rates and the age of the head forget the last steps, after a return to the field before them."""
+        postpone(state.schedulers, steps)
+        self.progress.undone += steps
+        state.undone = self.progress.undone
 
     # ------------------------------------------------------------------------------------------------------- trials
 
@@ -290,10 +293,12 @@ class Trials(Extension):
 
     def _fits(self, run: TrainingRun) -> bool:
         """Whether the chosen arm can train on for the length of a trial."""
-        if run.last_step is None:
-            return False
         plan = self._planned(run)
-        return run.last_step + run.state.offset >= self.begins_at + (plan.num_trials + 1) * plan.length
+        return self._end_of(run) + run.state.offset > self.begins_at + (plan.num_trials + 1) * plan.length
+
+    def _end_of(self, run: TrainingRun) -> int:
+        """Number of training steps of the run, whose first part this training may be; 0 if it does not train."""
+        return 0 if run.last_step is None else max(run.last_step + 1, run.schedule_length or 0)
 
     def _hold_out(self, run: TrainingRun) -> None:
         """Serve training views without the held-out ones of this phase."""
@@ -307,6 +312,8 @@ class Trials(Extension):
         if self.progress.arm == "features":
             self._widen(run.state)
         self._set_arm(run.state)
+        if self.progress.arm != "plain":
+            notify_pruned(run.state.schedulers, run.state.step, run.source.total)
 
     def _stored_bytes(self, state: FieldState) -> list[int]:
         """Bytes of the field with each arm's features and head."""
@@ -343,7 +350,7 @@ class Trials(Extension):
         arm = self.progress.arm
         # Not the step at which the arm began: a run that resumes on several GPUs counts other steps.
         state.head_starts_at = math.inf if arm == "plain" else self.begins_at
-        state.trying = self.progress.phase == "trials"
+        state.trying, state.undone = self.progress.phase == "trials", self.progress.undone
 
     def _end(self, run: TrainingRun) -> None:
         """End the current trial; begin the next one from the same field, or decide."""
@@ -356,20 +363,24 @@ class Trials(Extension):
         self._ends[arm] = state.snapshot(head=arm != "plain")
         assert self._start is not None
         self._return_to(state, self._start)
-        postpone(state.schedulers, state.schedule_step - progress.began)
+        self.undo(state, state.schedule_step - progress.began)
         progress.trial += 1
         self._begin(run)
 
     def _measured(self, run: TrainingRun) -> list[list[float]]:
         """Figures of the held-out views with the mean of the weights, if there is one."""
-        mend = "decide by hand with --pipeline.model.head.mode residual or off"
         with self._mean.shown(weights_of(run.state)):
-            views = [list(view) for view in measure_heldout(run, mend=mend)]
+            views = [list(view) for view in measure_heldout(run)]
         self._mean = RunningMean()
         return views
 
     def _decide(self, run: TrainingRun) -> None:
         progress, state = self.progress, run.state
+        if not all(progress.qualities(arm) for arm in progress.tried):
+            if progress.arm != "plain":
+                self._return_to(state, self._ends["plain"])
+            self._settle(run, "plain", "masks leave no pixel of the held-out training views")
+            return
         decision = progress.best()
         figures = {arm: mean_quality(progress.qualities(arm)) for arm in progress.tried}
         texts = [
@@ -386,7 +397,7 @@ class Trials(Extension):
         """Take a decision, and serve all training views from now on."""
         progress = self.progress
         if reason:
-            CONSOLE.log(f"the head is {'removed' if decision == 'plain' else 'enabled'} without a trial: {reason}")
+            CONSOLE.log(f"the head is {'removed' if decision == 'plain' else 'enabled'}: {reason}")
         progress.phase, progress.decision, progress.reason = "done", decision, reason
         self._start, self._ends = None, {}
         run.hold_out([])

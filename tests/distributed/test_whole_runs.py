@@ -494,8 +494,10 @@ def test_more_ranks_than_gpus_are_refused_before_anything_is_written(
 
 def test_shortened_runs_see_as_many_images(tmp_path: Path) -> None:
     config = configured(tmp_path, "short")
+    config.schedule_length = 2 * STEPS
     short = shorten(config, 2)
     assert (short.max_num_iterations, config.max_num_iterations) == (STEPS // 2, STEPS)
+    assert (short.schedule_length, config.schedule_length) == (STEPS, 2 * STEPS)
     assert short.pipeline.model.pruning.prune_at == PRUNE_AT // 2
     assert short.pipeline.model.refine_every == 3
     full = config.optimizers["means"]["scheduler"].max_steps

@@ -14,7 +14,7 @@ from budget_runs import same, tidy
 from nerfstudio.engine.trainer import Trainer
 from trial_runs import LENGTH, PRUNE_AT, STEPS, tiny_run, tiny_scene
 
-from sundae_ns.training import stopping, trials
+from sundae_ns.training import averaging, stopping, trials
 from sundae_ns.training.heldout import HeldOutQuality
 
 DECIDED = PRUNE_AT + 2 * LENGTH
@@ -37,9 +37,11 @@ def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
     monkeypatch.setattr(stopping, "EVERY", 1)
     monkeypatch.setattr(trials.Progress, "best", lambda _: "plain")
 
-    def fix(decibels: Callable[[int], float], similarity: Callable[[int], float] = lambda _: 0.5) -> None:
-        def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
-            assert run.num_heldout == 2
+    def fix(
+        decibels: Callable[[int], float], similarity: Callable[[int], float] = lambda _: 0.5, held_out: int = 2
+    ) -> None:
+        def measured(run: Any) -> list[HeldOutQuality]:
+            assert run.num_heldout == held_out
             return [HeldOutQuality(576, decibels(run.state.step), similarity(run.state.step))]
 
         monkeypatch.setattr(stopping, "measure_heldout", measured)
@@ -113,6 +115,39 @@ def test_the_mean_of_the_last_window_stays(make: Make, curve: Curve) -> None:
     assert len(own) == WINDOW
     torch.testing.assert_close(centres[STEPS - 1], torch.stack(own).mean(dim=0))
     assert not torch.equal(centres[STEPS - 1], own[-1])
+
+
+def test_a_rest_in_the_last_steps_is_not_averaged(make: Make, curve: Curve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mean at the end of a run has counted weights before the rest began."""
+    monkeypatch.setattr(averaging, "EVERY", 1)
+    curve(lambda step: 20 - 0.08 * abs(step - DECIDED - 10 * WINDOW) / WINDOW)
+    trainer = make()
+    _, centres, _ = _watched(trainer)
+    trainer.train()
+    rest = DECIDED + 22 * WINDOW
+    assert STEPS - 10 < rest < STEPS - 1
+    assert not torch.equal(centres[rest], centres[rest - 1])
+    assert all(torch.equal(centres[rest], centres[step]) for step in range(rest, STEPS))
+
+
+def test_views_that_a_trial_has_seen_are_not_watched(tmp_path: Path, curve: Curve) -> None:
+    """With few views a trial holds out one of two, and the field that goes on has seen the other."""
+    trainer = tiny_run(tiny_scene(tmp_path, 8), tmp_path)
+    served: list[int] = []
+    manager: Any = trainer.pipeline.datamanager
+    serve = manager.view_of_step
+    manager.view_of_step = lambda step: served.append(serve(step)) or served[-1]
+    curve(lambda _: 20.0, held_out=1)
+    trainer.train()
+    tidy()
+    (held,) = json.loads((trainer.base_dir / "stopping.json").read_text())["held_out_views"]
+    length = LENGTH // 2
+    other, last = json.loads((trainer.base_dir / "trials.json").read_text())["held_out_views"]
+    assert held == last
+    chosen = served[PRUNE_AT + length + 1 : PRUNE_AT + 2 * length + 1]  # the second trial of no head
+    assert held not in chosen
+    # The views of the watch are those that are not held out, the seen one among them.
+    assert other in served[PRUNE_AT + 4 * length + 1 :]
 
 
 def test_training_goes_on_while_ssim_rises_more_than_psnr_falls(make: Make, curve: Curve) -> None:

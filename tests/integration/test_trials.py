@@ -52,7 +52,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def fix(head: tuple[float, float] = NONE, features: tuple[float, float] = NONE) -> None:
         real = trials.measure_heldout
 
-        def measured(run: Any, *, mend: str) -> list[HeldOutQuality]:
+        def measured(run: Any) -> list[HeldOutQuality]:
             state, width = run.state, run.state.field["features"].shape[1]
             decibels, similarity = NONE
             if state.head_enabled:
@@ -60,8 +60,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
                 decibels, similarity = features if width == 29 else head
             # With a trace of what was measured, so that other weights have other figures.
             return [
-                HeldOutQuality(view.pixels, 20 + decibels + 1e-4 * view.psnr, 0.5 + similarity)
-                for view in real(run, mend=mend)
+                HeldOutQuality(view.pixels, 20 + decibels + 1e-4 * view.psnr, 0.5 + similarity) for view in real(run)
             ]
 
         monkeypatch.setattr(trials, "measure_heldout", measured)
@@ -143,10 +142,12 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     model: Any = trainer.pipeline.model
     (trial,) = (extension for extension in model.extensions if extension.name == "trials")
     seen: dict[int, tuple[torch.Tensor, float]] = {}
+    head_rates: dict[int, list[float]] = {}
     real = trial.after_step
 
     def after_step(run: Any) -> None:
         real(run)
+        head_rates[run.state.step] = [group["lr"] for group in run.state.optimizers["compensation"].param_groups]
         rate = run.state.schedulers["means"].lr_lambdas[0](run.state.step)
         seen[run.state.step] = (model.gauss_params["means"].detach().clone(), rate)
 
@@ -157,6 +158,10 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     for step in starts[1:]:
         assert torch.equal(seen[starts[0]][0], seen[step][0])
         assert seen[starts[0]][1] == pytest.approx(seen[step][1])
+    # Each head's rate rises from the first step of its trial on, and is as high as it may be well before the end.
+    for step in starts[1:]:
+        for lowest, highest in zip(head_rates[step], head_rates[step + LENGTH // 2], strict=True):
+            assert lowest == pytest.approx(highest * 2 / (round(trials.RISE_SHARE * LENGTH) + 1), rel=0.05)
     decided, place = PRUNE_AT + tried * LENGTH, trials.ARMS.index(chosen) + 1
     end = seen[PRUNE_AT + place * LENGTH - 1][0]
     assert not torch.equal(end, seen[PRUNE_AT][0])
@@ -165,6 +170,8 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     assert min(distances) == distances[place - 1]
     record = _record(trainer)
     assert (record["decision"], record["step"], len(record["arms"])) == (chosen, decided, tried)
+    # A head that was chosen has trained for one trial.
+    assert model.state.undone == (tried - 1) * LENGTH
     width = {"plain": 0, "head": 5, "features": 29}[chosen]
     assert model.gauss_params["features"].shape[1] == width
     assert (model.head is None) == (chosen == "plain")
@@ -194,9 +201,9 @@ def test_the_verdict_is_on_the_mean_of_the_weights(make: Make, judge: Any, monke
         act(run)
         after[run.state.step] = means()
 
-    def measured(run: Any, *, mend: str) -> list[HeldOutQuality]:
+    def measured(run: Any) -> list[HeldOutQuality]:
         judged[run.state.step] = means()
-        return measure(run, mend=mend)
+        return measure(run)
 
     trial.after_step = after_step
     monkeypatch.setattr(trials, "measure_heldout", measured)
@@ -230,6 +237,8 @@ def test_a_resumed_run_takes_the_same_decision_bit_for_bit(
     same(a["pipeline"], b["pipeline"])
     same(a["optimizers"], b["optimizers"])
     same(a["schedulers"], b["schedulers"])
+    models: list[Any] = [one.pipeline.model for one in (whole, resumed)]
+    assert models[0].state.undone == models[1].state.undone > 0
     if stop < _record(whole)["step"]:  # before the decision
         assert _record(whole) == _record(resumed)
 
@@ -258,9 +267,7 @@ def test_with_too_few_views_the_head_stays_off(make: Make, capsys: pytest.Captur
         "reason": "5 training views are too few to tell whether a head helps",
         "step": 0,
     }
-    assert "the head is removed without a trial: 5 training views are too few" in " ".join(
-        capsys.readouterr().out.split()
-    )
+    assert "the head is removed: 5 training views are too few" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_run_that_is_too_short_for_trials_says_so(make: Make, capsys: pytest.CaptureFixture[str]) -> None:
@@ -269,6 +276,17 @@ def test_a_run_that_is_too_short_for_trials_says_so(make: Make, capsys: pytest.C
     assert not (trainer.base_dir / "trials.json").exists()
     assert not trainer.pipeline.model.state.head_enabled
     assert "before the head could be tried" in " ".join(capsys.readouterr().out.split())
+
+
+def test_masks_that_leave_no_pixel_leave_no_head(make: Make, judge: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    judge(head=(0.5, 0.01))
+    monkeypatch.setattr(trials, "measure_heldout", lambda run: [])
+    trainer = make()
+    trainer.train()
+    assert _record(trainer)["decision"] == "plain"
+    assert _record(trainer)["reason"] == "masks leave no pixel of the held-out training views"
+    assert trainer.pipeline.model.head is None
+    assert trainer.pipeline.datamanager.holdout_indices == []
 
 
 def test_a_late_head_has_its_trials_late(make: Make, judge: Any) -> None:

@@ -49,6 +49,18 @@ def test_the_last_weights_become_the_mean(state: Any, monkeypatch: pytest.Monkey
     torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
 
 
+def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that stops in its last part and is resumed for a longer one ends with weights of the end alone."""
+    monkeypatch.setattr(averaging, "EVERY", 3)
+    first, longer = Averaging(0.3, settled_at=0), Averaging(0.09, settled_at=0)
+    train(state, first, range(90))
+    assert first.state_dict()["count"] > 0
+    longer.load_state_dict(state, first.state_dict())
+    seen: list[torch.Tensor] = []
+    train(state, longer, range(80, LAST + 1), seen=seen)
+    torch.testing.assert_close(state.field["means"].detach(), torch.stack(seen).mean(dim=0))
+
+
 def test_no_mean_of_fields_that_differ(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a prune, or a return to an earlier field, only the weights since then count."""
     monkeypatch.setattr(averaging, "EVERY", 3)

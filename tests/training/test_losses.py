@@ -106,6 +106,8 @@ def test_a_pruned_field_has_a_prior_that_counts_once(
         ({"step": 159}, 1.01),
         ({"step": 1050}, 1.08),
         ({"step": 50, "images_per_step": 2}, 1.01),
+        ({"step": 1050, "undone": 800}, 1.02),
+        ({"step": 525, "images_per_step": 2, "undone": 1000}, 1.0),
         ({"step": 1050, "trying": True}, 1.0),
         ({"step": 1050, "head_starts_at": -math.inf}, 1.0),
         ({"step": 1050, "head_starts_at": 1100}, 1.0),

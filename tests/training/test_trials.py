@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import asdict
-from pathlib import Path
 
 import pytest
 from models import Training
-from nerfstudio.configs.method_configs import all_methods
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.model import SundaeModel
-from sundae_ns.training.run_length import fit_to_length
 from sundae_ns.training.trials import ARMS, MOST_HELD_OUT, Progress, Trials, plan_trials
 
 Build = Callable[..., SundaeModel]
@@ -54,27 +50,10 @@ def test_deciding_costs_at_most_a_tenth_of_the_steps(views: int, steps: int) -> 
     assert (trials.num_trials - 1) * trials.length <= 0.1 * steps
 
 
-@pytest.mark.parametrize(("steps", "length", "rise"), [(7000, 350, 146), (18000, 900, 375), (60000, 2400, 500)])
-def test_short_runs_have_longer_trials_for_their_length(steps: int, length: int, rise: int) -> None:
+@pytest.mark.parametrize(("steps", "length"), [(7000, 350), (18000, 900), (30000, 1200), (60000, 2400)])
+def test_short_runs_have_longer_trials_for_their_length(steps: int, length: int) -> None:
     """In a trial of 720 steps with a rise over 500 of them, a head on bonsai showed 0.08 of the 1.8 dB that it gains."""
     assert plan_trials(range(255), steps).length == length
-    config = deepcopy(all_methods["sundae"])
-    config.schedule_length = steps
-    fit_to_length(config, all_methods["sundae"], frozenset())
-    assert config.optimizers["compensation"]["scheduler"].warmup_steps == rise
-
-
-def test_a_warm_start_has_the_trials_of_the_whole_run() -> None:
-    config = deepcopy(all_methods["sundae"])
-    config.schedule_length, config.pipeline.model.warm_start = 15000, Path("field.ply")
-    fit_to_length(config, all_methods["sundae"], frozenset())
-    assert config.optimizers["compensation"]["scheduler"].warmup_steps == 500
-
-
-def test_the_rate_of_a_head_rises_within_its_trial() -> None:
-    expected = {"sundae": 500, "sundae-fast": 375, "sundae-paper": 500, "sundae-tiny": 100}
-    for name, rise in expected.items():
-        assert all_methods[name].optimizers["compensation"]["scheduler"].warmup_steps == rise, name
 
 
 @pytest.mark.parametrize(("views", "most"), [(6, 4), (43, 2)])

@@ -10,6 +10,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.sh_folding import mean_basis
@@ -98,8 +99,12 @@ class SearchedField:
         Raises:
             DataError: masks leave no pixel.
         """
-        mend = "hold out other views with --pipeline.datamanager.holdout-every"
-        views = measure_heldout(self.run, mend=mend, with_ssim=False)
+        views = measure_heldout(self.run, with_ssim=False)
+        if not views:
+            raise DataError(
+                "masks leave no pixel of the held-out views; mend the masks, or hold out other views with "
+                "--pipeline.datamanager.holdout-every"
+            )
         value = statistics.fmean(view.psnr for view in views)
         return value if math.isfinite(value) else NO_IMAGE
 
