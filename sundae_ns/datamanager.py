@@ -250,7 +250,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise DataError(f"no training images in {self.config.dataparser.data}; check the path and the split")
         warning = check_cameras(outputs.cameras, outputs.image_filenames)
         if warning is not None:
-            CONSOLE.print(f"[yellow]Warning: {warning}", soft_wrap=True)
+            CONSOLE.print(f"Warning: {warning}", style="yellow", markup=False, soft_wrap=True)
         outputs.metadata[DATASET_FRAME] = (outputs.dataparser_transform, float(outputs.dataparser_scale))
         return self._marked(super().create_train_dataset())
 

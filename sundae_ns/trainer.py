@@ -339,7 +339,8 @@ class SundaeTrainer(Trainer):
             outputs, result = recorded_outputs(model, camera, batch, self._recorded, self._views)
         except (BackendError, torch.cuda.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0]
-            CONSOLE.print(f"[yellow]Warning: training goes on without recordings, slower: {reason}", soft_wrap=True)
+            text = f"Warning: training goes on without recordings, slower: {reason}"
+            CONSOLE.print(text, style="yellow", markup=False, soft_wrap=True)
             self._recorded = None
             torch.cuda.empty_cache()
             return None
@@ -362,7 +363,7 @@ class SundaeTrainer(Trainer):
                 (time.perf_counter() - self._measured_from) / 10, self.last_step - self._start_step - 11
             )
             if warning is not None:
-                CONSOLE.print(f"[yellow]Warning: {warning}", soft_wrap=True)
+                CONSOLE.print(f"Warning: {warning}", style="yellow", markup=False, soft_wrap=True)
 
     def _stop(self) -> None:
         if not self.team.collective:  # ranks stop together
@@ -456,7 +457,8 @@ class SundaeTrainer(Trainer):
             return checkpoint.folder_of(saved) / f"step-{step:09d}.ckpt"
         path, passed_over = checkpoint.newest_whole(saved)
         for line in passed_over:
-            CONSOLE.print(f"[yellow]Warning: skipped a damaged checkpoint: {line}", highlight=False)
+            text = f"Warning: skipped a damaged checkpoint: {line}"
+            CONSOLE.print(text, style="yellow", markup=False, highlight=False)
         return path
 
     def _restore(self, loaded: dict[str, Any]) -> None:

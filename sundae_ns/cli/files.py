@@ -33,6 +33,7 @@ def export(
     scene: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     upright: bool = False,
+    data: Path | None = None,
     overwrite: Overwrite = False,
 ) -> int:
     """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz or .sog.
@@ -46,6 +47,7 @@ def export(
             A name without a suffix is a folder of page and scene, for a web server.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
             Do not use the rotated file for a warm start.
+        data: folder of the capture, if it moved; for a page of a run.
         overwrite: replace an existing file, once the new one is complete.
     """
     from rich.console import Console
@@ -62,12 +64,12 @@ def export(
     if not page:
         check_format(out)
     check = check_file if out.suffix else check_folder
-    check(out, reads=files_of(scene), overwrite=overwrite)
+    check(out, reads=[*files_of(scene), data], overwrite=overwrite)
     kind = kind_of(scene)
     if page:
         if upright:
             raise ConfigError("a page turns the scene upright by itself; leave out --upright")
-        return _export_page(scene, out)
+        return _export_page(scene, out, data)
     if kind == "ply":
         if out.suffix.lower() == ".ply":
             raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
@@ -99,8 +101,8 @@ def export(
     return 0
 
 
-def _export_page(scene: Path, out: Path) -> int:
-    with packed_scene(scene) as packed, redirect_stdout(StringIO()):
+def _export_page(scene: Path, out: Path, data: Path | None) -> int:
+    with packed_scene(scene, data=data) as packed, redirect_stdout(StringIO()):
         from sundae_ns.scenes.page import write_folder, write_page
 
         write = write_page if out.suffix else write_folder
@@ -110,8 +112,8 @@ def _export_page(scene: Path, out: Path) -> int:
 
 
 @contextmanager
-def packed_scene(scene: Path) -> Iterator[Path]:
-    """A packed scene as it is, or a run packed into a temporary file."""
+def packed_scene(scene: Path, *, data: Path | None = None) -> Iterator[Path]:
+    """A packed scene as it is, or a run, whose capture may have moved, packed into a temporary file."""
     from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.packing import write_scene
     from sundae_ns.storage.runs.config_file import check_run
@@ -125,7 +127,7 @@ def packed_scene(scene: Path) -> Iterator[Path]:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "scene.sundae"
         with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
-            write_scene(path, scene_of_run(scene))
+            write_scene(path, scene_of_run(scene, data=data))
         yield path
 
 

@@ -58,6 +58,25 @@ def check_folder(out: Path, *, reads: Iterable[Path | None], overwrite: bool) ->
         raise StorageError(f"{out} holds files; choose another folder, or replace its files with --overwrite")
 
 
+def check_comparison(out: Path, *, reads: Path) -> None:
+    """Refuse a folder for the jobs and tables of a comparison that is something else, or belongs to what is compared.
+
+    Args:
+        out: the folder; a comparison that it holds goes on there.
+        reads: the capture, or the folder of captures.
+
+    Raises:
+        StorageError: the folder may not be written.
+    """
+    if out.exists() and not out.is_dir():
+        raise StorageError(f"{out} is a file; choose another folder")
+    if _contains(out, reads) or _contains(reads, out):
+        raise StorageError(f"{out} belongs to what the command reads; choose another folder")
+    begun = any((out / name).is_dir() for name in ("jobs", "done")) or any(out.glob("*.jsonl"))
+    if out.is_dir() and any(out.iterdir()) and not begun:
+        raise StorageError(f"{out} holds files of something else; choose another folder")
+
+
 def _contains(outer: Path, inner: Path) -> bool:
     """Whether a path is another one, or lies in that folder; links count as what they point to."""
     return inner.resolve().is_relative_to(outer.resolve())

@@ -65,6 +65,8 @@ def pack(
     from sundae_ns.storage.runs.config_file import check_run
     from sundae_ns.storage.runs.folder import files_of
 
+    if max_cameras < 0:
+        raise ConfigError(f"max-cameras is {max_cameras}; give the number of cameras, or 0 for none")
     if finetune < 0:
         raise ConfigError(f"finetune is {finetune}; give the number of steps, or 0 for none")
     if target_bytes is not None and target_drop is not None:

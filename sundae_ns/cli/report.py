@@ -12,6 +12,7 @@ from pathlib import Path
 
 from PIL import Image
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from sundae_ns.errors import ConfigError, SundaeError
@@ -83,11 +84,11 @@ def run_report(
     with Progress(*columns, console=console, transient=True) as progress:
         scenes_done = progress.add_task("Scenes", total=len(paths))
         for number, path in enumerate(paths, start=1):
-            task = progress.add_task(f"Opening {path}", total=None)
+            task = progress.add_task(f"Opening {escape(str(path))}", total=None)
             try:
                 opened = _quietly(path, data)
                 label = _label(opened, {run.label for run in runs})
-                progress.update(task, description=f"Measuring {label}", total=len(opened.cameras))
+                progress.update(task, description=f"Measuring {escape(label)}", total=len(opened.cameras))
                 measured = measure_scene(
                     opened,
                     label=label,
@@ -135,7 +136,7 @@ def run_report(
     write_text(out / "report.csv", csv_text([run.as_json() for run in runs]))
     write_text(out / "report.md", document(scenes, images, notes, command))
     for note in notes:
-        console.print(f"[yellow]Left out: {note}", highlight=False)
+        console.print(f"[yellow]Left out: {escape(note)}", highlight=False)
     if video is not None:
         console.print(f"wrote {video}", highlight=False)
     console.print(f"wrote {out / 'report.md'}, with report.csv, report.json and images beside it", highlight=False)

@@ -51,7 +51,9 @@ def serve(page: str, port: int) -> _Server:
     return server
 
 
-def view(scene: Annotated[Path, tyro.conf.Positional], port: int = 0, open_browser: bool = True) -> int:
+def view(
+    scene: Annotated[Path, tyro.conf.Positional], port: int = 0, open_browser: bool = True, data: Path | None = None
+) -> int:
     """Show a scene with its head in the browser, until Ctrl-C.
 
     Serves the page of sundae export on 127.0.0.1 and opens it. From another machine, forward the port by ssh -L.
@@ -60,8 +62,9 @@ def view(scene: Annotated[Path, tyro.conf.Positional], port: int = 0, open_brows
         scene: a packed scene, or a run (its folder or config.yml).
         port: port on 127.0.0.1; 0 takes a free one.
         open_browser: open the default browser; otherwise only print the address.
+        data: folder of the capture of a run, if it moved.
     """
-    with packed_scene(scene) as packed:
+    with packed_scene(scene, data=data) as packed:
         from sundae_ns.scenes.page import page_of
 
         page = page_of(packed, title=scene.resolve().stem)

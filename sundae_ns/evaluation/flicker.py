@@ -88,10 +88,15 @@ class Flicker:
         return self._seen / max(self._pixels, 1)
 
     def errors(self) -> list[float]:
-        """Mean squared error of each method's warped frames; empty without pairs."""
-        return [] if self._errors is None else (self._errors / max(self._seen, 1)).tolist()
+        """Mean squared error of each method's warped frames; empty without pairs, NaN if no pair shares a pixel."""
+        if self._errors is None:
+            return []
+        return (self._errors / self._seen if self._seen else self._errors * torch.nan).tolist()
 
     def excess(self) -> list[float]:
-        """:meth:`errors` without the least error of each pixel over the methods: the flicker."""
+        """:meth:`errors` without the least error of each pixel over the methods: the flicker.
+
+        Figures compare only within one call: another set of methods has another least.
+        """
         least = self._least / max(self._seen, 1)
         return [error - least for error in self.errors()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.evaluation.flicker import Flicker, Frame
+from sundae_ns.scenes.measure import head_as
 from sundae_ns.scenes.opening import Opened
 
 FRAMES_APART = (1, 7)
@@ -23,26 +25,30 @@ FRAMES_BETWEEN = 20
 
 @dataclass(frozen=True)
 class FlickerFigures:
-    """Flicker of frames at one distance; squared errors of colours in [0, 1]."""
+    """Flicker of frames at one distance; squared errors of colours in [0, 1], NaN where frames share no pixel."""
 
+    phases: int
+    """Runs of the head for a frame."""
     frames_apart: int
     mse: float
     """Mean squared error of warped compensated frames."""
     mse_base: float
     """The same of base colours."""
     excess: float
-    """:attr:`mse` without the least of both at each pixel."""
+    """:attr:`mse` without the least over all measured frames, of base colours and of each number of runs, at each pixel."""
     excess_base: float
-    """:attr:`mse_base` without the least of both at each pixel."""
+    """:attr:`mse_base` without this least."""
     seen: float
     """Share of the pixels that both frames see."""
+    paths: int
+    """Number of paths."""
 
     @property
     def ratio(self) -> float:
-        """Flicker of the compensated frames over that of base colours; NaN if neither is left."""
+        """Flicker of the compensated frames over that of base colours; NaN if neither is left or known."""
         if self.excess_base > 0:
             return self.excess / self.excess_base
-        return float("inf") if self.excess > 0 else float("nan")
+        return math.inf if self.excess > 0 else math.nan
 
 
 def neighbours(poses: Tensor, places: int) -> list[tuple[int, int]]:
@@ -85,13 +91,14 @@ def between(first: Tensor, second: Tensor, share: float) -> Tensor:
 
 @torch.no_grad()
 def measure_flicker(
-    opened: Opened, *, places: int = 3, progress: Callable[[], object] | None = None
+    opened: Opened, *, places: int = 3, phases: Sequence[int] = (), progress: Callable[[], object] | None = None
 ) -> list[FlickerFigures]:
-    """Measure the flicker of compensated images and base colours, for each of :data:`FRAMES_APART`.
+    """Measure the flicker of compensated images and base colours, for each of ``phases`` and :data:`FRAMES_APART`.
 
     Args:
         opened: a scene with a head.
         places: number of paths, each between two neighbouring training cameras.
+        phases: runs of the head for a frame, each one of ``PHASES``; by default the scene's own.
         progress: called after each frame.
 
     Raises:
@@ -105,23 +112,30 @@ def measure_flicker(
     _ = opened.datamanager.cached_train  # undistortion, which comes with loading, changes the cameras
     cameras = opened.datamanager.train_dataset.cameras
     totals = {apart: Flicker() for apart in FRAMES_APART}
-    for pair in neighbours(cameras.camera_to_worlds, places):
+    pairs = neighbours(cameras.camera_to_worlds, places)
+    assert opened.model.head is not None
+    counts = list(dict.fromkeys(phases)) or [opened.model.head.config.phases]
+    for pair in pairs:
         frames: list[Frame] = []
-        for frame in _path(opened, cameras, pair):
+        for frame in _path(opened, cameras, pair, counts):
             frames.append(frame)
             for apart, total in totals.items():
                 if len(frames) > apart:
                     total.add(frames[-1 - apart], frame)
             if progress is not None:
                 progress()
-    return [
-        FlickerFigures(apart, *_both(total.errors()), *_both(total.excess()), total.seen)
-        for apart, total in totals.items()
-    ]
+    figures = []
+    for number, count in enumerate(counts):
+        for apart, total in totals.items():
+            *heads, base = total.errors()
+            *head_excesses, base_excess = total.excess()
+            errors = (heads[number], base, head_excesses[number], base_excess)
+            figures.append(FlickerFigures(count, apart, *errors, total.seen, len(pairs)))
+    return figures
 
 
-def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int]) -> Iterator[Frame]:
-    """Frames of a path from the first camera of a pair towards the second."""
+def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int], phases: Sequence[int]) -> Iterator[Frame]:
+    """Frames of a path from the first camera of a pair towards the second: compensated ones, and last base colours."""
     first, second = (cameras.camera_to_worlds[index].double() for index in pair)
     model = opened.model
     for number in range(FRAMES):
@@ -129,13 +143,12 @@ def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int]) -> Iterator[F
         camera.camera_to_worlds = between(first, second, number / FRAMES_BETWEEN)[None].to(cameras.camera_to_worlds)
         camera.metadata = None  # the training view's own, such as its place in a camera optimizer
         camera = camera.to(model.device)
-        outputs = model.get_outputs_for_camera(camera)
-        images = torch.stack([outputs["rgb"], outputs["base_rgb"]]).float()
+        compensated = []
+        for count in phases:
+            with head_as(model, phases=count):
+                outputs = model.get_outputs_for_camera(camera)
+                compensated.append(outputs["rgb"].clone())
+        images = torch.stack([*compensated, outputs["base_rgb"]]).float()
         view = model.view_of(camera)
         # Clones: a recorded frame draws into the same tensors again.
         yield Frame(images, outputs["depth"].clone(), outputs["accumulation"].clone(), view.viewmat, view.K)
-
-
-def _both(figures: Sequence[float]) -> tuple[float, float]:
-    compensated, base = figures
-    return compensated, base

@@ -121,18 +121,24 @@ def rendered_as(
         ConfigError: the factor is not above zero or too large, or phases are not of ``PHASES``.
         BackendError: half precision is asked for on a CPU.
     """
-    head, on_cpu = run.model.head, run.model.device.type == "cpu"
     if not 0 < factor < MOST_ZOOM:
         raise ConfigError(f"images cannot be {factor} times as large; give a factor above 0 and below {MOST_ZOOM}")
-    if on_cpu and precision not in (None, "fp32"):
-        raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
     cameras, truths = [zoomed(camera, factor) for camera in run.cameras], []
     for camera, truth in zip(cameras, run.truths, strict=True):
         size = int(camera.height), int(camera.width)
         truths.append(truth if truth.shape[:2] == size else resize(truth, *size))
-    resized = replace(run, cameras=cameras, truths=truths)
+    with head_as(run.model, precision=precision, phases=phases):
+        yield replace(run, cameras=cameras, truths=truths)
+
+
+@contextmanager
+def head_as(model: SundaeModel, *, precision: str | None = None, phases: int | None = None) -> Iterator[None]:
+    """Inside the block the head has another arithmetic, or runs another number of times; as in :func:`rendered_as`."""
+    head, on_cpu = model.head, model.device.type == "cpu"
+    if on_cpu and precision not in (None, "fp32"):
+        raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
     if head is None:
-        yield resized
+        yield
         return
     before: Any = head.config
     precision = precision or ("fp32" if on_cpu else before.precision)
@@ -140,7 +146,7 @@ def rendered_as(
     changed.validate()
     head.config = changed
     try:
-        yield resized
+        yield
     finally:
         head.config = before
 
@@ -188,8 +194,9 @@ def measure_scene(
             times["head"].append(found.head)
         if progress is not None:
             progress()
-    stored = sizes(model)
     bare = {name: value for name, value in model.gauss_params.items() if name != FEATURES}
+    # A head that is there but disabled is not needed, and neither are its features.
+    stored = sizes(model) if has_head else Sizes(bytes_of(bare), 0)
     needed = {HEAD_ON: stored.total, HEAD_OFF: bytes_of(bare)}
     if opened.packed_bytes is not None:
         # A packed file is read as a whole, with the head enabled or disabled.

@@ -207,8 +207,12 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
     )
 
 
-def load_run(path: Path) -> Opened:
+def load_run(path: Path, *, data: Path | None = None) -> Opened:
     """Open a finished run of sundae by its folder or ``config.yml``, and no other method's.
+
+    Args:
+        path: of the run.
+        data: the capture, if it has moved.
 
     Raises:
         CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
@@ -225,13 +229,14 @@ def load_run(path: Path) -> Opened:
     model = getattr(getattr(load_config(path), "pipeline", None), "model", None)
     if not isinstance(model, SundaeModelConfig):
         raise CheckpointError(f"{path} is a run of another method; give one of sundae")
-    return open_run(path)
+    return open_run(path, data=data)
 
 
 def _capture(config: TrainerConfig, data: Path | None) -> Path:
     """Folder of the capture."""
     manager = cast(FullImageDatamanagerConfig, config.pipeline.datamanager)
-    said = config.data or manager.data or manager.dataparser.data
+    # The datamanager's first: it follows a capture that has moved together with the run.
+    said = manager.data or config.data or manager.dataparser.data
     capture = data if data is not None else Path(said)
     if not capture.exists():
         raise DataError(f"the capture {capture} is missing; give its folder with --data")

@@ -68,7 +68,7 @@ def write_folder(packed: Path, folder: Path, *, title: str) -> int:
     """
     page = _filled(read_scene(packed), title, source=SCENE_FILE)
     with writing(f"cannot write to {folder}"):
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     # The scene first: a page without its scene shows an error.
     with replacing(folder / SCENE_FILE) as partial:
         partial.write_bytes(packed.read_bytes())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shlex
 from dataclasses import replace
 from io import StringIO
@@ -21,7 +22,7 @@ from sundae_ns.cli.bench.paper import DATASETS, PRINTED, find_scene
 from sundae_ns.cli.bench.plan import Arm, Job, jobs_of_shard, parser_of, plan_scene
 from sundae_ns.cli.bench.quality import run_paper, run_quality
 from sundae_ns.cli.bench.results import read_results, spread
-from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.errors import ConfigError, DataError, StorageError
 from sundae_ns.evaluation import COLUMNS
 
 
@@ -237,6 +238,50 @@ def test_damaged_results_are_refused(capture: Path, tmp_path: Path) -> None:
     (out / "more.jsonl").write_text((out / "results.jsonl").read_text() + '{"job"')
     with pytest.raises(DataError, match="more.jsonl, line 4"):
         read_results(out)
+    (out / "more.jsonl").write_bytes(b"\xff\xfe")
+    with pytest.raises(DataError, match="more.jsonl, line 1"):
+        read_results(out)
+
+
+def test_folders_of_something_else_are_left_alone(capture: Path, tmp_path: Path) -> None:
+    notes = tmp_path / "notes"
+    notes.mkdir()
+    (notes / "table.md").write_text("mine")
+    with pytest.raises(StorageError, match="holds files of something else"):
+        quality(capture, notes, Runner())
+    assert (notes / "table.md").read_text() == "mine"
+    for out in (capture, capture / "out", tmp_path):
+        with pytest.raises(StorageError, match="belongs to what the command reads"):
+            quality(capture, out, Runner())
+    with pytest.raises(StorageError, match="is a file"):
+        quality(capture, notes / "table.md", Runner())
+
+
+def test_seeds_whose_trials_differ_have_lines_of_their_own(capture: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    quality(capture, out, Runner(), arms=("sundae",), keep_ratios=(0.1,))
+    path = out / "done" / "fox-sundae-10pct-s43.json"
+    result = json.loads(path.read_text())
+    del result["measured"]["configurations"][1:]
+    path.write_text(json.dumps(result) + "\n")
+    (out / "results.jsonl").unlink()
+    quality(capture, out, Runner(), arms=("sundae",), keep_ratios=(0.1,))
+    page = (out / "table.md").read_text()
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| sun")]
+    assert [line[1:4] for line in lines if line[2] == "10%"] == [
+        ["head on", "10%", "2"],
+        ["head off", "10%", "2"],
+        ["no head", "10%", "1"],
+    ]
+
+
+def test_markup_in_names_and_errors_is_shown_as_it_is(tmp_path: Path) -> None:
+    folder = tmp_path / "fox[red]"
+    folder.mkdir()
+    (folder / "transforms.json").write_text("{}")
+    code, said = quality(folder, tmp_path / "out", Runner(broken="splatfacto-s42"), arms=("splatfacto",))
+    assert code == 1
+    assert "fox[red]-splatfacto-s42 failed: it broke" in said
 
 
 def test_spread() -> None:

@@ -52,6 +52,7 @@ def test_options_are_those_of_the_configuration() -> None:
         (["pack", "nothing", "-o", "a.sundae", "--scale-step", "2"], "scale-step is 2.0; give 0.0001 to 1"),
         (["pack", "nothing", "-o", "no/a.sundae"], "no is no folder"),
         (["pack", "nothing", "-o", "a.sundae", "--finetune", "-1"], "finetune is -1"),
+        (["pack", "nothing", "-o", "a.sundae", "--max-cameras", "-1"], "max-cameras is -1"),
         (["pack", "nothing", "-o", "a.sundae", "--target-bytes", "0"], "target-bytes is 0"),
         (["pack", "nothing", "-o", "a.sundae", "--target-drop", "nan"], "target-drop is nan"),
         (["pack", "nothing", "-o", "a.sundae", "--target-drop", "1", "--target-bytes", "9"], "exclude each other"),

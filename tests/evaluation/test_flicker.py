@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
@@ -63,6 +65,14 @@ def test_flicker_is_what_one_method_has_beyond_the_other() -> None:
     assert flicker.seen > 0.9
     assert flicker.errors() == pytest.approx([0.01, 0.0], abs=1e-6)
     assert flicker.excess() == pytest.approx([0.01, 0.0], abs=1e-6)
+
+
+def test_flicker_is_unknown_where_frames_share_no_pixel() -> None:
+    flicker = Flicker()
+    flicker.add(wall(0.0, 0.1, 0.0), wall(0.1, 0.1, 0.0, depth=1.1 * FAR))
+    assert flicker.seen == 0
+    assert all(math.isnan(figure) for figure in (*flicker.errors(), *flicker.excess()))
+    assert len(flicker.errors()) == 2
 
 
 def test_an_error_of_both_is_no_flicker() -> None:

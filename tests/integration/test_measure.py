@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +21,7 @@ from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import Measured, psnr
 from sundae_ns.rendering import render, zoomed
-from sundae_ns.scenes.flicker import measure_flicker
+from sundae_ns.scenes.flicker import FRAMES, measure_flicker
 from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, rendered_as, sizes
 from sundae_ns.scenes.opening import Opened, load_run
 
@@ -120,6 +121,38 @@ def test_the_head_is_disabled_inside_a_block(tiny: Any) -> None:
     assert corrected()
 
 
+def test_a_capture_that_has_moved_is_found_or_named(
+    tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Found where it stands as before as seen from the run, and otherwise by --data."""
+    root = Path(os.path.commonpath([tiny.scene, tiny.folder]))
+    run = Path(shutil.copytree(tiny.folder, tmp_path / tiny.folder.relative_to(root)))
+    capture = tmp_path / tiny.scene.relative_to(root)
+    config, lost = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader), tmp_path / "gone"
+    config.output_dir = lost / Path(config.output_dir).relative_to(root)
+    config.data = config.pipeline.datamanager.data = lost / tiny.scene.relative_to(root)
+    (run / "config.yml").write_text(yaml.dump(config))
+    arguments = ["bench", "frame", "--load-config", str(run), "--views", "1", "--repeats", "1", "--json"]
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert f"the capture {lost}" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as caught:
+        main([*arguments, "--data", str(tiny.scene)])
+    assert caught.value.code == 0
+    shutil.copytree(tiny.scene, capture)
+    assert load_run(run).capture == capture
+
+
+def test_a_head_that_is_not_enabled_yet_counts_no_bytes(tiny: Any) -> None:
+    run = load_run(tiny.config)
+    assert figures_of(run).bytes_head > 0
+    run.model.state.head_starts_at = 10**9
+    figures = figures_of(run)
+    assert figures.bytes_head == 0
+    assert figures.bytes_total == figures.full.bytes
+
+
 def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path) -> None:
     assert load_run(tiny.config).kept == tiny.keep_ratio
     run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
@@ -198,7 +231,10 @@ def test_bench_flicker_compares_the_head_with_base_colours(tiny: Any, capsys: py
     assert caught.value.code == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [(line["phases"], line["frames_apart"]) for line in lines] == [(1, 1), (1, 7), (4, 1), (4, 7)]
-    assert lines[0]["mse_base"] == lines[2]["mse_base"]
+    # One least for all rows, so that they compare.
+    for name in ("mse_base", "excess_base", "seen", "paths"):
+        assert [line[name] for line in lines[:2]] == [line[name] for line in lines[2:]]
+    assert lines[0]["paths"] == 1
     assert lines[0]["mse"] != lines[2]["mse"]
     for line in lines:
         assert 0 < line["seen"] < 1
@@ -208,6 +244,15 @@ def test_bench_flicker_compares_the_head_with_base_colours(tiny: Any, capsys: py
     with pytest.raises(SystemExit):
         main(arguments)
     assert "head / base" in capsys.readouterr().out
+
+
+def test_flicker_says_how_many_paths_there_were(tiny: Any) -> None:
+    run = load_run(tiny.config)
+    cameras = len(run.datamanager.train_dataset.cameras)
+    frames = []
+    found = measure_flicker(run, places=10 * cameras, progress=lambda: frames.append(1))
+    assert {one.paths for one in found} == {len(frames) / FRAMES}
+    assert 1 < found[0].paths <= cameras
 
 
 def test_flicker_needs_a_head_and_a_path(tiny: Any) -> None:

@@ -84,7 +84,7 @@ def test_a_folder_has_page_and_scene_apart(packed: Path, tmp_path: Path) -> None
 
 
 def test_export_writes_pages(packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for out in ("a.html", "folder"):
+    for out in ("a.html", "folder", "no/folder"):
         with pytest.raises(SystemExit) as caught:
             main(["export", str(packed), "-o", str(tmp_path / out)])
         assert caught.value.code == 0, capsys.readouterr().err

@@ -73,6 +73,7 @@ def frame(
     phases: tuple[Literal[1, 2, 4], ...] = (),
     views: int | None = None,
     repeats: int = 5,
+    data: Path | None = None,
     json: bool = False,
 ) -> int:
     """Time the frames of a finished run: splat, head and whole frame, with the error of the timed frames.
@@ -84,17 +85,31 @@ def frame(
         phases: passes of the head for a frame, at as many offsets of its grid; by default those of the run.
         views: number of test views to measure on, from the first; by default all.
         repeats: timed runs of each view; their median counts.
+        data: folder of the capture, if it moved.
         json: print one line of JSON for each size and precision, instead of a table.
     """
     from sundae_ns.cli.bench.frame import run_frame
 
     return run_frame(
-        load_config, factors=factors, precisions=precisions, phases=phases, views=views, repeats=repeats, json=json
+        load_config,
+        factors=factors,
+        precisions=precisions,
+        phases=phases,
+        views=views,
+        repeats=repeats,
+        data=data,
+        json=json,
     )
 
 
 @app.command
-def flicker(load_config: Path, places: int = 3, phases: tuple[Literal[1, 2, 4], ...] = (), json: bool = False) -> int:
+def flicker(
+    load_config: Path,
+    places: int = 3,
+    phases: tuple[Literal[1, 2, 4], ...] = (),
+    data: Path | None = None,
+    json: bool = False,
+) -> int:
     """Measure the flicker of the head along camera paths, over that of base colours, as StopThePop measures popping.
 
     Frames 1 and 7 apart are compared, the earlier warped onto the later by the field's depth. A sharper image shows more
@@ -104,11 +119,12 @@ def flicker(load_config: Path, places: int = 3, phases: tuple[Literal[1, 2, 4], 
         load_config: the folder of a run with a head, or its config.yml.
         places: number of paths, each between two neighbouring training cameras.
         phases: passes of the head for a frame, as in bench frame; by default those of the run.
+        data: folder of the capture, if it moved.
         json: print one line of JSON for each of these and each distance of frames, instead of a table.
     """
     from sundae_ns.cli.bench.flicker import run_flicker
 
-    return run_flicker(load_config, places=places, phases=phases, json=json)
+    return run_flicker(load_config, places=places, phases=phases, data=data, json=json)
 
 
 __all__ = ["app"]

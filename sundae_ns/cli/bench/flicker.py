@@ -15,12 +15,12 @@ from rich.progress import Progress
 from rich.table import Table
 
 from sundae_ns.evaluation import without_nan
-from sundae_ns.scenes.flicker import FRAMES, FlickerFigures, measure_flicker
-from sundae_ns.scenes.measure import rendered_as
+from sundae_ns.evaluation.document import number
+from sundae_ns.scenes.flicker import FRAMES, measure_flicker
 from sundae_ns.scenes.opening import load_run
 
 
-def run_flicker(load_config: Path, *, places: int, phases: Sequence[int], json: bool) -> int:
+def run_flicker(load_config: Path, *, places: int, phases: Sequence[int], data: Path | None, json: bool) -> int:
     """Measure and print; options are those of the command.
 
     Raises:
@@ -30,32 +30,26 @@ def run_flicker(load_config: Path, *, places: int, phases: Sequence[int], json: 
     """
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
-        run = load_run(load_config)
+        run = load_run(load_config, data=data)
         _ = run.datamanager.cached_train  # loads the training images, whose undistortion changes their cameras
-    found: list[tuple[int, FlickerFigures]] = []
     with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("Rendering paths", total=places * FRAMES * max(len(phases), 1))
-        for count in phases or (None,):
-            with rendered_as(run, phases=count) as shown:
-                figures = measure_flicker(shown, places=places, progress=lambda: progress.advance(task))
-                assert shown.model.head is not None
-                found += [(shown.model.head.config.phases, one) for one in figures]
+        task = progress.add_task("Rendering paths", total=places * FRAMES)
+        found = measure_flicker(run, places=places, phases=phases, progress=lambda: progress.advance(task))
     if json:
         device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
         where = {"config": str(load_config), "scene": run.scene, "device": device, "fingerprint": run.fingerprint}
-        for runs, one in found:
-            line = {**where, "places": places, "phases": runs, **asdict(one), "ratio": one.ratio}
+        for one in found:
+            line = {**where, **asdict(one), "ratio": one.ratio}
             print(jsonlib.dumps(without_nan(line), allow_nan=False))
         return 0
     table = Table(
-        title=f"{run.model.num_points:,} primitives, {places} paths of {FRAMES} frames",
-        caption="squared errors of warped frames x 1e6; flicker: without the least of both at each pixel",
+        title=f"{run.model.num_points:,} primitives, {found[0].paths} paths of {FRAMES} frames",
+        caption="squared errors of warped frames x 1e6; flicker: without the least of all rows and base at each pixel",
     )
     for column in ("runs", "frames apart", "head", "base", "flicker: head", "base", "head / base"):
         table.add_column(column, justify="right", no_wrap=True)
-    for runs, one in found:
-        errors = (one.mse, one.mse_base, one.excess, one.excess_base)
-        cells = (str(runs), str(one.frames_apart), *(f"{1e6 * error:,.1f}" for error in errors), f"{one.ratio:.2f}")
-        table.add_row(*cells)
+    for one in found:
+        errors = [number(1e6 * error, 1) for error in (one.mse, one.mse_base, one.excess, one.excess_base)]
+        table.add_row(str(one.phases), str(one.frames_apart), *errors, number(one.ratio, 2))
     Console().print(table)
     return 0

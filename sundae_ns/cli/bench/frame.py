@@ -30,6 +30,7 @@ def run_frame(
     phases: Sequence[int],
     views: int | None,
     repeats: int,
+    data: Path | None,
     json: bool,
 ) -> int:
     """Measure and print; options are those of the command.
@@ -44,12 +45,13 @@ def run_frame(
         raise ConfigError(f"{repeats} timed runs of {views} views measure nothing: use at least 1 of each")
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
-        run = load_run(load_config)
+        run = load_run(load_config, data=data)
     run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
     device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
     every = ("fp32", "bf16", "fp16") if device != "cpu" and run.model.head is not None else (None,)
     wanted: Sequence[str | None] = precisions or every
-    jobs = [(factor, precision, count) for factor in factors for precision in wanted for count in phases or (None,)]
+    runs = phases if run.model.head is not None and phases else (None,)
+    jobs = [(factor, precision, count) for factor in factors for precision in wanted for count in runs]
     found: list[dict[str, Any]] = []
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Timing frames", total=len(jobs) * len(run.cameras))

@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
 from sundae_ns.cli.bench.arms import choose_arms
@@ -18,6 +19,7 @@ from sundae_ns.cli.bench.paper import plan_paper
 from sundae_ns.cli.bench.plan import SAID, Job, done_file, job_folder, jobs_of_shard, parser_of, plan_scene
 from sundae_ns.cli.bench.results import Result, paper_page, quality_page, read_results, suite_page, write_results
 from sundae_ns.cli.bench.suite import plan_suite
+from sundae_ns.cli.outputs import check_comparison
 from sundae_ns.cli.process import percent_of, run_logged
 from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.evaluation.document import table
@@ -45,6 +47,7 @@ def run_quality(options: QualityOptions, *, runner: Runner | None = None, consol
         StorageError: the folder cannot be written to.
     """
     console, arms = console or Console(), choose_arms(options.arms, options.method, options.steps_scale)
+    check_comparison(options.out, reads=options.scene)
     data = options.scene.resolve()
     plan = plan_scene(
         data.name,
@@ -73,9 +76,10 @@ def run_suite(options: SuiteOptions, *, runner: Runner | None = None, console: C
     """
     console = console or Console()
     arms = choose_arms(options.arms, options.method, options.steps_scale, from_scratch=True)
+    check_comparison(options.out, reads=options.captures)
     plan, left_out = plan_suite(options, arms)
     for scene, reason in left_out.items():
-        console.print(f"[yellow]Left out: {scene}: {reason}", highlight=False, soft_wrap=True)
+        console.print(f"[yellow]Left out: {escape(f'{scene}: {reason}')}", highlight=False, soft_wrap=True)
 
     jobs = jobs_of_shard(plan, options.shard)
     captures = {key: scene for scene, key in _first_jobs(jobs).items()}
@@ -95,11 +99,12 @@ def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: C
         ConfigError, DataError, StorageError: as in :func:`run_quality`.
     """
     console, arms = console or Console(), choose_arms(options.arms, options.method, options.steps_scale)
+    check_comparison(options.out, reads=options.root)
     plan, missing = plan_paper(
         options.root.resolve(), arms, scenes=options.scenes, keep_ratios=options.keep_ratios, seed=options.seed
     )
     if missing:
-        console.print(f"[yellow]Scenes that are missing and left out: {', '.join(missing)}", highlight=False)
+        console.print(f"[yellow]Scenes that are missing and left out: {escape(', '.join(missing))}", highlight=False)
 
     def page(results: Sequence[Result], failed: Mapping[str, str]) -> str:
         return paper_page(results, arms, missing, options.command())
@@ -149,7 +154,7 @@ def run_jobs(
         everything = progress.add_task("Jobs", total=len(jobs))
         for job in jobs:
             if job.key not in done and first.get(job.scene) not in failed:
-                task = progress.add_task(job.key, total=100)
+                task = progress.add_task(escape(job.key), total=100)
                 try:
                     if job.needs in failed:
                         raise SundaeError(f"its warm-up has failed: {job.needs}")
@@ -157,9 +162,10 @@ def run_jobs(
                     runner(job, out, lambda percent, task=task: progress.update(task, completed=percent))  # type: ignore[misc]
                 except SundaeError as error:
                     failed[job.key] = str(error)
-                    console.print(f"[red]{job.key} failed:[/red] {error}", highlight=False, soft_wrap=True)
+                    text = f"[red]{escape(job.key)} failed:[/red] {escape(str(error))}"
+                    console.print(text, highlight=False, soft_wrap=True)
                     if first.get(job.scene) == job.key:
-                        console.print(f"[yellow]Left out: {job.scene}", highlight=False)
+                        console.print(f"[yellow]Left out: {escape(job.scene)}", highlight=False)
                 progress.remove_task(task)
             progress.advance(everything)
     return failed

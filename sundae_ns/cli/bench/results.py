@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ def read_results(out: Path) -> list[Result]:
     """
     found: dict[str, Result] = {}
     for path in (*sorted(out.glob("*.jsonl")), *sorted((out / "done").glob("*.json"))):
-        for count, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        for count, line in enumerate(path.read_bytes().splitlines(), start=1):
             try:
                 result = json.loads(line)
                 found[result["job"]["key"]] = result
@@ -57,6 +57,15 @@ def _group(results: Sequence[Result], arms: Sequence[Arm]) -> dict[tuple[str, st
         groups.setdefault((job["scene"], job["arm"], job["keep_ratio"]), []).append(result)
     order = {arm.name: place for place, arm in enumerate(arms)}
     return dict(sorted(groups.items(), key=lambda item: (item[0][0], item[0][2] or -1.0, order.get(item[0][1], -1))))
+
+
+def _alike(
+    groups: Mapping[tuple[str, str, float | None], list[Result]],
+) -> Iterator[tuple[str, float | None, list[Result]]]:
+    """Arm, share and results of each group, apart by whether a head came out: trials may differ between seeds."""
+    for (_, arm, ratio), own in groups.items():
+        for count in sorted({len(r["measured"]["configurations"]) for r in own}, reverse=True):
+            yield arm, ratio, [r for r in own if len(r["measured"]["configurations"]) == count]
 
 
 def _percent(ratio: float | None) -> str:
@@ -96,9 +105,9 @@ def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -
     heads += ["ms a frame", "training, s"]
     for scene in dict.fromkeys(result["job"]["scene"] for result in results):
         rows = []
-        for (_, arm, ratio), own in _group([r for r in results if r["job"]["scene"] == scene], arms).items():
+        for arm, ratio, own in _alike(_group([r for r in results if r["job"]["scene"] == scene], arms)):
             ways = [r["measured"]["configurations"] for r in own]
-            for place in range(min(len(way) for way in ways)):
+            for place in range(len(ways[0])):
                 chosen = [way[place] for way in ways]
                 head = "no head" if len(ways[0]) == 1 else chosen[0]["name"]
                 rows.append(
