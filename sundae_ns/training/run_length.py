@@ -97,7 +97,7 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
         A line for each option that the run has otherwise.
 
     Raises:
-        ConfigError: an option would change shapes of the checkpoint.
+        ConfigError: an option would change shapes or schedulers of the checkpoint.
     """
     config.optimizers = deepcopy(config.optimizers)
     names = [*step_options(usual), *_leaves(usual.pipeline.model, "pipeline.model")]
@@ -109,7 +109,8 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
             _set(config, name, deepcopy(theirs))
         elif _get(config, name) != theirs:
             line = f"--{name.replace('_', '-')} is {_get(config, name)}; the run to resume has {theirs}"
-            if name.removeprefix("pipeline.model.") in _SHAPES:  # refused before config.yml is replaced
+            # The state of a scheduler holds its options. Refused before config.yml is replaced.
+            if name.removeprefix("pipeline.model.") in _SHAPES or name.startswith("optimizers."):
                 raise ConfigError(f"{line}, which cannot change; leave the option out")
             differing.append(line)
     return differing

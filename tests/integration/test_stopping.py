@@ -173,6 +173,18 @@ def test_a_field_that_loses_nothing_trains_to_the_end_on_all_views(make: Make, c
     assert not torch.equal(centres[STEPS - 1], centres[STEPS - 2])
 
 
+def test_a_warm_start_is_not_watched(make: Make, curve: Curve) -> None:
+    """Its field knows the views that would be held out."""
+    curve(lambda step: 20 - step)
+    trainer = make()
+    trainer.pipeline.model.state.offset = PRUNE_AT
+    served, *_ = _watched(trainer)
+    trainer.train()
+    assert (trainer.base_dir / "trials.json").exists()
+    assert not (trainer.base_dir / "stopping.json").exists()
+    assert len(served) == STEPS
+
+
 def test_many_views_are_not_watched(make: Make, curve: Curve, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stopping, "MANY_VIEWS", 16)
     curve(lambda step: 20 - step)

@@ -166,6 +166,13 @@ def test_a_resumed_run_keeps_its_schedule() -> None:
     assert all_methods["sundae"] == usual
 
 
+def test_schedulers_of_a_checkpoint_stay() -> None:
+    """Their options lie in its states, which a resumed run loads."""
+    run, usual = fitted("sundae", 6000), deepcopy(all_methods["sundae"])
+    with pytest.raises(ConfigError, match="the run to resume has 6000, which cannot change; leave the option out"):
+        take_options(deepcopy(usual), run, usual, given_options(["--optimizers.means.scheduler.max-steps"]))
+
+
 @pytest.mark.parametrize("option", ["sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle"])
 def test_options_that_a_checkpoint_cannot_follow_are_refused(option: str) -> None:
     run, usual = fitted("sundae", 6000), deepcopy(all_methods["sundae"])
