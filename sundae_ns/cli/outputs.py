@@ -58,19 +58,19 @@ def check_folder(out: Path, *, reads: Iterable[Path | None], overwrite: bool) ->
         raise StorageError(f"{out} holds files; choose another folder, or replace its files with --overwrite")
 
 
-def check_comparison(out: Path, *, reads: Path) -> None:
+def check_comparison(out: Path, *, reads: Iterable[Path]) -> None:
     """Refuse a folder for the jobs and tables of a comparison that is something else, or belongs to what is compared.
 
     Args:
         out: the folder; a comparison that it holds goes on there.
-        reads: the capture, or the folder of captures.
+        reads: captures, or folders of captures.
 
     Raises:
         StorageError: the folder may not be written.
     """
     if out.exists() and not out.is_dir():
         raise StorageError(f"{out} is a file; choose another folder")
-    if _contains(out, reads) or _contains(reads, out):
+    if any(_contains(out, path) or _contains(path, out) for path in reads):
         raise StorageError(f"{out} belongs to what the command reads; choose another folder")
     begun = any((out / name).is_dir() for name in ("jobs", "done")) or any(out.glob("*.jsonl"))
     if out.is_dir() and any(out.iterdir()) and not begun:

@@ -47,7 +47,7 @@ def run_quality(options: QualityOptions, *, runner: Runner | None = None, consol
         StorageError: the folder cannot be written to.
     """
     console, arms = console or Console(), choose_arms(options.arms, options.method, options.steps_scale)
-    check_comparison(options.out, reads=options.scene)
+    check_comparison(options.out, reads=[options.scene])
     data = options.scene.resolve()
     plan = plan_scene(
         data.name,
@@ -76,7 +76,7 @@ def run_suite(options: SuiteOptions, *, runner: Runner | None = None, console: C
     """
     console = console or Console()
     arms = choose_arms(options.arms, options.method, options.steps_scale, from_scratch=True)
-    check_comparison(options.out, reads=options.captures)
+    check_comparison(options.out, reads=[options.captures])
     plan, left_out = plan_suite(options, arms)
     for scene, reason in left_out.items():
         console.print(f"[yellow]Left out: {escape(f'{scene}: {reason}')}", highlight=False, soft_wrap=True)
@@ -99,10 +99,10 @@ def run_paper(options: PaperOptions, *, runner: Runner | None = None, console: C
         ConfigError, DataError, StorageError: as in :func:`run_quality`.
     """
     console, arms = console or Console(), choose_arms(options.arms, options.method, options.steps_scale)
-    check_comparison(options.out, reads=options.root)
     plan, missing = plan_paper(
         options.root.resolve(), arms, scenes=options.scenes, keep_ratios=options.keep_ratios, seed=options.seed
     )
+    check_comparison(options.out, reads=[Path(job.data) for job in plan])
     if missing:
         console.print(f"[yellow]Scenes that are missing and left out: {escape(', '.join(missing))}", highlight=False)
 
