@@ -7,7 +7,19 @@ export PYTHONPATH=/opt/site PATH=/opt/site/bin:$PATH OMP_NUM_THREADS=3
 alone() { export PYTHONPATH=/opt/site:/tmp/benchmarks; cd /tmp || exit; T="python3 /tmp/benchmarks/bench_training.py"; }
 case $1 in
 1) # set up (40 s), and start the queue of lab/queue.txt, three at a time on each GPU
-  bash .gpu/setup.sh; mkdir -p /tmp/scenes /tmp/results
+  bash .gpu/setup.sh
+  # nerfstudio's commands: the project's installation has replaced the folder that held them
+  python3 - <<'P'
+import configparser, glob, os
+found = configparser.ConfigParser(); found.optionxform = str
+found.read(glob.glob("/opt/site/nerfstudio-*.dist-info/entry_points.txt"))
+for name, place in found["console_scripts"].items():
+    module, function = place.split(":")
+    path = f"/opt/site/bin/{name}"
+    if not os.path.exists(path):
+        open(path, "w").write(f"#!/usr/bin/env python3\nfrom {module} import {function}\n{function}()\n"); os.chmod(path, 0o755)
+P
+  mkdir -p /tmp/scenes /tmp/results /tmp/logs
   cp -r .gpu/scenes/* /tmp/scenes/; cp -r lab benchmarks tests pyproject.toml /tmp/
   nvidia-smi --query-gpu=name --format=csv,noheader
   export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mps
@@ -34,7 +46,11 @@ case $1 in
   (unset CUDA_MPS_PIPE_DIRECTORY; export CUDA_VISIBLE_DEVICES=1,0; setsid nohup env PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider \
     -o "addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload" \
     $(grep -rlE --include="*.py" "mark.gpu|pytestmark.*gpu" tests) > /tmp/pytest.log 2>&1 &) ;;
-4) # whole runs for runs.csv (20 s to start; six at a time end after 3 to 5 minutes): SCENE, ARM, SEED
-  alone; sundae bench suite /tmp/scenes -o /tmp/suite --scenes "$SCENE" --arms "$ARM" --seeds "${SEED:-42}"
-  cat /tmp/suite/done/*.json > "$OUT/results.jsonl" ;;
+4) # whole runs for runs.csv: the lines SCENE ARM SEED of lab/whole.txt, four at a time on each GPU, in the background
+  export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mps PYTHONPATH=/opt/site; cd /tmp || exit
+  nl -v 0 /tmp/lab/whole.txt | setsid nohup xargs -P "${PER:-8}" -L 1 bash -c 'export CUDA_VISIBLE_DEVICES=$(($0 % 2)); sundae bench suite \
+    /tmp/scenes -o /tmp/suite --scenes "$1" --arms "$2" --seeds "$3" > /tmp/logs/suite-$1-$2-$3.log 2>&1; echo "$1 $2 $3" >> /tmp/suite.done' > /dev/null 2>&1 & sleep 1 ;;
+6) # their results, once they have ended; then benchmarks/tables.py --suite RESULTS.jsonl
+  until [ $SECONDS -gt "${LIMIT:-500}" ]; do sleep 2; [ "$(cat /tmp/suite.done 2>/dev/null | wc -l)" -ge "$(grep -c . /tmp/lab/whole.txt)" ] && break; done
+  cat /tmp/suite/done/*.json > "$OUT/results.jsonl"; tail -n 2 /tmp/logs/suite-*.log | cut -c1-200; cat /tmp/suite.done ;;
 esac
