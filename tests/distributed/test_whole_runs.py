@@ -38,6 +38,8 @@ from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.rendering import StepResolution, View
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
+from sundae_ns.training import averaging
+from sundae_ns.training.averaging import RunningMean
 
 RunRanks = Callable[[str, Path], None]
 Passed = Callable[[Path, str], None]
@@ -107,18 +109,24 @@ def train(config: SundaeTrainerConfig, rank: int, ranks: int) -> SundaeTrainer:
 
 
 def check_training(shards: Shards, folder: Path) -> None:
-    """A run of two ranks; afterwards both have the same head, and no shard is far from the mean."""
-    anew = []
-    exchange = ShardedField._exchange
+    """A run of two ranks; it ends with a mean of weights, both have the same head, and no shard is far from the mean."""
+    anew, averaged = [], []
+    exchange, replace = ShardedField._exchange, RunningMean.replace
 
     def noted(self: ShardedField, view: View, at: StepResolution | None) -> Exchange:
         if at is not None and (self._planned is None or self._planned.at != at):
             anew.append(at.step)
         return exchange(self, view, at)
 
-    ShardedField._exchange = noted  # type: ignore[method-assign]
+    def noted_mean(self: RunningMean, weights: Any) -> Any:
+        averaged.append(self.count)
+        return replace(self, weights)
+
+    ShardedField._exchange, RunningMean.replace = noted, noted_mean  # type: ignore[method-assign]
+    averaging.EVERY = 1
     trainer = train(configured(folder, "train"), shards.rank, RANKS)
-    ShardedField._exchange = exchange  # type: ignore[method-assign]
+    ShardedField._exchange, RunningMean.replace = exchange, replace  # type: ignore[method-assign]
+    assert averaged == [3]
     # The first step, those after densification, and the one after the prune; the resolution rises at step 2.
     assert anew == [0, *range(1, PRUNE_AT // RANKS + 1, 3), PRUNE_AT // RANKS + 1]
     model: Any = trainer.pipeline.model
