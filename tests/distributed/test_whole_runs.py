@@ -124,7 +124,9 @@ def check_training(shards: Shards, folder: Path) -> None:
 
     ShardedField._exchange, RunningMean.replace = noted, noted_mean  # type: ignore[method-assign]
     averaging.EVERY = 1
-    trainer = train(configured(folder, "train"), shards.rank, RANKS)
+    config = configured(folder, "train")
+    config.schedule_length = STEPS  # as ns-train sets it
+    trainer = train(config, shards.rank, RANKS)
     ShardedField._exchange, RunningMean.replace = exchange, replace  # type: ignore[method-assign]
     assert averaged == [3]
     # The first step, those after densification, and the one after the prune; the resolution rises at step 2.
