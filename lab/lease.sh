@@ -6,7 +6,7 @@ set -u
 export PYTHONPATH=/opt/site PATH=/opt/site/bin:$PATH OMP_NUM_THREADS=3
 alone() { export PYTHONPATH=/opt/site:/tmp/benchmarks; cd /tmp || exit; T="python3 /tmp/benchmarks/bench_training.py"; }
 case $1 in
-1) # set up (40 s), and start the queue of lab/queue.txt, three at a time on each GPU
+1) # set up (40 s), and start the queue of lab/queue.txt, four at a time on each GPU
   bash .gpu/setup.sh
   # nerfstudio's commands: the project's installation has replaced the folder that held them
   python3 - <<'P'

@@ -93,7 +93,6 @@ def method(
         datamanager: other options of the datamanager.
         model: other options of the model.
     """
-    head = head or HeadConfig()
     config = SundaeTrainerConfig(
         method_name=name,
         steps_per_eval_image=500,
@@ -111,7 +110,7 @@ def method(
             ),
             model=SundaeModelConfig(
                 pruning=pruning,
-                head=head,
+                head=head or HeadConfig(),
                 camera_optimizer=CameraOptimizerConfig(mode="off"),
                 **model,
             ),

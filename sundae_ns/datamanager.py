@@ -22,6 +22,7 @@ from sundae_ns.data.capture import check_image, check_transforms, no_transforms,
 from sundae_ns.data.colmap import check_colmap
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.storage.point_cloud import read_point_cloud
+from sundae_ns.training.warning import warn
 
 DATASET_FRAME = "sundae_dataset_frame"
 """Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""
@@ -250,7 +251,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             raise DataError(f"no training images in {self.config.dataparser.data}; check the path and the split")
         warning = check_cameras(outputs.cameras, outputs.image_filenames)
         if warning is not None:
-            CONSOLE.print(f"Warning: {warning}", style="yellow", markup=False, soft_wrap=True)
+            warn(warning)
         outputs.metadata[DATASET_FRAME] = (outputs.dataparser_transform, float(outputs.dataparser_scale))
         return self._marked(super().create_train_dataset())
 

@@ -45,6 +45,7 @@ from sundae_ns.training.recordable import StepInputs, StepResult
 from sundae_ns.training.recorded import RecordedStep
 from sundae_ns.training.run_length import fit_to_length, given_options, schedule_table, take_options
 from sundae_ns.training.step import training_view
+from sundae_ns.training.warning import warn
 
 
 @dataclass
@@ -112,7 +113,7 @@ class SundaeTrainerConfig(TrainerConfig):
             if run is not None and usual is not None:
                 for line in take_options(self, run, usual, given):
                     late = "; a prune that is done is not repeated" if ".pruning." in line else ""
-                    CONSOLE.print(f"[yellow]Warning: {line}{late}", soft_wrap=True)
+                    warn(line + late)
                 self.schedule_length = self.schedule_length or run.schedule_length or run.max_num_iterations
                 if "max_num_iterations" not in given and self.max_num_iterations == usual.max_num_iterations:
                     self.max_num_iterations = self._steps_left()
@@ -339,8 +340,7 @@ class SundaeTrainer(Trainer):
             outputs, result = recorded_outputs(model, camera, batch, self._recorded, self._views)
         except (BackendError, torch.cuda.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0]
-            text = f"Warning: training goes on without recordings, slower: {reason}"
-            CONSOLE.print(text, style="yellow", markup=False, soft_wrap=True)
+            warn(f"training goes on without recordings, slower: {reason}")
             self._recorded = None
             torch.cuda.empty_cache()
             return None
@@ -363,7 +363,7 @@ class SundaeTrainer(Trainer):
                 (time.perf_counter() - self._measured_from) / 10, self.last_step - self._start_step - 11
             )
             if warning is not None:
-                CONSOLE.print(f"Warning: {warning}", style="yellow", markup=False, soft_wrap=True)
+                warn(warning)
 
     def _stop(self) -> None:
         if not self.team.collective:  # ranks stop together
@@ -457,8 +457,7 @@ class SundaeTrainer(Trainer):
             return checkpoint.folder_of(saved) / f"step-{step:09d}.ckpt"
         path, passed_over = checkpoint.newest_whole(saved)
         for line in passed_over:
-            text = f"Warning: skipped a damaged checkpoint: {line}"
-            CONSOLE.print(text, style="yellow", markup=False, highlight=False)
+            warn(f"skipped a damaged checkpoint: {line}")
         return path
 
     def _restore(self, loaded: dict[str, Any]) -> None:

@@ -68,8 +68,7 @@ def check_comparison(out: Path, *, reads: Iterable[Path]) -> None:
     Raises:
         StorageError: the folder may not be written.
     """
-    if out.exists() and not out.is_dir():
-        raise StorageError(f"{out} is a file; choose another folder")
+    check_folder(out, reads=(), overwrite=True)
     if any(_contains(out, path) or _contains(path, out) for path in reads):
         raise StorageError(f"{out} belongs to what the command reads; choose another folder")
     begun = any((out / name).is_dir() for name in ("jobs", "done")) or any(out.glob("*.jsonl"))

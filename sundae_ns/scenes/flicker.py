@@ -124,14 +124,15 @@ def measure_flicker(
                     total.add(frames[-1 - apart], frame)
             if progress is not None:
                 progress()
-    figures = []
-    for number, count in enumerate(counts):
-        for apart, total in totals.items():
-            *heads, base = total.errors()
-            *head_excesses, base_excess = total.excess()
-            errors = (heads[number], base, head_excesses[number], base_excess)
-            figures.append(FlickerFigures(count, apart, *errors, total.seen, len(pairs)))
-    return figures
+    # Base colours are the last of the methods.
+    measured = [(apart, total.errors(), total.excess(), total.seen) for apart, total in totals.items()]
+    return [
+        FlickerFigures(
+            count, apart, errors[number], errors[-1], excesses[number], excesses[-1], seen=seen, paths=len(pairs)
+        )
+        for number, count in enumerate(counts)
+        for apart, errors, excesses, seen in measured
+    ]
 
 
 def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int], phases: Sequence[int]) -> Iterator[Frame]:

@@ -17,6 +17,7 @@ from sundae_ns.pruning import select_random
 from sundae_ns.storage.runs.checkpoint import read_field
 from sundae_ns.storage.transform import similarity
 from sundae_ns.training.densification import start_of_chain
+from sundae_ns.training.warning import warn
 
 Points = tuple[Tensor, Tensor]
 """Positions ``[N, 3]`` and colours in 0 to 255 ``[N, 3]``."""
@@ -62,7 +63,7 @@ class Start:
         if self.failure is not None:
             raise self.failure
         for warning in self.warnings:
-            CONSOLE.print(f"[yellow]Warning: {warning}")
+            warn(warning)
 
 
 def initial_field(

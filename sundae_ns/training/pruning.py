@@ -16,6 +16,7 @@ from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.report import report_peak, write_report
 from sundae_ns.training.schedulers import notify_pruned
 from sundae_ns.training.schedules import PruningSchedule
+from sundae_ns.training.warning import warn
 
 
 class ScheduledPruning(Extension):
@@ -79,7 +80,7 @@ class ScheduledPruning(Extension):
             return
         CONSOLE.log(report.summary())
         if report.dropped_nonfinite:
-            CONSOLE.print(f"[yellow]Warning: removed {report.dropped_nonfinite} primitives that were not finite")
+            warn(f"removed {report.dropped_nonfinite} primitives that were not finite")
         after = _evaluated(run, "pruned") if evaluate else {}
         write_report(run, report, before=before, after=after)
 
@@ -102,10 +103,9 @@ class ScheduledPruning(Extension):
         mend = "enable it" if short.option.startswith("head") else "prune"
         # In steps of one image, as options count.
         images = run.images_per_step
-        CONSOLE.print(
-            f"[yellow]Warning: training ends after {(last_step + 1) * images:,} steps, and the {short.event} needs more than "
-            f"{short.step * images:,} ({short.option}): {short.consequence}; train longer, or {mend} earlier",
-            soft_wrap=True,
+        warn(
+            f"training ends after {(last_step + 1) * images:,} steps, and the {short.event} needs more than "
+            f"{short.step * images:,} ({short.option}): {short.consequence}; train longer, or {mend} earlier"
         )
 
 

@@ -30,6 +30,7 @@ from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, mean_quality, measure_heldout
 from sundae_ns.training.report import write_record
 from sundae_ns.training.schedulers import limit_rise, notify_pruned, postpone
+from sundae_ns.training.warning import warn
 
 ARMS = ("plain", "head", "features")
 """What is tried, in this order: no head, the head as configured, and one of more features. Each is larger than the last."""
@@ -60,8 +61,6 @@ LEAST_GAIN = 0.1
 GAIN_PER_DOUBLING = 0.4
 """PSNR that an arm must gain for each doubling of the stored bytes, dB. Twice as many primitives gain about twice this at the
 end of a run, and a trial shows a part of a gain."""
-
-
 _DISABLED = "so it stays disabled; train longer, or force it with --pipeline.model.head.mode residual"
 
 
@@ -86,15 +85,6 @@ class Plan(NamedTuple):
         return [index for fold in self.folds for index in fold]
 
 
-def trial_length(steps: int) -> int:
-    """Training steps of a trial.
-
-    Args:
-        steps: length of the schedule.
-    """
-    return max(round(max(LEAST_TRIAL * steps, min(TRIAL_STEPS, MOST_TRIAL * steps))), 1)
-
-
 def plan_trials(indices: Sequence[int], steps: int, arms: int = len(ARMS)) -> Plan:
     """Plan the trials of a run.
 
@@ -107,9 +97,8 @@ def plan_trials(indices: Sequence[int], steps: int, arms: int = len(ARMS)) -> Pl
     count = 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY))
     # Evenly over the capture, because neighbours in a path look alike.
     chosen = [indices[(2 * i + 1) * len(indices) // (2 * count)] for i in range(count)]
-    if few:
-        return Plan([[index] for index in chosen], max(round(LEAST_TRIAL * steps / 2), 1), arms)
-    return Plan([chosen], trial_length(steps), arms)
+    length = LEAST_TRIAL * steps / 2 if few else max(LEAST_TRIAL * steps, min(TRIAL_STEPS, MOST_TRIAL * steps))
+    return Plan([[index] for index in chosen] if few else [chosen], max(round(length), 1), arms)
 
 
 @dataclass
@@ -240,8 +229,7 @@ class Trials(Extension):
         elif progress.phase != "before":
             self._hold_out(run)
         elif run.last_step is not None and not self._fits(run):
-            text = "training ends before the head can be tried"
-            CONSOLE.print(f"[yellow]Warning: {text}, {_DISABLED}", soft_wrap=True)
+            warn(f"training ends before the head can be tried, {_DISABLED}")
 
     def after_step(self, run: TrainingRun) -> None:
         """Hold out views, begin and end trials, decide."""
@@ -271,8 +259,7 @@ class Trials(Extension):
     def finish(self, run: TrainingRun) -> None:
         """Warn if training ended before a decision."""
         if self.progress.phase != "done" and run.last_step is not None and run.last_step + 1 >= self._end_of(run):
-            text = "training ended before the head could be tried"
-            CONSOLE.print(f"[yellow]Warning: {text}, {_DISABLED}", soft_wrap=True)
+            warn(f"training ended before the head could be tried, {_DISABLED}")
 
     def held_out(self, run: TrainingRun) -> list[int]:
         """Indices of the views that the chosen field has not seen since before its trial; none if there were no trials."""
@@ -312,7 +299,7 @@ class Trials(Extension):
         if self.progress.arm == "features":
             self._widen(run.state)
         self._set_arm(run.state)
-        if self.progress.arm != "plain":
+        if self.progress.arm != "plain":  # now: the prunes' extension acts before this one, so a step later
             notify_pruned(run.state.schedulers, run.state.step, run.source.total)
 
     def _stored_bytes(self, state: FieldState) -> list[int]:
@@ -376,22 +363,25 @@ class Trials(Extension):
 
     def _decide(self, run: TrainingRun) -> None:
         progress, state = self.progress, run.state
-        if not all(progress.qualities(arm) for arm in progress.tried):
-            if progress.arm != "plain":
-                self._return_to(state, self._ends["plain"])
-            self._settle(run, "plain", "masks leave no pixel of the held-out training views")
-            return
-        decision = progress.best()
+        decision, seen = progress.best(), all(progress.qualities(arm) for arm in progress.tried)
+        if seen:
+            self._report(run, decision)
+        if decision != progress.arm:
+            self._return_to(state, self._ends[decision])
+        self._settle(run, decision, "" if seen else "masks leave no pixel of the held-out training views")
+
+    def _report(self, run: TrainingRun, decision: str) -> None:
+        """Log the figures of the arms, and the decision."""
+        progress = self.progress
         figures = {arm: mean_quality(progress.qualities(arm)) for arm in progress.tried}
         texts = [
             f"{NAMES[arm]} {decibels:.2f} dB, SSIM {ssim:.4f}, {megabytes(size)}"
             for (arm, (decibels, ssim)), size in zip(figures.items(), progress.bytes, strict=False)
         ]
-        CONSOLE.log(f"step {state.step}: held-out training views: {'; '.join(texts)}. Continuing: {NAMES[decision]}")
+        CONSOLE.log(
+            f"step {run.state.step}: held-out training views: {'; '.join(texts)}. Continuing: {NAMES[decision]}"
+        )
         run.log_scalars("Trials", {f"psnr_{arm}": decibels for arm, (decibels, _) in figures.items()})
-        if decision != progress.arm:
-            self._return_to(state, self._ends[decision])
-        self._settle(run, decision, "")
 
     def _settle(self, run: TrainingRun, decision: str, reason: str) -> None:
         """Take a decision, and serve all training views from now on."""

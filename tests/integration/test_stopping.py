@@ -133,10 +133,7 @@ def test_a_rest_in_the_last_steps_is_not_averaged(make: Make, curve: Curve, monk
 def test_views_that_a_trial_has_seen_are_not_watched(tmp_path: Path, curve: Curve) -> None:
     """With few views a trial holds out one of two, and the field that goes on has seen the other."""
     trainer = tiny_run(tiny_scene(tmp_path, 8), tmp_path)
-    served: list[int] = []
-    manager: Any = trainer.pipeline.datamanager
-    serve = manager.view_of_step
-    manager.view_of_step = lambda step: served.append(serve(step)) or served[-1]
+    served, *_ = _watched(trainer)
     curve(lambda _: 20.0, held_out=1)
     trainer.train()
     tidy()

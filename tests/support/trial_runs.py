@@ -1,4 +1,4 @@
-"""Runs of the default method on a scene of a few pixels, with trials of four steps."""
+"""Runs of the default method on a scene of a few pixels, with trials of five steps."""
 
 from __future__ import annotations
 

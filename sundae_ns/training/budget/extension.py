@@ -26,6 +26,7 @@ from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.report import PruneReport, write_report
+from sundae_ns.training.warning import warn
 
 MAX_REJECTED = 5
 """Cuts that may be rejected, before and after the head is enabled."""
@@ -169,7 +170,7 @@ class BudgetSearch(Extension):
         """Evaluate the final field against the target, and log whether it was reached."""
         config, search = self.config, self.search
         if search.phase == "before":
-            CONSOLE.print("[yellow]Warning: training ended before the budget search began (pruning.prune-at)")
+            warn("training ended before the budget search began (pruning.prune-at)")
             return
         searched, state = SearchedField(run, config), run.state
         end = self._point(searched, searched.measure(), "final", "reached")
@@ -417,7 +418,7 @@ class BudgetSearch(Extension):
     def _count_dropped(self, count: int) -> None:
         self.search.dropped_nonfinite += count
         if count:
-            CONSOLE.print(f"[yellow]Warning: removed {count} primitives that were not finite")
+            warn(f"removed {count} primitives that were not finite")
 
     def _restore(self, searched: SearchedField, saved: Mapping[str, Snapshot] | None) -> None:
         searched.restore(saved)
