@@ -21,6 +21,7 @@ for name, place in found["console_scripts"].items():
 P
   mkdir -p /tmp/scenes /tmp/results /tmp/logs
   cp -r .gpu/scenes/* /tmp/scenes/; cp -r lab benchmarks tests pyproject.toml /tmp/
+  for c in bonsai garden stone_horse; do ln -sfn $c /tmp/scenes/${c}16; done  # 16 views
   nvidia-smi --query-gpu=name --format=csv,noheader
   export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mps
   mkdir -p /tmp/mps && nvidia-cuda-mps-control -d
@@ -46,11 +47,31 @@ P
   (unset CUDA_MPS_PIPE_DIRECTORY; export CUDA_VISIBLE_DEVICES=1,0; setsid nohup env PYTHONSAFEPATH=1 python3 -m pytest -q -m gpu -p no:cacheprovider \
     -o "addopts=--strict-markers --import-mode=importlib --disable-plugin-autoload" \
     $(grep -rlE --include="*.py" "mark.gpu|pytestmark.*gpu" tests) > /tmp/pytest.log 2>&1 &) ;;
-4) # whole runs for runs.csv: the lines SCENE ARM SEED of lab/whole.txt, four at a time on each GPU, in the background
-  export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mps PYTHONPATH=/opt/site; cd /tmp || exit
-  nl -v 0 /tmp/lab/whole.txt | setsid nohup xargs -P "${PER:-8}" -L 1 bash -c 'export CUDA_VISIBLE_DEVICES=$(($0 % 2)); sundae bench suite \
-    /tmp/scenes -o /tmp/suite --scenes "$1" --arms "$2" --seeds "$3" > /tmp/logs/suite-$1-$2-$3.log 2>&1; echo "$1 $2 $3" >> /tmp/suite.done' > /dev/null 2>&1 & sleep 1 ;;
+4) # whole runs for runs.csv: the lines SCENE ARM SEED of lab/whole-$2.txt, PER at a time, in the background
+  export CUDA_MPS_PIPE_DIRECTORY=/tmp/mps CUDA_MPS_LOG_DIRECTORY=/tmp/mps PYTHONPATH=/opt/site; cp -rn .gpu/scenes/* /tmp/scenes/; cd /tmp || exit
+  nl -v 0 -b a "/tmp/lab/whole-$2.txt" | setsid nohup xargs -P "${PER:-4}" -L 1 bash -c 'export CUDA_VISIBLE_DEVICES=$(($0 % 2)); sundae bench suite \
+    /tmp/scenes -o /tmp/suite --scenes "$1" --arms "$2" --seeds "$3" > /tmp/logs/suite-$1-$2-$3.log 2>&1; echo "$1 $2 $3 $? $SECONDS" >> /tmp/suite.done' > /dev/null 2>&1 & sleep 1 ;;
 6) # their results, once they have ended; then benchmarks/tables.py --suite RESULTS.jsonl
-  until [ $SECONDS -gt "${LIMIT:-500}" ]; do sleep 2; [ "$(cat /tmp/suite.done 2>/dev/null | wc -l)" -ge "$(grep -c . /tmp/lab/whole.txt)" ] && break; done
-  cat /tmp/suite/done/*.json > "$OUT/results.jsonl"; tail -n 2 /tmp/logs/suite-*.log | cut -c1-200; cat /tmp/suite.done ;;
+  until [ $SECONDS -gt "${LIMIT:-500}" ]; do sleep 2; [ "$(cat /tmp/suite.done 2>/dev/null | wc -l)" -ge "$(cat /tmp/lab/whole-*.txt | wc -l)" ] && break; done
+  cat /tmp/suite/done/*.json > "$OUT/results.jsonl"; cat /tmp/results/*.jsonl > "$OUT/queue.jsonl"
+  python3 - <<'E'
+import glob, json, os
+with open(os.environ["OUT"] + "/trials.jsonl", "w") as out:
+    for path in sorted(glob.glob("/tmp/suite/jobs/*/*/*/run/trials.json") + glob.glob("/tmp/full/*/sundae/*/trials.json")):
+        out.write(json.dumps({"path": path, "trials": json.load(open(path))}) + "\n")
+E
+  cat /tmp/suite.done; ls /tmp/suite/done /tmp/results; cat /tmp/queue.log; grep -l Traceback /tmp/logs/* | xargs -r tail -n 5
+  tail -n 12 /tmp/pytest.log | cut -c1-300; cp /tmp/pytest.log "$OUT" ;;
+7) # frames and flicker of the new runs, then times alone: each GPU by itself
+  echo quit | CUDA_MPS_PIPE_DIRECTORY=/tmp/mps nvidia-cuda-mps-control; sleep 2; alone; J=/tmp/suite/jobs
+  run() { echo "$J/$1-$2-10pct-s42/$2/sundae/run"; }
+  frame() { sundae bench frame --load-config "$(run "$1" "$2")" --precisions bf16 --json; }
+  flick() { sundae bench flicker --load-config "$(run "$1" "$2")" --json; }
+  full() { sundae bench frame --load-config "$J/$1-sundae-warm-up-s42/sundae-warm-up/sundae/run" --precisions fp32 --json; }
+  (export CUDA_VISIBLE_DEVICES=0; frame bonsai sundae; full bonsai; flick bonsai sundae; flick garden sundae
+   $T /tmp/scenes/bonsai --arms sundae -o "$OUT/t0.jsonl") > "$OUT/g0.log" 2>&1 &
+  (export CUDA_VISIBLE_DEVICES=1; frame fox sundae-with-head; full fox; flick fox sundae-with-head; flick stone_horse sundae-with-head
+   $T /tmp/scenes/bonsai --arms sundae-fast -o "$OUT/t1.jsonl"; $T /tmp/scenes/garden --arms sundae-fast -o "$OUT/t1.jsonl") > "$OUT/g1.log" 2>&1 &
+  until [ $SECONDS -gt "${LIMIT:-540}" ]; do sleep 2; jobs -r | grep -q . || break; done
+  tail -n 20 "$OUT"/g?.log | cut -c1-700; cat "$OUT"/t?.jsonl ;;
 esac
