@@ -74,4 +74,9 @@ E
    $T /tmp/scenes/bonsai --arms sundae-fast -o "$OUT/t1.jsonl"; $T /tmp/scenes/garden --arms sundae-fast -o "$OUT/t1.jsonl") > "$OUT/g1.log" 2>&1 &
   until [ $SECONDS -gt "${LIMIT:-540}" ]; do sleep 2; jobs -r | grep -q . || break; done
   tail -n 20 "$OUT"/g?.log | cut -c1-700; cat "$OUT"/t?.jsonl ;;
+8) # frames again, each GPU by itself, three times
+  echo quit | CUDA_MPS_PIPE_DIRECTORY=/tmp/mps nvidia-cuda-mps-control; sleep 5; alone; J=/tmp/suite/jobs
+  for i in 1 2 3; do for r in fox-sundae-with-head-10pct-s42/sundae-with-head fox-sundae-warm-up-s42/sundae-warm-up; do
+    [ "${r%up}" = "$r" ] && p=bf16 || p=fp32
+    sundae bench frame --load-config "$J/$r/sundae/run" --precisions $p --repeats 9 --json 2>&1 | grep ms_frame; done; done ;;
 esac
