@@ -1,6 +1,6 @@
 """Draw the plots of docs/results.md from benchmarks/results, into docs/figures.
 
-python benchmarks/plot.py            # runs.png, heads.png, rules.png, training.png
+python benchmarks/plot.py            # runs.png, heads.png, rules.png
 python benchmarks/plot.py runs       # one of them
 """
 
@@ -62,8 +62,8 @@ def plot_runs() -> Any:
             panel.plot(*place, "o", color=color, markerfacecolor=color if row["of_today"] else "white")
             # Where sundae takes the head or none, it lies on that point.
             left = full or row["variant"] in ("sundae-with-head", "sundae-no-head")
-            height = 3 if ours else -3
-            beside = {"ha": "right", "xytext": (-7, height)} if left else {"xytext": (7, height)}
+            beside = {"ha": "right", "xytext": (-7, -3)} if left else {"xytext": (7, -3)}
+            beside = {"ha": "center", "xytext": (0, 9)} if ours else beside
             panel.annotate(SHORT[row["variant"]], place, textcoords="offset points", fontsize=9, **beside)
         panel.margins(y=0.1)
         panel.set_xscale("log")
@@ -128,41 +128,16 @@ def plot_rules() -> Any:
     return figure
 
 
-TRAINED = {"splatfacto": "gray", "sundae": "tab:red", "sundae-fast": "tab:blue"}
-"""Methods of the plot of training times, and their colours."""
-
-
-def plot_training() -> Any:
-    """PSNR of the test views against seconds of training, a panel for each capture."""
-    lines = [line for line in lines_of("training_time.jsonl") if line["arm"] in TRAINED and line.get("curve")]
-    scenes = list(dict.fromkeys(line["scene"] for line in lines))
-    figure, panels = plt.subplots(1, len(scenes), figsize=(5.5 * len(scenes), 4), layout="constrained", squeeze=False)
-    for panel, scene in zip(panels[0], scenes, strict=True):
-        for line in lines:
-            if line["scene"] == scene:
-                times = [point[0] for point in line["curve"]] + [line["train_s"]]
-                values = [point[1] for point in line["curve"]] + [line["psnr"]]
-                name = f"{line['arm']}, {line['primitives'] / 1000:,.0f} thousand primitives"
-                panel.plot(times, values, "o-", markersize=3, color=TRAINED[line["arm"]], label=name)
-        panel.set_title(f"{scene}, {lines[0]['gpu'].removeprefix('NVIDIA ')}", fontsize=10)
-        panel.set_xlabel("seconds of training, alone on the GPU")
-        panel.set_ylabel("test PSNR, dB")
-        panel.legend(fontsize=8, loc="lower right")
-        panel.grid(alpha=0.3)
-    return figure
-
-
 PLOTS: dict[str, Callable[[], Any]] = {
     "runs": plot_runs,
     "heads": plot_heads,
     "rules": plot_rules,
-    "training": plot_training,
 }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("plots", nargs="*", default=list(PLOTS), help="runs, heads, rules, training; by default all")
+    parser.add_argument("plots", nargs="*", default=list(PLOTS), help="runs, heads, rules; by default all")
     parser.add_argument("-o", "--out", type=Path, default=FIGURES, help="folder")
     options = parser.parse_args()
     odd = [name for name in options.plots if name not in PLOTS]

@@ -110,16 +110,14 @@ def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
 
 def headline() -> list[str]:
     """README's table: today's default beside stock splatfacto."""
-    heads = ["capture", "method", "primitives", "PSNR", "SSIM", "PSNR head off", "MB", "ms a frame"]
+    heads = ["capture", "method", "primitives", "PSNR", "SSIM", "PSNR head off", "MB"]
     rows = [cells_of(row) for row in default_runs() if row["variant"] in HEADLINE]
-    if not any(row["ms_frame"] for row in default_runs() if row["variant"] in HEADLINE):
-        heads, rows = heads[:-1], [row[:-1] for row in rows]
     return table(heads, first_of_each(rows))
 
 
 def quality() -> list[str]:
-    """All methods on the captures: quality, size and time of the same rendering."""
-    heads = ["capture", "method", "keep", "primitives", "PSNR, dB", "SSIM", "PSNR, head off", "MB", "ms a frame"]
+    """All methods on the captures: quality and size; :func:`speed` has times, because suites share their GPUs."""
+    heads = ["capture", "method", "keep", "primitives", "PSNR, dB", "SSIM", "PSNR, head off", "MB"]
     rows = []
     for row in default_runs():
         capture, method, *others = cells_of(row)
@@ -150,13 +148,13 @@ def shares() -> list[str]:
 
 
 def cells_of(row: dict[str, Any]) -> list[str]:
-    """Capture, method, number of primitives, metrics, size and time of a row of runs.csv."""
+    """Capture, method, number of primitives, metrics and size of a row of runs.csv."""
     return [
         f"{row['scene']}, {row['resolution'].replace('x', ' x ')}",
         named(METHODS[row["variant"]], row["of_today"]),
         *(number(row["primitives"], 0), row["psnr_cell"], row["ssim_cell"]),
         number(row["psnr_base"], 2) if row["bytes_head"] else "",
-        *(number(row["bytes_total"] / MB, 1), number(row["ms_frame"], 2)),
+        number(row["bytes_total"] / MB, 1),
     ]
 
 
@@ -337,10 +335,7 @@ def take_over(results: Path) -> None:
         ("training_time.jsonl", [_training_line(r) for r in own if _is_timed(r)], ("scene", "arm")),
         ("pack.jsonl", [_pack_line(r) for r in own if r["packed"]], ("run", "variant", "finetune_steps")),
     ):
-        # Curves are of trainings of their own, beside the suite's.
-        curves = [line for line in lines_of(name) if line.get("curve")]
-        others = [line for line in lines_of(name) if not line.get("curve")]
-        kept = [*curves, *_merged(others, lines, places)]
+        kept = _merged(lines_of(name), lines, places)
         (RESULTS / name).write_text("".join(json.dumps(line) + "\n" for line in kept), encoding="utf-8")
 
 
