@@ -62,9 +62,8 @@ def plot_runs() -> Any:
             panel.plot(*place, "o", color=color, markerfacecolor=color if row["of_today"] else "white")
             # Where sundae takes the head or none, it lies on that point.
             left = full or row["variant"] in ("sundae-with-head", "sundae-no-head")
-            beside = {"ha": "right", "xytext": (-7, -3)} if left else {"xytext": (7, -3)}
-            beside = {"ha": "center", "xytext": (0, 9)} if ours else beside
-            panel.annotate(SHORT[row["variant"]], place, textcoords="offset points", fontsize=9, **beside)
+            side, shift = ("center", (0, 9)) if ours else ("right", (-7, -3)) if left else ("left", (7, -3))
+            panel.annotate(SHORT[row["variant"]], place, shift, textcoords="offset points", fontsize=9, ha=side)
         panel.margins(y=0.1)
         panel.set_xscale("log")
         panel.set_xlim(2, 300)

@@ -154,9 +154,7 @@ class SundaeTrainerConfig(TrainerConfig):
         try:
             run = None if path is None else load_config(path)
         except CheckpointError as error:
-            CONSOLE.print(
-                f"[yellow]Warning: {error}; the run is resumed with the options of this command", soft_wrap=True
-            )
+            warn(f"{error}; the run is resumed with the options of this command")
             return None
         return run if isinstance(run, SundaeTrainerConfig) else None
 

@@ -31,6 +31,7 @@ from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.pruning import ScheduledPruning
+from sundae_ns.training.warning import warn
 
 State = dict[str, Any]
 
@@ -173,9 +174,9 @@ class Ranks(OneProcess):
         """Warn if the copies of the head differ between ranks."""
         apart = 0.0 if head is None else self.shards.apart(head.parameters())
         if apart != 0 and self.shards.rank == 0:
-            CONSOLE.print(
-                f"[yellow]Warning: the heads of the ranks differ by up to {apart:.2g}, which is a bug of sundae; the "
-                "checkpoint holds the head of the first rank, and resuming from it makes them equal"
+            warn(
+                f"the heads of the ranks differ by up to {apart:.2g}, which is a bug of sundae; the checkpoint holds the head "
+                "of the first rank, and resuming from it makes them equal"
             )
 
     def gathered(self, state: State, names: list[str]) -> State | None:

@@ -25,15 +25,12 @@ import torch.distributed as dist
 from PIL import Image
 from torch.multiprocessing.spawn import ProcessExitedException
 
-from sundae_ns import distributed
 from sundae_ns.data import write_embedded_capture
 from sundae_ns.distributed import ShardedField, Shards
-from sundae_ns.distributed.batches import shorten
 from sundae_ns.distributed.checkpoints import state_of_rank
 from sundae_ns.distributed.shards import DRIFT
 from sundae_ns.distributed.source import Exchange
-from sundae_ns.distributed.start import without_viewer
-from sundae_ns.errors import ConfigError, rank_ended, show_in_one_line
+from sundae_ns.errors import rank_ended, show_in_one_line
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.rendering import StepResolution, View
 from sundae_ns.storage.runs import checkpoint
@@ -446,74 +443,3 @@ def test_ns_train_on_two_gpus(tmp_path: Path) -> None:
     assert pipeline.model.num_points == report["after"]
     # 16 dB is far above a field that has not learned, and far below one that has.
     assert pipeline.get_average_eval_image_metrics()["psnr"] > 16
-
-
-def test_an_error_of_sundae_in_a_rank_keeps_its_message() -> None:
-    class Raised(Exception):
-        error_index = 1
-
-    text = "\n\n-- Process 1 terminated with the following error:\nTraceback ...\nsundae_ns.errors.DataError: cause; mend\n"
-    assert str(rank_ended(Raised(text))) == "rank 1: cause; mend"
-    assert "rank 1 ended (ValueError: odd)" in str(rank_ended(Raised("Traceback ...\nValueError: odd")))
-
-
-def test_nerfstudios_command_ends_with_one_line() -> None:
-    code = """
-import sys
-sys.argv = ["/usr/bin/ns-train"]
-from torch.multiprocessing.spawn import ProcessExitedException
-from sundae_ns.errors import show_in_one_line
-show_in_one_line()
-raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -9, "SIGKILL")
-"""
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT, check=False)
-    assert result.returncode == 1
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("sundae: rank 1 ended (killed by SIGKILL)")
-
-
-@pytest.mark.parametrize(
-    ("option", "value"), [("warmup", "mcmc"), ("pruning.mode", "auto"), ("camera_optimizer.mode", "SO3xR3")]
-)
-def test_options_that_several_ranks_cannot_use_are_refused(tmp_path: Path, option: str, value: str) -> None:
-    config = configured(tmp_path, "refused")
-    *owners, name = option.split(".")
-    owner: Any = config.pipeline.model
-    for part in owners:
-        owner = getattr(owner, part)
-    setattr(owner, name, value)
-    with pytest.raises(ConfigError, match="several GPUs"):
-        distributed.check_options(config)
-
-
-def test_more_ranks_than_gpus_are_refused_before_anything_is_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = configured(tmp_path, "refused")
-    with pytest.raises(ConfigError, match="needs GPUs.*device-type is cpu"):
-        config.save_config()
-    config.machine.device_type = "cuda"
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(ConfigError, match="is 2 and there are 1 GPUs; give --machine.num-devices 1"):
-        config.save_config()
-    assert not config.get_base_dir().exists()
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    config.save_config()
-    assert (config.get_base_dir() / "config.yml").exists()
-
-
-def test_shortened_runs_see_as_many_images(tmp_path: Path) -> None:
-    config = configured(tmp_path, "short")
-    config.schedule_length = 2 * STEPS
-    short = shorten(config, 2)
-    assert (short.max_num_iterations, config.max_num_iterations) == (STEPS // 2, STEPS)
-    assert (short.schedule_length, config.schedule_length) == (STEPS, 2 * STEPS)
-    assert short.pipeline.model.pruning.prune_at == PRUNE_AT // 2
-    assert short.pipeline.model.refine_every == 3
-    full = config.optimizers["means"]["scheduler"].max_steps
-    assert short.optimizers["means"]["scheduler"].max_steps == full // 2
-
-
-def test_loggers_stay_when_the_viewer_goes() -> None:
-    found = [without_viewer(vis) for vis in ("viewer", "viewer+wandb", "comet")]
-    assert found == ["tensorboard", "wandb", "comet"]
