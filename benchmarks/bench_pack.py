@@ -40,7 +40,7 @@ from sundae_ns.storage.packing import (
     Codecs,
     PackConfig,
     PackReport,
-    Scene,
+    PackedScene,
     fit_scene,
     read_scene,
     write_fitted,
@@ -48,7 +48,7 @@ from sundae_ns.storage.packing import (
 from sundae_ns.storage.runs.config_file import load_config
 
 
-def random_scene(n: int) -> Scene:
+def random_scene(n: int) -> PackedScene:
     g = torch.Generator().manual_seed(0)
     features = 13
     field = {
@@ -61,7 +61,7 @@ def random_scene(n: int) -> Scene:
         "features": torch.randn(n, features, generator=g),
     }
     torch.manual_seed(0)
-    return Scene(field, dict(CompensationHead(HeadConfig(num_features=features)).state_dict()))
+    return PackedScene(field, dict(CompensationHead(HeadConfig(num_features=features)).state_dict()))
 
 
 def config_of(settings: list[str], finetuned: bool) -> PackConfig:
@@ -74,8 +74,8 @@ def config_of(settings: list[str], finetuned: bool) -> PackConfig:
 
 
 def prepared(
-    run: Path | None, scene: Scene, config: PackConfig, steps: int, rate: float
-) -> tuple[Scene, Codecs, list[float]]:
+    run: Path | None, scene: PackedScene, config: PackConfig, steps: int, rate: float
+) -> tuple[PackedScene, Codecs, list[float]]:
     """The scene to write, fine-tuned for ``steps``, its codecs, and the loss of each step."""
     losses: list[Tensor] = []
     if run is None or steps == 0:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from sundae_ns.scenes.packed import model_of
 from sundae_ns.scenes.page import write_page
 from sundae_ns.scenes.statement import cameras_of
-from sundae_ns.storage.packing import Scene, container, read_scene
+from sundae_ns.storage.packing import PackedScene, container, read_scene
 from sundae_ns.storage.packing.scene import CAMERAS as STORED
 
 SECONDS = 400.0
@@ -44,7 +44,7 @@ SIDE = 320
 WEB = Path(__file__).parents[1] / "web"
 
 
-def scaled(scene: Scene, side: int) -> Scene:
+def scaled(scene: PackedScene, side: int) -> PackedScene:
     """The scene with six of its cameras, no larger than ``side``, as if the head had been trained at that size."""
     cameras = cameras_of(scene)
     picks = torch.linspace(0, len(cameras["poses"]) - 1, CAMERAS).round().long().unique()
@@ -60,7 +60,7 @@ def scaled(scene: Scene, side: int) -> Scene:
     return replace(scene, cameras=cameras, meta=meta)
 
 
-def write_scaled(out: Path, scene: Path, side: int) -> Scene:
+def write_scaled(out: Path, scene: Path, side: int) -> PackedScene:
     """Write a file as :func:`scaled` changes it; its levels and steps are copied, so the page decodes those of the file."""
     small, header = scaled(read_scene(scene), side), container.read_header(scene)
     meta = {**header.meta, **small.meta}
@@ -72,7 +72,7 @@ def write_scaled(out: Path, scene: Path, side: int) -> Scene:
     return read_scene(out)
 
 
-def truths(scene: Scene) -> list[dict[str, NDArray[np.float32]]]:
+def truths(scene: PackedScene) -> list[dict[str, NDArray[np.float32]]]:
     """``rgb`` and ``base_rgb`` of each camera, by Python."""
     model, cameras = model_of(scene), cameras_of(scene)
     images = []

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.scenes.statement import cameras_of
-from sundae_ns.storage.packing import Scene, read_scene
+from sundae_ns.storage.packing import PackedScene, read_scene
 from sundae_ns.storage.viewers import write_for_viewers
 
 PAGE = '<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><script type="module" src="viewers.js"></script>'
@@ -71,14 +71,14 @@ def settings(kind: str, antialiased: bool) -> dict[str, dict[str, Options]]:
     return ladders
 
 
-def base_colors(scene: Scene) -> Scene:
+def base_colors(scene: PackedScene) -> PackedScene:
     """The scene without its head, on a black background."""
     model = {**scene.meta["model"], "head": None, "trained_focal": None, "background_color": "black"}
     field = {name: value for name, value in scene.field.items() if name != FEATURES}
     return replace(scene, field=field, head={}, meta={**scene.meta, "model": model})
 
 
-def central(scene: Scene) -> Scene:
+def central(scene: PackedScene) -> PackedScene:
     """The scene with the primitives whose centres lie in the images of all cameras."""
     keep = torch.ones(len(scene.field["means"]), dtype=torch.bool)
     cameras = cameras_of(scene)
@@ -97,7 +97,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 class Viewers:
     """A page with the viewers, and the export and the cameras of a scene."""
 
-    def __init__(self, page: Browser, scene: Scene, file: str) -> None:
+    def __init__(self, page: Browser, scene: PackedScene, file: str) -> None:
         self._page, self._file = page, file
         cameras = cameras_of(scene)
         names = ("fx", "fy", "cx", "cy", "width", "height")
@@ -124,7 +124,7 @@ class Viewers:
 
 
 @contextmanager
-def opened(scene: Scene, kind: str) -> Iterator[Viewers]:
+def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
     """The viewers with an export of a scene; ``kind`` is ``ply`` or ``spz``."""
     chromium = find_chromium()
     if chromium is None or not has_packages():

@@ -1,3 +1,78 @@
-"""SUNDAE for nerfstudio: spectrally pruned Gaussian fields with neural compensation."""
+"""SUNDAE: spectrally pruned Gaussian fields with neural compensation, as a library and as a nerfstudio plug-in.
+
+The library needs no nerfstudio:
+
+    import sundae_ns as sn
+
+    scene = sn.load("garden.ply")                          # .ply, .spz, .sog, .sundae, or a run of ns-train
+    views = sn.virtual_views(scene)                        # or sn.views_of("transforms.json")
+    small = sn.prune(scene, keep=0.1, views=views)         # a new scene; dropped primitives are merged into kept ones
+    image = sn.render(small, views[0]).rgb                 # [H, W, 3], on a CPU or a GPU
+    sn.save(small, "small.sundae")
+
+Names are imported on first use, so that ``ns-*`` commands, which load every plug-in, do not wait for this one.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sundae_ns.api.measuring import Quality, measure
+    from sundae_ns.api.opening import load
+    from sundae_ns.api.pruning import prune
+    from sundae_ns.api.rendering import Rendering, render
+    from sundae_ns.api.saving import save
+    from sundae_ns.api.scene import Scene
+    from sundae_ns.api.views import views_of, virtual_views
+    from sundae_ns.errors import SundaeError
+    from sundae_ns.pruning import PruneRule
+    from sundae_ns.rendering.views import View
 
 __version__ = "0.1.0"
+
+_HOMES = {
+    "PruneRule": "sundae_ns.pruning",
+    "Quality": "sundae_ns.api.measuring",
+    "Rendering": "sundae_ns.api.rendering",
+    "Scene": "sundae_ns.api.scene",
+    "SundaeError": "sundae_ns.errors",
+    "View": "sundae_ns.rendering.views",
+    "load": "sundae_ns.api.opening",
+    "measure": "sundae_ns.api.measuring",
+    "prune": "sundae_ns.api.pruning",
+    "render": "sundae_ns.api.rendering",
+    "save": "sundae_ns.api.saving",
+    "views_of": "sundae_ns.api.views",
+    "virtual_views": "sundae_ns.api.views",
+}
+"""Public names and the modules that hold them."""
+
+__all__ = [
+    "PruneRule",
+    "Quality",
+    "Rendering",
+    "Scene",
+    "SundaeError",
+    "View",
+    "load",
+    "measure",
+    "prune",
+    "render",
+    "save",
+    "views_of",
+    "virtual_views",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

@@ -195,6 +195,7 @@ class SundaeModel(SplatfactoModel):
             running=state.running_states(),
             extensions={extension.name: extension.state_dict() for extension in self.extensions},
             trained_focal=state.trained_focal,
+            head_enabled=state.head_enabled,
         )
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import copy
+import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from sundae_ns.compensation import Window
-from sundae_ns.data.camera_axes import world_to_camera, world_to_camera_floats
+from sundae_ns.data.camera_axes import OPENGL_TO_OPENCV, world_to_camera, world_to_camera_floats
 from sundae_ns.rasterization.projection import camera_center
 
 if TYPE_CHECKING:
@@ -29,10 +31,73 @@ class View(NamedTuple):
     focal: float
     """Focal length in pixels, the mean of both axes. Kept beside K, because reading K back waits for the GPU."""
 
+    @classmethod
+    def from_pose(cls, pose: Tensor, intrinsics: Sequence[float], width: int, height: int) -> View:
+        """A pinhole camera from a pose as nerfstudio and Blender write it.
+
+        Args:
+            pose: camera-to-world with OpenGL axes (x right, y up, view along -z), ``[3, 4]`` or ``[4, 4]``.
+            intrinsics: focal lengths and principal point fx, fy, cx, cy, pixels.
+            width: of the image, pixels.
+            height: of the image, pixels.
+
+        >>> import torch, sundae_ns as sn
+        >>> sn.View.from_pose(torch.eye(4), (50.0, 50.0, 32.0, 24.0), 64, 48).center
+        tensor([0., 0., 0.])
+        """
+        fx, fy, cx, cy = (float(value) for value in intrinsics)
+        K = torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], device=pose.device)
+        return cls(world_to_camera(pose[:3].float()), K, int(width), int(height), (fx + fy) / 2)
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Sequence[float] | Tensor,
+        target: Sequence[float] | Tensor,
+        up: Sequence[float] | Tensor = (0.0, 0.0, 1.0),
+        *,
+        fov: float = 60.0,
+        width: int = 640,
+        height: int = 480,
+    ) -> View:
+        """A camera at one place that looks at another, on the CPU.
+
+        Args:
+            eye: centre of the camera, world units ``[3]``.
+            target: point in the middle of the image ``[3]``.
+            up: direction that is upwards in the image ``[3]``; any other one if it is the viewing direction.
+            fov: vertical field of view, degrees.
+            width: of the image, pixels.
+            height: of the image, pixels.
+
+        >>> import sundae_ns as sn
+        >>> sn.View.look_at((0, -2, 0), (0, 0, 0)).center
+        tensor([ 0., -2.,  0.])
+        """
+        eye, target, up = (torch.as_tensor(v, dtype=torch.float64, device="cpu") for v in (eye, target, up))
+        back = torch.nn.functional.normalize(eye - target, dim=0)
+        right = torch.linalg.cross(up, back)
+        if right.norm() < 1e-6:
+            right = torch.linalg.cross(torch.roll(back, 1) + torch.tensor([1.0, 0.0, 0.0]), back)
+        right = torch.nn.functional.normalize(right, dim=0)
+        pose = torch.stack([right, torch.linalg.cross(back, right), back, eye], dim=1)
+        focal = height / 2 / math.tan(math.radians(fov) / 2)
+        return cls.from_pose(pose, (focal, focal, width / 2, height / 2), width, height)
+
     @property
     def center(self) -> Tensor:
         """Camera centre, world units ``[3]``."""
         return camera_center(self.viewmat)
+
+    @property
+    def pose(self) -> Tensor:
+        """Camera-to-world with OpenGL axes ``[3, 4]``; the counterpart of :meth:`from_pose`."""
+        rotation = self.viewmat[:3, :3].T * self.viewmat.new_tensor(OPENGL_TO_OPENCV)
+        return torch.cat([rotation, self.center[:, None]], dim=1)
+
+    def to(self, device: torch.device | str) -> View:
+        """The camera on another device."""
+        return self._replace(viewmat=self.viewmat.to(device), K=self.K.to(device))
 
     def zoomed(self, factor: float) -> View:
         """The camera with the same field of view and sides ``factor`` times as long."""

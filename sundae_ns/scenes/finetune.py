@@ -22,7 +22,7 @@ from sundae_ns.rendering import View
 from sundae_ns.scenes.finetune_step import Through, TunedStep
 from sundae_ns.scenes.opening import open_pipeline
 from sundae_ns.scenes.packed import is_unpacked
-from sundae_ns.storage.packing import Codecs, PackConfig, Scene, fit_scene
+from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import config_of
 from sundae_ns.trainer import recorded_outputs
@@ -55,14 +55,14 @@ def rate_factor(step: int, steps: int) -> float:
 
 def finetune(
     run: Path,
-    scene: Scene,
+    scene: PackedScene,
     config: PackConfig,
     steps: int,
     *,
     rate: float = RATE,
     data: Path | None = None,
     progress: Callable[[Tensor], object] | None = None,
-) -> tuple[Scene, Codecs]:
+) -> tuple[PackedScene, Codecs]:
     """Train the field and head of a run with the rounding of its pack in the loop. The run is only read.
 
     Args:

@@ -34,7 +34,7 @@ from sundae_ns.scenes import stock
 from sundae_ns.scenes.sensitivity import sensitivity_of
 from sundae_ns.scenes.statement import HEAD_OPTIONS, cameras_of, choices, is_number, refusal, stated_model
 from sundae_ns.storage.atomic import write_text, writing
-from sundae_ns.storage.packing import Scene
+from sundae_ns.storage.packing import PackedScene
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import check_run, load_config
 from sundae_ns.storage.runs.folder import UNPACKED, config_of, unpacked_folder
@@ -52,7 +52,7 @@ paths of images to ffmpeg through one."""
 # -------------------------------------------------------------------------------------------------------------- packing
 
 
-def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> Scene:
+def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> PackedScene:
     """A finished run as a scene: the field, the head if it is enabled, and some training cameras.
 
     SH coefficients that were not trained yet are left out, and so are the features of a disabled head.
@@ -100,7 +100,7 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
         "capture": _describe(manager),
     }
     cameras = _cameras(manager, max_cameras) if max_cameras > 0 else None
-    return Scene(field, head, cameras, meta, sensitivity_of(model, cameras) if cameras else None)
+    return PackedScene(field, head, cameras, meta, sensitivity_of(model, cameras) if cameras else None)
 
 
 def _read_config(path: Path) -> TrainerConfig:
@@ -197,7 +197,7 @@ def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------------------ unpacking
 
 
-def write_run(scene: Scene, output_dir: Path, name: str, *, data: Path | None = None) -> Path:
+def write_run(scene: PackedScene, output_dir: Path, name: str, *, data: Path | None = None) -> Path:
     """Write a packed scene as a run that ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval`` open.
 
     Args:
@@ -259,7 +259,7 @@ def is_unpacked(config: TrainerConfig) -> bool:
     return config.timestamp == UNPACKED
 
 
-def model_of(scene: Scene) -> SundaeModel:
+def model_of(scene: PackedScene) -> SundaeModel:
     """The model of a scene, on the CPU."""
     stated = stated_model(scene)
     config = SundaeModelConfig(
@@ -324,7 +324,7 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
     return parser, float(scale)
 
 
-def _transforms(scene: Scene) -> dict[str, Any]:
+def _transforms(scene: PackedScene) -> dict[str, Any]:
     """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
     cameras = cameras_of(scene)
     frames = []

@@ -18,7 +18,7 @@ from sundae_ns.errors import DataError, PackError
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes.finetune import place
 from sundae_ns.scenes.opening import open_pipeline, views_to_test
-from sundae_ns.storage.packing import Codecs, PackConfig, Scene, fit_scene, write_fitted
+from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene, write_fitted
 from sundae_ns.storage.packing.config import STEPS
 from sundae_ns.storage.runs.folder import config_of
 
@@ -31,7 +31,7 @@ _VIEWS = 4
 class Try(NamedTuple):
     """One pack of the search."""
 
-    scene: Scene
+    scene: PackedScene
     codecs: Codecs
     bytes: int
     drop: float | None
@@ -48,9 +48,9 @@ def scaled(config: PackConfig, power: float) -> PackConfig:
 class Search:
     """Packs of one scene at several factors."""
 
-    def __init__(self, run: Path, scene: Scene, config: PackConfig, *, data: Path | None = None) -> None:
+    def __init__(self, run: Path, scene: PackedScene, config: PackConfig, *, data: Path | None = None) -> None:
         self.run, self.scene, self.config, self.data = run, scene, config, data
-        self._drop: Callable[[Scene, Codecs], float] | None = None
+        self._drop: Callable[[PackedScene, Codecs], float] | None = None
 
     def smaller_than(self, limit: int) -> Try:
         """The finest pack of at most ``limit`` bytes.
@@ -114,7 +114,7 @@ class Search:
 
 
 @torch.no_grad()
-def _drop_of(run: Path, data: Path | None) -> Callable[[Scene, Codecs], float]:
+def _drop_of(run: Path, data: Path | None) -> Callable[[PackedScene, Codecs], float]:
     """What measures the PSNR of a pack below that of the run, on some test views, dB."""
     opened = open_pipeline(config_of(run), data=data, test_mode="test")
     opened.pipeline.eval()
@@ -131,7 +131,7 @@ def _drop_of(run: Path, data: Path | None) -> Callable[[Scene, Codecs], float]:
 
     before = quality()
 
-    def drop(scene: Scene, codecs: Codecs) -> float:
+    def drop(scene: PackedScene, codecs: Codecs) -> float:
         place(model, codecs.rounded(scene.field))
         if model.head is not None and scene.head:
             model.head.load_state_dict(codecs.rounded_head(scene.head))

@@ -7,11 +7,18 @@ from typing import Literal
 
 from sundae_ns.errors import CheckpointError, regular
 
-Kind = Literal["packed", "ply"]
+Kind = Literal["packed", "ply", "spz", "sog"]
 
 PACKED = b"\x89SUNDAE\n"
 """First bytes of a packed scene."""
-_FIRST_BYTES: dict[bytes, Kind] = {PACKED: "packed", b"ply\n": "ply", b"ply\r": "ply"}
+_FIRST_BYTES: dict[bytes, Kind] = {
+    PACKED: "packed",
+    b"ply\n": "ply",
+    b"ply\r": "ply",
+    b"\x1f\x8b": "spz",
+    b"NGSP": "spz",
+    b"PK\x03\x04": "sog",
+}
 _NAMES: dict[Kind, str] = {"packed": "a packed scene", "ply": "a .ply file"}
 
 
@@ -22,7 +29,9 @@ def kind_of(path: Path) -> Kind | None:
             first = file.read(max(map(len, _FIRST_BYTES)))
     except OSError:
         return None
-    return next((kind for begin, kind in _FIRST_BYTES.items() if first.startswith(begin)), None)
+    kind = next((kind for begin, kind in _FIRST_BYTES.items() if first.startswith(begin)), None)
+    # A checkpoint is a zip file too.
+    return None if kind == "sog" and path.suffix.lower() != ".sog" else kind
 
 
 def refuse(path: Path, *, packed: str | None = None, ply: str | None = None) -> None:
@@ -38,5 +47,5 @@ def refuse(path: Path, *, packed: str | None = None, ply: str | None = None) -> 
     """
     advice: dict[Kind, str | None] = {"packed": packed, "ply": ply}
     kind = kind_of(path)
-    if kind is not None and (instead := advice[kind]) is not None:
+    if kind is not None and (instead := advice.get(kind)) is not None:
         raise CheckpointError(f"{path} is {_NAMES[kind]}; {instead}")

@@ -27,9 +27,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sundae_ns.errors import DataError, regular
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.morton import scene_order
-from sundae_ns.storage.spz import checked
+from sundae_ns.storage.spz import MAX_SH_DEGREE, checked
 
 MAX_PALETTE = 1 << 16
 """Palette rows that two bytes can index."""
@@ -41,6 +42,7 @@ _ROW_ROUNDS = 8  # Lloyd iterations of a palette
 _SAMPLE = 1 << 16  # rows that a k-means is fitted to
 _CHUNK = 1 << 14  # rows compared with all centres at once
 _LEVELS = 65535  # highest level of a position, in two bytes
+_MAX_INFLATED = 1 << 26  # bytes of a deflated entry; images are stored
 _FIRST_MODE = 252  # alpha of a rotation without its first component; the next values stand for the other components
 
 
@@ -108,6 +110,97 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
         bundle.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
         for name, pixels in images.items():
             bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))
+
+
+def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
+    """Read a bundled .sog of version 2.
+
+    Returns:
+        A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU, in the file's
+        coordinates; and whether it is marked as trained with antialiasing.
+
+    Raises:
+        DataError: the file is missing, damaged, no bundled .sog, or of another version.
+    """
+    try:
+        with zipfile.ZipFile(regular(path)) as bundle:
+            meta = json.loads(_entry(bundle, "meta.json"))
+            if meta["version"] != 2:
+                raise DataError(f"{path} has version {meta['version']} of the format; this program reads 2")
+            arrays = _decoded(bundle, meta)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+    except DataError:
+        raise
+    except Exception as error:  # zip, JSON and Pillow raise errors of many kinds on damaged files
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DataError(f"{path} is no complete .sog ({reason}); export it again") from error
+    field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
+    return field, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
+
+
+def _entry(bundle: zipfile.ZipFile, name: str) -> bytes:
+    """An entry of a bundle, which is stored, not deflated, so that it cannot grow."""
+    info = bundle.getinfo(name)
+    if info.compress_type != zipfile.ZIP_STORED and info.file_size > _MAX_INFLATED:
+        raise ValueError(f"{name} inflates to {info.file_size:,} bytes")
+    return bundle.read(name)
+
+
+def _decoded(bundle: zipfile.ZipFile, meta: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """The arrays of a field; the inverse of :func:`write_sog`."""
+    n = int(meta["count"])
+
+    def pixels(entry: Mapping[str, Any], index: int, channels: int) -> NDArray[np.uint8]:
+        return _pixels(_entry(bundle, entry["files"][index])).reshape(-1, 4)[:n, :channels]
+
+    low, high = (np.asarray(meta["means"][end], np.float64) for end in ("mins", "maxs"))
+    levels = pixels(meta["means"], 0, 3) + 256.0 * pixels(meta["means"], 1, 3)
+    bent = low + levels / _LEVELS * (high - low)
+    color = pixels(meta["sh0"], 0, 4)
+    opacity = np.clip(color[:, 3:] / 255.0, 1e-3 / 255, 1 - 1e-6)
+    coefficients, rest = 0, np.zeros((n, 0, 3), np.float32)
+    if "shN" in meta:
+        entry = meta["shN"]
+        coefficients = (int(entry["bands"]) + 1) ** 2 - 1
+        if not 0 < coefficients <= (MAX_SH_DEGREE + 1) ** 2 - 1:
+            raise ValueError(f"{entry['bands']} bands of harmonics")
+        centres = _pixels(_entry(bundle, entry["files"][0]))[..., :3].reshape(-1, coefficients, 3)
+        label = pixels(entry, 1, 2).astype(np.int64)
+        rest = np.asarray(entry["codebook"], np.float32)[centres[label[:, 0] + 256 * label[:, 1]]]
+    field = {
+        "means": np.sign(bent) * np.expm1(np.abs(bent)),
+        "scales": np.asarray(meta["scales"]["codebook"], np.float32)[pixels(meta["scales"], 0, 3)],
+        "quats": _from_smallest_three(pixels(meta["quats"], 0, 4)),
+        "features_dc": np.asarray(meta["sh0"]["codebook"], np.float32)[color[:, :3]],
+        "features_rest": rest,
+        "opacities": np.log(opacity / (1 - opacity)),
+    }
+    short = [name for name, value in field.items() if len(value) != n]
+    if n < 1 or short:
+        raise ValueError(f"{', '.join(short) or 'the field'} has fewer than {n:,} primitives")
+    return field
+
+
+def _pixels(file: bytes) -> NDArray[np.uint8]:
+    """A WebP image ``[H, W, 4]``."""
+    from PIL import Image
+
+    with Image.open(io.BytesIO(file), formats=["WEBP"]) as image:
+        return np.asarray(image.convert("RGBA"))
+
+
+def _from_smallest_three(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Unit quaternions wxyz ``[N, 4]``; the inverse of :func:`_smallest_three`."""
+    others = (pixels[:, :3] / 255.0 - 0.5) * math.sqrt(2.0)
+    largest = pixels[:, 3].astype(np.int64) - _FIRST_MODE
+    if ((largest < 0) | (largest > 3)).any():
+        raise ValueError("a rotation has no valid mode")
+    quats = np.empty((len(pixels), 4))
+    rows = np.arange(len(pixels))
+    quats[np.arange(4) != largest[:, None]] = others.ravel()
+    quats[rows, largest] = np.sqrt(np.clip(1 - (others**2).sum(axis=1), 0, None))
+    return quats
 
 
 def codebook(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:

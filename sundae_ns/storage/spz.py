@@ -1,4 +1,4 @@
-"""The .spz of Niantic: quantised, deflated primitives, which most web viewers read; written by ``gsply``.
+"""The .spz of Niantic: quantised, deflated primitives, which most web viewers read; coded by ``gsply``.
 
 The format rounds values before activation, except opacities:
 
@@ -15,6 +15,8 @@ The specification asks for right-up-back axes, but its own converter from .ply d
 from __future__ import annotations
 
 import gzip
+import struct
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -22,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import DataError
+from sundae_ns.errors import DataError, regular
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.ply import check_field
 
@@ -33,11 +35,19 @@ HARMONICS_STEP = 1 / 64
 _VERSION = 3  # one gzip stream; more programs read it than version 4
 _HEADER_FLAGS = 14  # offset of the flags in the header
 _ANTIALIASED = 0x1  # flag
+_HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
+_LEAST_BYTES = 19  # of a primitive of SH degree 0
+_CHUNK = 1 << 20
 _LARGEST = (1 << 23) - 1  # largest coordinate in steps, 24 bits with a sign
 _MOST_BITS = 24  # fractional bits of a coordinate
 _FEWEST_BITS = 8
 _SCALES = (-10.0, 5.9375)  # log-scales that fit
 _COLOR, _HARMONIC = 0.5 / 0.15, 1.0  # largest SH coefficients of degree 0, and of higher degrees
+
+
+def most_unpacked(size: int) -> int:
+    """Most bytes that a file of ``size`` bytes may unpack to; readers refuse others before they allocate."""
+    return (8 << 20) + 64 * size
 
 
 def fractional_bits(means: Tensor) -> int:
@@ -99,6 +109,66 @@ def write_spz(
         raw = bytearray(gzip.decompress(partial.read_bytes()))
         raw[_HEADER_FLAGS] |= _ANTIALIASED * antialiased
         partial.write_bytes(gzip.compress(bytes(raw), mtime=0))
+
+
+def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
+    """Read a .spz of version 1 to 4.
+
+    Returns:
+        A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU, in the file's
+        coordinates; and whether it is marked as trained with antialiasing.
+
+    Raises:
+        DataError: the file is missing, damaged, no .spz, or unpacks to far more than its size.
+    """
+    from gsply.spz import read_spz as read
+
+    try:
+        flags = _checked_flags(path)
+        data = read(path)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+    except DataError:
+        raise
+    except Exception as error:  # gsply and its codecs raise errors of many kinds on damaged files
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise DataError(f"{path} is no complete .spz ({reason}); export it again") from error
+    n = len(data.means)
+    rest = data.shN if data.shN is not None and data.shN.size else np.zeros((n, 0, 3))
+    columns = {
+        "means": data.means,
+        "scales": data.scales,
+        "quats": data.quats,
+        "features_dc": data.sh0.reshape(n, 3),
+        "features_rest": rest.reshape(n, -1, 3),
+        "opacities": data.opacities.reshape(n, 1),
+    }
+    field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in columns.items()}
+    return field, bool(flags & _ANTIALIASED)
+
+
+def _checked_flags(path: Path) -> int:
+    """Flags of a .spz. gsply unpacks without a limit, so the size is checked before.
+
+    Raises:
+        DataError: the file is no .spz, or its header contradicts its size.
+    """
+    raw = regular(path).read_bytes()
+    packed = raw[:2] == b"\x1f\x8b"
+    header = zlib.decompressobj(wbits=31).decompress(raw, _HEADER.size) if packed else raw[: _HEADER.size]
+    if len(header) < _HEADER.size or header[:4] != b"NGSP":
+        raise DataError(f"{path} is no .spz; give a .ply, .spz, .sog, .sundae, or a run")
+    _, _, count, _, _, flags, _ = _HEADER.unpack(header)
+    if count == 0 or count * _LEAST_BYTES > most_unpacked(len(raw)):
+        raise DataError(f"{path} states {count:,} primitives, which its {len(raw):,} bytes cannot hold; export it again")
+    if packed:
+        stream, rest, size = zlib.decompressobj(wbits=31), raw, 0
+        while rest and not stream.eof:
+            size += len(stream.decompress(rest, _CHUNK))
+            rest = stream.unconsumed_tail
+            if size > most_unpacked(len(raw)):
+                raise DataError(f"{path} unpacks to far more than its {len(raw):,} bytes; export it again")
+    return int(flags)
 
 
 def clamped(field: Mapping[str, Tensor]) -> int:

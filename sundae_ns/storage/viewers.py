@@ -54,8 +54,9 @@ def write_for_viewers(
     antialiased: bool = False,
     sigmoid_colors: bool = False,
     upright: bool = False,
+    in_model_frame: bool = True,
 ) -> ViewerFile:
-    """Write the base colours of a nerfstudio model's field in the format of the file's suffix, atomically.
+    """Write the base colours of a field in the format of the file's suffix, atomically.
 
     Drops primitives that are not finite, and SH coefficients above the format's degree.
 
@@ -65,6 +66,7 @@ def write_for_viewers(
         antialiased: mark the scene as trained with antialiasing.
         sigmoid_colors: ``features_dc`` are logits of colours, as in a model of SH degree 0, not SH coefficients.
         upright: rotate the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright.
+        in_model_frame: the field is in the coordinates of nerfstudio's model, as a .ply then says.
 
     Raises:
         ConfigError: the suffix is not supported.
@@ -81,7 +83,7 @@ def write_for_viewers(
     coefficients = field["features_rest"].shape[1]
     kind = path.suffix.lower()
     if kind == ".ply":
-        write_ply(path, field, comments=[*([] if upright else [MODEL_FRAME]), *([ANTIALIASED] if antialiased else [])])
+        write_ply(path, field, comments=[*([MODEL_FRAME] if in_model_frame and not upright else []), *([ANTIALIASED] if antialiased else [])])
     else:
         field["features_rest"] = field["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
         (write_spz if kind == ".spz" else write_sog)(path, field, antialiased=antialiased)

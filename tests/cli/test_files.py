@@ -17,7 +17,7 @@ from sundae_ns.cli import main
 from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.parameters import SH_C0, SPLAT_NAMES
 from sundae_ns.storage import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
-from sundae_ns.storage.packing import Scene, read_scene, write_scene
+from sundae_ns.storage.packing import PackedScene, read_scene, write_scene
 from sundae_ns.storage.viewers import write_for_viewers
 
 
@@ -38,7 +38,7 @@ def field(n: int = 200) -> dict[str, Tensor]:
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
-    write_scene(tmp_path / "a.sundae", Scene(field(), meta={"model": {"rasterize_mode": mode}}))
+    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": {"rasterize_mode": mode}}))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply") == 0
     found, truth = read_ply(tmp_path / "a.ply"), read_scene(tmp_path / "a.sundae").field
     assert all(torch.equal(found[name], truth[name]) for name in SPLAT_NAMES)
@@ -49,7 +49,7 @@ def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
 @pytest.mark.parametrize("kind", [".spz", ".sog"])
 def test_export_to_other_formats(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     model = {"rasterize_mode": "antialiased", "sh_degree": 1}
-    write_scene(tmp_path / "a.sundae", Scene(field(), meta={"model": model}))
+    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": model}))
     out = tmp_path / f"a{kind}"
     assert run("export", tmp_path / "a.sundae", "-o", out) == 0
     output = " ".join(capsys.readouterr().out.split())
@@ -105,7 +105,7 @@ def test_export_of_a_ply_of_nerfstudio_upright(tmp_path: Path) -> None:
 def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
     given = field()
     given["features_rest"] = given["features_rest"][:, :0]
-    write_scene(tmp_path / "a.sundae", Scene(given, meta={"model": {"sh_degree": 0}}))
+    write_scene(tmp_path / "a.sundae", PackedScene(given, meta={"model": {"sh_degree": 0}}))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply", "--upright") == 0
     truth = read_scene(tmp_path / "a.sundae").field
     found = read_ply(tmp_path / "a.ply")
@@ -190,7 +190,7 @@ def test_refusals_are_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_ply(Path("in.ply"), field())
-    write_scene(Path("in.sundae"), Scene(field()))
+    write_scene(Path("in.sundae"), PackedScene(field()))
     Path("in.bin").write_bytes(b"\x1f\x8b\xff")
     write_ply(Path("none.ply"), {name: torch.full_like(value[:5], torch.nan) for name, value in field().items()})
     write_ply(Path("empty.ply"), {name: value[:0] for name, value in field().items()})
@@ -209,7 +209,7 @@ def without(package: str, words: list[str], folder: Path) -> subprocess.Complete
 
 
 def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> None:
-    write_scene(tmp_path / "a.sundae", Scene(field()))
+    write_scene(tmp_path / "a.sundae", PackedScene(field()))
     write_kind(tmp_path / "head.sundae", KINDS["residual"])
     commands = [
         ["export", "a.sundae", "-o", "a.ply"],
@@ -224,7 +224,7 @@ def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> Non
 
 
 def test_an_existing_run_is_refused_without_nerfstudio(tmp_path: Path) -> None:
-    write_scene(tmp_path / "a.sundae", Scene(field()))
+    write_scene(tmp_path / "a.sundae", PackedScene(field()))
     run = tmp_path / "outputs" / "a" / "sundae" / "unpacked"
     run.mkdir(parents=True)
     (run / "config.yml").touch()

@@ -16,7 +16,7 @@ from sundae_ns.cli.outputs import check_file, check_folder
 from sundae_ns.errors import StorageError
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import write_ply
-from sundae_ns.storage.packing import Scene, write_scene
+from sundae_ns.storage.packing import PackedScene, write_scene
 
 LONG = "x" * 300
 Refused = Callable[..., str]
@@ -29,7 +29,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     points = torch.rand(400, 3)
     field = from_points(points, points, sh_degree=1, num_features=0)
     write_ply(tmp_path / "a.ply", field)
-    write_scene(tmp_path / "a.sundae", Scene(field))
+    write_scene(tmp_path / "a.sundae", PackedScene(field))
     return tmp_path
 
 
@@ -181,7 +181,7 @@ def test_names_too_long_are_one_line(here: Path, refused: Refused, words: list[s
         }
         points = torch.rand(30, 3)
         field = from_points(points, points, sh_degree=1, num_features=0)
-        write_scene(here / "a.sundae", Scene(field, meta={"model": model}))
+        write_scene(here / "a.sundae", PackedScene(field, meta={"model": model}))
     assert "too long" in refused(*words)
     assert {path.name for path in here.iterdir()} <= {"a.ply", "a.sundae", "outputs"}
 

@@ -13,7 +13,7 @@ import torch
 from sundae_ns.cli import main
 from sundae_ns.cli.packing import pack
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage.packing import FINETUNED, PackConfig, Scene, write_scene
+from sundae_ns.storage.packing import FINETUNED, PackConfig, PackedScene, write_scene
 
 
 def run(*arguments: object) -> int:
@@ -71,7 +71,7 @@ def test_refusals_are_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     points = torch.rand(20, 3)
-    write_scene(Path("bare.sundae"), Scene(from_points(points, points, sh_degree=0, num_features=0)))
+    write_scene(Path("bare.sundae"), PackedScene(from_points(points, points, sh_degree=0, num_features=0)))
     content = Path("bare.sundae").read_bytes()
     Path("cut.sundae").write_bytes(content[:-5])
     Path("harmed.sundae").write_bytes(content[:-5] + bytes([content[-5] ^ 64]) + content[-4:])

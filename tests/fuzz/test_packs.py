@@ -15,12 +15,12 @@ import zstandard
 
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage.packing import PackConfig, Scene, read_scene, write_scene
+from sundae_ns.storage.packing import PackConfig, PackedScene, read_scene, write_scene
 
 Json = dict[str, Any]
 
 
-def scene() -> Scene:
+def scene() -> PackedScene:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(50, 3, generator=generator)
     field = from_points(points, points, sh_degree=2, num_features=3, generator=generator)
@@ -31,7 +31,7 @@ def scene() -> Scene:
         "intrinsics": torch.full((1, 4), 20.0).double(),
         "sizes": torch.full((1, 2), 32),
     }
-    return Scene(field, head, cameras, {"model": {"sh_degree": 2}})
+    return PackedScene(field, head, cameras, {"model": {"sh_degree": 2}})
 
 
 def packed(folder: Path, config: PackConfig) -> bytes:
@@ -69,7 +69,7 @@ def judged(verdict: Any, path: Path, content: bytes) -> Any:
     return verdict(lambda: check_field(read_scene(path)), len(content))
 
 
-def check_field(unpacked: Scene) -> None:
+def check_field(unpacked: PackedScene) -> None:
     assert all(torch.isfinite(value).all() for value in unpacked.field.values())
     assert len({len(value) for value in unpacked.field.values()}) == 1
 
@@ -188,7 +188,7 @@ def test_a_few_constant_planes_cannot_fill_the_memory(verdict: Any, tmp_path: Pa
     """Every section is within its limit, but the field that they describe is not."""
     n = 200_000
     field = {k: v[:1].expand(n, *v.shape[1:]) for k, v in scene().field.items()}
-    write_scene(tmp_path / "a.sundae", Scene(field))
+    write_scene(tmp_path / "a.sundae", PackedScene(field))
     meta, body = parts((tmp_path / "a.sundae").read_bytes())
     padding = meta["sections"].pop()
     assert padding["name"] == "padding"

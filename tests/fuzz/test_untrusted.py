@@ -24,7 +24,7 @@ from sundae_ns.errors import SundaeError
 from sundae_ns.gaussians import from_points
 from sundae_ns.scenes.packed import write_run
 from sundae_ns.storage import read_ply, write_ply
-from sundae_ns.storage.packing import Scene, container, read_scene, write_scene
+from sundae_ns.storage.packing import PackedScene, container, read_scene, write_scene
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.viewers import write_for_viewers
 
@@ -96,7 +96,7 @@ def a_checkpoint(path: Path, place: str) -> None:
 
 def a_pack(path: Path, place: str) -> None:
     """Write a packed scene that names ``place`` as a section and throughout its header."""
-    write_scene(path, Scene(field(), meta={"source": {"method": place}, "name": place, "model": {"sh_degree": 1}}))
+    write_scene(path, PackedScene(field(), meta={"source": {"method": place}, "name": place, "model": {"sh_degree": 1}}))
     header = container.read_header(path)
     meta = {name: value for name, value in header.meta.items() if name != "sections"}
     arrays = container.read_sections(path, header)

@@ -24,7 +24,7 @@ from sundae_ns.scenes.finetune import finetune, rate_factor
 from sundae_ns.scenes.finetune_step import Through, TunedStep
 from sundae_ns.scenes.opening import load_run
 from sundae_ns.scenes.packed import scene_of_run, write_run
-from sundae_ns.storage.packing import FINETUNED, PackConfig, Scene, fit_scene, read_header, read_scene, write_fitted
+from sundae_ns.storage.packing import FINETUNED, PackConfig, PackedScene, fit_scene, read_header, read_scene, write_fitted
 from sundae_ns.storage.runs import checkpoint
 
 COARSE = PackConfig(
@@ -44,7 +44,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
-def quality(run: Any, scene: Scene, folder: Path) -> float:
+def quality(run: Any, scene: PackedScene, folder: Path) -> float:
     """Mean PSNR of a scene on the test views, dB."""
     pipeline = load_run(write_run(scene, folder, "a", data=run.scene))
     with torch.no_grad():

@@ -23,7 +23,7 @@ from sundae_ns.errors import CheckpointError, DataError, PackError, StorageError
 from sundae_ns.gaussians import from_points
 from sundae_ns.scenes import packed as packed_run
 from sundae_ns.scenes.packed import scene_of_run, write_run
-from sundae_ns.storage.packing import Scene, read_scene, write_scene
+from sundae_ns.storage.packing import PackedScene, read_scene, write_scene
 from sundae_ns.storage.runs import checkpoint
 
 Json = dict[str, Any]
@@ -70,8 +70,8 @@ def meta() -> Json:
     }
 
 
-def scene() -> Scene:
-    return Scene(field(), head(), cameras(), meta())
+def scene() -> PackedScene:
+    return PackedScene(field(), head(), cameras(), meta())
 
 
 def opened(config: Path) -> Any:
@@ -128,7 +128,7 @@ def test_a_run_without_its_capture_names_none(tmp_path: Path) -> None:
 
 
 def test_a_scene_without_cameras_gets_one_outside_of_it(tmp_path: Path) -> None:
-    pipeline = opened(write_run(Scene(field(), head(), None, meta()), tmp_path, "a"))
+    pipeline = opened(write_run(PackedScene(field(), head(), None, meta()), tmp_path, "a"))
     (camera,) = [pipeline.datamanager.train_dataset.cameras[0:1]]
     accumulation = pipeline.model.get_outputs_for_camera(camera)["accumulation"]
     assert accumulation.mean() > 0.02
@@ -138,7 +138,7 @@ def test_a_scene_without_cameras_gets_one_outside_of_it(tmp_path: Path) -> None:
 def test_a_scene_without_a_head(tmp_path: Path) -> None:
     plain = meta()
     plain["model"] |= {"head": None, "trained_focal": None}
-    model = opened(write_run(Scene(field(features=0), {}, cameras(), plain), tmp_path, "a")).model
+    model = opened(write_run(PackedScene(field(features=0), {}, cameras(), plain), tmp_path, "a")).model
     assert model.head is None
     assert "features" not in model.gauss_params
 
@@ -222,7 +222,7 @@ def merged(base: Json, changes: Json) -> Json:
 def test_headers_that_lie_are_refused(tmp_path: Path, lie: str) -> None:
     stated = merged(meta(), LIES[lie])
     with pytest.raises(PackError):
-        write_run(Scene(field(), head(), cameras(), stated), tmp_path, "a")
+        write_run(PackedScene(field(), head(), cameras(), stated), tmp_path, "a")
     assert not list(tmp_path.iterdir())
 
 

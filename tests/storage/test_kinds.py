@@ -11,13 +11,13 @@ from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import write_ply
 from sundae_ns.storage.kinds import kind_of, refuse
-from sundae_ns.storage.packing import Scene, write_scene
+from sundae_ns.storage.packing import PackedScene, write_scene
 
 
 @pytest.fixture
 def files(tmp_path: Path) -> Path:
     field = from_points(torch.rand(4, 3), torch.rand(4, 3), sh_degree=0, num_features=0)
-    write_scene(tmp_path / "packed.ply", Scene(field))
+    write_scene(tmp_path / "packed.ply", PackedScene(field))
     write_ply(tmp_path / "points.sundae", field)
     (tmp_path / "dos.txt").write_bytes(b"ply\r\nformat")
     (tmp_path / "word.ply").write_text("plywood")

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage.packing import PackConfig, Scene, Sensitivity, write_scene
+from sundae_ns.storage.packing import PackConfig, PackedScene, Sensitivity, write_scene
 
 WIDTH, HEIGHT = 50, 37
 FOCAL = 45.0
@@ -99,7 +99,7 @@ def write_kind(path: Path, kind: Kind) -> Path:
         "trained_focal": [kind.focal, kind.focal] if stated and kind.focal else None,
     }
     sensitivity = _sensitivity(field, head) if kind.measured else None
-    write_scene(path, Scene(field, head, _cameras(), {"model": model}, sensitivity), kind.config)
+    write_scene(path, PackedScene(field, head, _cameras(), {"model": model}, sensitivity), kind.config)
     return path
 
 

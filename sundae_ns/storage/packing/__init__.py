@@ -5,8 +5,9 @@ from sundae_ns.storage.packing.config import FINETUNED, PackConfig
 from sundae_ns.storage.packing.container import read_header
 from sundae_ns.storage.packing.scene import (
     PackReport,
-    Scene,
+    PackedScene,
     fit_scene,
+    pack_bytes,
     read_scene,
     write_fitted,
     write_scene,
@@ -17,9 +18,10 @@ __all__ = [
     "Codecs",
     "PackConfig",
     "PackReport",
-    "Scene",
+    "PackedScene",
     "Sensitivity",
     "fit_scene",
+    "pack_bytes",
     "read_header",
     "read_scene",
     "write_fitted",

@@ -119,29 +119,25 @@ def _decompress(part: memoryview, size: int) -> bytes:
         raise PackError("a section cannot be decompressed") from error
 
 
-def write(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0) -> int:
-    """Write a file, atomically.
+def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0) -> tuple[bytes, dict[str, int]]:
+    """The bytes of a file, and the number of bytes of each of its sections.
 
     Args:
         meta: JSON values for the header, without the key ``sections``.
         arrays: arrays of the dtypes in ``_DTYPES``.
         unpacked: bytes that a reader decodes from the arrays, if more than their own size.
 
-    Returns:
-        Bytes of the file.
-
     Raises:
         PackError: the header is too long for a reader.
-        StorageError: the disk is full or not writable.
     """
     named = {name: np.asarray(array) for name, array in arrays.items()}
 
-    def encode(array: Array) -> list[bytes]:
+    def compressed(array: Array) -> list[bytes]:
         little = array.astype(array.dtype.newbyteorder("<"), copy=False)
         return [_compress(plane) for plane in _split(little)]
 
     with ThreadPoolExecutor(_THREADS) as pool:
-        parts = dict(zip(named, pool.map(encode, named.values()), strict=True))
+        parts = dict(zip(named, pool.map(compressed, named.values()), strict=True))
     sections = [_entry(name, named[name], parts[name]) for name in named]
     body = sum(len(part) for planes in parts.values() for part in planes)
     size = max(unpacked, sum(array.nbytes for array in named.values()))
@@ -155,13 +151,23 @@ def write(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, Array], *, u
         raise PackError(
             f"the header takes {len(header):,} bytes, but readers accept {MAX_HEADER:,}; give fewer cameras"
         )
-    with replacing(path) as partial, partial.open("wb") as file:
-        file.write(_PREAMBLE.pack(PACKED, VERSION, len(header), hashlib.sha256(header).digest()))
-        file.write(header)
-        for planes in parts.values():
-            for part in planes:
-                file.write(part)
-    return path.stat().st_size
+    preamble = _PREAMBLE.pack(PACKED, VERSION, len(header), hashlib.sha256(header).digest())
+    return b"".join([preamble, header, *(part for planes in parts.values() for part in planes)]), {
+        name: sum(len(part) for part in planes) for name, planes in parts.items()
+    }
+
+
+def write(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0) -> int:
+    """Write the bytes of :func:`encode`, atomically, and return their number.
+
+    Raises:
+        PackError: the header is too long for a reader.
+        StorageError: the disk is full or not writable.
+    """
+    content, _ = encode(meta, arrays, unpacked=unpacked)
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+    return len(content)
 
 
 def _entry(name: str, array: Array, parts: list[bytes]) -> dict[str, Any]:

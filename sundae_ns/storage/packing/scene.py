@@ -20,6 +20,7 @@ from torch import Tensor
 
 from sundae_ns.errors import PackError
 from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, odd_shapes, sh_degree_of
+from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.packing import container, entropy, quantize, transform
 from sundae_ns.storage.packing.codecs import Codecs, Sensitivity, as_matrix, fit
 from sundae_ns.storage.packing.config import PackConfig
@@ -35,7 +36,7 @@ Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class PackedScene:
     """All that is needed to render a scene."""
 
     field: dict[str, Tensor]
@@ -101,7 +102,7 @@ def _check(params: Mapping[str, Tensor]) -> None:
 # ------------------------------------------------------------------------------------------------------------- encoding
 
 
-def fit_scene(scene: Scene, config: PackConfig | None = None) -> tuple[Scene, Codecs]:
+def fit_scene(scene: PackedScene, config: PackConfig | None = None) -> tuple[PackedScene, Codecs]:
     """Fit codecs to a scene.
 
     Returns:
@@ -118,12 +119,12 @@ def fit_scene(scene: Scene, config: PackConfig | None = None) -> tuple[Scene, Co
     return replace(scene, field=field), codecs
 
 
-def write_scene(path: Path, scene: Scene, config: PackConfig | None = None) -> PackReport:
+def write_scene(path: Path, scene: PackedScene, config: PackConfig | None = None) -> PackReport:
     """Pack a scene into one file: :func:`fit_scene`, then :func:`write_fitted`."""
     return write_fitted(path, *fit_scene(scene, config))
 
 
-def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
+def write_fitted(path: Path, scene: PackedScene, codecs: Codecs) -> PackReport:
     """Pack a scene, atomically, with codecs that were fitted to it before or after training with rounding.
 
     Args:
@@ -133,6 +134,19 @@ def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
         PackError: values are not finite, or the codecs do not fit the scene.
         StorageError: the disk is full or not writable.
     """
+    packed, sections = _encoded(scene, codecs)
+    with replacing(path) as partial:
+        partial.write_bytes(packed)
+    sections["header"] = len(packed) - sum(sections.values())
+    return PackReport(num_primitives(scene.field), len(packed), sections)
+
+
+def pack_bytes(scene: PackedScene, codecs: Codecs) -> bytes:
+    """The bytes of the file that :func:`write_fitted` writes."""
+    return _encoded(scene, codecs)[0]
+
+
+def _encoded(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int]]:
     _check(scene.field)
     config, blocks = codecs.config, codecs.blocks
     n = num_primitives(scene.field)
@@ -158,10 +172,7 @@ def write_fitted(path: Path, scene: Scene, codecs: Codecs) -> PackReport:
 
     meta = {**scene.meta, "primitives": n, "attributes": about}
     unpacked = 4 * sum(value.numel() for value in (*scene.field.values(), *scene.head.values()))
-    size = container.write(path, meta, arrays, unpacked=unpacked)
-    sections = {name: section.length for name, section in container.read_header(path).sections.items()}
-    sections["header"] = size - sum(sections.values())
-    return PackReport(n, size, sections)
+    return container.encode(meta, arrays, unpacked=unpacked)
 
 
 # ------------------------------------------------------------------------------------------------------------- decoding
@@ -316,7 +327,7 @@ def _decode_cameras(reader: _Reader) -> dict[str, Tensor] | None:
     return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
 
-def read_scene(path: Path) -> Scene:
+def read_scene(path: Path) -> PackedScene:
     """Unpack a file, without executing anything in it, and with memory bounded by its size.
 
     Raises:
@@ -348,7 +359,7 @@ def read_scene(path: Path) -> Scene:
     field["features_rest"] = torch.zeros(n, 0, 3) if rest is None else rest.reshape(n, width // 3, 3)
     ordered = {name: field[name] for name in (*SPLAT_NAMES, FEATURES) if name in field}
     meta = {name: value for name, value in header.meta.items() if name not in ("sections", "attributes", "primitives")}
-    return Scene(ordered, head, _decode_cameras(reader), meta)
+    return PackedScene(ordered, head, _decode_cameras(reader), meta)
 
 
 def _shape(path: Path, header: container.Header) -> tuple[int, int, int]:

@@ -201,6 +201,7 @@ def extra_state(
     running: Mapping[str, Mapping[str, Any]],
     extensions: Mapping[str, Mapping[str, Any]],
     trained_focal: tuple[float, float] | None,
+    head_enabled: bool,
 ) -> dict[str, Any]:
     """State of a model beside its tensors: plain numbers, strings, and tensors.
 
@@ -211,6 +212,7 @@ def extra_state(
         running: running states of ``densification`` and ``pruning``.
         extensions: states of the extensions, by name.
         trained_focal: shortest and longest focal length that the head was trained at, pixels.
+        head_enabled: whether images get the head's correction at this step; readers of finished scenes need it.
     """
     return {
         "method": "sundae",
@@ -221,6 +223,7 @@ def extra_state(
         "running": {name: dict(value) for name, value in running.items()},
         "extensions": {name: dict(value) for name, value in extensions.items()},
         "trained_focal": None if trained_focal is None else list(trained_focal),
+        "head_enabled": head_enabled,
     }
 
 
@@ -345,14 +348,35 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         field = read_ply(path)
         _check_field(field, path)
         return field, is_nerfstudio_ply(path)
-    state = load(path)["pipeline"]
-    prefix = "_model.module." if f"_model.module.{_PREFIX}means" in state else "_model."
-    keys = {name: f"{prefix}{_PREFIX}{name}" for name in SPLAT_NAMES}
+    return dict(field_of(load(path), path).as_harmonics()), True
+
+
+def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
+    """The field of a checkpoint of splatfacto or sundae as it is stored, without features, float32 on the CPU.
+
+    Args:
+        loaded: from :func:`load`.
+        path: for error messages.
+
+    Raises:
+        CheckpointError: it holds no Gaussian field, or is a SUNDAE checkpoint of another format.
+    """
+    state = model_state(loaded)
+    keys = {name: _PREFIX + name for name in SPLAT_NAMES}
     if not all(isinstance(state.get(key), Tensor) for key in keys.values()):
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
     field = {name: state[key].float() for name, key in keys.items()}
     _check_field(field, path)
-    return dict(Field(field, _encoding(field, state.get(f"_model.{EXTRA_STATE}"))).as_harmonics()), True
+    return Field(field, _encoding(field, state.get(EXTRA_STATE)))
+
+
+def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
+    """State of the model in a checkpoint, by its own names."""
+    found = {}
+    for name, value in loaded["pipeline"].items():
+        if name.startswith("_model."):
+            found[name.removeprefix("_model.").removeprefix("module.")] = value
+    return found
 
 
 def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:

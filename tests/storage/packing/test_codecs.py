@@ -17,7 +17,7 @@ from torch import Tensor
 from sundae_ns.errors import PackError
 from sundae_ns.storage.packing import (
     PackConfig,
-    Scene,
+    PackedScene,
     entropy,
     fit_scene,
     quantize,
@@ -77,10 +77,10 @@ def test_transform(kind: str, n: int, seed: int) -> None:
         assert np.abs(levels).max() <= entropy.LARGEST
 
 
-def scene(n: int = 700) -> Scene:
+def scene(n: int = 700) -> PackedScene:
     g = torch.Generator().manual_seed(1)
     head = {"a.weight": torch.randn(4, 3, 3, 3, generator=g), "a.bias": torch.randn(4, generator=g)}
-    return Scene(random_field(n), head)
+    return PackedScene(random_field(n), head)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_a_file_holds_the_values_rounded_in_training(tmp_path: Path, config: Pac
     moved = {name: value + 0.02 * torch.randn(value.shape, generator=g) for name, value in fitted.field.items()}
     assert codecs.head is not None
     head = {name: 1.1 * value for name, value in fitted.head.items()}
-    write_fitted(tmp_path / "a.sundae", Scene(moved, head), codecs)
+    write_fitted(tmp_path / "a.sundae", PackedScene(moved, head), codecs)
     found = read_scene(tmp_path / "a.sundae")
     rounded, rounded_head = codecs.rounded(moved), codecs.rounded_head(head)
     assert torch.equal(found.field["means"], fitted.field["means"])
@@ -117,13 +117,13 @@ def test_packing_is_fitting_and_writing(tmp_path: Path) -> None:
     assert (tmp_path / "a.sundae").read_bytes() == (tmp_path / "b.sundae").read_bytes()
 
 
-def without(name: str) -> Scene:
+def without(name: str) -> PackedScene:
     whole = scene()
-    return Scene({key: value for key, value in whole.field.items() if key != name}, whole.head)
+    return PackedScene({key: value for key, value in whole.field.items() if key != name}, whole.head)
 
 
-@pytest.mark.parametrize("other", [scene(650), without("features"), Scene(scene().field)])
-def test_codecs_of_another_scene_are_refused(tmp_path: Path, other: Scene) -> None:
+@pytest.mark.parametrize("other", [scene(650), without("features"), PackedScene(scene().field)])
+def test_codecs_of_another_scene_are_refused(tmp_path: Path, other: PackedScene) -> None:
     _, codecs = fit_scene(scene())
     with pytest.raises(PackError, match="another scene"):
         write_fitted(tmp_path / "a.sundae", other, codecs)
@@ -132,7 +132,7 @@ def test_codecs_of_another_scene_are_refused(tmp_path: Path, other: Scene) -> No
 
 def test_larger_steps_of_the_head_are_fewer_bytes(tmp_path: Path) -> None:
     big = {"a.weight": torch.randn(64, 64, 3, 3, generator=torch.Generator().manual_seed(0))}
-    whole = Scene(scene().field, big)
+    whole = PackedScene(scene().field, big)
     sizes = {}
     for step in (0.008, 0.03, 0.14):
         report = write_scene(tmp_path / "a.sundae", whole, PackConfig(head_step=step))
@@ -166,7 +166,7 @@ def test_weights_that_show_less_are_coarser_at_the_same_total_error() -> None:
     head = {name: torch.randn(8, 8, 3, 3, generator=g) for name in ("a.weight", "b.weight")}
     shown = {name: torch.rand(8, 8, generator=g, dtype=torch.float64) + 0.5 for name in head}
     shown["b.weight"] /= 64
-    original = Scene(random_field(50), head)
+    original = PackedScene(random_field(50), head)
     errors, sizes = [], []
     for sensitivity in (None, Sensitivity({}, shown)):
         _, codecs = fit_scene(replace(original, sensitivity=sensitivity), PackConfig(head_step=0.02))
@@ -185,7 +185,7 @@ def test_no_step_is_larger_than_half_of_the_largest_weight() -> None:
     """Weights behind an output layer of zeros seem useless, but training will need them."""
     head = {"a.weight": torch.randn(4, 4, 3, 3), "out.weight": torch.full((4, 4, 1, 1), 1e-6)}
     shown = {"a.weight": torch.full((4, 4), 1e-12).double(), "out.weight": torch.ones(4, 4).double()}
-    _, codecs = fit_scene(Scene(random_field(50), head, sensitivity=Sensitivity({}, shown)), PackConfig())
+    _, codecs = fit_scene(PackedScene(random_field(50), head, sensitivity=Sensitivity({}, shown)), PackConfig())
     assert codecs.head is not None
     largest = head["a.weight"].flatten(1).abs().amax(dim=1)
     assert (codecs.head.rows["a.weight"] <= 0.6 * largest).all()
@@ -199,7 +199,7 @@ def test_a_head_that_does_nothing_yet_is_packed(tmp_path: Path, seen: list[str])
     shown = {name: torch.full((8, 8), float(name in seen), dtype=torch.float64) for name in head}
     field = random_field(50)
     sensitivity = Sensitivity({"features": torch.zeros(2 * field["features"].shape[1:], dtype=torch.float64)}, shown)
-    write_scene(tmp_path / "a.sundae", Scene(field, head, sensitivity=sensitivity), PackConfig(head_step=0.02))
+    write_scene(tmp_path / "a.sundae", PackedScene(field, head, sensitivity=sensitivity), PackConfig(head_step=0.02))
     found = read_scene(tmp_path / "a.sundae")
     assert (found.field["features"].std(dim=0) > 0).all()
     for name, value in head.items():

@@ -17,7 +17,7 @@ from fields import random_field
 
 from sundae_ns.errors import ConfigError, PackError
 from sundae_ns.storage import morton
-from sundae_ns.storage.packing import PackConfig, Scene, container, read_scene, write_scene
+from sundae_ns.storage.packing import PackConfig, PackedScene, container, read_scene, write_scene
 
 Json = dict[str, Any]
 LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {
@@ -30,7 +30,7 @@ LIMITS: dict[str, tuple[Any, Any, Any, Any]] = {
 }
 
 
-def scene() -> Scene:
+def scene() -> PackedScene:
     g = torch.Generator().manual_seed(1)
     head = {"a.weight": torch.randn(4, 3, 3, 3, generator=g), "a.bias": torch.randn(4, generator=g)}
     cameras = {
@@ -38,7 +38,7 @@ def scene() -> Scene:
         "intrinsics": torch.tensor([[50.0, 51.0, 32.0, 24.0]]).double().repeat(2, 1),
         "sizes": torch.tensor([[64, 48], [32, 24]]),
     }
-    return Scene(random_field(40, degree=1, features=3), head, cameras)
+    return PackedScene(random_field(40, degree=1, features=3), head, cameras)
 
 
 @pytest.mark.parametrize("name", LIMITS)
@@ -210,7 +210,7 @@ def test_scene_order_sorts_points_on_a_line() -> None:
 def test_a_head_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     head = {"a.weight": torch.zeros(1000, 3500)}
-    report = write_scene(path, Scene(scene().field, head))
+    report = write_scene(path, PackedScene(scene().field, head))
     unpacked = 4 * head["a.weight"].numel()
     assert report.sections["padding"] > 0
     assert container.SPARE + container.MAX_RATIO * report.bytes >= unpacked

@@ -9,13 +9,13 @@ import pytest
 import torch
 from fields import random_field
 
-from sundae_ns.storage.packing import PackConfig, Scene, fit_scene, rate, write_fitted
+from sundae_ns.storage.packing import PackConfig, PackedScene, fit_scene, rate, write_fitted
 from sundae_ns.storage.packing.rate import estimated_bits
 
 
-def scene(n: int = 5000) -> Scene:
+def scene(n: int = 5000) -> PackedScene:
     g = torch.Generator().manual_seed(1)
-    return Scene(random_field(n), {"a.weight": torch.randn(32, 32, 3, 3, generator=g), "a.bias": torch.zeros(32)})
+    return PackedScene(random_field(n), {"a.weight": torch.randn(32, 32, 3, 3, generator=g), "a.bias": torch.zeros(32)})
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 4.0])
@@ -45,7 +45,7 @@ def test_steps_against_the_gradient_make_a_smaller_file(tmp_path: Path) -> None:
 
 
 def test_one_primitive_and_no_head() -> None:
-    fitted, codecs = fit_scene(Scene(random_field(1)))
+    fitted, codecs = fit_scene(PackedScene(random_field(1)))
     assert all(torch.isfinite(bits) for bits in estimated_bits(codecs, fitted.field, {}).values())
 
 

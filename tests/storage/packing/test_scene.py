@@ -14,7 +14,7 @@ from fields import random_field
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, PackError, StorageError
-from sundae_ns.storage.packing import PackConfig, Scene, container, quantize, read_header, read_scene, write_scene
+from sundae_ns.storage.packing import PackConfig, PackedScene, container, quantize, read_header, read_scene, write_scene
 
 
 def head() -> dict[str, Tensor]:
@@ -41,7 +41,7 @@ def matched(found: dict[str, Tensor], truth: dict[str, Tensor]) -> dict[str, Ten
 def test_everything_is_decoded_within_the_stated_bounds(tmp_path: Path, config: PackConfig) -> None:
     path, truth = tmp_path / "a.sundae", random_field()
     meta = {"model": {"sh_degree": 2}, "name": "überall"}
-    write_scene(path, Scene(truth, head(), cameras(), meta), config)
+    write_scene(path, PackedScene(truth, head(), cameras(), meta), config)
     scene = read_scene(path)
     assert scene.meta == meta
     assert scene.cameras is not None
@@ -77,7 +77,7 @@ def test_everything_is_decoded_within_the_stated_bounds(tmp_path: Path, config: 
 @pytest.mark.parametrize(("degree", "features"), [(0, 0), (3, 13), (4, 1)])
 def test_small_fields(tmp_path: Path, n: int, degree: int, features: int) -> None:
     truth = random_field(n, degree, features)
-    report = write_scene(tmp_path / "a.sundae", Scene(truth))
+    report = write_scene(tmp_path / "a.sundae", PackedScene(truth))
     scene = read_scene(tmp_path / "a.sundae")
     assert {name: value.shape for name, value in scene.field.items()} == {k: v.shape for k, v in truth.items()}
     assert (scene.head, scene.cameras, scene.meta) == ({}, None, {})
@@ -88,7 +88,7 @@ def test_small_fields(tmp_path: Path, n: int, degree: int, features: int) -> Non
 def test_constant_attributes_are_exact(tmp_path: Path) -> None:
     one = random_field(1)
     truth = {name: value.repeat(40, *([1] * (value.ndim - 1))) for name, value in one.items()}
-    write_scene(tmp_path / "a.sundae", Scene(truth))
+    write_scene(tmp_path / "a.sundae", PackedScene(truth))
     found = read_scene(tmp_path / "a.sundae").field
     for name in ("means", "opacities", "features"):
         assert torch.equal(found[name], truth[name]), name
@@ -98,7 +98,7 @@ def test_a_scene_that_compresses_too_well_is_padded(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     one = random_field(1, 3, 13)
     truth = {name: value.expand(60_000, *value.shape[1:]) for name, value in one.items()}
-    report = write_scene(path, Scene(truth))
+    report = write_scene(path, PackedScene(truth))
     unpacked = 4 * sum(value.numel() for value in truth.values())
     assert unpacked > container.SPARE
     assert report.sections["padding"] > 0
@@ -113,7 +113,7 @@ def test_packing_takes_few_bytes(tmp_path: Path) -> None:
     truth["features_rest"] = (
         0.05 * torch.randn(20_000, 15, 1, generator=g).expand(-1, -1, 3) * torch.rand(20_000, 1, 1) ** 4
     )
-    report = write_scene(tmp_path / "a.sundae", Scene(truth))
+    report = write_scene(tmp_path / "a.sundae", PackedScene(truth))
     assert report.bits["means"] < 30
     assert report.bits["features_rest"] < 45
     assert sum(report.bits.values()) / 8 < 26
@@ -121,7 +121,7 @@ def test_packing_takes_few_bytes(tmp_path: Path) -> None:
 
 def test_packing_is_deterministic(tmp_path: Path) -> None:
     for name in ("a", "b"):
-        write_scene(tmp_path / name, Scene(random_field(), head(), cameras()))
+        write_scene(tmp_path / name, PackedScene(random_field(), head(), cameras()))
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
@@ -130,25 +130,25 @@ def test_values_that_are_not_finite_are_refused(tmp_path: Path, name: str, value
     broken = random_field()
     broken[name][5, 1] = value
     with pytest.raises(PackError, match="1 of 600 primitives are not finite"):
-        write_scene(tmp_path / "a.sundae", Scene(broken))
+        write_scene(tmp_path / "a.sundae", PackedScene(broken))
     assert not list(tmp_path.iterdir())
 
 
 def test_invalid_fields_heads_and_options_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
     with pytest.raises(PackError, match="no primitives"):
-        write_scene(path, Scene(random_field(0)))
+        write_scene(path, PackedScene(random_field(0)))
     with pytest.raises(PackError, match="no quats"):
-        write_scene(path, Scene({k: v for k, v in random_field().items() if k != "quats"}))
+        write_scene(path, PackedScene({k: v for k, v in random_field().items() if k != "quats"}))
     with pytest.raises(PackError, match="scales has shape"):
-        write_scene(path, Scene(random_field() | {"scales": torch.zeros(600, 2)}))
+        write_scene(path, PackedScene(random_field() | {"scales": torch.zeros(600, 2)}))
     with pytest.raises(PackError, match="features_rest has shape"):
-        write_scene(path, Scene(random_field() | {"features_rest": torch.zeros(600, 7, 3)}))
+        write_scene(path, PackedScene(random_field() | {"features_rest": torch.zeros(600, 7, 3)}))
     for features in (torch.zeros(7, 3), torch.zeros(600), torch.zeros(600, 0)):
         with pytest.raises(PackError, match=r"features has shape .*; it must be \[600, 1 to 256\]"):
-            write_scene(path, Scene(random_field() | {"features": features}))
+            write_scene(path, PackedScene(random_field() | {"features": features}))
     with pytest.raises(PackError, match="head has weights that are not finite"):
-        write_scene(path, Scene(random_field(), {"a": torch.full((2, 2), torch.nan)}))
+        write_scene(path, PackedScene(random_field(), {"a": torch.full((2, 2), torch.nan)}))
     for options in (
         {"scale_step": 0},
         {"position_bits": 22},
@@ -157,7 +157,7 @@ def test_invalid_fields_heads_and_options_are_refused(tmp_path: Path) -> None:
         {"block": 1},
     ):
         with pytest.raises(ConfigError, match="give"):
-            write_scene(path, Scene(random_field()), PackConfig(**options))  # type: ignore[arg-type]
+            write_scene(path, PackedScene(random_field()), PackConfig(**options))  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
 
 
@@ -170,13 +170,13 @@ def test_a_pack_that_fails_leaves_the_older_file(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr("sundae_ns.storage.atomic._flush", full)
     with pytest.raises(StorageError, match="the disk is full"):
-        write_scene(path, Scene(random_field()))
+        write_scene(path, PackedScene(random_field()))
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.sundae", b"years of work")]
 
 
 def test_any_altered_byte_is_detected(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
-    write_scene(path, Scene(random_field(40, 1, 1), head()))
+    write_scene(path, PackedScene(random_field(40, 1, 1), head()))
     good = path.read_bytes()
     for place in range(0, len(good), 37):
         path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
@@ -193,7 +193,7 @@ def test_any_altered_byte_is_detected(tmp_path: Path) -> None:
 
 def test_another_version_has_an_error_of_its_own(tmp_path: Path) -> None:
     path = tmp_path / "a.sundae"
-    write_scene(path, Scene(random_field(20)))
+    write_scene(path, PackedScene(random_field(20)))
     content = bytearray(path.read_bytes())
     for version in (1, 3):
         content[8] = version
@@ -209,7 +209,7 @@ def test_the_file_follows_its_documentation(tmp_path: Path) -> None:
     import zstandard
 
     path = tmp_path / "a.sundae"
-    write_scene(path, Scene(random_field()))
+    write_scene(path, PackedScene(random_field()))
     content = path.read_bytes()
     assert content[:8] == b"\x89SUNDAE\n"
     version, length = np.frombuffer(content[8:16], "<u4")

@@ -14,7 +14,7 @@ from sundae_ns.rendering.render import render
 from sundae_ns.scenes.packed import model_of
 from sundae_ns.scenes.sensitivity import sensitivity_of
 from sundae_ns.scenes.statement import stored_view
-from sundae_ns.storage.packing import Scene
+from sundae_ns.storage.packing import PackedScene
 
 
 def head() -> dict[str, Tensor]:
@@ -44,7 +44,7 @@ def model() -> Any:
     stated = {"sh_degree": 2, "rasterize_mode": "classic", "background_color": "black", "head": kind}
     field = random_field(300)
     field["scales"] += 2
-    return model_of(Scene(field, head(), None, {"model": {**stated, "trained_focal": [40.0, 40.0]}}))
+    return model_of(PackedScene(field, head(), None, {"model": {**stated, "trained_focal": [40.0, 40.0]}}))
 
 
 @torch.no_grad()

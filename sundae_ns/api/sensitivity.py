@@ -8,17 +8,17 @@ derivatives (Hutchinson, 1990). Views and signs are fixed, so that a run packs a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from sundae_ns.api.scene import Scene
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization.harmonics import harmonic_basis
+from sundae_ns.rendering import LocalField, View
 from sundae_ns.rendering.render import render
-from sundae_ns.rendering.source import degree_in_use
-from sundae_ns.scenes.statement import stored_view
 from sundae_ns.storage.packing import Sensitivity
 
 _VIEWS = 8
@@ -29,30 +29,28 @@ _PRIMITIVES = 1 << 14
 """Primitives whose directions count, at most."""
 
 
-def sensitivity_of(model: SundaeModel, cameras: Mapping[str, Tensor]) -> Sensitivity:
-    """Measure a model on the CPU in cameras of its capture.
+def sensitivity_of(scene: Scene, views: Sequence[View]) -> Sensitivity:
+    """Measure a scene on the CPU.
 
     Args:
-        model: of a finished run.
-        cameras: as in :class:`sundae_ns.storage.packing.Scene`; at least one.
+        scene: on the CPU.
+        views: at least one.
     """
-    state = model.state
     rows = {}
-    degree = degree_in_use(state.field.sh_degree, state.active_sh_degree)
+    degree = scene.field.sh_degree if scene.field.encoding == "harmonics" else 0
     if degree > 0:
-        rows["features_rest"] = torch.kron(_of_harmonics(state.field["means"].detach(), cameras, degree), torch.eye(3))
+        rows["features_rest"] = torch.kron(_of_harmonics(scene.field["means"].detach(), views, degree), torch.eye(3))
     head: dict[str, Tensor] = {}
-    if model.head is not None and state.head_enabled:
-        rows[FEATURES], head = _of_head(model, cameras)
+    if scene.head is not None:
+        rows[FEATURES], head = _of_head(scene, views)
     return Sensitivity(rows, head)
 
 
-def _of_harmonics(means: Tensor, cameras: Mapping[str, Tensor], degree: int) -> Tensor:
-    """Mean product of each pair of basis functions of degrees 1 and up, over the cameras that see a primitive ``[K, K]``."""
+def _of_harmonics(means: Tensor, views: Sequence[View], degree: int) -> Tensor:
+    """Mean product of each pair of basis functions of degrees 1 and up, over the views that see a primitive ``[K, K]``."""
     chosen = means[:: -(-len(means) // _PRIMITIVES)]
     total = torch.zeros((degree + 1) ** 2 - 1, (degree + 1) ** 2 - 1, dtype=torch.float64)
-    for i in range(len(cameras["poses"])):
-        view = stored_view(cameras, i)
+    for view in views:
         x, y, z = (chosen @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
         across, down = x / z * view.K[0, 0] + view.K[0, 2], y / z * view.K[1, 1] + view.K[1, 2]
         seen = chosen[(z > 0) & (across >= 0) & (across < view.width) & (down >= 0) & (down < view.height)]
@@ -63,21 +61,21 @@ def _of_harmonics(means: Tensor, cameras: Mapping[str, Tensor], degree: int) -> 
 
 
 @torch.enable_grad()  # type: ignore[untyped-decorator]
-def _of_head(model: SundaeModel, cameras: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+def _of_head(scene: Scene, views: Sequence[View]) -> tuple[Tensor, dict[str, Tensor]]:
     """Mean products of the derivatives by pairs of features ``[F, F]``, and mean squares of those by weights."""
-    assert model.head is not None
-    weights = {name: value for name, value in model.head.named_parameters() if value.ndim > 1}
-    features = model.gauss_params[FEATURES]
+    assert scene.head is not None
+    features = scene.field[FEATURES].detach().requires_grad_()
+    source = LocalField(scene.field.replaced({FEATURES: features}))
+    settings = replace(scene.settings(), training=True)
+    weights = {name: value.requires_grad_() for name, value in scene.head.named_parameters() if value.ndim > 1}
     form = torch.zeros(features.shape[1], features.shape[1], dtype=torch.float64)
     squares = {name: torch.zeros(value.shape[:2], dtype=torch.float64) for name, value in weights.items()}
     signs = torch.Generator().manual_seed(0)
-    count = len(cameras["poses"])
-    for i in torch.linspace(0, count - 1, min(_VIEWS, count)).round().int().tolist():
-        view = stored_view(cameras, i)
+    for i in torch.linspace(0, len(views) - 1, min(_VIEWS, len(views))).round().int().tolist():
+        view = views[i]
         if view.width * view.height > _PIXELS:
             view = view.zoomed((_PIXELS / (view.width * view.height)) ** 0.5)
-        settings = model.render_settings(training=True)
-        image = render(model.source, view, model.shown_background, settings, depth=False)[0]["rgb"]
+        image = render(source, view, scene.background, settings, depth=False)[0]["rgb"]
         random = torch.randint(0, 2, image.shape, generator=signs) * 2.0 - 1
         of_features, *grads = torch.autograd.grad((image * random).sum(), [features, *weights.values()])
         form += of_features.double().T @ of_features.double()

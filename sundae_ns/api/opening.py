@@ -1,0 +1,151 @@
+"""The one opener of finished scenes, without nerfstudio: files of primitives, packed scenes, and runs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from sundae_ns.api.packing import is_frame, scene_of
+from sundae_ns.api.scene import Scene
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.compensation.head import SIZES
+from sundae_ns.data.capture import read_json
+from sundae_ns.errors import CheckpointError, DataError
+from sundae_ns.gaussians import FEATURES, finite_mask
+from sundae_ns.gaussians.field import Field
+from sundae_ns.rendering.source import degree_in_use
+from sundae_ns.storage import is_nerfstudio_ply, ply_comments, read_ply
+from sundae_ns.storage.kinds import kind_of
+from sundae_ns.storage.packing import read_scene
+from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage.runs.config_file import model_options
+from sundae_ns.storage.runs.folder import find_config
+from sundae_ns.storage.sog import read_sog
+from sundae_ns.storage.spz import read_spz
+from sundae_ns.storage.viewers import ANTIALIASED
+
+_HEAD = "networks.head."
+FRAME_FILE = "dataparser_transforms.json"
+"""Transform from the capture's coordinates to the model's, which nerfstudio writes into the folder of a run."""
+
+
+def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
+    """Open a finished scene. Nothing in its files is executed, and nerfstudio is not needed.
+
+    Args:
+        path: a ``.ply``, ``.spz`` or ``.sog`` of any program, a packed ``.sundae``, or a run of ``ns-train`` with sundae
+            or splatfacto: its folder, its ``config.yml`` or one of its checkpoints.
+        device: of the scene.
+
+    Raises:
+        DataError: a file of primitives is missing, damaged, or has no finite primitive.
+        PackError: a packed scene is damaged, or states impossible values.
+        CheckpointError: there is no such run, it is of another method, or has no whole checkpoint.
+
+    >>> import pathlib, tempfile, torch, sundae_ns as sn
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "cloud.ply")
+    >>> sn.save(sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3)), path)
+    >>> sn.load(path)
+    Scene(50 primitives, SH degree 0, no head, cpu)
+    """
+    path = Path(path)
+    kind, suffix = kind_of(path), path.suffix.lower()
+    if kind == "packed" or suffix == ".sundae":
+        return scene_of(read_scene(path)).to(device)
+    if kind == "ply" or suffix == ".ply":
+        params = read_ply(path)
+        antialiased, in_model_frame = ANTIALIASED in ply_comments(path), is_nerfstudio_ply(path)
+        return _of_file(path, params, antialiased, in_model_frame).to(device)
+    if kind in ("spz", "sog") or suffix in (".spz", ".sog"):
+        params, antialiased = (read_spz if kind == "spz" or suffix == ".spz" else read_sog)(path)
+        return _of_file(path, params, antialiased).to(device)
+    return _of_run(path).to(device)
+
+
+def _of_file(path: Path, params: dict[str, Tensor], antialiased: bool, in_model_frame: bool = False) -> Scene:
+    if not finite_mask(params).any():
+        raise DataError(f"{path} has {len(params['means']):,} primitives, and none is finite; export it again")
+    return Scene(Field(params), antialiased=antialiased, in_model_frame=in_model_frame)
+
+
+def _of_run(path: Path) -> Scene:
+    config = find_config(path)
+    if config is None:
+        reason = "is no run" if path.exists() else "does not exist"
+        raise CheckpointError(f"{path} {reason}; give a run, its config.yml, or a .sundae, .ply, .spz or .sog file")
+    options = model_options(config)
+    source = path if path.suffix == ".ckpt" else checkpoint.newest_whole(config.parent)[0]
+    loaded = checkpoint.load(source)
+    field, state = checkpoint.field_of(loaded, source), checkpoint.model_state(loaded)
+    extra = state.get(checkpoint.EXTRA_STATE)
+    extra = extra if isinstance(extra, Mapping) else {}
+    head = _head_of(state, options, source) if _uses_head(extra) else None
+    if head is not None:
+        field[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
+    field["features_rest"] = field["features_rest"][:, : (_trained_degree(field, options, loaded) + 1) ** 2 - 1]
+    focal = extra.get("trained_focal")
+    frame = _frame_of(config.parent)
+    return Scene(
+        field,
+        head,
+        background_color=options.get("background_color", "random"),
+        antialiased=options.get("rasterize_mode") == "antialiased",
+        trained_focal=(float(focal[0]), float(focal[1])) if head is not None and focal else None,
+        in_model_frame=True,
+        meta={"source": {"step": int(loaded["step"])}, **({} if frame is None else {"frame": frame})},
+    )
+
+
+def _uses_head(extra: Mapping[str, Any]) -> bool:
+    """Whether images of a checkpoint get a correction; earlier versions did not say, but noted what it trained on."""
+    return bool(extra.get("head_enabled", extra.get("trained_focal") is not None))
+
+
+def _trained_degree(field: Field, options: Mapping[str, Any], loaded: Mapping[str, Any]) -> int:
+    """Highest SH degree that training has reached."""
+    interval = options.get("sh_degree_interval")
+    if options.get("warm_start") is not None or not isinstance(interval, int):
+        return field.sh_degree
+    return degree_in_use(field.sh_degree, int(loaded["step"]) // max(interval, 1))
+
+
+def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path) -> CompensationHead | None:
+    """The head of a checkpoint. Its size is that of its weights, because training may choose another than it was given.
+
+    Raises:
+        CheckpointError: its weights fit no known size.
+    """
+    weights = {name.removeprefix(_HEAD): value for name, value in state.items() if name.startswith(_HEAD)}
+    features = state.get(f"gauss_params.{FEATURES}")
+    if not weights or not isinstance(features, Tensor):
+        return None
+    known = options.get("head")
+    known = known if isinstance(known, dict) else {}
+    fields = {name: known[name] for name in ("pixel_unshuffle", "precision", "phases", "fused") if name in known}
+    mode = "features" if known.get("mode") == "features" else "residual"
+    shapes = {name: value.shape for name, value in weights.items()}
+    for size in sorted(SIZES, key=lambda size: size != known.get("size")):
+        config = HeadConfig(mode=mode, size=size, num_features=features.shape[1], **fields)  # type: ignore[arg-type]
+        with torch.device("meta"):
+            candidate = CompensationHead(config)
+        if {name: value.shape for name, value in candidate.state_dict().items()} == shapes:
+            head = CompensationHead(config)
+            head.load_state_dict(weights)
+            return head.eval()
+    raise CheckpointError(f"{source} has a head that does not fit its own config.yml; give another run")
+
+
+def _frame_of(run: Path) -> dict[str, Any] | None:
+    """Transform and scale from the capture's coordinates to the model's; None without a usable file."""
+    try:
+        frame = read_json(run / FRAME_FILE)
+        frame = {"transform": frame["transform"], "scale": float(frame["scale"])}
+    except (DataError, KeyError, TypeError, ValueError):
+        return None
+    return frame if is_frame(frame) else None
+
+

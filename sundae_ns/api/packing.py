@@ -1,0 +1,174 @@
+"""Between scenes and the contents of packed files. What a file states is checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args, get_type_hints
+
+import torch
+from torch import Tensor
+
+from sundae_ns.api.scene import Background, Scene
+from sundae_ns.api.sensitivity import sensitivity_of
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.errors import PackError, SundaeError
+from sundae_ns.gaussians import FEATURES
+from sundae_ns.gaussians.field import Field
+from sundae_ns.rendering.views import View
+from sundae_ns.storage.packing import PackedScene
+
+HEAD_OPTIONS = ("mode", "size", "pixel_unshuffle", "num_features", "precision")
+"""Options of a head that a packed scene states."""
+_MOST_UNSHUFFLE = 8
+_RASTERIZE_MODES = ("classic", "antialiased")
+_CARRIED = ("source", "frame", "capture")
+"""Entries of the header that a scene carries along."""
+
+
+def scene_of(packed: PackedScene) -> Scene:
+    """The scene of a packed file's contents, on the CPU.
+
+    Raises:
+        PackError: the contents state an impossible model, or another head than they have.
+    """
+    stated = packed.meta.get("model")
+    if not isinstance(stated, dict):
+        raise refusal("no model")
+    degree = whole(stated, "sh_degree", 0, 4)
+    if packed.field["features_rest"].shape[1] > (degree + 1) ** 2 - 1:
+        raise refusal("a lower SH degree than it has")
+    meta = {name: packed.meta[name] for name in _CARRIED if packed.meta.get(name) is not None}
+    in_model_frame = is_frame(meta.get("frame"))
+    if not in_model_frame:
+        meta.pop("frame", None)
+    return Scene(
+        Field(dict(packed.field), "logits" if degree == 0 else "harmonics"),
+        _head_of(packed, _head_config(stated.get("head"))),
+        background_color=one_of(stated, "background_color", get_args(Background)),
+        antialiased=one_of(stated, "rasterize_mode", _RASTERIZE_MODES) == "antialiased",
+        trained_focal=_focal(stated.get("trained_focal")),
+        views=views_of_arrays(packed.cameras),
+        in_model_frame=in_model_frame or "capture" in meta,
+        meta=meta,
+    )
+
+
+def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> PackedScene:
+    """The contents of a packed file for a scene, with how much errors are seen in its cameras.
+
+    Args:
+        scene: any device; its primitives must be finite.
+        cameras: arrays by the names of :data:`sundae_ns.storage.packing.scene.CAMERAS`; by default those of the
+            scene's views.
+    """
+    scene = scene.to("cpu")
+    head = {} if scene.head is None else dict(scene.head.state_dict())
+    field = {name: value.detach() for name, value in scene.field.items() if name != FEATURES or head}
+    if cameras is None and scene.views:
+        cameras = arrays_of_views(scene.views)
+    options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in HEAD_OPTIONS}
+    # Degree 0 stands for logits.
+    degree = 0 if scene.field.encoding == "logits" else max(scene.field.sh_degree, 1)
+    model = {
+        "sh_degree": degree,
+        "rasterize_mode": _RASTERIZE_MODES[scene.antialiased],
+        "background_color": scene.background_color,
+        "head": options,
+        "trained_focal": list(scene.trained_focal) if head and scene.trained_focal else None,
+    }
+    meta = {"source": {}, **scene.meta, "model": model}
+    views = views_of_arrays(cameras)
+    return PackedScene(
+        field, head, None if cameras is None else dict(cameras), meta, sensitivity_of(scene, views) if views else None
+    )
+
+
+def views_of_arrays(cameras: Mapping[str, Tensor] | None) -> tuple[View, ...]:
+    """Cameras of a packed file as views, on the CPU; none for None."""
+    if cameras is None:
+        return ()
+    rows = zip(cameras["poses"], cameras["intrinsics"].tolist(), cameras["sizes"].tolist(), strict=True)
+    return tuple(View.from_pose(pose, intrinsics, *size) for pose, intrinsics, size in rows)
+
+
+def arrays_of_views(views: Sequence[View]) -> dict[str, Tensor]:
+    """Counterpart of :func:`views_of_arrays`."""
+    return {
+        "poses": torch.stack([view.pose for view in views]).cpu(),
+        "intrinsics": torch.stack([view.K[[0, 1, 0, 1], [0, 1, 2, 2]] for view in views]).double().cpu(),
+        "sizes": torch.tensor([[view.width, view.height] for view in views]),
+    }
+
+
+def _head_of(packed: PackedScene, config: HeadConfig) -> CompensationHead | None:
+    features = packed.field[FEATURES].shape[1] if FEATURES in packed.field else 0
+    if config.mode == "off" and not packed.head and features == 0:
+        return None
+    if features != config.num_features:
+        raise refusal("another number of features than it has")
+    try:
+        head = CompensationHead(config)
+        head.load_state_dict(packed.head)
+    except (SundaeError, RuntimeError) as error:
+        raise refusal("another head than it has") from error
+    return head.eval()
+
+
+def refusal(reason: str) -> PackError:
+    """The error of a scene that states something impossible."""
+    return PackError(f"the packed scene states {reason}; update this program, or pack it again")
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of JSON is a finite number."""
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def one_of(stated: Mapping[str, Any], name: str, known: Sequence[Any]) -> Any:
+    """A stated value that is one of the known ones."""
+    value = stated.get(name)
+    if value not in known:
+        raise refusal(f"a {name} that is none of {', '.join(map(str, known))}")
+    return value
+
+
+def is_frame(stated: Any) -> bool:
+    """Whether a value states a transform ``[3 or 4, 4]`` and a scale, from a capture's coordinates to a model's."""
+    if not isinstance(stated, dict) or not is_number(stated.get("scale")):
+        return False
+    rows = stated.get("transform")
+    return isinstance(rows, list) and all(isinstance(row, list) and all(map(is_number, row)) for row in rows)
+
+
+def whole(stated: Mapping[str, Any], name: str, least: int, most: int) -> int:
+    """A stated whole number from ``least`` to ``most``."""
+    value = stated.get(name)
+    if type(value) is not int or not least <= value <= most:
+        raise refusal(f"a {name} outside of {least} to {most}")
+    return value
+
+
+def _head_config(stated: Any) -> HeadConfig:
+    if stated is None:
+        return HeadConfig(mode="off")
+    if not isinstance(stated, dict) or set(stated) != set(HEAD_OPTIONS):
+        raise refusal("a head of an unknown kind")
+    kinds = get_type_hints(HeadConfig)
+    mode, size, precision = (one_of(stated, name, get_args(kinds[name])) for name in ("mode", "size", "precision"))
+    return HeadConfig(
+        mode=mode,
+        size=size,
+        precision=precision,
+        pixel_unshuffle=whole(stated, "pixel_unshuffle", 1, _MOST_UNSHUFFLE),
+        num_features=whole(stated, "num_features", 1, 256),
+        start_at=0,
+    )
+
+
+def _focal(stated: Any) -> tuple[float, float] | None:
+    if stated is None:
+        return None
+    if not isinstance(stated, list) or len(stated) != 2 or not all(is_number(v) and v > 0 for v in stated):
+        raise refusal("impossible focal lengths")
+    return float(stated[0]), float(stated[1])

@@ -1,0 +1,79 @@
+"""Pruning of a scene by what views see of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import torch
+
+from sundae_ns.api.scene import Scene
+from sundae_ns.api.views import virtual_views
+from sundae_ns.errors import ConfigError
+from sundae_ns.gaussians import finite_mask
+from sundae_ns.pruning import PruneRule, kept_count
+from sundae_ns.pruning import prune as prune_field
+from sundae_ns.rendering import LocalField, TrainingView, View, contribution
+
+
+@torch.no_grad()
+def prune(
+    scene: Scene,
+    *,
+    keep: float | None = None,
+    count: int | None = None,
+    views: Sequence[View] | None = None,
+    rule: PruneRule | None = None,
+    progress: bool = False,
+) -> Scene:
+    """Keep the primitives that matter most to the views, and merge the others into them.
+
+    Primitives with NaN or infinite values are dropped first.
+
+    Args:
+        scene: to prune; it does not change.
+        keep: share of the finite primitives to keep, in (0, 1].
+        count: number of primitives to keep, in place of a share; at least 1.
+        views: cameras that say what is seen; by default those stored with the scene, else
+            :func:`sundae_ns.virtual_views`.
+        rule: score, selection and merge; by default those of ``ns-train sundae``.
+        progress: show a progress bar on stderr.
+
+    Returns:
+        A scene of ``round(keep * N)`` or ``count`` primitives, on the same device. It keeps the head, which was
+        trained for the fuller field.
+
+    Raises:
+        ConfigError: neither or both of ``keep`` and ``count`` are given, or they or an option are out of range.
+        DataError: no primitive is finite.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
+    >>> sn.prune(scene, keep=0.1, views=sn.virtual_views(scene, 4, size=32)).num_primitives
+    20
+    """
+    if (keep is None) == (count is None):
+        raise ConfigError("prune needs either keep (a share) or count (a number of primitives); give one of them")
+    if keep is not None and not 0 < keep <= 1:
+        raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
+    if count is not None and count < 1:
+        raise ConfigError(f"count is {count}; give 1 or more primitives")
+    rule = rule or PruneRule()
+    finite = finite_mask(scene.field)
+    field = scene.field if bool(finite.all()) else scene.field.rows(finite)
+    if count is None:
+        count = kept_count(keep or 1.0, len(field["means"]))
+
+    def weights() -> torch.Tensor:
+        usable = dataclasses.replace(scene, field=field)
+        seen = views if views is not None else scene.views or virtual_views(usable)
+        return contribution(
+            LocalField(field),
+            [TrainingView(lambda view=view: view.to(scene.device), None) for view in seen],  # type: ignore[misc]
+            scene.background,
+            scene.settings(head=False),
+            count=count if rule.uses_detail else None,
+            progress=progress,
+        )
+
+    return dataclasses.replace(scene, field=prune_field(field, rule, count=count, contribution=weights).field)

@@ -1,0 +1,65 @@
+"""Scenes as files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sundae_ns.api.packing import contents_of
+from sundae_ns.api.page import write_page
+from sundae_ns.api.scene import Scene
+from sundae_ns.errors import ConfigError
+from sundae_ns.storage.packing import fit_scene, pack_bytes, write_scene
+from sundae_ns.storage.viewers import FORMATS, ViewerFile, write_for_viewers
+
+SUFFIXES = (*FORMATS, ".sundae", ".html")
+"""Suffixes of the files that :func:`save` writes."""
+
+
+def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
+    """Write a scene in the format of the file's suffix, atomically; an existing file is replaced.
+
+    ``.sundae`` holds everything that a render needs, quantised. ``.html`` is a web page that renders it. ``.ply`` (exact),
+    ``.spz`` and ``.sog`` (quantised) hold base colours only, for other viewers.
+
+    Args:
+        scene: any device.
+        path: file to write; its folder must exist.
+        upright: turn from nerfstudio's z-up axes to the -y-up axes of viewers; ``.ply``, ``.spz`` and ``.sog`` only.
+
+    Raises:
+        ConfigError: the suffix is not supported, or the format is not turned.
+        DataError, PackError: the format cannot store the scene.
+        StorageError: the disk is full or not writable.
+
+    >>> import pathlib, tempfile, torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(50, 3), torch.rand(50, 3))
+    >>> path = pathlib.Path(tempfile.mkdtemp(), "cloud.sundae")
+    >>> sn.save(scene, path)
+    >>> sn.load(path).num_primitives
+    50
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix in FORMATS:
+        save_for_viewers(scene, path, upright=upright)
+        return
+    if suffix not in SUFFIXES:
+        raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+    if upright:
+        raise ConfigError(f"{suffix} files keep their coordinates; leave out upright")
+    if suffix == ".sundae":
+        write_scene(path, contents_of(scene))
+    else:
+        write_page(path, scene, pack_bytes(*fit_scene(contents_of(scene))), title=path.resolve().stem)
+
+
+def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:
+    """Write base colours as ``.ply``, ``.spz`` or ``.sog``, and return what was left out or clamped; see :func:`save`."""
+    return write_for_viewers(
+        path,
+        scene.field,
+        antialiased=scene.antialiased,
+        sigmoid_colors=scene.field.encoding == "logits",
+        upright=upright,
+        in_model_frame=scene.in_model_frame,
+    )
