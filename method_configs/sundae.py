@@ -14,10 +14,10 @@ from nerfstudio.plugins.types import MethodSpecification
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.model import SundaeModelConfig
-from sundae_ns.pruning import PruningConfig
 from sundae_ns.trainer import SundaeTrainerConfig
 from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.training.progress import ProgressWriter
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedulers import PruneAwareDecayConfig
 
 

@@ -26,7 +26,6 @@ from sundae_ns.compensation import CompensationHead, HeadConfig, Window
 from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, no_images_error, view_index
 from sundae_ns.evaluation import Lpips, psnr, ssim
 from sundae_ns.gpu.memory import naming_full_memory
-from sundae_ns.pruning import PruningConfig
 from sundae_ns.rasterization import Backend, select_backend
 from sundae_ns.rendering import (
     FieldSource,
@@ -51,6 +50,7 @@ from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.initial_field import Start
 from sundae_ns.training.losses import StepLosses
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.step import training_image
 from sundae_ns.viewer import ViewerControls
 
@@ -299,12 +299,12 @@ class SundaeModel(SplatfactoModel):
         late["background"] = background.expand(view.height, view.width, 3)
         return late
 
-    def contribution(self, datamanager: SundaeDatamanager, keep_ratio: float | None = None) -> Tensor:
+    def contribution(self, datamanager: SundaeDatamanager, count: int | None = None) -> Tensor:
         """Blending weight of each primitive, summed over the pixels of the training views ``[N]``; see
         :func:`sundae_ns.rendering.contribution`.
         """
         views, settings = training_views(self, datamanager), self.render_settings(training=False)
-        return contribution(self.source, views, self.background_color, settings, keep_ratio, progress=True)
+        return contribution(self.source, views, self.background_color, settings, count, console=CONSOLE)
 
     # ----------------------------------------------------------------------------------------------------- training
 

@@ -22,24 +22,21 @@ from torch import Tensor
 from sundae_ns.compensation import PHASES
 from sundae_ns.errors import ConfigError, SundaeError
 from sundae_ns.gaussians import finite_mask
-from sundae_ns.gaussians.field import Field
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning import Decision, PruningConfig, band_rule, decide, field_graph, single_prune
-from sundae_ns.pruning.scores import for_graph
+from sundae_ns.pruning import Pruned, PruneRule, band_rule, field_graph, kept_count, prune
 from sundae_ns.rendering.outputs import FieldKey
-from sundae_ns.rendering.source import FieldSource
+from sundae_ns.rendering.source import FieldSource, LocalField
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.schedules import make_schedule
 
-Rule = Literal["as configured", "band: high", "band: low", "band: both", "opacity", "random"]
+RuleName = Literal["as configured", "band: high", "band: low", "band: both", "opacity", "random"]
 
 STEP = 0.01
 """Step of the slider, and its lowest share."""
 STEPS_BETWEEN_SCORES = 100
 """Training steps after which the scores of a moving field are computed again."""
 
-Contribute = Callable[[Any, float | None], Tensor]
-"""Contribution of the primitives ``[N]``, given nerfstudio's datamanager and the share that will stay."""
+ContributionOf = Callable[[Any, int | None], Tensor]
+"""Contribution of the primitives ``[N]``, given nerfstudio's datamanager and the number that a prune will keep."""
 
 
 def in_viewer() -> bool:
@@ -50,21 +47,18 @@ def in_viewer() -> bool:
     return isinstance(threading.current_thread(), RenderStateMachine)
 
 
-def rule_config(config: PruningConfig, rule: Rule, keep_ratio: float) -> PruningConfig:
-    """Options of one prune by ``rule`` to a share; everything else is as in ``config``.
+def previewed_rule(configured: PruneRule, name: RuleName) -> PruneRule:
+    """The rule of a name in the menu; everything that the name does not say is as configured.
 
-    ``band: both`` is the paper's rule with ``config``'s gamma, ``band: high`` and ``band: low`` are its two ends. These,
+    ``band: both`` is the paper's rule with the configured gamma, ``band: high`` and ``band: low`` are its two ends. These,
     opacity and random do not merge.
     """
-    bands = {"band: high": 1.0, "band: low": 0.0, "band: both": config.gamma}
-    if rule in bands:
-        return band_rule(replace(config, signal="positions"), keep_ratio, bands[rule])
-    config = single_prune(config, keep_ratio)
-    if rule == "opacity":
-        return replace(config, score="opacity", selection="top", redistribution="none")
-    if rule == "random":
-        return replace(config, score="random", selection="sampled", redistribution="none")
-    return config
+    if name == "opacity":
+        return replace(configured, score="opacity", selection="top", redistribution="none")
+    if name == "random":
+        return replace(configured, score="random", selection="sampled", redistribution="none")
+    bands = {"band: high": 1.0, "band: low": 0.0, "band: both": configured.gamma}
+    return band_rule(replace(configured, signal="positions"), bands[name]) if name in bands else configured
 
 
 @dataclass(frozen=True)
@@ -107,11 +101,11 @@ class ViewerControls(torch.nn.Module):
 
     Args:
         state: the field.
-        config: options of pruning.
+        configured: the rule of the run's prune.
         contribute: computes contributions.
     """
 
-    def __init__(self, state: FieldState, config: PruningConfig, contribute: Contribute) -> None:
+    def __init__(self, state: FieldState, configured: PruneRule, contribute: ContributionOf) -> None:
         super().__init__()
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
         self.phases: ViewerDropdown[str] = ViewerDropdown(
@@ -129,7 +123,7 @@ class ViewerControls(torch.nn.Module):
             STEP,
             hint="Show only what a prune to this share would keep; 1 shows everything",
         )
-        rules = list(get_args(Rule))
+        rules = list(get_args(RuleName))
         self.rule = ViewerDropdown(
             "Rule", rules[0], rules, hint="Rule of the previewed prune; the head is disabled in a preview"
         )
@@ -137,12 +131,12 @@ class ViewerControls(torch.nn.Module):
         """Gives access to the viewer, and so to the training views."""
         self.training_field = False
         """Whether a trainer changes the field."""
-        self._state, self._config, self._contribute = state, config, contribute
+        self._state, self._configured, self._contribute = state, configured, contribute
         self._lock = threading.Lock()
         self._seen: _FieldVersion | None = None
         self._graphs: dict[str, NeighborGraph] = {}
-        self._contribution: tuple[float | None, Tensor] | None = None
-        self._found: tuple[tuple[str, float], Decision | None] | None = None
+        self._contribution: tuple[int | None, Tensor] | None = None
+        self._found: tuple[tuple[str, float], Pruned | None] | None = None
 
     @property
     def field_key(self) -> FieldKey | None:
@@ -164,60 +158,59 @@ class ViewerControls(torch.nn.Module):
             crop: primitives in the crop box, bool ``[N]``; None for no box.
             compensate: whether images outside of a viewer get the head's correction.
         """
-        preview, mask = self.preview(), crop
+        preview = self.preview()
         if preview is not None:
-            mask = preview.mask if mask is None else mask & preview.mask
-        if mask is None:
-            return Visible(source, None, self.compensate.value if in_viewer() else compensate)
-        if not mask.any():
-            return None
-        values = None
-        if preview is not None and preview.values is not None:
-            rows = mask[preview.mask]
-            values = {name: value[rows] for name, value in preview.values.items()}
-        allowed = preview is None and (self.compensate.value if in_viewer() else compensate)
-        return Visible(source.part(mask, values), mask, allowed)
+            field, mask = preview.field, preview.decision.mask
+            if crop is not None:
+                field, mask = field.rows(crop[mask]), mask & crop
+            return Visible(LocalField(field, whole=False), mask, compensate=False) if mask.any() else None
+        if in_viewer():
+            compensate = self.compensate.value
+        if crop is None:
+            return Visible(source, None, compensate)
+        return Visible(LocalField(source.field.rows(crop), whole=False), crop, compensate) if crop.any() else None
 
-    def preview(self) -> Decision | None:
+    def preview(self) -> Pruned | None:
         """The previewed prune; None outside of the viewer, with the slider at 1, or if the rule cannot be applied.
 
         Graphs are built once for a field. The pass over the training views is repeated if the rule weights pixels by the
-        share that stays. The caller holds nerfstudio's lock on the field, so training in another thread waits.
+        count that stays. The caller holds nerfstudio's lock on the field, so training in another thread waits.
         """
-        keep_ratio = round(float(self.keep_ratio.value), 6)
-        if keep_ratio >= 1 or not in_viewer():
+        share = round(float(self.keep_ratio.value), 6)
+        if share >= 1 or not in_viewer():
             return None
-        asked = (self.rule.value, keep_ratio)
+        asked = (self.rule.value, share)
         with self._lock:
             if self._seen is None or not self._seen.matches(self._state, self.training_field):
                 self._seen = _FieldVersion(self._state, self.training_field)
                 self._graphs, self._contribution, self._found = {}, None, None
             if self._found is None or self._found[0] != asked:
-                found: Decision | None = None
+                found: Pruned | None = None
                 try:
-                    found = self._decide(rule_config(self._config, *asked))
+                    found = self._prune(previewed_rule(self._configured, self.rule.value), share)
                 except (SundaeError, torch.cuda.OutOfMemoryError) as error:
                     # An exception in the viewer's thread would end all rendering.
                     reason = " ".join(str(error).split())[:200]
-                    CONSOLE.log(f"[yellow]No preview of {asked[0]}: {reason}")
+                    CONSOLE.log(f"[yellow]No preview of {self.rule.value}: {reason}")
                 self._found = (asked, found)
             return self._found[1]
 
-    def _decide(self, config: PruningConfig) -> Decision:
+    @torch.no_grad()
+    def _prune(self, rule: PruneRule, share: float) -> Pruned:
         field = self._state.field
         finite = finite_mask(field)
-        if config.uses_graph and config.edges not in self._graphs:
-            usable = Field({name: value.detach()[finite] for name, value in field.items()}, field.encoding)
-            self._graphs[config.edges] = field_graph(for_graph(usable, config), config)
-        count = make_schedule(config).target(int(finite.sum()))
-        graph = self._graphs.get(config.edges)
-        return decide(field, config, lambda: self._contribution_of(config), count=count, graph=graph)
+        n = int(finite.sum())
+        count = kept_count(share, n)
+        if rule.uses_graph and rule.edges not in self._graphs:
+            self._graphs[rule.edges] = field_graph(field.rows(finite), rule)
+        needed = rule.uses_contribution and count < n
+        weights = self._contribution_of(count if rule.uses_detail else None) if needed else None
+        return prune(field, rule, count, weights, self._graphs.get(rule.edges))
 
-    def _contribution_of(self, config: PruningConfig) -> Tensor:
-        share = config.keep_ratio if config.uses_detail else None
-        if self._contribution is None or self._contribution[0] != share:
+    def _contribution_of(self, count: int | None) -> Tensor:
+        if self._contribution is None or self._contribution[0] != count:
             viewer: Any = getattr(self.control, "viewer", None)
             if viewer is None:
                 raise ConfigError("there are no training views; open the run with ns-viewer, or choose another rule")
-            self._contribution = (share, self._contribute(viewer.pipeline.datamanager, share))
+            self._contribution = (count, self._contribute(viewer.pipeline.datamanager, count))
         return self._contribution[1]

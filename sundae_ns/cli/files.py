@@ -163,20 +163,21 @@ def prune(
 
     from sundae_ns.errors import ConfigError
     from sundae_ns.gaussians import finite_mask
-    from sundae_ns.pruning import PruningConfig, decide, footprint, kept_count
+    from sundae_ns.pruning import PruneRule, check_share, decide, footprint, kept_count
     from sundae_ns.storage.kinds import refuse
     from sundae_ns.storage.ply import keep_vertices
 
     if out.suffix.lower() != ".ply":
         raise ConfigError(f"{out} does not end in .ply, the only output format; rename it")
     check_file(out, reads=[source], overwrite=overwrite)
-    config = PruningConfig(keep_ratio=keep, score=score, selection=selection, signal=signal, gamma=gamma, seed=seed)
-    config.validate()
+    check_share(keep)
+    rule = PruneRule(score=score, selection=selection, signal=signal, gamma=gamma, seed=seed)
+    rule.validate()
     refuse(source, packed="sundae export makes a .ply of it, which can be pruned")
     field = _read_primitives(source)
     count = kept_count(keep, int(finite_mask(field).sum()))
     with Console(stderr=True).status(f"Choosing {count:,} primitives"):
-        decision = decide(field, config, lambda: footprint(field), count=count)
+        decision = decide(field, rule, count, footprint(field))
         keep_vertices(source, out, decision.mask)
     print(f"{out}: {decision.kept:,} of {len(decision.mask):,} primitives")
     if decision.dropped_nonfinite:

@@ -186,10 +186,10 @@ def bands(
     check_folder(out, reads=[run], overwrite=overwrite)
     with _loading():
         from sundae_ns.cli.bands import run_bands
-        from sundae_ns.pruning import PruningConfig
+        from sundae_ns.pruning import PruneRule
 
-    config = PruningConfig(signal=signal, gamma=gamma, num_neighbors=neighbors, bandwidth=bandwidth)
-    return run_bands(run, out, keep_ratios=keep_ratio, config=config, view=view)
+    rule = PruneRule(signal=signal, gamma=gamma, num_neighbors=neighbors, bandwidth=bandwidth)
+    return run_bands(run, out, shares=keep_ratio, rule=rule, view=view)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,111 +13,85 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from sundae_ns.distributed.shards import Shards
-from sundae_ns.errors import DataError, SundaeError
-from sundae_ns.gaussians.field import Encoding, Field, as_field
+from sundae_ns.errors import SundaeError
+from sundae_ns.gaussians.field import Field, as_field
 from sundae_ns.gaussians.parameters import finite_mask, num_primitives
 from sundae_ns.gaussians.surgery import rewrite
-from sundae_ns.pruning.scores import Contribution
-from sundae_ns.training.report import PruneReport
-from sundae_ns.training.schedules import PruningSchedule
+from sundae_ns.pruning import Decision, PruneRule, decide
+from sundae_ns.pruning.cutting import FieldPruner
+from sundae_ns.pruning.decision import diverged
 
 
-@dataclass(frozen=True)
-class GlobalPruning(PruningSchedule):
-    """A pruning schedule over the shards of one field."""
+class RankPruner(FieldPruner):
+    """Prunes the shards of one field as one process prunes the whole; its verbs are collective."""
 
-    schedule: PruningSchedule
-    shards: Shards
-
-    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """Whether a field of ``n`` primitives is pruned after this step."""
-        return self.schedule.due(state, step, n)
-
-    def target(self, n: int) -> int:
-        """Number of primitives that a prune keeps of ``n``."""
-        return self.schedule.target(n)
-
-    @torch.no_grad()
-    def step_post_backward(
+    def __init__(
         self,
+        shards: Shards,
         params: MutableMapping[str, Parameter],
         optimizers: Mapping[str, Optimizer],
-        state: MutableMapping[str, Any],
-        step: int,
-        info: Mapping[str, Any] | None = None,
-        *,
-        contribution: Contribution | None = None,
-        strategy_state: MutableMapping[str, Any] | None = None,
-    ) -> PruneReport | None:
-        """Prune if it is due; see :class:`sundae_ns.training.schedules.PruningSchedule`. Collective."""
-        shards, before = self.shards, self.shards.total
-        state["peak"] = max(state["peak"], before)
-        if not self.schedule.due(state, step, before):
-            return None
-        for held in params.values():
-            held.grad = None  # surgery drops it too, but only after the whole field has been gathered
-        states = [] if strategy_state is None else [strategy_state]
-        finite = finite_mask(params)
-        dropped = before - sum(count for (count,) in shards.numbers(int(finite.sum())))
-        if dropped == before:
-            raise DataError(
-                f"none of {before} primitives is finite: the training has diverged, resume from an earlier checkpoint"
-            )
-        if dropped:
-            shards.level(params, optimizers, states, finite)
-        needed = contribution is not None and self.config.uses_contribution and self.config.keep_ratio < 1
-        sums = shards.gather(contribution()) if contribution is not None and needed else None
-        whole: Mapping[str, Any] = {name: shards.gather(value) for name, value in params.items()}
+        states: Sequence[MutableMapping[str, Any]] = (),
+    ) -> None:
+        super().__init__(params, optimizers, states)
+        self.shards = shards
 
+    @property
+    def total(self) -> int:
+        """Number of primitives of all ranks."""
+        return self.shards.total
+
+    def drop_nonfinite(self) -> int:
+        """Remove the primitives of all ranks with a NaN or infinite parameter; returns their number. Collective.
+
+        Raises:
+            DataError: no primitive is finite.
+        """
+        finite, before = finite_mask(self.params), self.total
+        dropped = before - sum(count for (count,) in self.shards.numbers(int(finite.sum())))
+        if dropped == before:
+            raise diverged(before)
+        if dropped:
+            self.shards.level(self.params, self.optimizers, self.states, finite)
+        return dropped
+
+    @torch.no_grad()
+    def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:
+        """Decide on rank 0, remove and merge on all. Collective; an error of rank 0 is raised on every rank.
+
+        Args:
+            contribution: of this rank's primitives ``[N_r]``, on all ranks or on none.
+        """
+        shards = self.shards
+        for held in self.params.values():
+            held.grad = None  # surgery drops it too, but only after the whole field has been gathered
+        weights = None if contribution is None else shards.gather(contribution)
+        whole: dict[str, Any] = {name: shards.gather(value) for name, value in self.params.items()}
+        mask, values = torch.empty(shards.total, dtype=torch.bool, device=shards.device), {}
         outcome: Any = None
-        rows = torch.empty(0, dtype=torch.bool, device=shards.device)
         if shards.rank == 0:
-            outcome, whole, rows = _decide(self.schedule, whole, state, step, sums, as_field(params).encoding)
+            try:
+                decision = decide(Field(whole, as_field(self.params).encoding), rule, count, weights)
+                mask, values = decision.mask, dict(decision.values or {})
+                outcome = replace(decision, mask=torch.empty(0), values=None), list(values)
+            except SundaeError as error:
+                outcome = error
         outcome = shards.announce(outcome)
         if isinstance(outcome, SundaeError):
             raise outcome
-        report, counted, changed = outcome
-        state.update(counted)
+        figures, names = outcome
 
-        mask = torch.zeros(shards.total, dtype=torch.bool, device=shards.device)
-        if shards.rank == 0:
-            mask[rows] = True
         dist.broadcast(mask, 0)
-        start = sum(shards.counts[: shards.rank])
-        shards.level(params, optimizers, states, mask[start : start + num_primitives(params)])
-        start = sum(shards.counts[: shards.rank])
-        values = {}
-        for name in changed:
-            value = params[name].new_empty(shards.total, *params[name].shape[1:])
-            if shards.rank == 0:
-                value.copy_(whole[name])  # type: ignore[arg-type]
+        shards.level(self.params, self.optimizers, self.states, mask[self._rows()])
+        rows = self._rows()
+        for name in names:
+            own = self.params[name]
+            value = values[name].to(own) if name in values else own.new_empty(shards.total, *own.shape[1:])
             dist.broadcast(value, 0)
-            values[name] = value[start : start + num_primitives(params)].clone()
-        rewrite(params, optimizers, values)
-        # In steps of one image, as in checkpoints.
-        return replace(report, step=(step + 1) * shards.ranks - 1, before=before, dropped_nonfinite=dropped)
+            values[name] = value[rows].clone()
+        rewrite(self.params, self.optimizers, values)
+        return replace(figures, mask=mask)
 
-
-def _decide(
-    schedule: PruningSchedule,
-    gathered: Mapping[str, Any],
-    state: Mapping[str, Any],
-    step: int,
-    sums: Tensor | None,
-    encoding: Encoding,
-) -> tuple[Any, Mapping[str, Any], Tensor]:
-    """Prune the gathered field: outcome for all ranks, the field afterwards, and the rows that are kept."""
-    # Surgery makes new tensors, so the gathered ones stay without a copy.
-    params = Field({name: Parameter(value, requires_grad=False) for name, value in gathered.items()}, encoding)
-    rows = torch.arange(num_primitives(params), device=params["means"].device)
-    # Surgery slices every per-primitive tensor of the state, so this one becomes the rows that are kept.
-    counted: dict[str, Any] = {**state, "rows": rows}
-    try:
-        report = schedule.step_post_backward(
-            params, {}, counted, step, contribution=None if sums is None else lambda: sums
-        )
-    except SundaeError as error:
-        return error, params, rows
-    rows = counted.pop("rows")
-    changed = [name for name, value in params.items() if not torch.equal(value, gathered[name][rows])]
-    return (report, counted, changed), params, rows
+    def _rows(self) -> slice:
+        """This rank's rows of the whole field."""
+        start = sum(self.shards.counts[: self.shards.rank])
+        return slice(start, start + num_primitives(self.params))

@@ -138,11 +138,6 @@ class ShardedField:
         plan = plan_exchange(may_be_seen(self.field["means"], self.field["scales"], cameras.bounds, slack))
         self._planned = Ahead(at, cameras, plan, stamped(self.field))
 
-    def part(self, mask: Tensor, values: Mapping[str, Tensor] | None = None) -> ShardedField:
-        """A source of the primitives under a mask of this rank's, bool ``[N_r]``."""
-        rows = self.field.rows(mask)
-        return ShardedField(self.shards, rows if values is None else rows.replaced(values), self.timetable)
-
     # ------------------------------------------------------------------------------------------------------- training
 
     def follow(self, primitives: Primitives, info: MutableMapping[str, Any], *, absgrad: bool) -> None:

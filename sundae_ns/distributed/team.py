@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from sundae_ns.distributed.ahead import Timetable
 from sundae_ns.distributed.batches import SharedOptimizers, scale_rates, shorten
 from sundae_ns.distributed.checkpoints import state_of_rank, whole_state
 from sundae_ns.distributed.densification import ShardedDensification
-from sundae_ns.distributed.pruning import GlobalPruning
+from sundae_ns.distributed.pruning import RankPruner
 from sundae_ns.distributed.shards import Shards, bounds
 from sundae_ns.distributed.source import ShardedField
 from sundae_ns.distributed.start import check_options, without_viewer
@@ -160,8 +161,7 @@ class Ranks(OneProcess):
                 strategy.see_each_image_after_resets(-(-num_images // self.count))
             return ShardedDensification(strategy, self.shards)
         if isinstance(extension, ScheduledPruning):
-            schedule = extension.schedule
-            return ScheduledPruning(GlobalPruning(schedule.config, schedule, self.shards), evaluate=extension.evaluate)
+            extension.pruner = partial(RankPruner, self.shards)
         return extension
 
     def optimizers(self, make: Callable[[], Optimizers], config: Any, groups: Any, names: list[str]) -> Optimizers:

@@ -1,25 +1,27 @@
 """Pruning: signals, scores, exact selection and merging. Knows no schedule.
 
-:func:`decide` turns a field, a configuration and a count into a mask and changes nothing.
-:func:`sundae_ns.pruning.cutting.cut` calls it and applies the decision to a field in training.
+:func:`prune` takes a field, a :class:`PruneRule` and a count, and returns a new field; :func:`decide` returns the mask alone.
+:class:`sundae_ns.pruning.cutting.FieldPruner` applies the same decision to a field in training.
 """
 
-from sundae_ns.pruning.config import PruningConfig, band_rule, single_prune
-from sundae_ns.pruning.decision import Decision, decide
+from sundae_ns.pruning.decision import Decision, Pruned, decide, prune
 from sundae_ns.pruning.edges import field_graph
 from sundae_ns.pruning.footprint import footprint
+from sundae_ns.pruning.rule import PruneRule, band_rule
 from sundae_ns.pruning.scores import response
-from sundae_ns.pruning.selection import kept_count, select_random
+from sundae_ns.pruning.selection import check_share, kept_count, select_random
 
 __all__ = [
     "Decision",
-    "PruningConfig",
+    "PruneRule",
+    "Pruned",
     "band_rule",
+    "check_share",
     "decide",
     "field_graph",
     "footprint",
     "kept_count",
+    "prune",
     "response",
     "select_random",
-    "single_prune",
 ]

@@ -82,14 +82,16 @@ def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Te
         members = tier.nonzero().squeeze(1)
         if len(members) > left:
             weight = values[members] if tier is positive else torch.ones(len(members), dtype=torch.float64)
-            members = members[_passed(inclusion_probabilities(weight, left), left, start)] if left else members[:0]
+            members = (
+                members[_systematic_sample(inclusion_probabilities(weight, left), left, start)] if left else members[:0]
+            )
         chosen[order[members]] = True
         left -= len(members)
     return chosen.to(score.device)
 
 
-def _passed(probabilities: Tensor, count: int, start: float) -> Tensor:
-    """Places where the sum of the probabilities passes ``start + j``: exactly ``count``, all different."""
+def _systematic_sample(probabilities: Tensor, count: int, start: float) -> Tensor:
+    """Indices of a systematic sample: where the sum of the probabilities passes ``start + j``; ``count`` different ones."""
     certain = probabilities >= 1
     places = (~certain).nonzero().squeeze(1)
     wanted = count - int(certain.sum())

@@ -1,78 +1,85 @@
-"""Pruning of a field in training: what schedules and the budget search call when a prune is due."""
+"""Pruning of a field in training: parameters, optimizers and running states together."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, MutableMapping
-from dataclasses import replace
+from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from sundae_ns.gaussians.parameters import finite_mask
-from sundae_ns.gaussians.surgery import keep, rewrite
-from sundae_ns.pruning.config import PruningConfig
-from sundae_ns.pruning.decision import Decision, decide
-from sundae_ns.pruning.scores import Contribution
+from sundae_ns.gaussians.parameters import finite_mask, num_primitives
+from sundae_ns.gaussians.relocation import grow
+from sundae_ns.gaussians.surgery import keep, per_primitive, rewrite
+from sundae_ns.pruning.decision import Decision, decide, diverged
+from sundae_ns.pruning.rule import PruneRule
 
 
-def drop_nonfinite(
-    params: MutableMapping[str, Parameter],
-    optimizers: Mapping[str, Optimizer],
-    states: Iterable[MutableMapping[str, Any]],
-) -> int:
-    """Remove the primitives with a NaN or infinite parameter, in place; see :func:`sundae_ns.gaussians.surgery.keep`.
-
-    Returns:
-        Number of removed primitives. If no primitive is finite, it is 0 and the field is unchanged.
-    """
-    finite = finite_mask(params)
-    dropped = int((~finite).sum())
-    if dropped == len(finite):
-        return 0
-    if dropped:
-        keep(params, optimizers, states, finite)
-    return dropped
-
-
-@torch.no_grad()
-def cut(
-    params: MutableMapping[str, Parameter],
-    optimizers: Mapping[str, Optimizer],
-    state: MutableMapping[str, Any],
-    config: PruningConfig,
-    contribution: Contribution | None = None,
-    *,
-    step: int,
-    count: Callable[[int], int],
-    strategy_state: MutableMapping[str, Any] | None = None,
-) -> Decision:
-    """Prune a field in training, in place: drop primitives that are not finite, decide, remove, and merge.
+class FieldPruner:
+    """Prunes the field of one process, in place; :class:`sundae_ns.distributed.pruning.RankPruner` does so over ranks.
 
     Args:
-        params, optimizers: see :func:`sundae_ns.gaussians.surgery.keep`.
-        state: running state of a schedule; the prune is recorded in it.
-        config: options of this prune.
-        contribution: returns the summed blending weights of ``params`` over the training views ``[N]``; called only if
-            needed, after primitives that are not finite have been removed.
-        step: step of the schedule that has just ended.
-        count: maps the number of finite primitives to the number to keep.
-        strategy_state: state of a densification strategy on the same primitives; sliced with them.
-
-    Returns:
-        The decision; its mask is over the finite primitives.
-
-    Raises:
-        ConfigError, DataError: see :func:`sundae_ns.pruning.decide`.
+        params: the field, name to parameter ``[N, ...]``; its parameters are replaced.
+        optimizers: by parameter name, one parameter each; others are left alone.
+        states: running states on the same primitives; their tensors of N rows are sliced along.
     """
-    # Before the decision: the contribution renders the field, and one NaN spreads over the image.
-    states = [state] if strategy_state is None else [state, strategy_state]
-    dropped = drop_nonfinite(params, optimizers, states)
-    decision = decide(params, config, contribution, count=count(len(params["means"])))
-    keep(params, optimizers, states, decision.mask)
-    if decision.values is not None:
-        rewrite(params, optimizers, decision.values)
-    state["pruned_at"] = step
-    state["num_prunes"] += 1
-    return replace(decision, dropped_nonfinite=dropped)
+
+    def __init__(
+        self,
+        params: MutableMapping[str, Parameter],
+        optimizers: Mapping[str, Optimizer],
+        states: Sequence[MutableMapping[str, Any]] = (),
+    ) -> None:
+        self.params, self.optimizers, self.states = params, optimizers, states
+
+    @property
+    def total(self) -> int:
+        """Number of primitives of the whole field."""
+        return num_primitives(self.params)
+
+    def drop_nonfinite(self) -> int:
+        """Remove the primitives with a NaN or infinite parameter.
+
+        Call it before the contribution, which renders the field: one NaN spreads over the image.
+
+        Returns:
+            Number of removed primitives.
+
+        Raises:
+            DataError: no primitive is finite; the field is unchanged.
+        """
+        finite = finite_mask(self.params)
+        dropped = int((~finite).sum())
+        if dropped == len(finite):
+            raise diverged(dropped)
+        if dropped:
+            keep(self.params, self.optimizers, self.states, finite)
+        return dropped
+
+    @torch.no_grad()
+    def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:
+        """Decide, remove and merge; see :func:`sundae_ns.pruning.decide` for arguments and errors.
+
+        Args:
+            contribution: of the primitives of this process.
+
+        Returns:
+            The decision over the whole field.
+        """
+        decision = decide(self.params, rule, count, contribution)
+        keep(self.params, self.optimizers, self.states, decision.mask)
+        if decision.values is not None:
+            rewrite(self.params, self.optimizers, decision.values)
+        return decision
+
+    def add(self, count: int, least_opacity: float) -> None:
+        """Add ``count`` primitives on top of others, which share their opacity, so that no image changes.
+
+        Per-primitive statistics are dropped: call it once densification has ended.
+        """
+        n = num_primitives(self.params)
+        grow(self.params, self.optimizers, count, least_opacity)
+        for state in self.states:
+            state.update(dict.fromkeys(name for name, value in state.items() if per_primitive(value, n)))

@@ -1,23 +1,23 @@
-"""The decision which primitives of a field to keep. Pure: it changes nothing."""
+"""The decision which primitives of a field to keep, and the field that it leaves. Both change nothing."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.field import Field, as_field
-from sundae_ns.gaussians.parameters import finite_mask, num_primitives
+from sundae_ns.gaussians.parameters import finite_mask
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning.config import PruningConfig
 from sundae_ns.pruning.coverage import neighbor_order, select_systematic
 from sundae_ns.pruning.edges import field_graph
 from sundae_ns.pruning.redistribution import merged
-from sundae_ns.pruning.scores import Contribution, for_graph, response, score
+from sundae_ns.pruning.rule import PruneRule
+from sundae_ns.pruning.scores import response, score
 from sundae_ns.pruning.selection import select_band, select_random, select_sampled, select_top
 
 
@@ -41,13 +41,34 @@ class Decision:
     """New parameters of the kept primitives, in order ``[kept, ...]``; None if they are unchanged."""
 
 
+class Pruned(NamedTuple):
+    """A pruned field, and the decision behind it."""
+
+    field: Field
+    """The kept primitives, merged with the dropped ones if the rule merges; tensors of its own."""
+    decision: Decision
+    """Mask over the field before the prune, and figures."""
+
+
+@torch.no_grad()
+def prune(
+    field: Mapping[str, Tensor],
+    rule: PruneRule,
+    count: int,
+    contribution: Tensor | None = None,
+    graph: NeighborGraph | None = None,
+) -> Pruned:
+    """Prune a field to ``count`` primitives; arguments and errors are those of :func:`decide`."""
+    decision = decide(field, rule, count, contribution, graph)
+    return Pruned(as_field(field).rows(decision.mask).replaced(decision.values or {}), decision)
+
+
 @torch.no_grad()
 def decide(
     params: Mapping[str, Tensor],
-    config: PruningConfig,
-    contribution: Contribution | None = None,
-    *,
+    rule: PruneRule,
     count: int,
+    contribution: Tensor | None = None,
     graph: NeighborGraph | None = None,
 ) -> Decision:
     """Decide which primitives of a field to keep.
@@ -57,41 +78,47 @@ def decide(
     reach.
 
     Args:
-        params: the field.
-        config: options; its keep ratio and schedule are not used.
-        contribution: returns the summed blending weights of ``params`` over the training views ``[N]``; called only if
-            needed.
+        params: the field, N primitives.
+        rule: how to score, select and merge.
         count: number of primitives to keep, at least 1; all finite primitives are kept if they are fewer.
-        graph: :func:`field_graph` of the finite primitives by the same options; built if not given and needed.
+        contribution: blending weights, summed over the training views, any device ``[N]``; see
+            :func:`sundae_ns.rendering.contribution`. Needed if ``rule.uses_contribution``.
+        graph: :func:`field_graph` of the finite primitives by the same rule; built if not given and needed.
 
     Raises:
         ConfigError: an option is invalid, or a contribution is needed and not given.
         DataError: no primitive is finite, or the contribution does not have one value per primitive.
     """
-    config.validate()
-    n = num_primitives(params)
-    finite = finite_mask(params)
-    n_finite = int(finite.sum())
+    rule.validate()
+    field, finite = as_field(params), finite_mask(params)
+    n, n_finite = len(finite), int(finite.sum())
     if n_finite == 0:
-        raise DataError(
-            f"none of {n} primitives is finite: the training has diverged, go back to an earlier checkpoint"
-        )
+        raise diverged(n)
     count = min(count, n_finite)
     if count == n_finite:
         return Decision(finite, n_finite, n - n_finite)
 
-    field = as_field(params)
+    if contribution is not None:
+        if contribution.shape != finite.shape:
+            raise DataError(f"contribution has shape {list(contribution.shape)} for {n} primitives: return [{n}]")
+        contribution = contribution.detach()[finite.to(contribution.device)].to(finite.device)
     usable = field if n_finite == n else field.rows(finite)
-    weights = _once(contribution, finite)
-    if not config.uses_graph:
+    if not rule.uses_graph:
         graph = None
     elif graph is None:
-        graph = field_graph(for_graph(usable, config), config)
-    magnitude = response(usable, config, graph) if config.uses_response else None
-    values = score(usable, config, magnitude, weights)
-    selected = _select(values, config, count, usable["means"])
+        graph = field_graph(usable, rule)
+    magnitude = response(usable, rule, graph) if rule.uses_response else None
+    selected = _select(score(usable, rule, magnitude, contribution), rule, count, usable["means"])
     mask = finite.clone()
     mask[finite] = selected.to(mask.device)
+    values = None
+    if rule.redistribution == "merge":
+        assert graph is not None
+        if contribution is None:
+            raise ConfigError(
+                "a merge needs a pass over the training views and there are none: set redistribution to none"
+            )
+        values = merged(usable, graph, selected, contribution)
     return Decision(
         mask=mask,
         kept=count,
@@ -99,45 +126,22 @@ def decide(
         tau=None if graph is None else graph.tau,
         sigma=None if graph is None else graph.sigma,
         isolated=None if graph is None else int(graph.isolated.sum()),
-        values=_redistributed(usable, config, graph, selected, weights),
+        values=values,
     )
 
 
-def _redistributed(
-    params: Field,
-    config: PruningConfig,
-    graph: NeighborGraph | None,
-    mask: Tensor,
-    weights: Contribution | None,
-) -> dict[str, Tensor] | None:
-    if config.redistribution == "none":
-        return None
-    assert graph is not None
-    if weights is None:
-        raise ConfigError("a merge needs a pass over the training views and there are none: set redistribution to none")
-    return merged(params, graph, mask, weights())
-
-
-def _select(values: Tensor, config: PruningConfig, count: int, points: Tensor) -> Tensor:
-    if config.selection == "systematic":
-        return select_systematic(values, count, neighbor_order(points), config.seed)
-    if config.score == "random":
-        return select_random(len(values), count, config.seed, values.device)
-    if config.selection == "band":
-        return select_band(values, count, config.gamma)
-    if config.selection == "top":
+def _select(values: Tensor, rule: PruneRule, count: int, points: Tensor) -> Tensor:
+    if rule.selection == "systematic":
+        return select_systematic(values, count, neighbor_order(points), rule.seed)
+    if rule.score == "random":
+        return select_random(len(values), count, rule.seed, values.device)
+    if rule.selection == "band":
+        return select_band(values, count, rule.gamma)
+    if rule.selection == "top":
         return select_top(values, count)
-    return select_sampled(values, count, config.seed)
+    return select_sampled(values, count, rule.seed)
 
 
-def _once(contribution: Contribution | None, finite: Tensor) -> Contribution | None:
-    """The contribution of the finite primitives, computed at most once."""
-    return None if contribution is None else functools.cache(lambda: _rows(contribution(), finite))
-
-
-def _rows(contribution: Tensor, finite: Tensor) -> Tensor:
-    if contribution.shape != finite.shape:
-        raise DataError(
-            f"contribution has shape {list(contribution.shape)} for {len(finite)} primitives: return [{len(finite)}]"
-        )
-    return contribution[finite.to(contribution.device)].to(finite.device)
+def diverged(n: int) -> DataError:
+    """The error of a field of ``n`` primitives of which none is finite."""
+    return DataError(f"none of {n} primitives is finite: the training has diverged, go back to an earlier checkpoint")

@@ -9,21 +9,30 @@ import torch
 from torch import Tensor
 
 from sundae_ns.gaussians.covariance import covariances, overlap
+from sundae_ns.gaussians.field import as_field
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.pruning.config import PruningConfig
+from sundae_ns.pruning.rule import PruneRule
 
 LEAST_WIDTH = 0.25
 """Width added to primitives when their overlap is measured, as a share of the graph's sigma: some are flat."""
 
 MOST_UNLIKE = 8.0
 """Largest difference of colours that counts, in typical differences. Weights fall to e^-32 and stay positive; otherwise a
-primitive of an extreme colour would have no neighbour and no heir."""
+primitive of an extreme colour would have no neighbour and could not be merged."""
+
+
+def graph_inputs(params: Mapping[str, Tensor], rule: PruneRule) -> Mapping[str, Tensor]:
+    """Parameters for graphs and signals: colours as harmonics, on the device of the graph."""
+    params = as_field(params).as_harmonics()
+    if rule.graph_device == "field":
+        return params
+    return {name: params[name].detach().cpu() for name in ("means", "features_dc", "opacities", "scales", "quats")}
 
 
 @torch.no_grad()
-def field_graph(params: Mapping[str, Tensor], config: PruningConfig) -> NeighborGraph:
-    """Neighbour graph of a field, with the configured weights.
+def field_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGraph:
+    """Neighbour graph of a field, with the weights and on the device that the rule asks for.
 
     With ``centres``, as in the paper, weights fall with distance. ``appearance`` multiplies them by the overlap of the two
     primitives (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean square
@@ -32,21 +41,21 @@ def field_graph(params: Mapping[str, Tensor], config: PruningConfig) -> Neighbor
     A field of at most ``num_neighbors`` primitives has the graph of all pairs within reach.
 
     Args:
-        params: the field, all finite, N primitives, colours as harmonics (:func:`sundae_ns.pruning.scores.for_graph`). The
-            graph is built on its device.
+        params: the field, all finite, N primitives.
 
     Raises:
         DataError: only one primitive, or positions that are not finite.
     """
+    params = graph_inputs(params, rule)
     means = params["means"].detach()
     graph = build_graph(
         means,
-        num_neighbors=min(config.num_neighbors, max(len(means) - 1, 1)),
-        rule=config.bandwidth,
-        tau=config.tau,
-        sigma=config.sigma,
+        num_neighbors=min(rule.num_neighbors, max(len(means) - 1, 1)),
+        rule=rule.bandwidth,
+        tau=rule.tau,
+        sigma=rule.sigma,
     )
-    if config.edges == "centres":
+    if rule.edges == "centres":
         return graph
     weights = graph.weights * _color_affinity(sh_to_rgb(params["features_dc"].detach()), graph)
     covariance = covariances(params["scales"].detach().double().exp(), params["quats"].detach().double())

@@ -13,16 +13,16 @@ from sundae_ns.gaussians.parameters import rgb_to_logit
 from sundae_ns.graphs import NeighborGraph
 
 MOST_HOPS = 64
-"""Most edges between a dropped primitive and its heir; keep ratios from 0.001 on need about a dozen."""
+"""Most edges between a dropped primitive and its kept one; keep ratios from 0.001 on need about a dozen."""
 
 
 @torch.no_grad()
-def heirs(graph: NeighborGraph, mask: Tensor) -> Tensor:
-    """The heir of each primitive: the nearest kept primitive along the edges of the graph.
+def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
+    """Voronoi label of each primitive: the index of the nearest kept primitive along the edges of the graph.
 
     The length of an edge is ``-log W_ij``, so edges between primitives of different appearance are long if the graph weights
-    by appearance. The heirs form a Voronoi diagram on the graph. All edges are relaxed at once, hop by hop (Bellman and
-    Ford). Among equally near heirs the one found in fewer hops wins, then the one over the earlier neighbour.
+    by appearance. All edges are relaxed at once, hop by hop (Bellman and Ford). Among equally near kept primitives the one
+    found in fewer hops wins, then the one over the earlier neighbour.
 
     Edges are followed from a primitive to its neighbours. Primitives that reach no kept one so follow edges in both
     directions: a thousand clones share the same few neighbours, and all of these may be dropped.
@@ -31,13 +31,13 @@ def heirs(graph: NeighborGraph, mask: Tensor) -> Tensor:
         mask: True for primitives to keep, bool, any device ``[N]``.
 
     Returns:
-        Indices of the heirs, int64, on the graph's device ``[N]``: a kept primitive is its own heir; -1 for primitives
-        that are connected to no kept one.
+        Labels, int64, on the graph's device ``[N]``: its own index for a kept primitive; -1 for primitives that are
+        connected to no kept one.
     """
     device = graph.weights.device
     mask = mask.to(device)
     own = torch.arange(graph.N, device=device)
-    heir = torch.where(mask, own, -1)
+    label = torch.where(mask, own, -1)
     lengths = torch.where(graph.weights > 0, -graph.weights.double().log(), torch.inf).clamp_min(0)
     distance = torch.where(mask, 0.0, torch.inf).double()
     changed = mask
@@ -50,22 +50,22 @@ def heirs(graph: NeighborGraph, mask: Tensor) -> Tensor:
         if not bool(nearer.any()):
             break
         rows, through = rows[nearer], near.gather(1, over[:, None]).squeeze(1)[nearer]
-        heir[rows] = heir[through]
+        label[rows] = label[through]
         distance[rows] = reached[nearer]
         changed = torch.zeros_like(mask)
         changed[rows] = True
-    return _either_way(graph, heir, distance, lengths)
+    return _label_either_way(graph, label, distance, lengths)
 
 
-def _either_way(graph: NeighborGraph, heir: Tensor, distance: Tensor, lengths: Tensor) -> Tensor:
-    """Complete the heirs of primitives without one, along edges in both directions."""
-    heirless = heir < 0
-    rows, slots = ((heirless[:, None] | heirless[graph.indices]) & (graph.weights > 0)).nonzero(as_tuple=True)
+def _label_either_way(graph: NeighborGraph, label: Tensor, distance: Tensor, lengths: Tensor) -> Tensor:
+    """Label the primitives without a label, along edges in both directions."""
+    unlabelled = label < 0
+    rows, slots = ((unlabelled[:, None] | unlabelled[graph.indices]) & (graph.weights > 0)).nonzero(as_tuple=True)
     ends, length = graph.indices[rows, slots], lengths[rows, slots]
     source, target, length = torch.cat([rows, ends]), torch.cat([ends, rows]), torch.cat([length, length])
-    wanted = heirless[target]
+    wanted = unlabelled[target]
     source, target, length = source[wanted], target[wanted], length[wanted]
-    heir, distance = heir.clone(), distance.clone()
+    label, distance = label.clone(), distance.clone()
     for _ in range(MOST_HOPS):
         over = distance[source] + length
         reached = distance.scatter_reduce(0, target, over, "amin")
@@ -73,16 +73,17 @@ def _either_way(graph: NeighborGraph, heir: Tensor, distance: Tensor, lengths: T
         if not bool(best.any()):
             break
         # The lowest index among equally near sources, on every device.
-        through = torch.full_like(heir, graph.N).scatter_reduce_(0, target[best], source[best], "amin")
+        through = torch.full_like(label, graph.N).scatter_reduce_(0, target[best], source[best], "amin")
         nearer = reached < distance
-        heir[nearer] = heir[through[nearer]]
+        label[nearer] = label[through[nearer]]
         distance = reached
-    return heir
+    return label
 
 
 @torch.no_grad()
 def merged(params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, weight: Tensor) -> dict[str, Tensor]:
-    """Kept primitives merged with those whose heirs they are: :func:`heirs`, then :func:`sundae_ns.gaussians.merging.merge`.
+    """Merge the primitives of each Voronoi cell of the graph into its kept one; see :func:`voronoi_labels`, and
+    :func:`sundae_ns.gaussians.merging.merge` for the result.
 
     A field that stores logits averages colours, not logits.
 
@@ -94,12 +95,12 @@ def merged(params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, wei
     Returns:
         Parameters of the kept primitives ``[M, ...]``.
     """
-    heir = heirs(graph, mask)
+    labels = voronoi_labels(graph, mask)
     if as_field(params).encoding == "harmonics":
-        return merge(params, heir, weight)
+        return merge(params, labels, weight)
     own = params["features_dc"].detach()
     colors = own.sigmoid()
-    values = merge({**params, "features_dc": colors}, heir, weight)
+    values = merge({**params, "features_dc": colors}, labels, weight)
     stay, mixed = mask.to(own.device), values["features_dc"]
     # Unmerged colours keep their logits: a saturated colour does not survive the round trip.
     values["features_dc"] = torch.where(mixed == colors[stay], own[stay], rgb_to_logit(mixed))

@@ -2,37 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.filters import high_pass, response_magnitude
-from sundae_ns.gaussians.field import as_field
 from sundae_ns.gaussians.parameters import num_primitives
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning.config import PruningConfig
-from sundae_ns.pruning.edges import field_graph
+from sundae_ns.pruning.edges import field_graph, graph_inputs
+from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.signals import attribute_signal, position_signal
 
 SIGNALS = {"attributes": attribute_signal, "positions": position_signal}
 
-Contribution = Callable[[], Tensor]
-"""Returns the summed blending weights over the training views ``[N]``; expensive, so called only if needed."""
-
-
-def for_graph(params: Mapping[str, Tensor], config: PruningConfig) -> Mapping[str, Tensor]:
-    """The parameters that graphs and signals use: colours as harmonics, on the configured device."""
-    params = as_field(params).as_harmonics()
-    if config.graph_device == "field":
-        return params
-    return {name: params[name].detach().cpu() for name in ("means", "features_dc", "opacities", "scales", "quats")}
-
 
 @torch.no_grad()
-def response(params: Mapping[str, Tensor], config: PruningConfig, graph: NeighborGraph | None = None) -> Tensor:
-    """Squared norm of the high-pass response of the configured signal, pi of the paper.
+def response(params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph | None = None) -> Tensor:
+    """Squared norm of the high-pass response of the rule's signal, pi of the paper.
 
     Args:
         params: the field, all finite, N primitives.
@@ -44,20 +32,16 @@ def response(params: Mapping[str, Tensor], config: PruningConfig, graph: Neighbo
     Raises:
         DataError: only one primitive, or positions that are not finite.
     """
-    device = params["means"].device
-    params = for_graph(params, config)
-    graph = field_graph(params, config) if graph is None else graph
-    return response_magnitude(high_pass(graph, SIGNALS[config.signal](params))).to(device)
+    graph = field_graph(params, rule) if graph is None else graph
+    signal = SIGNALS[rule.signal](graph_inputs(params, rule))
+    return response_magnitude(high_pass(graph, signal)).to(params["means"].device)
 
 
 @torch.no_grad()
 def score(
-    params: Mapping[str, Tensor],
-    config: PruningConfig,
-    magnitude: Tensor | None,
-    contribution: Contribution | None,
+    params: Mapping[str, Tensor], rule: PruneRule, magnitude: Tensor | None, contribution: Tensor | None
 ) -> Tensor:
-    """Configured score of each primitive, float64 ``[N]``.
+    """Score of each primitive by the rule, float64 ``[N]``.
 
     The response enters as the norm ``|f_i| = sqrt(pi_i)``. Its ranking is that of ``pi_i``, and sampling in proportion to the
     norm gives the least expected error (Chen et al., "Fast Resampling of Three-Dimensional Point Clouds via Graphs", 2018).
@@ -69,34 +53,30 @@ def score(
     Args:
         params: the field, all finite, N primitives.
         magnitude: result of :func:`response` on the same field; needed by scores with a response.
-        contribution: returns the blending weights ``[N]``; needed by scores with a contribution, otherwise not called.
+        contribution: blending weights ``[N]``; needed by scores with a contribution.
 
     Raises:
         ConfigError: the score needs a contribution that is not given.
     """
     n = num_primitives(params)
-    if config.score == "opacity":
+    if rule.score == "opacity":
         return torch.sigmoid(params["opacities"].detach().double()).reshape(n)
-    if config.score == "random":
+    if rule.score == "random":
         return torch.ones(n, dtype=torch.float64, device=params["means"].device)
-    if config.score == "contribution" or config.uses_detail:
-        return _weights(contribution, config)
+    if rule.score == "response":
+        assert magnitude is not None
+        return magnitude.double().sqrt()
+    if contribution is None:
+        raise ConfigError(
+            f"score {rule.score!r} needs a pass over the training views and there are none: "
+            "use response, opacity or random"
+        )
+    weights = torch.nan_to_num(contribution.double(), nan=0.0)
+    if not rule.uses_response:
+        return weights
     assert magnitude is not None
     norm = magnitude.double().sqrt()
-    return norm if config.score == "response" else _weights(contribution, config) * _filled_with_median(norm)
-
-
-def _filled_with_median(norm: Tensor) -> Tensor:
     known = norm[~norm.isnan()]
     # On a graph without edges no response is known: one value for all leaves the choice to the contribution.
     filling = known.median() if known.numel() else norm.new_tensor(1.0)
-    return torch.where(norm.isnan(), filling, norm)
-
-
-def _weights(contribution: Contribution | None, config: PruningConfig) -> Tensor:
-    if contribution is None:
-        raise ConfigError(
-            f"score {config.score!r} needs a pass over the training views and there are none: "
-            "use response, opacity or random"
-        )
-    return torch.nan_to_num(contribution().detach().double(), nan=0.0)
+    return weights * torch.where(norm.isnan(), filling, norm)

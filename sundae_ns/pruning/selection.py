@@ -11,12 +11,25 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import DataError
+from sundae_ns.errors import ConfigError, DataError
 
 
-def kept_count(keep_ratio: float, n: int) -> int:
-    """Number of ``n`` primitives that one prune keeps: ``round(keep_ratio * n)``, at least 1."""
-    return max(1, round(keep_ratio * n))
+def check_share(share: float) -> None:
+    """Raise ``ConfigError`` for a share to keep that is not in (0, 1]."""
+    if not 0 < share <= 1:
+        raise ConfigError(f"keep_ratio is {share}: use a share in (0, 1], 0.1 to keep a tenth")
+
+
+def kept_count(share: float, n: int) -> int:
+    """Number of ``n`` primitives that a prune to a share keeps: ``round(share * n)``, at least 1.
+
+    The one place that turns a share into a count.
+
+    Raises:
+        ConfigError: the share is not in (0, 1].
+    """
+    check_share(share)
+    return max(1, round(share * n))
 
 
 def select_top(score: Tensor, count: int) -> Tensor:

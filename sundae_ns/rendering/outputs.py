@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -12,7 +11,7 @@ from sundae_ns.errors import DataError
 from sundae_ns.evaluation import display
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
-from sundae_ns.pruning import PruningConfig, response
+from sundae_ns.pruning import PruneRule, response
 from sundae_ns.rendering.lazy import Later, LazyOutputs
 from sundae_ns.rendering.render import RenderSettings, splat
 from sundae_ns.rendering.views import View
@@ -36,20 +35,20 @@ class ShownResponse:
         """The field whose response is kept; None before the first."""
         return self._last[0]
 
-    def values(self, field: Field, key: FieldKey | None, config: PruningConfig) -> Tensor | None:
+    def values(self, field: Field, key: FieldKey | None, rule: PruneRule) -> Tensor | None:
         """Values in [0, 1] ``[N]``; None if there is no response, as for a single primitive without neighbours.
 
         Args:
             field: the primitives.
             key: their state; None for a field that still grows, whose response is not shown.
-            config: signal and graph.
+            rule: signal and graph.
         """
         if key is None:
             return None
         of, values = self._last
         if of != key:
             try:
-                values = display.response_values(response(field, config))
+                values = display.response_values(response(field, rule))
             except DataError:
                 values = None
             self._last = (key, values)
@@ -81,53 +80,34 @@ def late_outputs(
         values: gives the response of all primitives, in [0, 1] ``[N]``, or None.
         splattable: whether there are features that this process can splat by itself; otherwise their image is black.
     """
-    alpha = images["accumulation"]
-    of_features = partial(_feature_colors, images.get("feature_image"), field, drawn, view, settings, alpha, splattable)
-    outputs = {
-        **images,
-        "depth": Later(partial(_depth_image, images.get("depth"), drawn, view, settings, alpha)),
-        "features": Later(of_features),
-        "response": Later(partial(_response_image, field, mask, view, settings, values)),
-    }
+    alpha, found_depth, found_features = (images.get(name) for name in ("accumulation", "depth", "feature_image"))
+    assert alpha is not None
+
+    def depth() -> Tensor:
+        found = found_depth
+        if found is None:
+            found = splat(drawn, view, drawn["opacities"], settings, render_depth=True).depth
+            assert found is not None
+        return display.fill_depth(found, alpha)
+
+    def features() -> Tensor:
+        image = found_features
+        if image is None or image.shape[-1] == 0:
+            if not splattable:
+                return alpha.new_zeros(*alpha.shape[:2], 3)
+            image = splat(drawn, view, drawn[FEATURES], settings).colors
+        return display.feature_colors(image, *display.principal_components(field[FEATURES]), alpha)
+
+    def response_image() -> Tensor:
+        shown = values()
+        if shown is None:
+            return field["means"].new_zeros(view.height, view.width, 1)
+        visible = field if mask is None else field.rows(mask)
+        return splat(visible, view, (shown if mask is None else shown[mask])[:, None], settings).colors
+
+    late = {"depth": Later(depth), "features": Later(features), "response": Later(response_image)}
+    outputs = {**images, **late}
     return LazyOutputs({name: outputs[name] for name in OUTPUTS})
-
-
-def _depth_image(depth: Tensor | None, drawn: Field, view: View, settings: RenderSettings, alpha: Tensor) -> Tensor:
-    if depth is None:
-        depth = splat(drawn, view, drawn["opacities"], settings, render_depth=True).depth
-        assert depth is not None
-    return display.fill_depth(depth, alpha)
-
-
-def _feature_colors(
-    image: Tensor | None,
-    field: Field,
-    drawn: Field,
-    view: View,
-    settings: RenderSettings,
-    alpha: Tensor,
-    splattable: bool,
-) -> Tensor:
-    if image is None or image.shape[-1] == 0:
-        if not splattable:
-            return alpha.new_zeros(*alpha.shape[:2], 3)
-        image = splat(drawn, view, drawn[FEATURES], settings).colors
-    return display.feature_colors(image, *display.principal_components(field[FEATURES]), alpha)
-
-
-def _response_image(
-    field: Field,
-    mask: Tensor | None,
-    view: View,
-    settings: RenderSettings,
-    values: Callable[[], Tensor | None],
-) -> Tensor:
-    shown = values()
-    if shown is None:
-        return field["means"].new_zeros(view.height, view.width, 1)
-    if mask is not None:
-        field, shown = field.rows(mask), shown[mask]
-    return splat(field, view, shown[:, None], settings).colors
 
 
 def empty_outputs(width: int, height: int, background: Tensor) -> dict[str, Any]:

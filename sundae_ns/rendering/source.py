@@ -136,9 +136,6 @@ class FieldSource(Protocol):
     def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
         """Add values of the primitives of a batch ``[M]`` to a sum over the primitives of this process ``[N]``."""
 
-    def part(self, mask: Tensor, values: Mapping[str, Tensor] | None = None) -> FieldSource:
-        """A source of the primitives under a mask, bool ``[N]``, with other values of some parameters."""
-
 
 def colors_from(params: Mapping[str, Tensor], field: Field, center: Tensor, settings: ColorSettings) -> Tensor:
     """Colours of primitives as seen from a place.
@@ -222,8 +219,3 @@ class LocalField:
     def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
         """Add the values, one for each primitive."""
         total += values
-
-    def part(self, mask: Tensor, values: Mapping[str, Tensor] | None = None) -> LocalField:
-        """A source of the primitives under a mask, which is not recorded."""
-        rows = self.field.rows(mask)
-        return LocalField(rows if values is None else rows.replaced(values), whole=False)

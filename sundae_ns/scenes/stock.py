@@ -13,7 +13,7 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.model import SundaeModelConfig
-from sundae_ns.pruning import PruningConfig
+from sundae_ns.training.pruning_config import PruningConfig
 
 
 def model_config(stock: SplatfactoModelConfig, *, field: Path | None = None) -> SundaeModelConfig:

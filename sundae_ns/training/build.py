@@ -11,7 +11,6 @@ import torch
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
-from sundae_ns.pruning import PruningConfig
 from sundae_ns.training.averaging import Averaging
 from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.densification import Densification, GrowthOptions, make_strategy
@@ -19,6 +18,7 @@ from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.initial_field import Frame, PointOptions, Points, Start, initial_field
 from sundae_ns.training.pruning import ScheduledPruning
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import make_schedule
 from sundae_ns.training.stopping import Stopping
 from sundae_ns.training.trials import Trials

@@ -18,9 +18,9 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from sundae_ns.gaussians.relocation import grow, jitter, relocate
-from sundae_ns.pruning import PruningConfig
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.pruning_config import PruningConfig
 
 STATISTICS = ("grad2d", "count", "radii")
 """Tensors ``[N]`` in the running state of gsplat's strategy."""

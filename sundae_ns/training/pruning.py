@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sundae_ns.errors import SundaeError
-from sundae_ns.pruning import PruningConfig
+from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rendering.contribution import contribution
 from sundae_ns.training.extension import Extension, TrainingRun
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.report import report_peak, write_report
 from sundae_ns.training.schedulers import notify_pruned
 from sundae_ns.training.schedules import PruningSchedule
@@ -32,6 +34,8 @@ class ScheduledPruning(Extension):
     def __init__(self, schedule: PruningSchedule, *, evaluate: bool) -> None:
         self.schedule = schedule
         self.evaluate = evaluate
+        self.pruner: Callable[..., FieldPruner] = FieldPruner
+        """Makes the pruner of field, optimizers and running states; several ranks have their own."""
 
     @property
     def _searching(self) -> bool:
@@ -58,15 +62,13 @@ class ScheduledPruning(Extension):
             CONSOLE.log(f"step {state.step}: pruning {total:,} primitives, with passes over the training views")
         evaluate = due and self.evaluate and config.ends_growth_at is not None
         before = _evaluated(run, "warm-up") if evaluate else {}
+
+        def contribute(count: int | None) -> Tensor:
+            return contribution(run.source, run.training_views(), run.background, run.settings, count, console=CONSOLE)
+
         try:
-            report = self.schedule.step_post_backward(
-                state.field,
-                state.optimizers,
-                state.pruning,
-                state.schedule_step,
-                strategy_state=state.densification,
-                contribution=partial(self._contribution, run),
-            )
+            pruner = self.pruner(state.field, state.optimizers, [state.densification])
+            report = self.schedule.after_step(pruner, state.pruning, state.schedule_step, contribute)
         except SundaeError:
             # Do not lose the warm-up to an option that can be corrected: a resumed run prunes at its first step.
             run.save()
@@ -78,6 +80,8 @@ class ScheduledPruning(Extension):
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
             return
+        # In steps of one image, as in checkpoints.
+        report = replace(report, step=(report.step + 1) * run.images_per_step - 1)
         CONSOLE.log(report.summary())
         if report.dropped_nonfinite:
             warn(f"removed {report.dropped_nonfinite} primitives that were not finite")
@@ -89,11 +93,6 @@ class ScheduledPruning(Extension):
         report_peak(run)
         if not self._searching:
             self._warn_if_too_short(run, run.state.step)
-
-    def _contribution(self, run: TrainingRun) -> Tensor:
-        total = run.source.total
-        keep_ratio = self.schedule.target(total) / total if self.schedule.config.uses_detail else None
-        return contribution(run.source, run.training_views(), run.background, run.settings, keep_ratio, progress=True)
 
     def _warn_if_too_short(self, run: TrainingRun, last_step: int) -> None:
         """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""

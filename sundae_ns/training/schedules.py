@@ -1,29 +1,21 @@
 """Pruning schedules: when a field is pruned, and to how many primitives.
 
-A schedule decides, :func:`sundae_ns.pruning.cutting.cut` prunes. Its verbs, ``initialize_state`` and
-``step_post_backward``, are those of gsplat's densification strategies. The running state is a dict of integers, so that a
-checkpoint can carry it: a resumed run neither prunes twice nor forgets its peak.
+A schedule decides, a :class:`sundae_ns.pruning.cutting.FieldPruner` prunes. The running state is a dict of integers, so that
+a checkpoint can carry it: a resumed run neither prunes twice nor forgets its peak.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-import torch
 from torch import Tensor
-from torch.nn import Parameter
-from torch.optim import Optimizer
 
-from sundae_ns.gaussians.parameters import num_primitives
-from sundae_ns.gaussians.relocation import grow
-from sundae_ns.gaussians.surgery import per_primitive
-from sundae_ns.pruning.config import PruningConfig
-from sundae_ns.pruning.cutting import cut
-from sundae_ns.pruning.scores import Contribution
-from sundae_ns.pruning.selection import kept_count
+from sundae_ns.evaluation.timing import now
+from sundae_ns.pruning import PruneRule, kept_count
+from sundae_ns.pruning.cutting import FieldPruner
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.report import PruneReport
 
 NEVER = -1
@@ -31,10 +23,14 @@ NEVER = -1
 LEAST_OPACITY = 0.005
 """Lowest opacity of primitives that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
 
+Contribute = Callable[[int | None], Tensor]
+"""Renders the training views and returns the contribution of the pruner's primitives ``[N]``; the argument is ``count`` of
+:func:`sundae_ns.rendering.contribution`."""
+
 
 @dataclass(frozen=True)
 class PruningSchedule:
-    """Base of the schedules: running state, peak and report. Subclasses say when a prune is due, and how many it keeps."""
+    """Base of the schedules: subclasses say when a prune is due, and how many primitives it keeps."""
 
     config: PruningConfig
     """Options; not changed."""
@@ -47,71 +43,45 @@ class PruningSchedule:
         """Number of primitives that a prune keeps of ``n`` finite ones. The one place that decides this number."""
         raise NotImplementedError
 
+    def rule_at(self, step: int) -> PruneRule:
+        """Rule of the prune at a step."""
+        return self.config
+
+    def lacking(self, step: int, n: int) -> int:
+        """Number of primitives to add to ``n`` after this step."""
+        return 0
+
     def initialize_state(self) -> dict[str, Any]:
         """Running state: step of the last prune (-1 for none), number of prunes, peak number of primitives."""
         return {"pruned_at": NEVER, "num_prunes": 0, "peak": 0}
 
-    @torch.no_grad()
-    def step_post_backward(
-        self,
-        params: MutableMapping[str, Parameter],
-        optimizers: Mapping[str, Optimizer],
-        state: MutableMapping[str, Any],
-        step: int,
-        info: Mapping[str, Any] | None = None,
-        *,
-        contribution: Contribution | None = None,
-        strategy_state: MutableMapping[str, Any] | None = None,
+    def after_step(
+        self, pruner: FieldPruner, state: MutableMapping[str, Any], step: int, contribute: Contribute | None = None
     ) -> PruneReport | None:
-        """Prune if it is due. Call it after the optimizer's step and after densification.
+        """Prune if it is due, and add primitives if they are lacking. Call it after optimizers and densification.
 
         Args:
-            params: the field; its parameters are replaced when it is pruned.
-            optimizers: optimizers by parameter name; others are left alone.
+            pruner: of the field.
             state: from :meth:`initialize_state`, or from a checkpoint.
             step: training step that has just ended.
-            info: part of the common signature, not read.
-            contribution: gives the blending weights over the training views ``[N]``. It is called only if the score needs
-                it, after primitives that are not finite have been removed.
-            strategy_state: state of a densification strategy on the same primitives; sliced with them.
+            contribute: called only if the rule needs it, after primitives that are not finite have been removed.
 
         Returns:
             A report, or None if no prune was due.
 
         Raises:
-            ConfigError: the score needs a contribution and there is none.
+            ConfigError: the rule needs a contribution and there is none.
             DataError: the field cannot be pruned, see :func:`sundae_ns.pruning.decide`.
         """
-        before = num_primitives(params)
-        state["peak"] = max(state["peak"], before)
-        if not self.due(state, step, before):
-            return None
-        started = _now(params)
-        decision = cut(
-            params,
-            optimizers,
-            state,
-            self._config_at(step),
-            contribution,
-            step=step,
-            count=self.target,
-            strategy_state=strategy_state,
-        )
-        return PruneReport(
-            step=step,
-            before=before,
-            after=decision.kept,
-            dropped_nonfinite=decision.dropped_nonfinite,
-            peak=state["peak"],
-            seconds=_now(params) - started,
-            tau=decision.tau,
-            sigma=decision.sigma,
-            isolated=decision.isolated,
-        )
-
-    def _config_at(self, step: int) -> PruningConfig:
-        """Options of the prune at a step."""
-        return self.config
+        state["peak"] = max(state["peak"], pruner.total)
+        report = None
+        if self.due(state, step, pruner.total):
+            report = prune_to(self.target, self.rule_at(step), pruner, state, step, contribute)
+        lacking = self.lacking(step, pruner.total)
+        if lacking > 0:
+            pruner.add(lacking, LEAST_OPACITY)
+            state["peak"] = max(state["peak"], pruner.total)
+        return report
 
 
 class NoPruning(PruningSchedule):
@@ -160,40 +130,6 @@ class ContinuousPruning(PruningSchedule):
         by_count = above and (scheduled or step >= config.stop)
         return (by_share or by_count) and step > state["pruned_at"]
 
-    def _config_at(self, step: int) -> PruningConfig:
-        # A new draw at each prune, and the same one after a resume.
-        return replace(self.config, seed=self.config.seed + step)
-
-    @torch.no_grad()
-    def step_post_backward(
-        self,
-        params: MutableMapping[str, Parameter],
-        optimizers: Mapping[str, Optimizer],
-        state: MutableMapping[str, Any],
-        step: int,
-        info: Mapping[str, Any] | None = None,
-        *,
-        contribution: Contribution | None = None,
-        strategy_state: MutableMapping[str, Any] | None = None,
-    ) -> PruneReport | None:
-        """Prune if it is due. If densification has ended with fewer than ``target_primitives``, add the missing ones.
-
-        They are added on top of others and share their opacity, so that no image changes. Per-primitive statistics of
-        densification are dropped then, because it has ended.
-        """
-        report = super().step_post_backward(
-            params, optimizers, state, step, info, contribution=contribution, strategy_state=strategy_state
-        )
-        n = num_primitives(params)
-        lacking = (self.config.target_primitives or 0) - n
-        if step >= self.config.stop and lacking > 0:
-            grow(params, optimizers, lacking, LEAST_OPACITY)
-            if strategy_state is not None:
-                stale = [k for k, v in strategy_state.items() if per_primitive(v, n)]
-                strategy_state.update(dict.fromkeys(stale))
-            state["peak"] = max(state["peak"], n + lacking)
-        return report
-
     def target(self, n: int) -> int:
         """``target_primitives``, or the keep ratio's share under the cap."""
         config = self.config
@@ -201,6 +137,14 @@ class ContinuousPruning(PruningSchedule):
             return min(config.target_primitives, n)
         count = kept_count(config.keep_ratio, n)
         return count if config.max_primitives is None else min(count, config.max_primitives)
+
+    def rule_at(self, step: int) -> PruneRule:
+        """The rule with a new draw at each prune, and the same one after a resume."""
+        return replace(self.config, seed=self.config.seed + step)
+
+    def lacking(self, step: int, n: int) -> int:
+        """Those below ``target_primitives`` once densification has ended."""
+        return (self.config.target_primitives or 0) - n if step >= self.config.stop else 0
 
 
 def make_schedule(config: PruningConfig) -> PruningSchedule:
@@ -215,9 +159,37 @@ def make_schedule(config: PruningConfig) -> PruningSchedule:
     return schedules[config.mode](config)
 
 
-def _now(params: Mapping[str, Tensor]) -> float:
-    """Wall-clock seconds after all queued work on the field's device."""
-    device = params["means"].device
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return time.perf_counter()
+def prune_to(
+    target: Callable[[int], int],
+    rule: PruneRule,
+    pruner: FieldPruner,
+    state: MutableMapping[str, Any],
+    step: int,
+    contribute: Contribute | None,
+) -> PruneReport:
+    """Prune a field in training now: drop what is not finite, decide the count, render, cut, and record the step.
+
+    Args:
+        target: maps the number of finite primitives to the number to keep.
+        rule: which primitives stay.
+        pruner, state, step, contribute: see :meth:`PruningSchedule.after_step`, also for errors.
+    """
+    device = pruner.params["means"].device
+    before, started = pruner.total, now(device)
+    dropped = pruner.drop_nonfinite()
+    count, weights = target(pruner.total), None
+    if contribute is not None and rule.uses_contribution and count < pruner.total:
+        weights = contribute(count if rule.uses_detail else None)
+    decision = pruner.cut(rule, count, weights)
+    state.update(pruned_at=step, num_prunes=state["num_prunes"] + 1)
+    return PruneReport(
+        step=step,
+        before=before,
+        after=decision.kept,
+        dropped_nonfinite=dropped,
+        peak=state["peak"],
+        seconds=now(device) - started,
+        tau=decision.tau,
+        sigma=decision.sigma,
+        isolated=decision.isolated,
+    )

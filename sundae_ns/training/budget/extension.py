@@ -15,7 +15,6 @@ from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
 from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.snapshot import Snapshot
-from sundae_ns.pruning import PruningConfig
 from sundae_ns.storage import accounting, megabytes
 from sundae_ns.training.budget import heads, sizes
 from sundae_ns.training.budget.record import budget_of, write
@@ -25,6 +24,7 @@ from sundae_ns.training.budget.sh_degree import flatten, lower_degree
 from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.report import PruneReport, write_report
 from sundae_ns.training.warning import warn
 

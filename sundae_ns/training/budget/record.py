@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from sundae_ns.evaluation import without_nan
-from sundae_ns.pruning import PruningConfig
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.training.budget.search import Point, Search
 from sundae_ns.training.budget.searched_field import SearchedField
+from sundae_ns.training.pruning_config import PruningConfig
 
 
 def budget_of(config: PruningConfig) -> tuple[str, float]:

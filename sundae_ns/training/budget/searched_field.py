@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians import FEATURES
+from sundae_ns.gaussians import FEATURES, finite_mask
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.sh_folding import mean_basis
 from sundae_ns.gaussians.snapshot import Snapshot
-from sundae_ns.pruning import PruningConfig
-from sundae_ns.pruning.cutting import cut, drop_nonfinite
+from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering.contribution import contribution, weights_by_batch
 from sundae_ns.rendering.source import TrainingView
@@ -25,7 +24,9 @@ from sundae_ns.training.budget.sizes import bytes_of
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import measure_heldout
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedulers import notify_pruned
+from sundae_ns.training.schedules import prune_to
 
 MAX_VIEWS = 64
 """Training views, evenly chosen, for each score: a search scores the field at every cut."""
@@ -54,6 +55,10 @@ class SearchedField:
         return self.field.num_primitives
 
     @property
+    def _pruner(self) -> FieldPruner:
+        return FieldPruner(self.field, self.state.optimizers)
+
+    @property
     def bare(self) -> dict[str, Tensor]:
         """Parameters without features."""
         return {name: value for name, value in self.field.items() if name != FEATURES}
@@ -75,9 +80,9 @@ class SearchedField:
         views = self.run.training_views()
         return views[:: -(-len(views) // MAX_VIEWS)]
 
-    def contribution(self, keep_ratio: float | None = None) -> Tensor:
+    def contribution(self, count: int | None = None) -> Tensor:
         """Blending weights over some training views ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
-        return contribution(self.run.source, self._views(), self.run.background, self.run.settings, keep_ratio)
+        return contribution(self.run.source, self._views(), self.run.background, self.run.settings, count)
 
     @torch.no_grad()
     def mean_basis(self, degree: int) -> tuple[Tensor, Tensor]:
@@ -111,8 +116,8 @@ class SearchedField:
     # ------------------------------------------------------------------------------------------------------- fields
 
     def drop_nonfinite(self) -> int:
-        """Remove primitives with a NaN or infinite parameter; returns their number."""
-        return drop_nonfinite(self.field, self.state.optimizers, [self.state.pruning])
+        """Remove primitives with a NaN or infinite parameter; returns their number, 0 if no primitive is finite."""
+        return self._pruner.drop_nonfinite() if finite_mask(self.field).any() else 0
 
     def cut_to(self, count: int) -> int:
         """Keep ``count`` primitives by the configured rule, or all that are finite if there are fewer.
@@ -123,22 +128,10 @@ class SearchedField:
         Raises:
             DataError: the field cannot be scored.
         """
-        state = self.state
-        options = replace(self.config, seed=self.config.seed + state.schedule_step)
-
-        def weights() -> Tensor:
-            return self.contribution(count / self.count if options.uses_detail else None)
-
-        decision = cut(
-            self.field,
-            state.optimizers,
-            state.pruning,
-            options,
-            weights,
-            step=state.schedule_step,
-            count=lambda n: min(count, n),
-        )
-        return decision.dropped_nonfinite
+        step = self.state.schedule_step
+        rule = replace(self.config, seed=self.config.seed + step)
+        report = prune_to(lambda n: min(count, n), rule, self._pruner, self.state.pruning, step, self.contribution)
+        return report.dropped_nonfinite
 
     def restore(self, saved: Mapping[str, Snapshot] | None) -> None:
         """Return to a snapshot."""
