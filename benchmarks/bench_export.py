@@ -29,7 +29,7 @@ from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering import LocalField, render
 from sundae_ns.scenes.opening import Opened, load_run
-from sundae_ns.scenes.packed import scene_of_run
+from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage import read_ply
 from sundae_ns.storage.viewers import ANTIALIASED, write_for_viewers
 
@@ -79,7 +79,7 @@ def main() -> None:
 
     run = load_run(options.run / "config.yml")
     model = run.model
-    scene = scene_of_run(options.run, max_cameras=0)
+    scene = contents_of_run(options.run, max_cameras=0)
     antialiased = model.config.rasterize_mode == "antialiased"
     logits = model.config.sh_degree == 0
     views = torch.linspace(0, len(run.cameras) - 1, min(options.views, len(run.cameras))).round().long().tolist()

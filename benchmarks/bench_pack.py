@@ -34,7 +34,7 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.finetune import RATE, finetune
 from sundae_ns.scenes.opening import load_run, open_scene
-from sundae_ns.scenes.packed import scene_of_run
+from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage.packing import (
     FINETUNED,
     Codecs,
@@ -171,7 +171,7 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     config = config_of(options.set, options.finetune > 0)
     steps = options.finetune
-    scene = random_scene(options.primitives) if options.run is None else scene_of_run(options.run)
+    scene = random_scene(options.primitives) if options.run is None else contents_of_run(options.run)
     with tempfile.TemporaryDirectory() as name:
         file = Path(name) / "scene.sundae"
         start = time.perf_counter()

@@ -30,9 +30,10 @@ from browser import WEBGPU, Browser, find_chromium, wait_for
 from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 
+from sundae_ns.api.packing import arrays_of_views, scene_of
+from sundae_ns.api.page import write_page
+from sundae_ns.api.views import view_in_front
 from sundae_ns.scenes.packed import model_of
-from sundae_ns.scenes.page import write_page
-from sundae_ns.scenes.statement import cameras_of
 from sundae_ns.storage.packing import PackedScene, container, read_scene
 from sundae_ns.storage.packing.scene import CAMERAS as STORED
 
@@ -74,7 +75,8 @@ def write_scaled(out: Path, scene: Path, side: int) -> PackedScene:
 
 def truths(scene: PackedScene) -> list[dict[str, NDArray[np.float32]]]:
     """``rgb`` and ``base_rgb`` of each camera, by Python."""
-    model, cameras = model_of(scene), cameras_of(scene)
+    opened = scene_of(scene)
+    model, cameras = model_of(opened), arrays_of_views(opened.views or [view_in_front(opened)])
     images = []
     for pose, lens, size in zip(*(cameras[name] for name in ("poses", "intrinsics", "sizes")), strict=True):
         fx, fy, cx, cy = lens.float().reshape(4, 1, 1)
@@ -111,7 +113,7 @@ def compared(scene: Path, side: int = SIDE, *, half: bool = False) -> dict[str, 
     with TemporaryDirectory() as folder:
         packed, html = Path(folder) / "a.sundae", Path(folder) / "a.html"
         small = write_scaled(packed, scene, side)
-        write_page(packed, html, title=scene.stem)
+        write_page(html, scene_of(small), packed.read_bytes(), title=scene.stem)
         images = truths(small)
         width, height = (int(length) for length in cameras_of(small)["sizes"][0])
         row: dict[str, Any] = {"scene": scene.name, "bytes": scene.stat().st_size, "size": f"{width}x{height}"}

@@ -27,6 +27,7 @@ FLOORS = (
     "pruning",
     "storage",
     "rendering",
+    "api",
     "training",
     "distributed",
     "datamanager",

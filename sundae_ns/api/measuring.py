@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
@@ -50,7 +51,8 @@ def measure(
 
     Args:
         scene: to measure.
-        reference: a scene, whose own images count as true, or an image in [0, 1] ``[H, W, 3]`` for each view.
+        reference: a scene, whose own images count as true, or an image in [0, 1] ``[H, W, 3]`` for each view. Both
+            scenes are rendered over the background of the reference.
         views: the cameras; by default those stored with the reference, or with the scene.
         head: whether the heads of both scenes correct their images.
         backend: the rasteriser.
@@ -70,6 +72,8 @@ def measure(
         raise DataError("there is no view to measure in; give views, such as sundae_ns.virtual_views(scene)")
     if not isinstance(reference, Scene) and len(reference) != len(views):
         raise DataError(f"{len(reference)} images do not fit {len(views)} views; give one image for each view")
+    if isinstance(reference, Scene):
+        scene = dataclasses.replace(scene, background_color=reference.background_color)
     found = []
     for i, view in enumerate(views):
         image = render(scene, view, head=head, backend=backend).rgb

@@ -147,5 +147,3 @@ def _frame_of(run: Path) -> dict[str, Any] | None:
     except (DataError, KeyError, TypeError, ValueError):
         return None
     return frame if is_frame(frame) else None
-
-

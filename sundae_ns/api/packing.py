@@ -39,9 +39,9 @@ def scene_of(packed: PackedScene) -> Scene:
     if packed.field["features_rest"].shape[1] > (degree + 1) ** 2 - 1:
         raise refusal("a lower SH degree than it has")
     meta = {name: packed.meta[name] for name in _CARRIED if packed.meta.get(name) is not None}
-    in_model_frame = is_frame(meta.get("frame"))
-    if not in_model_frame:
+    if not is_frame(meta.get("frame")):
         meta.pop("frame", None)
+    source = meta.get("source")
     return Scene(
         Field(dict(packed.field), "logits" if degree == 0 else "harmonics"),
         _head_of(packed, _head_config(stated.get("head"))),
@@ -49,7 +49,7 @@ def scene_of(packed: PackedScene) -> Scene:
         antialiased=one_of(stated, "rasterize_mode", _RASTERIZE_MODES) == "antialiased",
         trained_focal=_focal(stated.get("trained_focal")),
         views=views_of_arrays(packed.cameras),
-        in_model_frame=in_model_frame or "capture" in meta,
+        in_model_frame=not isinstance(source, dict) or source.get("model_frame") is not False,
         meta=meta,
     )
 
@@ -77,7 +77,8 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
         "head": options,
         "trained_focal": list(scene.trained_focal) if head and scene.trained_focal else None,
     }
-    meta = {"source": {}, **scene.meta, "model": model}
+    source = {**scene.meta.get("source", {}), **({} if scene.in_model_frame else {"model_frame": False})}
+    meta = {**scene.meta, "source": source, "model": model}
     views = views_of_arrays(cameras)
     return PackedScene(
         field, head, None if cameras is None else dict(cameras), meta, sensitivity_of(scene, views) if views else None

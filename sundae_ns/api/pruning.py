@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
+from rich.console import Console
+from torch import Tensor
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import virtual_views
@@ -16,7 +19,14 @@ from sundae_ns.pruning import prune as prune_field
 from sundae_ns.rendering import LocalField, TrainingView, View, contribution
 
 
-@torch.no_grad()
+class PrunedScene(NamedTuple):
+    """A pruned scene, and what it keeps."""
+
+    scene: Scene
+    mask: Tensor
+    """True for kept primitives of the scene before the prune, bool ``[N]``."""
+
+
 def prune(
     scene: Scene,
     *,
@@ -52,6 +62,20 @@ def prune(
     >>> sn.prune(scene, keep=0.1, views=sn.virtual_views(scene, 4, size=32)).num_primitives
     20
     """
+    return prune_with_mask(scene, keep=keep, count=count, views=views, rule=rule, progress=progress).scene
+
+
+@torch.no_grad()
+def prune_with_mask(
+    scene: Scene,
+    *,
+    keep: float | None,
+    count: int | None,
+    views: Sequence[View] | None,
+    rule: PruneRule | None,
+    progress: bool,
+) -> PrunedScene:
+    """As :func:`prune`, with the mask of the kept primitives."""
     if (keep is None) == (count is None):
         raise ConfigError("prune needs either keep (a share) or count (a number of primitives); give one of them")
     if keep is not None and not 0 < keep <= 1:
@@ -64,16 +88,19 @@ def prune(
     if count is None:
         count = kept_count(keep or 1.0, len(field["means"]))
 
-    def weights() -> torch.Tensor:
+    weights = None
+    if rule.uses_contribution and count < len(field["means"]):
         usable = dataclasses.replace(scene, field=field)
         seen = views if views is not None else scene.views or virtual_views(usable)
-        return contribution(
+        weights = contribution(
             LocalField(field),
             [TrainingView(lambda view=view: view.to(scene.device), None) for view in seen],  # type: ignore[misc]
             scene.background,
             scene.settings(head=False),
             count=count if rule.uses_detail else None,
-            progress=progress,
+            console=Console(stderr=True) if progress else None,
         )
-
-    return dataclasses.replace(scene, field=prune_field(field, rule, count=count, contribution=weights).field)
+    pruned = prune_field(field, rule, count, weights)
+    mask = finite.clone()
+    mask[finite] = pruned.decision.mask
+    return PrunedScene(dataclasses.replace(scene, field=pruned.field), mask)

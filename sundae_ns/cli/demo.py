@@ -91,17 +91,19 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
 
         # nerfstudio prints messages while it imports and loads.
         with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
+            from sundae_ns.api.page import write_page
             from sundae_ns.scenes.measure import frame_times, sizes
             from sundae_ns.scenes.opening import load_run
-            from sundae_ns.scenes.packed import scene_of_run
-            from sundae_ns.scenes.page import write_page
-            from sundae_ns.storage.packing import write_scene
+            from sundae_ns.scenes.packed import packed_file
+            from sundae_ns.storage.atomic import replacing
 
             opened = load_run(run / "config.yml")
             model, cameras = opened.model, opened.cameras
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
-            write_scene(out / "scene.sundae", scene_of_run(run))
-            write_page(out / "scene.sundae", out / "scene.html", title="sundae demo")
+            finished, packed = packed_file(run)
+            with replacing(out / "scene.sundae") as partial:
+                partial.write_bytes(packed)
+            write_page(out / "scene.html", finished, packed, title="sundae demo")
     _comparison(out / "renders", out / "comparison.png")
 
     results = json.loads((out / "eval.json").read_text())["results"]

@@ -95,9 +95,9 @@ def pack(
     with Progress(console=Console(file=sys.stdout), transient=True, disable=json) as progress:
         task = progress.add_task("Reading the run", total=2 + finetune)
         with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
-            from sundae_ns.scenes.packed import scene_of_run  # takes seconds
+            from sundae_ns.scenes.packed import contents_of_run  # takes seconds
 
-            scene = scene_of_run(run, max_cameras=max_cameras, data=data)
+            scene = contents_of_run(run, max_cameras=max_cameras, data=data)
             progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
             if finetune:
                 from sundae_ns.scenes.finetune import finetune as train

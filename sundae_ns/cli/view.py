@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.files import packed_scene
+from sundae_ns.cli.files import open_packed_file
 
 
 class _Server(ThreadingHTTPServer):
@@ -64,10 +64,9 @@ def view(
         open_browser: open the default browser; otherwise only print the address.
         data: folder of the capture of a run, if it moved.
     """
-    with packed_scene(scene, data=data) as packed:
-        from sundae_ns.scenes.page import page_of
+    from sundae_ns.api.page import page_of
 
-        page = page_of(packed, title=scene.resolve().stem)
+    page = page_of(*open_packed_file(scene, data), title=scene.resolve().stem)
     with serve(page, port) as server:
         address = f"http://127.0.0.1:{server.server_port}/"
         print(f"{scene} is shown at {address} until Ctrl-C", flush=True)

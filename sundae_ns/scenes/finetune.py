@@ -67,7 +67,7 @@ def finetune(
 
     Args:
         run: folder of a run of sundae or splatfacto, or its ``config.yml``.
-        scene: the same run, from ``scenes.packed.scene_of_run``.
+        scene: the same run, from ``scenes.packed.contents_of_run``.
         config: bits of the pack.
         steps: number of steps, at least 1.
         rate: added to the loss for each bit per stored number, of the field and of the head.

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple, cast
 
 import torch
@@ -15,11 +14,13 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
+from sundae_ns.api.opening import load
+from sundae_ns.api.packing import scene_of
 from sundae_ns.datamanager import SundaeDatamanager, no_images_error
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.scenes import stock
-from sundae_ns.scenes.packed import write_run
+from sundae_ns.scenes.packed import capture_of, model_of
 from sundae_ns.storage.kinds import kind_of, refuse
 from sundae_ns.storage.packing import read_scene
 from sundae_ns.storage.runs import checkpoint
@@ -96,24 +97,32 @@ def open_packed(path: Path, *, data: Path | None) -> Opened:
     """
     if data is None:
         raise DataError(f"{path} is a packed scene, which does not name its capture; give the capture with --data")
-    scene = read_scene(path)
-    with TemporaryDirectory() as folder:
-        opened = open_run(write_run(scene, Path(folder), path.stem, data=data))
-    source = scene.meta.get("source")
+    packed = read_scene(path)
+    device = _device()
+    model = model_of(scene_of(packed)).to(device)
+    manager = capture_of(packed, data).setup(device=device, test_mode="test", world_size=1, local_rank=0)
+    cameras, truths = views_to_test(model, manager)
+    if not cameras:
+        raise DataError(f"{data} has no test views, so there is nothing to measure {path} on")
+    source = packed.meta.get("source")
     source = source if isinstance(source, dict) else {}
     step = source.get("step")
-    return replace(
-        opened,
+    return Opened(
+        model=model,
+        cameras=cameras,
+        truths=truths,
         source=path,
-        method=str(source.get("method") or opened.method),
+        capture=data,
+        scene=_name_of(data),
+        method=str(source.get("method") or "sundae"),
         variant=path.name,
         kept=None,
         seed=None,
         steps=step + 1 if isinstance(step, int) else 0,
         prune_s=None,
         curves=None,
+        datamanager=manager,
         packed_bytes=path.stat().st_size,
-        fingerprint="",
     )
 
 
@@ -160,15 +169,15 @@ def open_pipeline(
     newest, _ = checkpoint.newest_whole(folder)
     foreign = not isinstance(model_config, SundaeModelConfig)
     if foreign:
-        pipeline_config.model = stock.model_config(model_config, field=newest)
+        pipeline_config.model = stock.model_config(model_config)
         pipeline_config.datamanager = stock.datamanager_config(pipeline_config.datamanager)
     capture = _capture(config, data)
     pipeline_config.datamanager.data = capture
 
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    pipeline: Any = pipeline_config.setup(device=device, test_mode=test_mode)
+    pipeline: Any = pipeline_config.setup(device=_device(), test_mode=test_mode)
     loaded = checkpoint.load(newest)
     if foreign:
+        pipeline.model.hold(load(newest))
         pipeline.model.step = int(loaded["step"])
     else:
         pipeline.load_pipeline(loaded["pipeline"], loaded["step"])
@@ -194,7 +203,7 @@ def open_run(path: Path, *, data: Path | None = None) -> Opened:
         truths=truths,
         source=path.parent,
         capture=capture,
-        scene=(capture.parent if capture.suffix == ".json" else capture).resolve().name,
+        scene=_name_of(capture),
         method=config.method_name or "",
         variant=config.experiment_name or "",
         kept=1.0 if unpruned else _product(prunes),
@@ -230,6 +239,15 @@ def load_run(path: Path, *, data: Path | None = None) -> Opened:
     if not isinstance(model, SundaeModelConfig):
         raise CheckpointError(f"{path} is a run of another method; give one of sundae")
     return open_run(path, data=data)
+
+
+def _name_of(capture: Path) -> str:
+    """Name of a capture's folder."""
+    return (capture.parent if capture.suffix == ".json" else capture).resolve().name
+
+
+def _device() -> torch.device:
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def _capture(config: TrainerConfig, data: Path | None) -> Path:

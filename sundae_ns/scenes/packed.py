@@ -7,12 +7,12 @@ checked, and a new configuration is made from them.
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 import re
-from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, get_args, get_type_hints
 
 import torch
 import yaml
@@ -25,21 +25,22 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
+from sundae_ns.api.opening import FRAME_FILE, load
+from sundae_ns.api.packing import arrays_of_views, contents_of, is_frame, is_number, refusal, scene_of
+from sundae_ns.api.scene import Scene
+from sundae_ns.api.views import view_in_front
+from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, no_images_error
-from sundae_ns.errors import CheckpointError, PackError, regular
-from sundae_ns.gaussians import FEATURES
+from sundae_ns.errors import CheckpointError, PackError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
-from sundae_ns.rendering.source import degree_in_use
 from sundae_ns.scenes import stock
-from sundae_ns.scenes.sensitivity import sensitivity_of
-from sundae_ns.scenes.statement import HEAD_OPTIONS, cameras_of, choices, is_number, refusal, stated_model
 from sundae_ns.storage.atomic import write_text, writing
-from sundae_ns.storage.packing import PackedScene
+from sundae_ns.storage.kinds import kind_of
+from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import check_run, load_config
 from sundae_ns.storage.runs.folder import UNPACKED, config_of, unpacked_folder
 
-_FRAME_FILE = "dataparser_transforms.json"
 _PARSERS: dict[str, type[DataParserConfig]] = {
     "colmap": ColmapDataParserConfig,
     "nerfstudio-data": NerfstudioDataParserConfig,
@@ -52,8 +53,8 @@ paths of images to ffmpeg through one."""
 # -------------------------------------------------------------------------------------------------------------- packing
 
 
-def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> PackedScene:
-    """A finished run as a scene: the field, the head if it is enabled, and some training cameras.
+def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None) -> PackedScene:
+    """The contents of a packed file for a finished run: field, head if it is enabled, and some training cameras.
 
     SH coefficients that were not trained yet are left out, and so are the features of a disabled head.
 
@@ -68,87 +69,37 @@ def scene_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = None)
     """
     check_run(run)
     path = config_of(run)
-    config = _read_config(path)
-    source = checkpoint.newest_whole(path.parent / config.relative_model_dir)[0]
-    loaded = checkpoint.load(source)
-    model = _restored(cast(SplatfactoModelConfig, config.pipeline.model), loaded, source)
-    field = {name: value.detach() for name, value in model.gauss_params.items()}
-    coefficients = (degree_in_use(model.state.field.sh_degree, model.state.active_sh_degree) + 1) ** 2 - 1
-    field["features_rest"] = field["features_rest"][:, :coefficients]
-    head: dict[str, Tensor] = {}
-    kind: dict[str, Any] | None = None
-    if model.head is not None and model.state.head_enabled:
-        head = dict(model.head.state_dict())
-        # Options of the head itself: a budget search may have chosen a smaller one than the configuration names.
-        kind = {name: getattr(model.head.config, name) for name in HEAD_OPTIONS}
-    else:
-        field.pop(FEATURES, None)
-    manager = _manager(config)
-    if data is not None and not manager.images:
-        raise no_images_error(path.parent)
-    manager.data = data or manager.data
-    meta = {
-        "source": {"method": config.method_name, "step": int(loaded["step"])},
-        "model": {
-            "sh_degree": model.config.sh_degree,
-            "rasterize_mode": model.config.rasterize_mode,
-            "background_color": model.config.background_color,
-            "head": kind,
-            "trained_focal": list(model.state.trained_focal) if head and model.state.trained_focal else None,
-        },
-        "frame": _frame(path.parent / _FRAME_FILE),
-        "capture": _describe(manager),
-    }
-    cameras = _cameras(manager, max_cameras) if max_cameras > 0 else None
-    return PackedScene(field, head, cameras, meta, sensitivity_of(model, cameras) if cameras else None)
-
-
-def _read_config(path: Path) -> TrainerConfig:
     config = load_config(path)
     model = getattr(getattr(config, "pipeline", None), "model", None)
     if not isinstance(config, TrainerConfig) or not isinstance(model, SplatfactoModelConfig):
         raise CheckpointError(f"{path} is a run of another method; give one of sundae or splatfacto")
-    return config
+    scene = load(path)
+    manager = _manager(config)
+    if data is not None and not manager.images:
+        raise no_images_error(path.parent)
+    manager.data = data or manager.data
+    source = {"method": config.method_name, **scene.meta["source"]}
+    meta = {**scene.meta, "source": source, "capture": _describe(manager)}
+    return contents_of(
+        dataclasses.replace(scene, meta=meta), _cameras(manager, max_cameras) if max_cameras > 0 else None
+    )
 
 
-def _setup(config: SundaeModelConfig) -> SundaeModel:
-    """A model around a field that is replaced afterwards."""
-    # Two points; without any, the model would start from tens of thousands of random points.
-    seeds = (torch.eye(3)[:2], torch.zeros(2, 3))
-    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
-    model: SundaeModel = config.setup(scene_box=box, num_train_data=0, metadata={}, seed_points=seeds)
-    return model.eval()
+def packed_file(path: Path, *, data: Path | None = None) -> tuple[Scene, bytes]:
+    """A scene, and the packed file that holds it: a packed scene as it is, anything else packed by the defaults.
 
+    Args:
+        path: a packed scene, a run, or a file of primitives.
+        data: the capture of a run, if it has moved.
 
-def _restored(found: SplatfactoModelConfig, loaded: Mapping[str, Any], source: Path) -> SundaeModel:
-    """The model of a checkpoint, on the CPU."""
-    state = {}
-    for name, value in loaded["pipeline"].items():
-        if name.startswith("_model."):
-            state[name.removeprefix("_model.").removeprefix("module.")] = value
-    ours = isinstance(found, SundaeModelConfig)
-    config = copy.deepcopy(found) if isinstance(found, SundaeModelConfig) else stock.model_config(copy.deepcopy(found))
-    config.camera_optimizer.mode = "off"  # it moves the cameras of training only
-    config.random_init = False
-    model = _setup(config)
-    if not ours:
-        state[checkpoint.EXTRA_STATE] = {**model.get_extra_state(), "step": int(loaded["step"])}
-    own = model.state_dict()
-    try:
-        model.load_state_dict({name: state[name] for name in own if name in state})
-    except RuntimeError as error:
-        reason = " ".join(str(error).split())[:200]
-        raise CheckpointError(f"{source} does not fit its own config.yml ({reason}); give another run") from error
-    return model
-
-
-def _frame(path: Path) -> dict[str, Any] | None:
-    """Transform from the capture's coordinates to the model's, which nerfstudio writes into the run's folder."""
-    try:
-        frame = json.loads(regular(path).read_text(encoding="utf-8"))
-        return {"transform": frame["transform"], "scale": float(frame["scale"])}
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+    Raises:
+        CheckpointError, DataError, PackError: it cannot be opened, or packed.
+    """
+    if kind_of(path) == "packed" or path.suffix == ".sundae":
+        return load(path), path.read_bytes()
+    single = path.is_file() and path.suffix.lower() in (".ply", ".spz", ".sog")
+    contents = contents_of(load(path)) if single else contents_of_run(path, data=data)
+    return scene_of(contents), pack_bytes(*fit_scene(contents))
 
 
 def _manager(config: TrainerConfig) -> SundaeDatamanagerConfig:
@@ -197,11 +148,11 @@ def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------------------ unpacking
 
 
-def write_run(scene: PackedScene, output_dir: Path, name: str, *, data: Path | None = None) -> Path:
+def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | None = None) -> Path:
     """Write a packed scene as a run that ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval`` open.
 
     Args:
-        scene: from ``read_scene``; its values are checked.
+        packed: from ``read_scene``; its values are checked.
         output_dir: folder of runs; the run is ``output_dir/name/sundae/unpacked``.
         name: of the experiment: letters, digits, ``_``, ``.``, ``-``.
         data: the capture; without it the run has cameras without images.
@@ -219,7 +170,7 @@ def write_run(scene: PackedScene, output_dir: Path, name: str, *, data: Path | N
     config: TrainerConfig = copy.deepcopy(all_methods["sundae"])  # type: ignore[assignment]
     folder = unpacked_folder(output_dir, name)
     config.output_dir, (config.experiment_name, _, config.timestamp) = output_dir.resolve(), folder.parts[-3:]
-    model = model_of(scene)
+    model = model_of(scene_of(packed))
     config.pipeline.model = model.config
     manager = config.pipeline.datamanager
     assert isinstance(manager, SundaeDatamanagerConfig)
@@ -234,18 +185,16 @@ def write_run(scene: PackedScene, output_dir: Path, name: str, *, data: Path | N
         manager.images = False
         config.data = folder / "cameras"
     else:
-        manager.dataparser, manager.camera_res_scale_factor = _capture(scene.meta.get("capture"))
-        check_capture(manager.dataparser, data, ("train", "test"))
+        manager = config.pipeline.datamanager = capture_of(packed, data)
         config.data = data.resolve()
     manager.data = config.data
     with writing(f"cannot write to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         if data is None:
             config.data.mkdir(exist_ok=True)
-            write_text(config.data / "transforms.json", json.dumps(_transforms(scene), indent=1))
-        frame = scene.meta.get("frame")
-        if _is_frame(frame):
-            write_text(folder / _FRAME_FILE, json.dumps(frame, indent=4))
+            write_text(config.data / "transforms.json", json.dumps(_transforms(packed), indent=1))
+        if is_frame(frame := packed.meta.get("frame")):
+            write_text(folder / FRAME_FILE, json.dumps(frame, indent=4))
     state = {f"_model.{name}": value for name, value in model.state_dict().items()}
     checkpoint.save(
         {"step": model.step, "pipeline": state}, config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"
@@ -259,41 +208,40 @@ def is_unpacked(config: TrainerConfig) -> bool:
     return config.timestamp == UNPACKED
 
 
-def model_of(scene: PackedScene) -> SundaeModel:
-    """The model of a scene, on the CPU."""
-    stated = stated_model(scene)
+def model_of(scene: Scene) -> SundaeModel:
+    """The model of a scene in evaluation mode, on the CPU, with all SH degrees and the head enabled."""
+    degree = 0 if scene.field.encoding == "logits" else max(scene.field.sh_degree, 1)
+    head = HeadConfig(mode="off") if scene.head is None else dataclasses.replace(scene.head.config, start_at=0)
     config = SundaeModelConfig(
-        sh_degree=stated.sh_degree,
+        sh_degree=degree,
         sh_degree_interval=1,
-        rasterize_mode=stated.rasterize_mode,
-        background_color=stated.background_color,
-        head=stated.head,
+        rasterize_mode="antialiased" if scene.antialiased else "classic",
+        background_color=scene.background_color,
+        head=head,
     )
     config.camera_optimizer.mode = "off"
-    field = dict(scene.field)
-    n, found = field["features_rest"].shape[:2]
-    wanted = (config.sh_degree + 1) ** 2 - 1
-    field["features_rest"] = torch.cat([field["features_rest"], torch.zeros(n, wanted - found, 3)], dim=1)
-    model = _setup(config)
+    # Two points; without any, the model would start from tens of thousands of random points.
+    seeds = (torch.eye(3)[:2], torch.zeros(2, 3))
+    box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
+    model: SundaeModel = config.setup(scene_box=box, num_train_data=0, metadata={}, seed_points=seeds)
+    model.hold(scene)
     # A step at which all SH degrees are active and the head is enabled.
-    step = max(config.sh_degree, 1)
-    extra = {**model.get_extra_state(), "step": step, "trained_focal": stated.trained_focal}
-    state: dict[str, Any] = {name: value for name, value in model.state_dict().items() if "." not in name}
-    state[checkpoint.EXTRA_STATE] = extra
-    state |= {f"gauss_params.{name}": value for name, value in field.items()}
-    state |= {f"networks.head.{name}": value for name, value in scene.head.items()}
-    try:
-        model.load_state_dict(state)
-    except (CheckpointError, RuntimeError) as error:
-        raise refusal("another head than it has") from error
-    return model
+    model.step = max(degree, 1)
+    return model.eval()
 
 
-def _is_frame(stated: Any) -> bool:
-    if not isinstance(stated, dict) or not is_number(stated.get("scale")):
-        return False
-    rows = stated.get("transform")
-    return isinstance(rows, list) and all(isinstance(row, list) and all(map(is_number, row)) for row in rows)
+def capture_of(packed: PackedScene, data: Path) -> SundaeDatamanagerConfig:
+    """Configuration that parses, splits and scales a capture as in the training of a packed scene.
+
+    Raises:
+        DataError: the capture is missing, or cannot be used.
+        PackError: the scene does not say how its capture is read, or states something impossible.
+    """
+    parser, scale = _capture(packed.meta.get("capture"))
+    check_capture(parser, data, ("train", "test"))
+    return SundaeDatamanagerConfig(
+        dataparser=parser, camera_res_scale_factor=scale, data=data.resolve(), cache_images_type="uint8"
+    )
 
 
 def _capture(stated: Any) -> tuple[DataParserConfig, float]:
@@ -309,7 +257,9 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
     known = _options(_PARSERS[kind])
     for name, value in options.items():
         default = known.get(name)
-        known_values = choices(_PARSERS[kind], name) if isinstance(default, str) and name in known else ()
+        known_values = (
+            get_args(get_type_hints(_PARSERS[kind])[name]) if isinstance(default, str) and name in known else ()
+        )
         fits = (
             (isinstance(default, bool) and isinstance(value, bool))
             or (isinstance(default, float) and is_number(value))
@@ -324,9 +274,11 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
     return parser, float(scale)
 
 
-def _transforms(scene: PackedScene) -> dict[str, Any]:
+def _transforms(packed: PackedScene) -> dict[str, Any]:
     """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
-    cameras = cameras_of(scene)
+    cameras = packed.cameras
+    if cameras is None or not len(cameras["poses"]):
+        cameras = arrays_of_views([view_in_front(scene_of(packed))])
     frames = []
     for i, pose in enumerate(cameras["poses"].double().tolist()):
         fx, fy, cx, cy = cameras["intrinsics"][i].tolist()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from pathlib import Path
 from typing import cast
 
 from nerfstudio.data.datamanagers.base_datamanager import DataManagerConfig
@@ -16,20 +15,13 @@ from sundae_ns.model import SundaeModelConfig
 from sundae_ns.training.pruning_config import PruningConfig
 
 
-def model_config(stock: SplatfactoModelConfig, *, field: Path | None = None) -> SundaeModelConfig:
-    """A model of ours that renders a field of splatfacto as splatfacto does: without pruning and without a head.
-
-    Args:
-        stock: of the run.
-        field: checkpoint to start from; None if the state is loaded afterwards.
-    """
+def model_config(stock: SplatfactoModelConfig) -> SundaeModelConfig:
+    """A model of ours that renders a field of splatfacto as splatfacto does: without pruning and without a head."""
     options = {known.name: getattr(stock, known.name) for known in fields(SplatfactoModelConfig) if known.init}
     options.pop("_target")
     # The grid corrects training images only; test views are rendered without it.
     options["use_bilateral_grid"] = False
-    return SundaeModelConfig(
-        **options, pruning=PruningConfig(mode="off"), head=HeadConfig(mode="off"), warm_start=field
-    )
+    return SundaeModelConfig(**options, pruning=PruningConfig(mode="off"), head=HeadConfig(mode="off"))
 
 
 def datamanager_config(stock: DataManagerConfig) -> SundaeDatamanagerConfig:

@@ -69,26 +69,30 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
     path = Path(path)
     check_field(params)
     n = num_primitives(params)
-
-    def columns(name: str) -> NDArray[np.float32]:
-        return params[name].detach().to(device="cpu", dtype=torch.float32).numpy()
-
-    rest = columns("features_rest").transpose(0, 2, 1).reshape(n, 3 * params["features_rest"].shape[1])
-    blocks = [
-        (_COLUMNS["means"], columns("means")),
-        (_NORMALS, np.zeros((n, 3), np.float32)),
-        (_COLUMNS["features_dc"], columns("features_dc")),
-        (_rest_columns(rest.shape[1]), rest),
-        (_COLUMNS["opacities"], columns("opacities")),
-        (_COLUMNS["scales"], columns("scales")),
-        (_COLUMNS["quats"], columns("quats")),
-    ]
+    means, *others = _table(params)
+    blocks = [means, (_NORMALS, np.zeros((n, 3), np.float32)), *others]
     names = [name for block, _ in blocks for name in block]
     table = np.ascontiguousarray(np.concatenate([values for _, values in blocks], axis=1), dtype="<f4")
     vertices = table.view([(name, "<f4") for name in names]).reshape(n)
     data = PlyData([PlyElement.describe(vertices, "vertex")], text=False, byte_order="<", comments=list(comments))
     with replacing(path) as partial:
         data.write(str(partial))
+
+
+def _table(params: Mapping[str, Tensor]) -> list[tuple[tuple[str, ...], NDArray[np.float32]]]:
+    """Properties of a field and their values ``[N, C]``, in the order of the format."""
+
+    def columns(name: str) -> NDArray[np.float32]:
+        return params[name].detach().to(device="cpu", dtype=torch.float32).numpy()
+
+    rest = (
+        columns("features_rest")
+        .transpose(0, 2, 1)
+        .reshape(num_primitives(params), 3 * params["features_rest"].shape[1])
+    )
+    colors = [(_COLUMNS["features_dc"], columns("features_dc")), (_rest_columns(rest.shape[1]), rest)]
+    shapes = [(_COLUMNS[name], columns(name)) for name in ("opacities", "scales", "quats")]
+    return [(_COLUMNS["means"], columns("means")), *colors, *shapes]
 
 
 class Header(NamedTuple):
@@ -213,13 +217,14 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     return {name: params[name] for name in SPLAT_NAMES}
 
 
-def keep_vertices(source: Path, out: Path, mask: Tensor) -> None:
+def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Tensor] | None = None) -> None:
     """Copy a .ply with only some of its vertices; properties, comments and other elements are unchanged.
 
     Args:
         source: any .ply.
         out: the file to write atomically.
         mask: True for vertices to keep, bool ``[N]``.
+        params: new parameters of the kept primitives ``[M, ...]``; None to keep their values.
 
     Raises:
         DataError: the file cannot be read, or has another number of vertices.
@@ -229,7 +234,11 @@ def keep_vertices(source: Path, out: Path, mask: Tensor) -> None:
     vertex = data["vertex"]
     if vertex.count != len(mask):
         raise DataError(f"{source} has {vertex.count} vertices, not {len(mask)}: it was changed meanwhile; run again.")
-    kept = PlyElement.describe(np.asarray(vertex.data[mask.cpu().numpy()]), "vertex", comments=vertex.comments)
+    rows = np.asarray(vertex.data[mask.cpu().numpy()])
+    for names, values in _table(params) if params is not None else ():
+        for name, column in zip(names, values.T, strict=True):
+            rows[name] = column
+    kept = PlyElement.describe(rows, "vertex", comments=vertex.comments)
     elements = [kept if element.name == "vertex" else element for element in data.elements]
     copy = PlyData(elements, text=data.text, byte_order=data.byte_order, comments=data.comments, obj_info=data.obj_info)
     with replacing(Path(out)) as partial:

@@ -160,7 +160,9 @@ def _checked_flags(path: Path) -> int:
         raise DataError(f"{path} is no .spz; give a .ply, .spz, .sog, .sundae, or a run")
     _, _, count, _, _, flags, _ = _HEADER.unpack(header)
     if count == 0 or count * _LEAST_BYTES > most_unpacked(len(raw)):
-        raise DataError(f"{path} states {count:,} primitives, which its {len(raw):,} bytes cannot hold; export it again")
+        raise DataError(
+            f"{path} states {count:,} primitives, which its {len(raw):,} bytes cannot hold; export it again"
+        )
     if packed:
         stream, rest, size = zlib.decompressobj(wbits=31), raw, 0
         while rest and not stream.eof:

@@ -83,7 +83,8 @@ def write_for_viewers(
     coefficients = field["features_rest"].shape[1]
     kind = path.suffix.lower()
     if kind == ".ply":
-        write_ply(path, field, comments=[*([MODEL_FRAME] if in_model_frame and not upright else []), *([ANTIALIASED] if antialiased else [])])
+        stated = {MODEL_FRAME: in_model_frame and not upright, ANTIALIASED: antialiased}
+        write_ply(path, field, comments=[comment for comment, true in stated.items() if true])
     else:
         field["features_rest"] = field["features_rest"][:, : (MAX_SH_DEGREE + 1) ** 2 - 1]
         (write_spz if kind == ".spz" else write_sog)(path, field, antialiased=antialiased)

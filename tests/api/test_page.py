@@ -23,9 +23,11 @@ from chromium import bench_page
 from packed_scenes import KINDS, write_kind
 from PIL import Image
 
+from sundae_ns.api.packing import scene_of
+from sundae_ns.api.page import page_of, render_first, write_page
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
-from sundae_ns.scenes.page import page_of, render_first, write_folder, write_page
+from sundae_ns.scenes.packed import packed_file
 from sundae_ns.storage.packing import read_scene
 
 ROOT = Path(__file__).parents[2]
@@ -48,7 +50,7 @@ def packed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_page_holds_the_scene_and_no_address(packed: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.html"
-    assert write_page(packed, out, title="a <b> & c") == out.stat().st_size
+    assert write_page(out, *packed_file(packed), title="a <b> & c") == out.stat().st_size
     page = out.read_text()
     (scene,) = re.findall(r'<script type="application/octet-stream"[^>]*>([^<]*)</script>', page)
     assert base64.b64decode(scene, validate=True) == packed.read_bytes()
@@ -60,9 +62,9 @@ def test_a_page_holds_the_scene_and_no_address(packed: Path, tmp_path: Path) -> 
 
 
 def test_a_page_shows_the_first_camera_until_it_draws(packed: Path) -> None:
-    (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(packed, title="a"))
+    (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(*packed_file(packed), title="a"))
     found = np.asarray(Image.open(io.BytesIO(base64.b64decode(code))), dtype=np.float32)
-    truth = np.asarray(render_first(read_scene(packed)), dtype=np.float32)
+    truth = np.asarray(render_first(packed_file(packed)[0]), dtype=np.float32)
     assert found.shape == truth.shape == (37, 50, 3)
     assert np.abs(found - truth).mean() < 6  # JPEG
 
@@ -72,15 +74,15 @@ def test_the_first_image_is_that_of_the_model(name: str, tmp_path: Path) -> None
     scene = read_scene(write_kind(tmp_path / "a.sundae", KINDS[name]))
     truth = bench_page.truths(scene)[0]["rgb"]
     # Rounded to bytes: sums of another order may cross the edge between two.
-    np.testing.assert_allclose(np.asarray(render_first(scene)), np.rint(255 * truth), atol=1)
+    np.testing.assert_allclose(np.asarray(render_first(scene_of(scene))), np.rint(255 * truth), atol=1)
 
 
 def test_a_folder_has_page_and_scene_apart(packed: Path, tmp_path: Path) -> None:
     out = tmp_path / "site"
-    assert write_folder(packed, out, title="a") == sum(path.stat().st_size for path in out.iterdir())
+    assert write_page(out, *packed_file(packed), title="a") == sum(path.stat().st_size for path in out.iterdir())
     assert (out / "scene.sundae").read_bytes() == packed.read_bytes()
     assert 'data-source="scene.sundae"></script>' in (out / "index.html").read_text()
-    write_folder(packed, out, title="a")
+    write_page(out, *packed_file(packed), title="a")
 
 
 def test_export_writes_pages(packed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,7 +101,7 @@ def test_export_writes_pages(packed: Path, tmp_path: Path, capsys: pytest.Captur
 def test_a_file_that_is_no_scene_is_refused(packed: Path, tmp_path: Path) -> None:
     (tmp_path / "b.sundae").write_bytes(packed.read_bytes()[:-1])
     with pytest.raises(PackError):
-        write_page(tmp_path / "b.sundae", tmp_path / "b.html", title="b")
+        write_page(tmp_path / "b.html", *packed_file(tmp_path / "b.sundae"), title="b")
     assert not (tmp_path / "b.html").exists()
 
 
@@ -107,7 +109,7 @@ def test_a_file_that_is_no_scene_is_refused(packed: Path, tmp_path: Path) -> Non
 
 
 def test_the_page_adds_little_to_the_scene() -> None:
-    page = (ROOT / "sundae_ns" / "scenes" / "page.html").read_bytes()
+    page = (ROOT / "sundae_ns" / "api" / "page.html").read_bytes()
     assert len(gzip.compress(page)) < 100_000
 
 
@@ -115,7 +117,7 @@ def test_the_page_adds_little_to_the_scene() -> None:
 def test_the_page_is_built_from_its_sources(tmp_path: Path) -> None:
     built = tmp_path / "page.html"
     subprocess.run(["node", "build.mjs", built], cwd=WEB, check=True)
-    assert built.read_text() == (ROOT / "sundae_ns" / "scenes" / "page.html").read_text(), "run make web"
+    assert built.read_text() == (ROOT / "sundae_ns" / "api" / "page.html").read_text(), "run make web"
 
 
 @needs_node

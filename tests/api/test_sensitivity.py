@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
 
 import pytest
 import torch
 from fields import random_field
 from torch import Tensor
 
+from sundae_ns.api.packing import scene_of, views_of_arrays
+from sundae_ns.api.scene import Scene
+from sundae_ns.api.sensitivity import sensitivity_of
 from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.rendering import LocalField, View
 from sundae_ns.rendering.render import render
-from sundae_ns.scenes.packed import model_of
-from sundae_ns.scenes.sensitivity import sensitivity_of
-from sundae_ns.scenes.statement import stored_view
 from sundae_ns.storage.packing import PackedScene
 
 
@@ -24,7 +25,7 @@ def head() -> dict[str, Tensor]:
     return state
 
 
-def cameras(n: int, *, turn: float) -> dict[str, Tensor]:
+def cameras(n: int, *, turn: float, away: float = 0.0) -> tuple[View, ...]:
     """Cameras on a circle around the origin, or on a part of it, which look at its centre."""
     angles = torch.arange(n) * (turn / n)
     zero, one = torch.zeros(n), torch.ones(n)
@@ -34,59 +35,60 @@ def cameras(n: int, *, turn: float) -> dict[str, Tensor]:
         torch.stack([angles.sin(), zero, angles.cos()], dim=1),
     ]
     poses = torch.stack([*axes, 6 * axes[2]], dim=2)
+    poses[:, :, 3] += away * poses[:, :, 2].roll(1, dims=1)
     sizes = torch.tensor([[48, 32]]).expand(n, 2)
-    return {"poses": poses, "intrinsics": torch.tensor([[40.0, 40, 24, 16]]).double().expand(n, 4), "sizes": sizes}
+    intrinsics = torch.tensor([[40.0, 40, 24, 16]]).double().expand(n, 4)
+    return views_of_arrays({"poses": poses, "intrinsics": intrinsics, "sizes": sizes})
 
 
 @pytest.fixture(scope="module")
-def model() -> Any:
+def scene() -> Scene:
     kind = {"mode": "residual", "size": "tiny", "pixel_unshuffle": 2, "num_features": 5, "precision": "fp32"}
     stated = {"sh_degree": 2, "rasterize_mode": "classic", "background_color": "black", "head": kind}
     field = random_field(300)
     field["scales"] += 2
-    return model_of(PackedScene(field, head(), None, {"model": {**stated, "trained_focal": [40.0, 40.0]}}))
+    return scene_of(PackedScene(field, head(), None, {"model": {**stated, "trained_focal": [40.0, 40.0]}}))
 
 
 @torch.no_grad()
-def image(model: Any, view: Any) -> Tensor:
-    found: Tensor = render(
-        model.source, view, model.shown_background, model.render_settings(training=True), depth=False
-    )[0]["rgb"]
+def image(scene: Scene, view: View) -> Tensor:
+    settings = dataclasses.replace(scene.settings(), training=True)
+    found: Tensor = render(LocalField(scene.field), view, scene.background, settings, depth=False)[0]["rgb"]
     return found.double()
 
 
-def changed(model: Any, seen: dict[str, Tensor], parameters: list[Tensor], size: float) -> float:
+def changed(scene: Scene, views: tuple[View, ...], parameters: list[Tensor], size: float) -> float:
     """Mean squared change of images by random changes of parameters, for a change of length 1 of each number."""
     before = [value.detach().clone() for value in parameters]
-    views = [stored_view(seen, i) for i in range(len(seen["poses"]))]
-    images = [image(model, view) for view in views]
+    images = [image(scene, view) for view in views]
     total, tries = 0.0, 8
     for _ in range(tries):
         for value, old in zip(parameters, before, strict=True):
             value.data = old + size * torch.randn_like(old)
-        total += sum(float((image(model, view) - old).square().sum()) for view, old in zip(views, images, strict=True))
+        total += sum(float((image(scene, view) - old).square().sum()) for view, old in zip(views, images, strict=True))
     for value, old in zip(parameters, before, strict=True):
         value.data = old
     return total / tries / size**2
 
 
-def test_predicted_changes_are_those_of_images(model: Any) -> None:
+def test_predicted_changes_are_those_of_images(scene: Scene) -> None:
     torch.manual_seed(1)
     seen = cameras(8, turn=6.28)
-    found = sensitivity_of(model, seen)
-    measured = changed(model, seen, [model.gauss_params["features"]], 1e-3)
+    found = sensitivity_of(scene, seen)
+    measured = changed(scene, seen, [scene.field["features"]], 1e-3)
     assert float(found.rows["features"].trace()) == pytest.approx(measured, rel=0.35)
-    weights = dict(model.head.named_parameters())
+    assert scene.head is not None
+    weights = dict(scene.head.named_parameters())
     for name in ("net.encoder.0.2.weight", "net.encoder.3.0.weight", "net.out.weight"):
         predicted = float(found.head[name].sum()) * weights[name][0, 0].numel()
-        assert predicted == pytest.approx(changed(model, seen, [weights[name]], 1e-3), rel=0.35), name
-    again = sensitivity_of(model, seen)
+        assert predicted == pytest.approx(changed(scene, seen, [weights[name]], 1e-3), rel=0.35), name
+    again = sensitivity_of(scene, seen)
     assert all(torch.equal(found.rows[name], again.rows[name]) for name in found.rows)
     assert all(torch.equal(found.head[name], again.head[name]) for name in found.head)
 
 
-def test_cameras_of_one_side_tell_fewer_harmonics_apart(model: Any) -> None:
-    forms = [sensitivity_of(model, cameras(24, turn=turn)).rows["features_rest"] for turn in (6.28, 0.1)]
+def test_cameras_of_one_side_tell_fewer_harmonics_apart(scene: Scene) -> None:
+    forms = [sensitivity_of(scene, cameras(24, turn=turn)).rows["features_rest"] for turn in (6.28, 0.1)]
     assert all(form.shape == (24, 24) for form in forms)
     values = [torch.linalg.eigvalsh(form) for form in forms]
     assert all(float(part[0]) > 0 for part in values)
@@ -94,10 +96,7 @@ def test_cameras_of_one_side_tell_fewer_harmonics_apart(model: Any) -> None:
     assert around > aside + 1
 
 
-def test_primitives_that_no_camera_sees(model: Any) -> None:
-    away = cameras(2, turn=0.1)
-    away["poses"] = away["poses"].clone()
-    away["poses"][:, :, 3] += 1000 * away["poses"][:, :, 2].roll(1, dims=1)
-    form = sensitivity_of(model, away).rows["features_rest"]
+def test_primitives_that_no_camera_sees(scene: Scene) -> None:
+    form = sensitivity_of(scene, cameras(2, turn=0.1, away=1000.0)).rows["features_rest"]
     assert torch.isfinite(form).all()
     assert float(torch.linalg.eigvalsh(form)[0]) > 0

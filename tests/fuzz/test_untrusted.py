@@ -96,7 +96,9 @@ def a_checkpoint(path: Path, place: str) -> None:
 
 def a_pack(path: Path, place: str) -> None:
     """Write a packed scene that names ``place`` as a section and throughout its header."""
-    write_scene(path, PackedScene(field(), meta={"source": {"method": place}, "name": place, "model": {"sh_degree": 1}}))
+    write_scene(
+        path, PackedScene(field(), meta={"source": {"method": place}, "name": place, "model": {"sh_degree": 1}})
+    )
     header = container.read_header(path)
     meta = {name: value for name, value in header.meta.items() if name != "sections"}
     arrays = container.read_sections(path, header)

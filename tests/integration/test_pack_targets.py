@@ -11,7 +11,7 @@ import pytest
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
 from sundae_ns.scenes import targets
-from sundae_ns.scenes.packed import scene_of_run
+from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.scenes.targets import COARSEST, Search, scaled
 from sundae_ns.storage.packing import PackConfig, read_header
 
@@ -36,7 +36,7 @@ def test_a_target_of_bytes_is_met_and_used(tiny: Any, tmp_path: Path, capsys: py
 
 
 def test_a_target_of_quality_is_met(tiny: Any) -> None:
-    search = Search(tiny.folder, scene_of_run(tiny.folder, max_cameras=0), PackConfig())
+    search = Search(tiny.folder, contents_of_run(tiny.folder, max_cameras=0), PackConfig())
     found = search.better_than(0.02)
     assert found.drop is not None
     assert found.drop <= 0.02
@@ -45,7 +45,7 @@ def test_a_target_of_quality_is_met(tiny: Any) -> None:
 def test_the_search_uses_what_is_allowed(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a loss that grows with the steps."""
     monkeypatch.setattr(targets, "_drop_of", lambda *_: lambda _, codecs: codecs.config.harmonics_step)
-    search = Search(tiny.folder, scene_of_run(tiny.folder, max_cameras=0), PackConfig())
+    search = Search(tiny.folder, contents_of_run(tiny.folder, max_cameras=0), PackConfig())
     for limit in (0.01, 0.1):
         found = search.better_than(limit)
         assert 0.95 * limit < found.codecs.config.harmonics_step <= limit
@@ -62,7 +62,7 @@ def test_targets_that_cannot_be_met(
     assert "bytes and loses " in line
     assert not list(tmp_path.iterdir())
     monkeypatch.setattr(targets, "_drop_of", lambda *_: lambda *_: 0.5)
-    search = Search(tiny.folder, scene_of_run(tiny.folder, max_cameras=0), scaled(PackConfig(), COARSEST))
+    search = Search(tiny.folder, contents_of_run(tiny.folder, max_cameras=0), scaled(PackConfig(), COARSEST))
     with pytest.raises(
         PackError, match=r"the finest pack loses 0\.50* dB at [\d,]+ bytes; give a larger --target-drop"
     ):

@@ -22,9 +22,10 @@ from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packag
 from numpy.typing import NDArray
 from packed_scenes import KINDS, write_kind
 
+from sundae_ns.api.page import page_of, write_page
 from sundae_ns.cli.view import serve
-from sundae_ns.scenes.packed import scene_of_run
-from sundae_ns.scenes.page import page_of, write_folder, write_page
+from sundae_ns.scenes.packed import contents_of_run
+from sundae_ns.scenes.packed import packed_file
 from sundae_ns.storage.packing import read_scene, write_scene
 
 pytestmark = needs_chromium
@@ -77,7 +78,7 @@ def check(page: Any, packed: Path, cameras: list[int]) -> None:
 
 def test_images_of_the_page_are_those_of_python(tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual, folded"])
-    write_page(packed, tmp_path / "a.html", title="a")
+    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
     with opened((tmp_path / "a.html").as_uri()) as page:
         check(page, packed, [0, 1])
 
@@ -86,7 +87,7 @@ def test_images_of_the_page_are_those_of_python(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", [name for name in KINDS if name != "residual, folded"])
 def test_every_kind_of_scene(name: str, tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS[name])
-    write_page(packed, tmp_path / "a.html", title="a")
+    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
     with opened((tmp_path / "a.html").as_uri()) as page:
         check(page, packed, [0, 1])
 
@@ -97,7 +98,7 @@ def capture(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     if request.param == "SCENE":
         given = os.environ.get("SUNDAE_BROWSER_SCENE")
         return Path(given) if given else pytest.skip("no scene was given (make browser SCENE=scene.sundae)")
-    write_scene(tmp_path / "tiny.sundae", scene_of_run(request.getfixturevalue("tiny").folder))
+    write_scene(tmp_path / "tiny.sundae", contents_of_run(request.getfixturevalue("tiny").folder))
     return tmp_path / "tiny.sundae"
 
 
@@ -145,7 +146,7 @@ def hold(page: Any, code: str) -> None:
 @pytest.mark.browser
 def test_the_controls(tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    server = serve(page_of(packed, title="a"), 0)
+    server = serve(page_of(*packed_file(packed), title="a"), 0)
     threading.Thread(target=server.serve_forever, daemon=True).start()
 
     def look(page: Any) -> tuple[NDArray[np.int64], str]:
@@ -214,7 +215,7 @@ def test_the_controls(tmp_path: Path) -> None:
 @pytest.mark.browser
 def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    page = page_of(packed, title="a")
+    page = page_of(*packed_file(packed), title="a")
     content = packed.read_bytes()
     wrong = page.replace(base64.b64encode(content).decode(), base64.b64encode(content[:-1] + b"~").decode())
     (tmp_path / "a.html").write_text(wrong)
@@ -226,7 +227,7 @@ def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
 @pytest.mark.browser
 def test_a_folder_is_served_and_says_so_when_opened_from_disk(tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_folder(packed, tmp_path / "site", title="a")
+    write_page(tmp_path / "site", *packed_file(packed), title="a")
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=tmp_path / "site")) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         with opened(f"http://127.0.0.1:{server.server_port}/") as page:
@@ -241,7 +242,7 @@ def test_a_folder_is_served_and_says_so_when_opened_from_disk(tmp_path: Path) ->
 @pytest.mark.browser
 def test_without_webgpu_the_page_shows_base_colours(tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(packed, tmp_path / "a.html", title="a")
+    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
     with opened((tmp_path / "a.html").as_uri(), flags=["--disable-features=WebGPU"]) as page:
         assert page.evaluate("sundae.drawn") == "webgl"
         assert "without the compensation head" in page.evaluate("document.getElementById('message').innerText")
@@ -253,7 +254,7 @@ def test_without_webgpu_the_page_shows_base_colours(tmp_path: Path) -> None:
 @pytest.mark.browser
 def test_without_webgl_the_page_shows_an_image(tmp_path: Path) -> None:
     packed = write_kind(tmp_path / "a.sundae", KINDS["residual"])
-    write_page(packed, tmp_path / "a.html", title="a")
+    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
     flags = ["--disable-features=WebGPU", "--disable-3d-apis"]
     with opened((tmp_path / "a.html").as_uri(), state="failed", flags=flags) as page:
         assert "neither WebGPU nor WebGL2" in page.evaluate("document.getElementById('message').innerText")

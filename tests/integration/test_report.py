@@ -22,7 +22,7 @@ from sundae_ns.evaluation import COLUMNS, flip_available
 from sundae_ns.rendering import render
 from sundae_ns.scenes.measure import quality
 from sundae_ns.scenes.opening import open_scene
-from sundae_ns.scenes.packed import scene_of_run
+from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.scenes.walk import walk
 from sundae_ns.storage.packing import write_scene
 
@@ -219,7 +219,7 @@ def test_a_packed_scene_counts_the_bytes_of_its_file(
 ) -> None:
     packed = tmp_path / "tiny.sundae"
     with torch.no_grad():
-        write_scene(packed, scene_of_run(tiny.folder))
+        write_scene(packed, contents_of_run(tiny.folder))
     assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0) == 2
     assert "give the capture with --data" in one_line(capsys)
     assert sundae("report", packed, "-o", tmp_path / "out", "--repeats", 0, "--data", tiny.scene) == 0

@@ -22,7 +22,7 @@ from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, DataError, PackError, StorageError
 from sundae_ns.gaussians import from_points
 from sundae_ns.scenes import packed as packed_run
-from sundae_ns.scenes.packed import scene_of_run, write_run
+from sundae_ns.scenes.packed import contents_of_run, write_run
 from sundae_ns.storage.packing import PackedScene, read_scene, write_scene
 from sundae_ns.storage.runs import checkpoint
 
@@ -111,7 +111,7 @@ def test_a_scene_becomes_a_run(tmp_path: Path) -> None:
 def test_images_of_the_run_are_those_of_the_scene(tmp_path: Path) -> None:
     """Through the file, and through another run made of that run."""
     first = opened(write_run(scene(), tmp_path / "a", "x"))
-    write_scene(tmp_path / "x.sundae", scene_of_run(tmp_path / "a" / "x" / "sundae" / "unpacked"))
+    write_scene(tmp_path / "x.sundae", contents_of_run(tmp_path / "a" / "x" / "sundae" / "unpacked"))
     second = opened(write_run(read_scene(tmp_path / "x.sundae"), tmp_path / "b", "x"))
     camera = first.datamanager.train_dataset.cameras[1:2]
     images = [run.model.get_outputs_for_camera(camera)["rgb"] for run in (first, second)]
@@ -122,9 +122,9 @@ def test_images_of_the_run_are_those_of_the_scene(tmp_path: Path) -> None:
 def test_a_run_without_its_capture_names_none(tmp_path: Path) -> None:
     """Its parser is another one; options of that would move every camera to a wrong place."""
     blind = write_run(scene(), tmp_path, "x").parent
-    assert scene_of_run(blind).meta["capture"] is None
+    assert contents_of_run(blind).meta["capture"] is None
     with pytest.raises(DataError, match="unpacked without its capture"):
-        scene_of_run(blind, data=tmp_path)
+        contents_of_run(blind, data=tmp_path)
 
 
 def test_a_scene_without_cameras_gets_one_outside_of_it(tmp_path: Path) -> None:
@@ -315,7 +315,7 @@ def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path
 
 def test_a_packed_run_holds_what_its_images_need(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 1100)
-    found = scene_of_run(run, max_cameras=0)
+    found = contents_of_run(run, max_cameras=0)
     assert set(found.field) == set(truth)
     assert all(torch.equal(found.field[name], truth[name]) for name in truth)
     assert found.head
@@ -324,12 +324,12 @@ def test_a_packed_run_holds_what_its_images_need(tmp_path: Path) -> None:
     assert found.meta["model"]["head"]["size"] == "tiny"
     # No path of the machine that trained it.
     assert str(tmp_path) not in str(found.meta)
-    assert scene_of_run(run / "config.yml", max_cameras=0).meta == found.meta
+    assert contents_of_run(run / "config.yml", max_cameras=0).meta == found.meta
 
 
 def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "sundae-tiny", 30, sh_degree_interval=20)
-    found = scene_of_run(run, max_cameras=0)
+    found = contents_of_run(run, max_cameras=0)
     assert found.head == {}
     assert "features" not in found.field
     assert torch.equal(found.field["features_rest"], truth["features_rest"][:, :3])
@@ -340,7 +340,7 @@ def test_a_disabled_head_and_unused_coefficients_are_left_out(tmp_path: Path) ->
 
 def test_a_run_of_splatfacto(tmp_path: Path) -> None:
     run, truth = run_folder(tmp_path / "run", "splatfacto", 29999, sh_degree=2, rasterize_mode="antialiased")
-    found = scene_of_run(run, max_cameras=0)
+    found = contents_of_run(run, max_cameras=0)
     assert found.head == {}
     assert all(torch.equal(found.field[name], truth[name]) for name in truth)
     assert found.meta["model"]["rasterize_mode"] == "antialiased"
@@ -348,16 +348,16 @@ def test_a_run_of_splatfacto(tmp_path: Path) -> None:
 
 def test_runs_that_cannot_be_packed(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="cannot be read"):
-        scene_of_run(tmp_path / "nothing")
+        contents_of_run(tmp_path / "nothing")
     (tmp_path / "config.yml").write_text("a: [1")
     with pytest.raises(CheckpointError, match=r"is not a run's config\.yml"):
-        scene_of_run(tmp_path)
+        contents_of_run(tmp_path)
     (tmp_path / "config.yml").write_text(yaml.dump(all_methods["nerfacto"]))
     with pytest.raises(CheckpointError, match="another method"):
-        scene_of_run(tmp_path)
+        contents_of_run(tmp_path)
     run, _ = run_folder(tmp_path / "run", "sundae-tiny", 30)
     with pytest.raises(DataError):
-        scene_of_run(run)  # its capture is missing
+        contents_of_run(run)  # its capture is missing
     (run / "nerfstudio_models" / "step-000000030.ckpt").write_bytes(b"PK")
     with pytest.raises(CheckpointError, match="no whole checkpoint"):
-        scene_of_run(run, max_cameras=0)
+        contents_of_run(run, max_cameras=0)

@@ -19,7 +19,7 @@ from sundae_ns.callbacks import NerfstudioRun
 from sundae_ns.evaluation import psnr
 from sundae_ns.method_configs import sundae_auto
 from sundae_ns.scenes.finetune import finetune
-from sundae_ns.scenes.packed import scene_of_run, write_run
+from sundae_ns.scenes.packed import contents_of_run, write_run
 from sundae_ns.storage.packing import PackConfig, read_scene, write_fitted
 from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.budget.searched_field import SearchedField
@@ -108,7 +108,7 @@ def same(a: Any, b: Any, where: str = "") -> None:
 
 def shown_alike_when_packed(run: Run, folder: Path) -> None:
     """Assert that a packed and fine-tuned run of a budget search shows the same images."""
-    scene = scene_of_run(run.folder)
+    scene = contents_of_run(run.folder)
     trained, codecs = finetune(run.folder, scene, PackConfig(), 1)
     write_fitted(folder / "a.sundae", trained, codecs)
     found = eval_setup(write_run(read_scene(folder / "a.sundae"), folder, "packed"), test_mode="test")[1].model

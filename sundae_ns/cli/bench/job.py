@@ -24,6 +24,7 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler, writer
 
+from sundae_ns.api.opening import load
 from sundae_ns.cli.bench.alone import watched_gpu
 from sundae_ns.cli.bench.plan import SAID, Job, Words, done_file, job_folder
 from sundae_ns.errors import BackendError, CheckpointError, PackError, SundaeError
@@ -31,9 +32,9 @@ from sundae_ns.evaluation import Lpips, Measured, lpips_weights_available
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import Opened, open_scene
-from sundae_ns.scenes.packed import model_of, scene_of_run
+from sundae_ns.scenes.packed import contents_of_run, model_of
 from sundae_ns.storage.atomic import write_text
-from sundae_ns.storage.packing import PackConfig, fit_scene, read_scene, write_fitted
+from sundae_ns.storage.packing import PackConfig, fit_scene, write_fitted
 from sundae_ns.storage.runs.fingerprint import fingerprint
 from sundae_ns.trainer import SundaeTrainerConfig
 
@@ -125,11 +126,11 @@ def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
         None for a field that cannot be packed.
     """
     try:
-        report = write_fitted(path, *fit_scene(scene_of_run(opened.source), PackConfig()))
+        report = write_fitted(path, *fit_scene(contents_of_run(opened.source), PackConfig()))
     except PackError as error:
         print(f"{SAID}not packed: {error}")
         return None
-    model = model_of(read_scene(path)).to(opened.model.device).eval()
+    model = model_of(load(path)).to(opened.model.device).eval()
     found = measure_scene(replace(opened, model=model, packed_bytes=report.bytes), label="", repeats=0, with_flip=False)
     errors = {name: found.full.mean(name) for name in ("psnr", "ssim")}
     return {"bytes": report.bytes, **errors, **{f"{name}_base": found.base.mean(name) for name in ("psnr", "ssim")}}

@@ -4,8 +4,8 @@ from sundae_ns.storage.packing.codecs import Codecs, Sensitivity
 from sundae_ns.storage.packing.config import FINETUNED, PackConfig
 from sundae_ns.storage.packing.container import read_header
 from sundae_ns.storage.packing.scene import (
-    PackReport,
     PackedScene,
+    PackReport,
     fit_scene,
     pack_bytes,
     read_scene,

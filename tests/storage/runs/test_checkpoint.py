@@ -41,6 +41,7 @@ def model_state(n: int = 6, degree: int = 3, **extra: Any) -> dict[str, Any]:
         encoding="harmonics",
         running={"densification": {"grad2d": None}, "pruning": {"pruned_at": -1}},
         extensions={},
+        head_enabled=False,
         trained_focal=None,
     )
     state["_extra_state"] = {**about, **extra}
@@ -268,6 +269,7 @@ def test_extra_state_is_plain_data(tmp_path: Path) -> None:
         encoding="harmonics",
         running={"densification": {"grad2d": torch.ones(3), "scene_scale": 1.0}, "pruning": {"pruned_at": 7}},
         extensions={"budget": {"numbers": {"phase": "before"}}},
+        head_enabled=False,
         trained_focal=(900.0, 1100.0),
     )
     torch.save(state, tmp_path / "a.pt")

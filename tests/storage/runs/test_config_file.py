@@ -14,7 +14,7 @@ from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.scenes.cameras import training_cameras
 from sundae_ns.scenes.opening import load_run, open_scene
-from sundae_ns.scenes.packed import scene_of_run
+from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage.runs.config_file import load_config, schedule_length
 
 METHODS = sorted(name for name in all_methods if name.startswith("sundae")) + ["splatfacto", "nerfacto"]
@@ -74,7 +74,7 @@ HOSTILE = {
 def test_no_code_that_it_names_runs(tmp_path: Path, kind: str) -> None:
     mark, path = tmp_path / "ran", tmp_path / "config.yml"
     path.write_text(HOSTILE[kind].format(mark) if "{}" in HOSTILE[kind] else HOSTILE[kind])
-    for read in (load_config, scene_of_run, open_scene, load_run, training_cameras):
+    for read in (load_config, contents_of_run, open_scene, load_run, training_cameras):
         with pytest.raises(CheckpointError) as raised:
             read(path)
         assert "\n" not in str(raised.value)
@@ -99,7 +99,7 @@ def test_a_file_that_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(DataError, match="another layout"):
         training_cameras(path)
     with pytest.raises(CheckpointError):
-        scene_of_run(path)
+        contents_of_run(path)
     with pytest.raises(CheckpointError):
         open_scene(path)
     with pytest.raises(CheckpointError, match=r"cannot be read \(No such file"):
