@@ -21,16 +21,17 @@ from torch import Tensor
 import sundae_ns.pruning.decision
 import sundae_ns.viewer
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.gaussians.field import Field
 from sundae_ns.model import SundaeModel, SundaeModelConfig
-from sundae_ns.pruning import PruningConfig, response
+from sundae_ns.pruning import PruneRule, response
+from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rendering import LocalField, render
 from sundae_ns.training.optimizers import FusedAdamConfig
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import make_schedule
-from sundae_ns.viewer import Rule, rule_config
+from sundae_ns.viewer import RuleName, previewed_rule
 
 N = 90
-RULES: tuple[Rule, ...] = get_args(Rule)
+RULES: tuple[RuleName, ...] = get_args(RuleName)
 
 
 def camera(shift: float = 0.0) -> Cameras:
@@ -93,10 +94,10 @@ def as_the_viewer(call: Callable[[], Any]) -> Any:
     return found[0]
 
 
-def shown(model: SundaeModel, rule: Rule, keep_ratio: float) -> Tensor | None:
+def shown(model: SundaeModel, rule: RuleName, keep_ratio: float) -> Tensor | None:
     model.viewer_controls.rule.value, model.viewer_controls.keep_ratio.value = rule, keep_ratio
-    decision = as_the_viewer(model.viewer_controls.preview)
-    return None if decision is None else decision.mask
+    preview = as_the_viewer(model.viewer_controls.preview)
+    return None if preview is None else preview.decision.mask
 
 
 def picture(model: SundaeModel) -> dict[str, Any]:
@@ -121,7 +122,7 @@ def test_the_viewer_finds_slider_and_menu() -> None:
 
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("keep_ratio", [0.01, 0.1, 0.37, 0.99])
-def test_exactly_the_share_is_shown(rule: Rule, keep_ratio: float) -> None:
+def test_exactly_the_share_is_shown(rule: RuleName, keep_ratio: float) -> None:
     model, _ = build()
     mask = shown(model, rule, keep_ratio)
     assert mask is not None
@@ -145,23 +146,20 @@ PRUNES: list[dict[str, Any]] = [
 def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None:
     model, views = build(**options)
     model.viewer_controls.keep_ratio.value = 0.2
-    decision = as_the_viewer(model.viewer_controls.preview)
+    preview = as_the_viewer(model.viewer_controls.preview)
     seen = as_the_viewer(lambda: picture(model))
     model.config.pruning.keep_ratio = 0.2
-    share = 0.2 if model.config.pruning.uses_detail else None
-    before = {name: value.clone() for name, value in model.state.field.items()}
     optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
-    report = make_schedule(model.config.pruning).step_post_backward(
-        model.state.field,
-        optimizers,
-        {"pruned_at": -1, "num_prunes": 0, "peak": N},
+    schedule = make_schedule(model.config.pruning)
+    report = schedule.after_step(
+        FieldPruner(model.state.field, optimizers),
+        schedule.initialize_state(),
         model.config.pruning.prune_at,
-        contribution=lambda: model.contribution(views, share),  # type: ignore[arg-type]
+        lambda count: model.contribution(views, count),  # type: ignore[arg-type]
     )
     assert report is not None
-    assert report.after == int(decision.mask.sum()) == 18
-    values = {name: value[decision.mask] for name, value in before.items()} | dict(decision.values or {})
-    assert {name for name, value in model.state.field.items() if not torch.equal(value, values[name])} == set()
+    assert report.after == int(preview.decision.mask.sum()) == 18
+    assert all(torch.equal(value, preview.field[name]) for name, value in model.state.field.items())
     # A merge and growth show in the picture too.
     settings = model.render_settings(training=False).without_head()
     left, _ = render(model.source, model.view_of(camera()), seen["background"][0, 0], settings)
@@ -170,7 +168,7 @@ def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None
 
 def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
     model, _ = build()
-    known = response(model.state.field, rule_config(model.config.pruning, "band: both", 0.2))
+    known = response(model.state.field, previewed_rule(model.config.pruning, "band: both"))
     masks = {rule: shown(model, rule, 0.2) for rule in RULES}
     high, low, both, top = (masks[rule] for rule in ("band: high", "band: low", "band: both", "opacity"))
     assert high is not None
@@ -195,21 +193,21 @@ def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
 def test_a_crop_box_cuts_the_preview_too() -> None:
     model, _ = build()
     model.viewer_controls.keep_ratio.value = 0.5
-    decision = as_the_viewer(model.viewer_controls.preview)
+    preview = as_the_viewer(model.viewer_controls.preview)
     half = OrientedBox(torch.eye(3), torch.tensor([1.0, 0.0, 0.0]), torch.tensor([2.0, 9.0, 9.0]))
     seen = as_the_viewer(lambda: model.get_outputs_for_camera(camera(), half))
-    rows = half.within(model.means).squeeze(-1)[decision.mask]
+    rows = half.within(model.means).squeeze(-1)[preview.decision.mask]
     assert 0 < int(rows.sum()) < len(rows)
-    params = {name: value[decision.mask][rows] for name, value in model.state.field.items()}
-    params |= {name: value[rows] for name, value in decision.values.items()}
     settings = model.render_settings(training=False).without_head()
-    expected, _ = render(LocalField(Field(params)), model.view_of(camera()), seen["background"][0, 0], settings)
+    expected, _ = render(
+        LocalField(preview.field.rows(rows)), model.view_of(camera()), seen["background"][0, 0], settings
+    )
     assert torch.equal(seen["rgb"], expected["rgb"])
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("rule", RULES)
-def test_off_every_picture_is_as_before(rule: Rule) -> None:
+def test_off_every_picture_is_as_before(rule: RuleName) -> None:
     model, views = build()
     before = picture(model)
     model.viewer_controls.rule.value = rule
@@ -258,9 +256,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     seen: list[int] = []
     original = sundae_ns.viewer.field_graph
 
-    def counted(params: Any, config: PruningConfig) -> Any:
+    def counted(params: Any, rule: PruneRule) -> Any:
         seen.append(len(params["means"]))
-        return original(params, config)
+        return original(params, rule)
 
     monkeypatch.setattr(sundae_ns.viewer, "field_graph", counted)
     monkeypatch.setattr(sundae_ns.pruning.decision, "field_graph", counted)

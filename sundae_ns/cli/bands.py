@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +24,7 @@ from sundae_ns.evaluation import (
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, kept_count, response
+from sundae_ns.pruning import PruneRule, band_rule, check_share, decide, field_graph, kept_count, response
 from sundae_ns.storage import replacing, write_point_cloud, write_text
 from sundae_ns.storage.atomic import writing
 from sundae_ns.storage.kinds import kind_of
@@ -49,9 +48,7 @@ def base_colors(features_dc: Tensor) -> Tensor:
     return (255 * sh_to_rgb(features_dc).clamp(0, 1)).round().to(torch.uint8)
 
 
-def band_masks(
-    params: Mapping[str, Tensor], config: PruningConfig, graph: NeighborGraph, keep_ratio: float
-) -> dict[str, Tensor]:
+def band_masks(params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph, count: int) -> dict[str, Tensor]:
     """The primitives that each rule keeps, bool ``[N]`` by the names of :data:`RULES`.
 
     All rules rank the primitives by the magnitude of their high-pass response, as the paper does. The high-pass rule keeps
@@ -60,30 +57,26 @@ def band_masks(
 
     Args:
         params: the field, all finite.
-        config: signal and gamma.
+        rule: signal and gamma.
         graph: neighbour graph of the field.
-        keep_ratio: share that each rule keeps.
+        count: number of primitives that each rule keeps.
     """
-    shares = {"high": 1.0, "low": 0.0, "combined": config.gamma}
-    count = kept_count(keep_ratio, len(params["means"]))
-    return {
-        name: decide(params, band_rule(config, keep_ratio, share), count=count, graph=graph).mask
-        for name, share in shares.items()
-    }
+    gammas = {"high": 1.0, "low": 0.0, "combined": rule.gamma}
+    return {name: decide(params, band_rule(rule, gamma), count, graph=graph).mask for name, gamma in gammas.items()}
 
 
-def band_figures(magnitude: Tensor, masks: Mapping[str, Tensor], keep_ratio: float) -> dict[str, Any]:
+def band_figures(magnitude: Tensor, masks: Mapping[str, Tensor], share: float) -> dict[str, Any]:
     """Counts, thresholds and overlaps of the masks, as plain numbers for JSON.
 
     Args:
         magnitude: response magnitudes ``[N]``, NaN where undefined.
         masks: from :func:`band_masks`.
-        keep_ratio: keep ratio of the masks.
+        share: keep ratio of the masks.
     """
     ends = {name: magnitude[mask & magnitude.isfinite()] for name, mask in masks.items()}
     both = masks["combined"]
     return {
-        "keep_ratio": keep_ratio,
+        "keep_ratio": share,
         "kept": {name: int(mask.sum()) for name, mask in masks.items()},
         "high_from": float(ends["high"].min()) if len(ends["high"]) else None,
         "low_to": float(ends["low"].max()) if len(ends["low"]) else None,
@@ -162,8 +155,8 @@ def run_bands(
     source: Path,
     out: Path,
     *,
-    keep_ratios: Sequence[float],
-    config: PruningConfig,
+    shares: Sequence[float],
+    rule: PruneRule,
     view: int | None,
     console: Console | None = None,
 ) -> int:
@@ -176,14 +169,15 @@ def run_bands(
         StorageError: the folder cannot be written to.
     """
     console = console or Console()
-    if not keep_ratios:
+    if not shares:
         raise ConfigError("there is nothing to keep: give --keep-ratio one or more shares in (0, 1]")
-    for keep_ratio in keep_ratios:
-        replace(config, keep_ratio=keep_ratio).validate()
-    ratios = sorted(set(keep_ratios))
+    for share in shares:
+        check_share(share)
+    rule.validate()
+    shares = sorted(set(shares))
     run = source.parent if source.name == "config.yml" else source
     with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("Reading the field", total=3 + len(ratios))
+        task = progress.add_task("Reading the field", total=3 + len(shares))
 
         def next_is(description: str) -> None:
             progress.update(task, advance=1, description=description)
@@ -193,9 +187,9 @@ def run_bands(
         params = {name: value[finite] for name, value in field.items()}
         colors = base_colors(params["features_dc"])
         next_is("Graph and response")
-        config = band_rule(config, ratios[0], config.gamma)
-        graph = field_graph(params, config)
-        magnitude = response(params, config, graph)
+        rule = band_rule(rule, rule.gamma)
+        graph = field_graph(params, rule)
+        magnitude = response(params, rule, graph)
         next_is("Cameras")
         projections, seen_from = _project(params["means"], source, view)
         next_is("Rules")
@@ -215,21 +209,19 @@ def run_bands(
             files.append(name)
 
         cloud("all.ply")
-        for keep_ratio in ratios:
-            masks = band_masks(params, config, graph, keep_ratio)
-            figures.append(band_figures(magnitude, masks, keep_ratio))
-            thresholds[f"{keep_ratio:g}"] = (figures[-1]["low_to"], figures[-1]["high_from"])
+        for share in shares:
+            masks = band_masks(params, rule, graph, kept_count(share, len(magnitude)))
+            figures.append(band_figures(magnitude, masks, share))
+            thresholds[f"{share:g}"] = (figures[-1]["low_to"], figures[-1]["high_from"])
             for name, mask in masks.items():
-                cloud(f"{name}-{keep_ratio:g}.ply", mask)
+                cloud(f"{name}-{share:g}.ply", mask)
             everything = torch.ones_like(masks["high"])
             sets = {f"all: {len(everything):,} primitives": everything}
             sets |= {f"{RULES[name]}: {int(mask.sum()):,}": mask for name, mask in masks.items()}
-            title = (
-                f"Centres of the primitives that each rule keeps: keep ratio {keep_ratio:g}, signal {config.signal}, "
-            )
+            title = f"Centres of the primitives that each rule keeps: keep ratio {share:g}, signal {rule.signal}, "
             title += seen_from.partition(",")[0]
-            save_png(f"bands-{keep_ratio:g}.png", points_sheet(projections, colors, sets, title=title))
-            next_is(f"Keep ratio {keep_ratio:g}")
+            save_png(f"bands-{share:g}.png", points_sheet(projections, colors, sets, title=title))
+            next_is(f"Keep ratio {share:g}")
         save_png("response.png", response_histogram(magnitude, thresholds=thresholds))
 
     result = {
@@ -237,12 +229,12 @@ def run_bands(
         "primitives": len(finite),
         "not_finite": len(finite) - len(params["means"]),
         "isolated": int(graph.isolated.sum()),
-        "signal": config.signal,
-        "num_neighbors": config.num_neighbors,
-        "bandwidth": config.bandwidth,
+        "signal": rule.signal,
+        "num_neighbors": rule.num_neighbors,
+        "bandwidth": rule.bandwidth,
         "tau": graph.tau,
         "sigma": graph.sigma,
-        "gamma": config.gamma,
+        "gamma": rule.gamma,
         "response": response_figures(magnitude),
         "bands": figures,
         "seen_from": seen_from,

@@ -89,10 +89,10 @@ class PruningConfig(PruneRule):
         if self.mode == "continuous" and self.stop < self.start:
             raise ConfigError(f"start ({self.start}) lies after stop ({self.stop}): swap them")
         homes = {
-            "max_primitives": ("continuous", "auto"),
-            "target_primitives": ("continuous",),
             "max_psnr_drop": ("auto",),
             "max_bytes": ("auto",),
+            "max_primitives": ("continuous", "auto"),
+            "target_primitives": ("continuous",),
         }
         given = [name for name in homes if getattr(self, name) is not None]
         for name in given:

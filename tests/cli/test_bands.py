@@ -17,7 +17,7 @@ from torch import Tensor
 from sundae_ns.cli import main
 from sundae_ns.cli.bands import base_colors
 from sundae_ns.gaussians import from_points
-from sundae_ns.pruning import PruningConfig, band_rule, response
+from sundae_ns.pruning import PruneRule, band_rule, response
 from sundae_ns.storage import read_ply, read_point_cloud, write_ply
 
 N = 300
@@ -53,8 +53,8 @@ def test_files_and_statistics_agree(ply: Path, tmp_path: Path, capsys: pytest.Ca
     assert "wrote bands.json" in capsys.readouterr().out
 
     params = {name: value[torch.isfinite(x_of(ply))] for name, value in read_ply(ply).items()}
-    config = PruningConfig(signal="positions", num_neighbors=9)
-    magnitude = response(params, band_rule(config, 0.1, 0.3))
+    rule = PruneRule(signal="positions", num_neighbors=9)
+    magnitude = response(params, band_rule(rule, 0.3))
     known = magnitude[magnitude.isfinite()]
     assert result["response"]["known"] == len(known)
     assert result["isolated"] == len(magnitude) - len(known)
@@ -66,7 +66,7 @@ def test_files_and_statistics_agree(ply: Path, tmp_path: Path, capsys: pytest.Ca
         count = round(keep_ratio * (N - 2))
         masks = {}
         for name, gamma in (("high", 1.0), ("low", 0.0), ("combined", 0.3)):
-            masks[name] = decide_share(params, band_rule(config, keep_ratio, gamma)).mask
+            masks[name] = decide_share(params, band_rule(rule, gamma), keep_ratio).mask
             found = PlyData.read(str(out / f"{name}-{keep_ratio}.ply"))["vertex"]
             kept = torch.from_numpy(np.stack([found["x"], found["y"], found["z"]], axis=1))
             assert torch.equal(kept, params["means"][masks[name]])

@@ -14,15 +14,14 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
-from torch.nn import Parameter
 
-from sundae_ns.distributed import checkpoints, pruning
+from sundae_ns.distributed import checkpoints
 from sundae_ns.distributed.shards import bounds, moves
-from sundae_ns.errors import CheckpointError, ConfigError
+from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.surgery import per_primitive
-from sundae_ns.pruning import PruningConfig
 from sundae_ns.storage.runs.checkpoint import FORMAT
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import make_schedule
 
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "features")
@@ -213,38 +212,6 @@ def a_field(n: int = 60) -> Field:
             "features_rest": normal(3, 3),
         }
     )
-
-
-@pytest.mark.parametrize("redistribution", ["none", "merge"])
-def test_the_deciding_rank_says_which_rows_stay_and_which_values_change(redistribution: Any) -> None:
-    field, weights = a_field(), torch.rand(60, generator=torch.Generator().manual_seed(1))
-    config = PruningConfig(prune_at=1, keep_ratio=0.3, num_neighbors=6, redistribution=redistribution)
-    schedule = make_schedule(config)
-    state = schedule.initialize_state()
-    (report, counted, changed), params, rows = pruning._decide(schedule, field, state, 2, weights, field.encoding)
-    alone = Field({name: Parameter(value.clone()) for name, value in field.items()})
-    own = schedule.initialize_state()
-    expected = schedule.step_post_backward(alone, {}, own, 2, contribution=lambda: weights)
-    assert expected is not None
-    assert (report.before, report.after) == (60, expected.after)
-    assert counted == own
-    assert "rows" not in state
-    assert len(rows) == report.after
-    for name, value in alone.items():
-        assert torch.equal(params[name], value), name
-        assert torch.equal(value, field[name][rows]) == (name not in changed), name
-    assert bool(changed) == (redistribution == "merge")
-    assert all(torch.equal(field[name], value) for name, value in a_field().items()), (
-        "the gathered field was written to"
-    )
-
-
-def test_the_deciding_rank_hands_on_an_error_instead_of_raising_it() -> None:
-    schedule = make_schedule(PruningConfig(prune_at=1, keep_ratio=0.3))
-    field = a_field()
-    error, params, rows = pruning._decide(schedule, field, schedule.initialize_state(), 2, None, field.encoding)
-    assert isinstance(error, ConfigError)
-    assert len(rows) == len(params["means"]) == 60
 
 
 @pytest.mark.parametrize(("total", "ranks"), [(10, 3), (2, 4), (0, 2), (9, 1)])

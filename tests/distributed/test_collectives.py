@@ -23,19 +23,20 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.distributed import ShardedField, Shards
 from sundae_ns.distributed.batches import average_gradients
 from sundae_ns.distributed.densification import ShardedDensification
-from sundae_ns.distributed.pruning import GlobalPruning
+from sundae_ns.distributed.pruning import RankPruner
 from sundae_ns.distributed.shards import bounds
 from sundae_ns.distributed.source import ReceivedPrimitives, statistics_of
 from sundae_ns.distributed.team import take_shard
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
-from sundae_ns.pruning import PruningConfig
+from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rasterization import rasterize, select_backend
 from sundae_ns.rasterization.sharded import Cameras, camera_row, cameras_of, may_be_seen
 from sundae_ns.rendering import ColorSettings, StepResolution, TrainingView, View
 from sundae_ns.rendering.source import colors_from
 from sundae_ns.training.densification import CappedStrategy
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import make_schedule
 
 RunRanks = Callable[[str, Path], None]
@@ -449,33 +450,26 @@ def check_pruning(shards: Shards, **options: Any) -> None:
     params = shard_of(whole, start, end)
     optimizers, counts = adams(params, start), {"grad2d": torch.arange(start, end)}
     shards.recount(params)
-    schedule = GlobalPruning(config, make_schedule(config), shards)
+    schedule = make_schedule(config)
     state = schedule.initialize_state()
-    assert schedule.config is config
-    assert schedule.due(state, 2, 200)
-    assert schedule.target(199) == round(0.3 * 199)
+    asked = []
 
-    def contribution() -> Tensor:  # of the finite primitives, which are balanced by then
+    def contribute(count: int | None) -> Tensor:  # of the finite primitives, which are balanced by then
+        asked.append(count)
         return weights[counts["grad2d"]]
 
-    report = schedule.step_post_backward(params, optimizers, state, 2, contribution=contribution, strategy_state=counts)
+    report = schedule.after_step(RankPruner(shards, params, optimizers, [counts]), state, 2, contribute)
+    assert asked == [round(0.3 * 199)] * config.uses_contribution
 
     alone = shard_of(whole, 0, 200)
     own_optimizers, own_counts = adams(alone, 0), {"grad2d": torch.arange(200)}
-    own = make_schedule(config)
-    own_state = own.initialize_state()
-    expected = own.step_post_backward(
-        alone,
-        own_optimizers,
-        own_state,
-        2,
-        contribution=lambda: weights[own_counts["grad2d"]],
-        strategy_state=own_counts,
-    )
+    own_state = schedule.initialize_state()
+    pruner = FieldPruner(alone, own_optimizers, [own_counts])
+    expected = schedule.after_step(pruner, own_state, 2, lambda _: weights[own_counts["grad2d"]])
     assert report is not None
     assert expected is not None
     assert (report.before, report.after, report.dropped_nonfinite) == (200, round(0.3 * 199), 1)
-    assert report.step == 2 * RANKS + 1
+    assert report.step == 2
     assert (report.tau, report.sigma, report.peak) == (expected.tau, expected.sigma, expected.peak)
     assert state == own_state
     assert sum(shards.counts) == report.after
@@ -492,10 +486,9 @@ def check_refusal(shards: Shards) -> None:
     """All ranks raise the error that rank 0 finds."""
     params = own_half(shards)
     shards.recount(params)
-    config = PruningConfig(prune_at=1, keep_ratio=0.3)
-    schedule = GlobalPruning(config, make_schedule(config), shards)
+    schedule = make_schedule(PruningConfig(prune_at=1, keep_ratio=0.3))
     with pytest.raises(ConfigError, match="pass over the training views"):
-        schedule.step_post_backward(params, {}, schedule.initialize_state(), 2)
+        schedule.after_step(RankPruner(shards, params, {}), schedule.initialize_state(), 2)
 
 
 def check_averages(shards: Shards) -> None:

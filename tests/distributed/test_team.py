@@ -11,17 +11,17 @@ import torch
 
 from sundae_ns.distributed import team_of
 from sundae_ns.distributed.densification import ShardedDensification
-from sundae_ns.distributed.pruning import GlobalPruning
+from sundae_ns.distributed.pruning import RankPruner
 from sundae_ns.distributed.team import OneProcess, Ranks
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.method_configs import sundae_tiny
-from sundae_ns.pruning import PruningConfig
 from sundae_ns.rendering import LocalField
 from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.pruning import ScheduledPruning
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import make_schedule
 
 
@@ -78,7 +78,9 @@ def test_ranks_densify_and_prune_as_one() -> None:
     assert strategy.pause_refine_after_reset == 4 + 6, "each of 7 images is seen in 4 steps of 2"
     pruning = team._sharded(ScheduledPruning(make_schedule(PruningConfig(prune_at=3)), evaluate=True), 7)
     assert isinstance(pruning, ScheduledPruning)
-    assert isinstance(pruning.schedule, GlobalPruning)
-    assert (pruning.schedule.shards, pruning.schedule.config.prune_at, pruning.evaluate) == (shards, 3, True)
+    assert (pruning.schedule.config.prune_at, pruning.evaluate) == (3, True)
+    pruner = pruning.pruner({}, {}, [])
+    assert isinstance(pruner, RankPruner)
+    assert pruner.shards is shards
     other = Extension()
     assert team._sharded(other, 7) is other

@@ -23,9 +23,8 @@ from PIL import Image
 from torch import Tensor
 from viser import transforms
 
-from sundae_ns.pruning import decide, kept_count
+from sundae_ns.pruning import kept_count
 from sundae_ns.rendering import render
-from sundae_ns.viewer import rule_config
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 SIDE = 256
@@ -134,15 +133,16 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
 
     keep_ratio = page.settle(lambda: page.slide("Keep ratio", 0.1), SIDE)
     assert 0.05 < keep_ratio < 0.15
-    config = rule_config(model.config.pruning, "as configured", keep_ratio)
+    rule = previewed_rule(model.config.pruning, "as configured")
     count = kept_count(keep_ratio, model.num_points)
-    share = keep_ratio if config.uses_detail else None
-    decision = decide(model.state.field, config, lambda: model.contribution(pipeline.datamanager, share), count=count)
-    assert decision.values is not None
+    weights = model.contribution(pipeline.datamanager, count if rule.uses_detail else None)
+    pruned = prune(model.state.field, rule, count, weights)
+    assert pruned.decision.values is not None
     settings = model.render_settings(training=False).without_head()
     with torch.no_grad():
-        part = model.source.part(decision.mask, decision.values)
-        preview, _ = render(part, model.view_of(camera_of(page)), expected["background"][0, 0], settings)
+        preview, _ = render(
+            LocalField(pruned.field), model.view_of(camera_of(page)), expected["background"][0, 0], settings
+        )
     previewed = scene(page)
     found["preview"] = differences(previewed, preview["rgb"])
     assert differences(previewed, expected["base_rgb"])[0] > 2 * found["preview"][0]

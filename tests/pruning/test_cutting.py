@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 from torch.nn import Parameter
 
-from sundae_ns.pruning import PruningConfig
-from sundae_ns.pruning.cutting import cut, drop_nonfinite
+from sundae_ns.errors import DataError
+from sundae_ns.pruning import PruneRule, prune
+from sundae_ns.pruning.cutting import FieldPruner
 
 N = 20
 
@@ -24,7 +24,7 @@ def field() -> dict[str, Parameter]:
 def test_primitives_that_are_not_finite_are_removed_and_counted(bad: list[int], removed: int) -> None:
     params, statistics = field(), {"count": torch.arange(N)}
     params["opacities"].data[bad] = torch.nan
-    assert drop_nonfinite(params, {}, [statistics]) == removed
+    assert FieldPruner(params, {}, [statistics]).drop_nonfinite() == removed
     kept = [row for row in range(N) if row not in bad]
     assert statistics["count"].tolist() == kept
     assert all(len(value) == len(kept) for value in params.values())
@@ -33,21 +33,18 @@ def test_primitives_that_are_not_finite_are_removed_and_counted(bad: list[int], 
 def test_a_field_without_a_finite_primitive_stays() -> None:
     params = field()
     params["means"].data[:, 1] = torch.inf
-    assert drop_nonfinite(params, {}, []) == 0
+    with pytest.raises(DataError, match=f"none of {N} primitives is finite"):
+        FieldPruner(params, {}).drop_nonfinite()
     assert len(params["means"]) == N
 
 
-def test_a_cut_merges_into_what_stays_and_counts_itself() -> None:
-    params, before = field(), {name: value.detach().clone() for name, value in field().items()}
-    state = {"pruned_at": -1, "num_prunes": 0, "peak": N}
-    config = PruningConfig(score="opacity", selection="top", num_neighbors=5)
-
-    def weights() -> Tensor:
-        return torch.linspace(1, 2, N)
-
-    decision = cut(params, {}, state, config, weights, step=7, count=lambda n: n // 2)
+def test_a_cut_leaves_the_field_that_prune_returns() -> None:
+    params, statistics = field(), {"count": torch.arange(N)}
+    rule, weights = PruneRule(score="opacity", selection="top", num_neighbors=5), torch.linspace(1, 2, N)
+    expected = prune(field(), rule, N // 2, weights)
+    decision = FieldPruner(params, {}, [statistics]).cut(rule, N // 2, weights)
     assert decision.kept == len(params["means"]) == N // 2
-    assert state == {"pruned_at": 7, "num_prunes": 1, "peak": N}
-    assert decision.values is not None
-    assert all(torch.equal(params[name], value) for name, value in decision.values.items())
-    assert not torch.equal(params["means"], before["means"][decision.mask])
+    assert torch.equal(decision.mask, expected.decision.mask)
+    assert torch.equal(statistics["count"], decision.mask.nonzero().squeeze(1))
+    assert all(torch.equal(params[name], value) for name, value in expected.field.items())
+    assert not torch.equal(params["means"], field()["means"][decision.mask])

@@ -11,12 +11,13 @@ from prunes import decide_share
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError, SundaeError
+from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.parameters import rgb_to_sh
-from sundae_ns.pruning import PruningConfig, decide, response
+from sundae_ns.pruning import PruneRule, decide, prune, response
 from sundae_ns.pruning.scores import score
 from sundae_ns.pruning.signals import attribute_signal, position_signal
 
-PLAIN = PruningConfig(selection="sampled", score="response-contribution", edges="centres", redistribution="none")
+PLAIN = PruneRule(selection="sampled", score="response-contribution", edges="centres", redistribution="none")
 """Response times contribution and independent draws, without the additions of the default rule."""
 PAPER = replace(PLAIN, selection="band", score="response", signal="positions")
 
@@ -44,17 +45,17 @@ def ones(n: int = 60) -> Tensor:
 def test_every_score_and_selection_keeps_the_exact_count(name: Any, selection: Any, keep_ratio: float) -> None:
     params = field()
     before = {key: value.clone() for key, value in params.items()}
-    config = replace(PLAIN, score=name, selection=selection, keep_ratio=keep_ratio)
-    decision = decide_share(params, config, ones)
+    rule = replace(PLAIN, score=name, selection=selection)
+    decision = decide_share(params, rule, keep_ratio, ones())
     assert int(decision.mask.sum()) == decision.kept == max(1, round(keep_ratio * 60))
-    assert torch.equal(decide_share(params, config, ones).mask, decision.mask)
-    assert (decision.sigma is not None) == (config.uses_graph and keep_ratio < 1)
+    assert torch.equal(decide_share(params, rule, keep_ratio, ones()).mask, decision.mask)
+    assert (decision.sigma is not None) == (rule.uses_graph and keep_ratio < 1)
     assert all(torch.equal(params[key], before[key]) for key in params)
 
 
 def test_the_papers_rule_is_the_band_of_the_position_response() -> None:
     params = field()
-    decision = decide_share(params, replace(PAPER, keep_ratio=0.2))
+    decision = decide_share(params, PAPER, 0.2)
     found = response(params, PAPER)
     ranked = found[~found.isnan()].sort().values
     assert sorted(found[decision.mask].tolist()) == torch.cat([ranked[:6], ranked[-6:]]).tolist()
@@ -65,18 +66,17 @@ def test_isolated_floaters_are_judged_by_contribution_or_not_kept() -> None:
     params = field()
     params["means"][[3, 40]] = torch.tensor([[500.0, 0, 0], [0, 500.0, 0]])
     for gamma in (0.0, 0.5, 1.0):
-        assert not decide_share(params, replace(PAPER, keep_ratio=0.5, gamma=gamma)).mask[[3, 40]].any()
+        assert not decide_share(params, replace(PAPER, gamma=gamma), 0.5).mask[[3, 40]].any()
     contribution = torch.ones(60)
     contribution[3], contribution[40] = 1e6, 0.0
-    mask = decide_share(params, replace(PLAIN, keep_ratio=0.5), lambda: contribution).mask
+    mask = decide_share(params, PLAIN, 0.5, contribution).mask
     assert mask[3]
     assert not mask[40]
 
 
 def test_contribution_alone_decides_on_a_graph_without_edges() -> None:
     contribution = torch.arange(60).float()
-    config = replace(PLAIN, selection="top", keep_ratio=0.1, tau=1e-12)
-    decision = decide_share(field(), config, lambda: contribution)
+    decision = decide_share(field(), replace(PLAIN, selection="top", tau=1e-12), 0.1, contribution)
     assert decision.isolated == 60
     assert decision.mask.nonzero().squeeze(1).tolist() == list(range(54, 60))
 
@@ -125,38 +125,58 @@ def test_primitives_that_are_not_finite_are_dropped_and_do_not_count(value: floa
     params["means"][8] = value
     contribution = torch.ones(60)
     contribution[7] = torch.nan
-    decision = decide_share(params, replace(PLAIN, keep_ratio=0.5), lambda: contribution)
+    decision = decide_share(params, PLAIN, 0.5, contribution)
     assert decision.dropped_nonfinite == 2
     assert int(decision.mask.sum()) == decision.kept == 29
     assert not decision.mask[[7, 8]].any()
-    everything = decide_share(params, PruningConfig(keep_ratio=1.0), lambda: contribution)
+    everything = decide_share(params, PruneRule(), 1.0, contribution)
     assert everything.mask.nonzero().squeeze(1).tolist() == [i for i in range(60) if i not in (7, 8)]
 
 
-def test_contribution_is_computed_only_if_needed() -> None:
-    def never() -> Tensor:
-        raise AssertionError
-
+def test_contribution_is_asked_for_only_if_needed() -> None:
     for name in ("response", "opacity", "random"):
-        decide_share(field(), replace(PLAIN, score=name), never)
-    decide_share(field(), PruningConfig(keep_ratio=1.0), never)
+        rule = replace(PLAIN, score=name)
+        assert not rule.uses_contribution
+        decide_share(field(), rule)
+    assert PruneRule().uses_contribution
+    decide_share(field(), PruneRule(), 1.0)
 
 
 def test_exactly_count_primitives_are_kept_and_all_if_they_are_fewer() -> None:
     config = replace(PLAIN, score="opacity", selection="top")
-    decision = decide(field(), config, count=17)
+    decision = decide(field(), config, 17)
     opacities = field()["opacities"].squeeze(1)
     assert torch.equal(decision.mask, opacities >= opacities.sort(descending=True).values[16])
-    assert decide(field(), config, count=1000).kept == 60
+    assert decide(field(), config, 1000).kept == 60
+
+
+@pytest.mark.parametrize("rule", [PruneRule(), PLAIN], ids=["merged", "plain"])
+def test_prune_leaves_what_the_decision_says_and_the_field_alone(rule: PruneRule) -> None:
+    params = field()
+    params["means"][8] = torch.nan
+    before = Field({name: value.clone() for name, value in params.items()}, "logits")
+    found = prune(Field(params, "logits"), rule, 12, ones())
+    decision = decide(before, rule, 12, ones())
+    assert torch.equal(found.decision.mask, decision.mask)
+    assert found.field.encoding == "logits"
+    assert found.field.num_primitives == decision.kept == 12
+    assert found.decision.dropped_nonfinite == 1
+    assert (decision.values is None) == (rule.redistribution == "none")
+    for name, value in params.items():
+        expected = (decision.values or {}).get(name, before[name][decision.mask])
+        assert torch.equal(found.field[name], expected), name
+        assert torch.equal(value.nan_to_num(), before[name].nan_to_num()), name
+        assert value.data_ptr() != found.field[name].data_ptr()
 
 
 def test_invalid_input_raises_one_line() -> None:
     cases: list[tuple[type[Exception], str, Any]] = [
         (DataError, "1 primitives cannot have 1 neighbours", lambda: response(field(1), PAPER)),
         (DataError, "none of 60", lambda: decide_share({k: v * torch.nan for k, v in field().items()}, PAPER)),
-        (ConfigError, "training views", lambda: decide_share(field(), PruningConfig())),
-        (DataError, r"shape \[59\] for 60", lambda: decide_share(field(), PruningConfig(), lambda: ones(59))),
-        (ConfigError, "keep_ratio", lambda: decide_share(field(), PruningConfig(keep_ratio=0.0))),
+        (ConfigError, "training views", lambda: decide_share(field(), PruneRule())),
+        (DataError, r"shape \[59\] for 60", lambda: decide_share(field(), PruneRule(), 0.1, ones(59))),
+        (ConfigError, "keep_ratio", lambda: decide_share(field(), PruneRule(), 0.0)),
+        (ConfigError, "gamma", lambda: decide_share(field(), PruneRule(gamma=2.0))),
     ]
     for error, message, call in cases:
         with pytest.raises(error, match=message) as caught:
@@ -168,15 +188,14 @@ def test_invalid_input_raises_one_line() -> None:
 @pytest.mark.gpu
 def test_decision_on_the_gpu_keeps_the_same_primitives() -> None:
     params = field(500)
-    config = replace(PAPER, keep_ratio=0.3)
-    on_gpu = decide_share({name: value.cuda() for name, value in params.items()}, config)
+    on_gpu = decide_share({name: value.cuda() for name, value in params.items()}, PAPER, 0.3)
     assert on_gpu.mask.is_cuda
-    assert torch.equal(on_gpu.mask.cpu(), decide_share(params, config).mask)
+    assert torch.equal(on_gpu.mask.cpu(), decide_share(params, PAPER, 0.3).mask)
 
 
 def test_a_contribution_of_nan_counts_as_0() -> None:
-    config = PruningConfig(score="contribution")
-    values = score(field(), config, None, lambda: torch.arange(60.0).index_fill(0, torch.tensor([7]), torch.nan))
+    weights = torch.arange(60.0).index_fill(0, torch.tensor([7]), torch.nan)
+    values = score(field(), PruneRule(score="contribution"), None, weights)
     assert values[7] == 0
     assert values[8] == 8
 
@@ -193,9 +212,9 @@ def test_scores_by_hand() -> None:
     }
     for name, values in expected.items():
         config = replace(PLAIN, score=name)  # type: ignore[arg-type]
-        assert score(params, config, found, lambda: weights).tolist() == pytest.approx(values), name
+        assert score(params, config, found, weights).tolist() == pytest.approx(values), name
     assert score(params, replace(PLAIN, score="response"), found, None)[[0, 2]].tolist() == [2, 3]
     opacities = score(params, replace(PLAIN, score="opacity"), None, None)
     assert torch.equal(opacities, params["opacities"].double().sigmoid().flatten())
     nothing = torch.full((3,), torch.nan)
-    assert score(params, replace(PLAIN, score="response-contribution"), nothing, lambda: weights)[0] == 2
+    assert score(params, replace(PLAIN, score="response-contribution"), nothing, weights)[0] == 2

@@ -1,4 +1,4 @@
-"""Heirs of dropped primitives, and values of kept primitives after a merge."""
+"""Voronoi labels of dropped primitives, and values of kept primitives after a merge."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.parameters import rgb_to_sh, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.pruning import PruningConfig, field_graph
-from sundae_ns.pruning.redistribution import heirs
+from sundae_ns.pruning import PruneRule, field_graph
+from sundae_ns.pruning.redistribution import voronoi_labels
 from sundae_ns.training.schedulers import Decay, notify_pruned
 
 
@@ -37,10 +37,10 @@ def weights(n: int = 300) -> Tensor:
     return torch.linspace(0.1, 1, n)
 
 
-def test_heirs_are_the_nearest_along_the_edges() -> None:
+def test_labels_are_the_nearest_along_the_edges() -> None:
     graph = build_graph(field()["means"].double(), num_neighbors=3)
     mask = torch.rand(300, generator=torch.Generator().manual_seed(1)) < 0.05
-    found = heirs(graph, mask)
+    found = voronoi_labels(graph, mask)
     rows, lengths = np.repeat(np.arange(300), 3), -graph.weights.log().numpy().ravel()
     edge = graph.weights.numpy().ravel() > 0
     # Heirs follow edges from dropped primitives; the search from kept ones follows them backwards.
@@ -52,7 +52,7 @@ def test_heirs_are_the_nearest_along_the_edges() -> None:
     assert not reached.all()
     assert len(expected[reached].unique()) > 5
     assert torch.equal(found[reached], expected[reached])
-    # The others follow edges in both directions; primitives in a component without a kept one have no heir.
+    # The others follow edges in both directions; primitives in a component without a kept one have no label.
     _, component = connected_components(backwards, directed=False)
     joined = torch.from_numpy(np.isin(component, component[kept]))
     assert torch.equal(found >= 0, joined)
@@ -60,31 +60,31 @@ def test_heirs_are_the_nearest_along_the_edges() -> None:
     assert (component[found[joined]] == component[joined.numpy()]).all()
 
 
-def test_the_one_clone_that_is_kept_is_the_heir_of_all() -> None:
+def test_the_one_clone_that_is_kept_labels_all() -> None:
     graph = build_graph(torch.zeros(100, 3), num_neighbors=4)
     for stays in (0, 3, 50, 99):
-        assert (heirs(graph, torch.arange(100) == stays) == stays).all()
+        assert (voronoi_labels(graph, torch.arange(100) == stays) == stays).all()
 
 
-def test_against_edges_the_nearest_heir_wins_and_then_the_lowest_index() -> None:
+def test_against_edges_the_nearest_wins_and_then_the_lowest_index() -> None:
     # Node 0 has no neighbour; it is the neighbour of 1, 2 and 3, and as near to 2 as to 3.
     weights = torch.tensor([[0.0], [0.5], [0.9], [0.9]])
     graph = NeighborGraph(torch.tensor([[0], [0], [0], [0]]), weights, weights[:, 0], 1.0, 1.0)
-    assert heirs(graph, torch.tensor([False, True, True, True])).tolist() == [2, 1, 2, 3]
-    assert heirs(graph, torch.tensor([False, True, False, False])).tolist() == [1, 1, 1, 1]
+    assert voronoi_labels(graph, torch.tensor([False, True, True, True])).tolist() == [2, 1, 2, 3]
+    assert voronoi_labels(graph, torch.tensor([False, True, False, False])).tolist() == [1, 1, 1, 1]
 
 
-def test_a_chain_has_one_heir_over_many_hops_and_islands_have_none() -> None:
+def test_a_chain_has_one_label_over_many_hops_and_islands_have_none() -> None:
     line = torch.cartesian_prod(torch.arange(50.0), torch.zeros(1), torch.zeros(1))
     graph = build_graph(torch.cat([line, line[:4] + 1e6]), num_neighbors=2)
     mask = torch.zeros(54, dtype=torch.bool)
     mask[0] = True
-    found = heirs(graph, mask)
+    found = voronoi_labels(graph, mask)
     assert (found[:50] == 0).all()
     assert (found[50:] == -1).all()
 
 
-def test_appearance_keeps_heirs_on_their_side_of_an_edge() -> None:
+def test_appearance_keeps_labels_on_their_side_of_an_edge() -> None:
     params = field(400)
     params["means"] = torch.cartesian_prod(torch.arange(20.0), torch.arange(20.0), torch.zeros(1))
     params["scales"] = torch.full((400, 3), 0.5).log()
@@ -95,8 +95,8 @@ def test_appearance_keeps_heirs_on_their_side_of_an_edge() -> None:
     mask[[8 * 20 + 10, 19 * 20 + 10]] = True
     wrong = []
     for edges in ("centres", "appearance"):
-        heir = heirs(field_graph(params, PruningConfig(num_neighbors=8, edges=edges)), mask)
-        wrong.append(int((left[heir] != left).sum()))
+        labels = voronoi_labels(field_graph(params, PruneRule(num_neighbors=8, edges=edges)), mask)
+        wrong.append(int((left[labels] != left).sum()))
     assert wrong[0] > 40
     assert wrong[1] == 0
 
@@ -104,19 +104,19 @@ def test_appearance_keeps_heirs_on_their_side_of_an_edge() -> None:
 @pytest.mark.parametrize("edges", ["centres", "appearance"])
 def test_a_merge_keeps_the_weighted_sum_of_colours(edges: Any) -> None:
     params = field()
-    config = PruningConfig(keep_ratio=0.1, score="contribution", redistribution="merge", edges=edges)
+    config = PruneRule(score="contribution", redistribution="merge", edges=edges)
     before = {name: value.clone() for name, value in params.items()}
-    decision = decide_share(params, config, weights)
+    decision = decide_share(params, config, 0.1, weights())
     assert all(torch.equal(params[name], before[name]) for name in params)
     assert decision.values is not None
     assert {name: len(value) for name, value in decision.values.items()} == dict.fromkeys(params, 30)
-    heir = heirs(field_graph(params, config), decision.mask)
-    total = torch.zeros(300).index_add_(0, heir.clamp_min(0), weights() * (heir >= 0))[decision.mask]
+    labels = voronoi_labels(field_graph(params, config), decision.mask)
+    total = torch.zeros(300).index_add_(0, labels.clamp_min(0), weights() * (labels >= 0))[decision.mask]
     found = (total[:, None] * decision.values["features_dc"]).sum(dim=0)
-    expected = (weights() * (heir >= 0)) @ params["features_dc"]
+    expected = (weights() * (labels >= 0)) @ params["features_dc"]
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
     # A merge does not change the selection.
-    assert torch.equal(decide_share(params, replace(config, redistribution="none"), weights).mask, decision.mask)
+    assert torch.equal(decide_share(params, replace(config, redistribution="none"), 0.1, weights()).mask, decision.mask)
 
 
 @pytest.mark.parametrize("device", ["cpu", "field"])
@@ -133,10 +133,10 @@ def test_logits_are_pruned_as_their_colours(rule: dict[str, Any], device: Any) -
     logits = field()
     logits["features_dc"] *= 4
     harmonics = {**logits, "features_dc": rgb_to_sh(logits["features_dc"].sigmoid())}
-    config = PruningConfig(keep_ratio=0.3, graph_device=device, **rule)
+    config = PruneRule(graph_device=device, **rule)
     found, expected = (
-        decide_share(Field(logits, "logits"), config, weights),
-        decide_share(harmonics, config, weights),
+        decide_share(Field(logits, "logits"), config, 0.3, weights()),
+        decide_share(harmonics, config, 0.3, weights()),
     )
     assert torch.equal(found.mask, expected.mask)
     assert found.values is not None
@@ -152,17 +152,17 @@ def test_logits_are_pruned_as_their_colours(rule: dict[str, Any], device: Any) -
 
 def test_merged_values_follow_a_permutation_a_scale_and_a_shift() -> None:
     params = {name: value.double() for name, value in field().items()}
-    config = PruningConfig(keep_ratio=0.1, score="contribution", selection="top")
-    plain = decide_share(params, config, weights).values
+    config = PruneRule(score="contribution", selection="top")
+    plain = decide_share(params, config, 0.1, weights()).values
     assert plain is not None
     order = torch.randperm(300)
-    shuffled = decide_share({k: v[order] for k, v in params.items()}, config, lambda: weights()[order])
+    shuffled = decide_share({k: v[order] for k, v in params.items()}, config, 0.1, weights()[order])
     assert shuffled.values is not None
     back = torch.argsort(order[shuffled.mask])
     for name, value in plain.items():
         torch.testing.assert_close(shuffled.values[name][back], value, rtol=1e-9, atol=1e-9)
     moved = {**params, "means": 1024 * params["means"] + 4096, "scales": params["scales"] + math.log(1024)}
-    found = decide_share(moved, config, weights).values
+    found = decide_share(moved, config, 0.1, weights()).values
     assert found is not None
     torch.testing.assert_close(found["means"], 1024 * plain["means"] + 4096)
     torch.testing.assert_close(found["scales"], plain["scales"] + math.log(1024))
@@ -180,15 +180,15 @@ def test_hard_fields_stay_finite() -> None:
     }
     for means in hard.values():
         for edges in ("centres", "appearance"):
-            config = PruningConfig(keep_ratio=0.05, score="contribution", edges=edges)
-            values = decide_share({**field(200), "means": means}, config, lambda: weights(200)).values
+            config = PruneRule(score="contribution", edges=edges)
+            values = decide_share({**field(200), "means": means}, config, 0.05, weights(200)).values
             assert values is not None
             assert all(value.isfinite().all() for value in values.values())
 
 
 def test_a_merge_without_training_views_is_refused() -> None:
     with pytest.raises(ConfigError, match="training views.* set redistribution to none"):
-        decide_share(field(), PruningConfig(score="random", redistribution="merge"))
+        decide_share(field(), PruneRule(score="random", redistribution="merge"))
 
 
 def test_held_learning_rates_wait_for_the_last_prune() -> None:
@@ -205,9 +205,9 @@ def test_held_learning_rates_wait_for_the_last_prune() -> None:
 
 @pytest.mark.gpu
 def test_a_merge_on_the_gpu_gives_the_same_values() -> None:
-    config = PruningConfig(keep_ratio=0.1, score="contribution")
-    on_cpu = decide_share(field(), config, weights)
-    on_gpu = decide_share({name: value.cuda() for name, value in field().items()}, config, lambda: weights().cuda())
+    config = PruneRule(score="contribution")
+    on_cpu = decide_share(field(), config, 0.1, weights())
+    on_gpu = decide_share({name: value.cuda() for name, value in field().items()}, config, 0.1, weights().cuda())
     assert torch.equal(on_gpu.mask.cpu(), on_cpu.mask)
     assert on_cpu.values is not None
     assert on_gpu.values is not None
@@ -216,6 +216,6 @@ def test_a_merge_on_the_gpu_gives_the_same_values() -> None:
         torch.testing.assert_close(on_gpu.values[name].cpu(), value, rtol=1e-4, atol=1e-5)
 
 
-def test_isolated_primitives_have_no_heir() -> None:
+def test_isolated_primitives_have_no_label() -> None:
     graph = NeighborGraph(torch.tensor([[1], [0], [2]]), torch.tensor([[1.0], [1.0], [0.0]]), torch.ones(3), 1.0, 1.0)
-    assert heirs(graph, torch.tensor([True, False, False])).tolist() == [0, 0, -1]
+    assert voronoi_labels(graph, torch.tensor([True, False, False])).tolist() == [0, 0, -1]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.pruning import PruningConfig, kept_count, select_random
+from sundae_ns.pruning import PruneRule, kept_count, select_random
 from sundae_ns.pruning.selection import select_band, select_sampled, select_top
 
 VALUES = st.one_of(st.floats(0, 1e30), st.sampled_from([0.0, 1.0, math.nan, math.inf, -math.inf, 1e-300]))
@@ -138,7 +138,7 @@ def test_impossible_counts_are_refused(count: int) -> None:
 
 def test_bad_options_are_refused() -> None:
     with pytest.raises(ConfigError, match="gamma"):
-        PruningConfig(gamma=1.5).validate()
+        PruneRule(gamma=1.5).validate()
     with pytest.raises(DataError, match="one number per primitive"):
         select_top(torch.ones(3, 2), 1)
 

@@ -16,11 +16,12 @@ from torch import Tensor
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.covariance import covariances, quaternions
 from sundae_ns.gaussians.rotations import rotation_matrices
-from sundae_ns.pruning import Decision, PruningConfig, field_graph, kept_count, response
-from sundae_ns.pruning.redistribution import heirs
+from sundae_ns.pruning import Decision, PruneRule, field_graph, kept_count, response
+from sundae_ns.pruning.redistribution import voronoi_labels
 from sundae_ns.pruning.selection import select_band, select_sampled, select_top
 
-DEFAULT = PruningConfig(keep_ratio=0.2)
+SHARE = 0.2
+DEFAULT = PruneRule()
 PLAIN = replace(DEFAULT, selection="sampled", score="response-contribution", edges="centres", redistribution="none")
 """Response times contribution and independent draws, without the additions of the default rule."""
 PAPER = replace(PLAIN, selection="band", score="response", signal="positions")
@@ -50,12 +51,12 @@ def cloud(n: int = 600, dtype: torch.dtype = torch.float32) -> Tensor:
     return torch.randn(n, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
 
 
-def decided(params: dict[str, Tensor], config: PruningConfig) -> Decision:
+def decided(params: dict[str, Tensor], config: PruneRule, share: float = SHARE) -> Decision:
     n = len(params["means"])
     contribution = torch.linspace(0.1, 1, n)
-    decision = decide_share(params, config, lambda: contribution)
-    assert int(decision.mask.sum()) == decision.kept == kept_count(config.keep_ratio, n)
-    again = decide_share(params, config, lambda: contribution)
+    decision = decide_share(params, config, share, contribution)
+    assert int(decision.mask.sum()) == decision.kept == kept_count(share, n)
+    again = decide_share(params, config, share, contribution)
     assert torch.equal(again.mask, decision.mask)
     assert (decision.values is None) == (config.redistribution == "none" or bool(decision.mask.all()))
     if decision.values is not None and again.values is not None:
@@ -67,19 +68,19 @@ def decided(params: dict[str, Tensor], config: PruningConfig) -> Decision:
     return decision
 
 
-def kept(params: dict[str, Tensor], config: PruningConfig) -> Tensor:
-    return decided(params, config).mask
+def kept(params: dict[str, Tensor], config: PruneRule, share: float = SHARE) -> Tensor:
+    return decided(params, config, share).mask
 
 
-def scaled(params: dict[str, Tensor], scale: float, config: PruningConfig) -> dict[str, Tensor]:
+def scaled(params: dict[str, Tensor], scale: float, config: PruneRule) -> dict[str, Tensor]:
     """The field at another scale; primitives are scaled too if the rule uses their overlap."""
     if config.edges == "centres":
         return {**params, "means": params["means"] * scale}
     return {**params, "means": params["means"] * scale, "scales": params["scales"] + math.log(scale)}
 
 
-def merged_values(params: dict[str, Tensor], config: PruningConfig) -> dict[str, Tensor]:
-    values = decided(params, config).values
+def merged_values(params: dict[str, Tensor], config: PruneRule, share: float = SHARE) -> dict[str, Tensor]:
+    values = decided(params, config, share).values
     assert values is not None
     return dict(values)
 
@@ -95,7 +96,7 @@ def rotated(params: dict[str, Tensor], rotation: Tensor) -> dict[str, Tensor]:
 
 
 @pytest.fixture(params=RULES.values(), ids=[name.replace(" ", "-") for name in RULES])
-def rule(request: pytest.FixtureRequest) -> PruningConfig:
+def rule(request: pytest.FixtureRequest) -> PruneRule:
     return request.param
 
 
@@ -117,10 +118,8 @@ HARD = {
 
 @pytest.mark.parametrize("name", HARD)
 @pytest.mark.parametrize("keep_ratio", [0.001, 0.2, 1.0])
-def test_every_rule_keeps_the_exact_count_of_every_hard_field(
-    rule: PruningConfig, name: str, keep_ratio: float
-) -> None:
-    kept(field(HARD[name]()), replace(rule, keep_ratio=keep_ratio))
+def test_every_rule_keeps_the_exact_count_of_every_hard_field(rule: PruneRule, name: str, keep_ratio: float) -> None:
+    kept(field(HARD[name]()), rule, keep_ratio)
 
 
 @pytest.mark.parametrize("gamma", [0.0, 1.0])
@@ -135,7 +134,7 @@ def test_gamma_0_and_1_take_one_end_each(gamma: float) -> None:
         assert found[mask].max() <= found[~mask & known].min()
 
 
-def test_the_scene_shifted_by_1e5_keeps_its_selection_in_float32(rule: PruningConfig) -> None:
+def test_the_scene_shifted_by_1e5_keeps_its_selection_in_float32(rule: PruneRule) -> None:
     means = (cloud() * 64).round() / 64
     assert torch.equal((means + 1e5) - 1e5, means)
     moved, still = decided(field(means + 1e5), rule), decided(field(means), rule)
@@ -150,7 +149,7 @@ def test_the_scene_shifted_by_1e5_keeps_its_selection_in_float32(rule: PruningCo
 
 
 @pytest.mark.parametrize("scale", [2.0**-80, 2.0**-20, 2.0**20, 2.0**60])
-def test_a_scale_without_rounding_keeps_the_selection(rule: PruningConfig, scale: float) -> None:
+def test_a_scale_without_rounding_keeps_the_selection(rule: PruneRule, scale: float) -> None:
     # Scales are stored as logarithms, and adding a logarithm rounds: float64 keeps the selection.
     params = field(cloud())
     if rule.edges == "appearance" and rule.uses_response:
@@ -160,9 +159,7 @@ def test_a_scale_without_rounding_keeps_the_selection(rule: PruningConfig, scale
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_scale_with_rounding_swaps_no_more_than_near_ties(
-    rule: PruningConfig, scale: float, dtype: torch.dtype
-) -> None:
+def test_a_scale_with_rounding_swaps_no_more_than_near_ties(rule: PruneRule, scale: float, dtype: torch.dtype) -> None:
     params = field(cloud(dtype=dtype))
     before = kept(params, rule)
     swapped = int((kept(scaled(params, scale, rule), rule) != before).sum())
@@ -208,8 +205,8 @@ def test_merged_values_rotate_with_the_scene() -> None:
 
 def test_the_default_rule_follows_a_permutation() -> None:
     params, order, contribution = field(cloud()), torch.randperm(600), torch.linspace(0.1, 1, 600)
-    plain = decide_share(params, DEFAULT, lambda: contribution)
-    mixed = decide_share({key: value[order] for key, value in params.items()}, DEFAULT, lambda: contribution[order])
+    plain = decide_share(params, DEFAULT, SHARE, contribution)
+    mixed = decide_share({key: value[order] for key, value in params.items()}, DEFAULT, SHARE, contribution[order])
     assert torch.equal(mixed.mask, plain.mask[order])
     assert mixed.values is not None
     assert plain.values is not None
@@ -231,7 +228,7 @@ def test_extreme_primitives_merge_to_finite_ones(name: str) -> None:
     params["features_dc"][:] = 0.1
     params["features_dc"][n // 2] = 1e6
     for keep_ratio in (0.001, 0.2, 1.0):
-        decided(params, replace(DEFAULT, keep_ratio=keep_ratio))
+        decided(params, DEFAULT, keep_ratio)
 
 
 def test_a_primitive_of_extreme_colour_has_an_heir() -> None:
@@ -242,7 +239,7 @@ def test_a_primitive_of_extreme_colour_has_an_heir() -> None:
     graph = field_graph(params, DEFAULT)
     assert not graph.isolated[wild]
     mask = torch.arange(2000) % 10 == (wild + 1) % 10
-    assert int(heirs(graph, mask)[wild]) >= 0
+    assert int(voronoi_labels(graph, mask)[wild]) >= 0
 
 
 @pytest.mark.parametrize("name", ["band", "band of attributes", "top", "merge into the top"])
@@ -264,7 +261,7 @@ def test_responses_follow_a_permutation() -> None:
 def test_isolated_primitives_are_selected_last() -> None:
     means = torch.cat([cloud(100), 1e4 * cloud(20)])
     for gamma in (0.0, 0.5, 1.0):
-        mask = kept(field(means), replace(PAPER, gamma=gamma, keep_ratio=0.5))
+        mask = kept(field(means), replace(PAPER, gamma=gamma), 0.5)
         assert not mask[response(field(means), PAPER).isnan()].any()
 
 
@@ -300,16 +297,16 @@ def test_responses_of_inf_come_first_and_nan_last() -> None:
 @pytest.mark.parametrize("keep_ratio", [0.001, 0.5, 1.0])
 @pytest.mark.parametrize("n", [1, 2, 3, 16])
 def test_fewer_primitives_than_neighbours_are_pruned_like_any_others(
-    rule: PruningConfig, n: int, keep_ratio: float
+    rule: PruneRule, n: int, keep_ratio: float
 ) -> None:
     apart, at_one_spot = torch.arange(3.0 * n).reshape(n, 3), torch.zeros(n, 3)
     for means in (apart, at_one_spot):
-        kept(field(means), replace(rule, keep_ratio=keep_ratio))
+        kept(field(means), rule, keep_ratio)
 
 
 def test_two_primitives_merge_into_one_and_one_alone_is_kept_without_a_graph() -> None:
     params = field(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]))
-    values = merged_values(params, replace(DEFAULT, keep_ratio=0.001))
+    values = merged_values(params, DEFAULT, 0.001)
     # Contributions are 0.1 and 1.
     torch.testing.assert_close(values["means"], torch.tensor([[1 / 1.1, 0, 0]]))
     torch.testing.assert_close(
@@ -333,8 +330,8 @@ def test_any_cells_at_any_scale(
     cells: list[Any], exponent: int, keep_ratio: float, gamma: float, name: str, seed: int
 ) -> None:
     params = field(torch.tensor(cells, dtype=torch.float32) * 2.0**exponent, seed)
-    config = replace(RULES[name], keep_ratio=keep_ratio, gamma=gamma, num_neighbors=5, seed=seed)
-    mask = kept(params, config)
+    config = replace(RULES[name], gamma=gamma, num_neighbors=5, seed=seed)
+    mask = kept(params, config, keep_ratio)
     found = response(params, config)
     assert (found[~found.isnan()] >= 0).all()
     assert not found.isinf().any()
@@ -343,18 +340,18 @@ def test_any_cells_at_any_scale(
     # A shift by a whole number of cells is exact.
     moved = {**params, "means": params["means"] + 64 * 2.0**exponent}
     if config.signal == "positions" or name == "default":
-        assert torch.equal(kept(moved, config), mask)
+        assert torch.equal(kept(moved, config, keep_ratio), mask)
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("name", HARD)
-def test_cpu_and_gpu_select_the_same_up_to_ties(rule: PruningConfig, name: str) -> None:
+def test_cpu_and_gpu_select_the_same_up_to_ties(rule: PruneRule, name: str) -> None:
     params = field(HARD[name]())
     n = len(params["means"])
     contribution = torch.linspace(0.1, 1, n)
-    on_cpu = decide_share(params, rule, lambda: contribution)
+    on_cpu = decide_share(params, rule, SHARE, contribution)
     on_device = {key: value.cuda() for key, value in params.items()}
-    on_gpu = decide_share(on_device, replace(rule, graph_device="field"), contribution.cuda)
+    on_gpu = decide_share(on_device, replace(rule, graph_device="field"), SHARE, contribution.cuda())
     differing = on_gpu.mask.cpu() != on_cpu.mask
     print(f"{name}: {int(differing.sum())} of {n} primitives differ")
     assert on_gpu.kept == on_cpu.kept

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.model import SundaeModel
+from sundae_ns.pruning.detail import pixel_detail
+from sundae_ns.rendering import contribution
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[[SundaeModel], Any]
@@ -42,26 +44,26 @@ def test_what_masks_leave_out_of_training_asks_for_no_primitives(build: Build, d
     """All of a picture is what one half shows and what the other does; many primitives have nothing in one of the two."""
     model = build(pruning={"score": score})
     model.gauss_params["scales"].data[:] = -4.0
-    share = 0.5 if score == "detail-contribution" else None
-    whole = model.contribution(datamanager, share)
+    count = N // 2 if score == "detail-contribution" else None
+    whole = model.contribution(datamanager, count)
     left = torch.zeros(32, 40, 1, dtype=torch.bool)
     left[:, :20] = True
     parts = []
     for datamanager.mask in (left, ~left):
-        parts.append(model.contribution(datamanager, share))
+        parts.append(model.contribution(datamanager, count))
     torch.testing.assert_close(parts[0] + parts[1], whole)
     for only, other in (parts, parts[::-1]):
         assert ((only == 0) & (other > 0)).any()
     datamanager.mask = torch.ones_like(left)
-    torch.testing.assert_close(model.contribution(datamanager, share), whole)
+    torch.testing.assert_close(model.contribution(datamanager, count), whole)
     for datamanager.mask in (left[:-1], left[..., 0], left[:1]):
         with pytest.raises(DataError, match="its view is 40 x 32 px"):
-            model.contribution(datamanager, share)
+            model.contribution(datamanager, count)
 
 
 def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(build: Build, datamanager: Any) -> None:
     model = build()
-    found = [model.contribution(datamanager, share) for share in (None, 0.5, 0.5)]
+    found = [model.contribution(datamanager, count) for count in (None, N // 2, N // 2)]
     assert torch.equal(found[1], found[2])
     assert torch.equal(found[1] > 0, found[0] > 0)
     seen = found[0] > 0
@@ -70,23 +72,21 @@ def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(buil
     assert float(ratio.min()) < 0.9
 
 
-def test_a_prune_weighs_detail_for_the_share_that_it_keeps(
+def test_a_prune_weighs_detail_for_the_count_that_it_keeps(
     build: Build, training_of: TrainingOf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     training = training_of(build(pruning={"mode": "continuous", "start": 3, "stop": 3, "target_primitives": 15}))
-    asked: list[float | None] = []
-    rendering = sys.modules["sundae_ns.rendering.contribution"]  # its name is also that of a function
-    view_weights = rendering.view_weights
+    asked: list[float] = []
 
-    def spy(*arguments: Any) -> Tensor:
-        asked.append(arguments[4])
-        weights: Tensor = view_weights(*arguments)
-        return weights
+    def spy(image: Tensor, cells: float) -> Tensor:
+        asked.append(cells)
+        return pixel_detail(image, cells)
 
-    monkeypatch.setattr(rendering, "view_weights", spy)
+    monkeypatch.setattr(sys.modules[contribution.__module__], "pixel_detail", spy)
     counts = []
     for step in range(6):
         training.step(step)
         counts.append(training.model.num_points)
     assert counts == [60, 60, 60, 15, 15, 15]
-    assert asked == [0.25] * 3
+    # All primitives are visible in each of three views, and 15 of them stay.
+    assert asked == [15.0] * 3

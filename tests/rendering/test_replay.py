@@ -202,7 +202,7 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(
         assert replay._recordable(source, settings)
         assert not replay._recordable(empty, settings)
         assert not replay._recordable(source, replace(settings, training=True))
-        assert not replay._recordable(source.part(torch.ones(1, dtype=torch.bool)), settings)
+        assert not replay._recordable(LocalField(source.field, whole=False), settings)
     assert not replay._recordable(source, settings)  # with gradients
 
 

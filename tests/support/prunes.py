@@ -1,4 +1,4 @@
-"""One prune to the keep ratio of a configuration."""
+"""One prune to a share of a field."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from torch import Tensor
 
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning import Decision, PruningConfig, decide, kept_count
-from sundae_ns.pruning.scores import Contribution
+from sundae_ns.pruning import Decision, PruneRule, decide, kept_count
 
 
 def decide_share(
     params: Mapping[str, Tensor],
-    config: PruningConfig,
-    contribution: Contribution | None = None,
+    rule: PruneRule,
+    share: float = 0.1,
+    contribution: Tensor | None = None,
     graph: NeighborGraph | None = None,
 ) -> Decision:
-    """The decision that keeps ``config.keep_ratio`` of the finite primitives; arguments as of :func:`decide`."""
-    count = kept_count(config.keep_ratio, int(finite_mask(params).sum()))
-    return decide(params, config, contribution, count=count, graph=graph)
+    """The decision that keeps a share of the finite primitives; arguments as of :func:`decide`."""
+    return decide(params, rule, kept_count(share, int(finite_mask(params).sum())), contribution, graph)

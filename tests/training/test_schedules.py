@@ -15,7 +15,8 @@ from torch.optim import Adam, Optimizer
 
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.graphs import build_graph
-from sundae_ns.pruning import PruningConfig
+from sundae_ns.pruning.cutting import FieldPruner
+from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.report import PruneReport
 from sundae_ns.training.schedules import (
     ContinuousPruning,
@@ -53,15 +54,16 @@ def train_step(params: dict[str, Parameter], optimizers: dict[str, Optimizer]) -
 
 
 def run(
-    policy: PruningSchedule, made: Field, steps: range, state: dict[str, Any] | None = None, **options: Any
+    policy: PruningSchedule, made: Field, steps: range, state: dict[str, Any] | None = None
 ) -> tuple[list[PruneReport], dict[str, Any]]:
     params, optimizers = made
     state = policy.initialize_state() if state is None else state
     reports = []
-    options.setdefault("contribution", lambda: params["opacities"].detach().sigmoid().squeeze(1))
     for step in steps:
         train_step(params, optimizers)
-        report = policy.step_post_backward(params, optimizers, state, step, {}, **options)
+        report = policy.after_step(
+            FieldPruner(params, optimizers), state, step, lambda _: params["opacities"].detach().sigmoid().squeeze(1)
+        )
         if report is not None:
             reports.append(report)
     return reports, state
@@ -158,9 +160,8 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
     params, optimizers = field(last)  # what densification has made of it meanwhile
     densification = {"grad2d": torch.zeros(last), "count": torch.zeros(last), "scene_scale": 1.0}
     for step in (3, 4):
-        policy.step_post_backward(
-            params, optimizers, state, step, contribution=lambda: torch.ones(last), strategy_state=densification
-        )
+        pruner = FieldPruner(params, optimizers, [densification])
+        policy.after_step(pruner, state, step, lambda _: torch.ones(last))
         assert {len(value) for value in params.values()} == {80}
         assert all(optimizers[name].param_groups[0]["params"] == [params[name]] for name in optimizers)
         rows = [len(value) for value in densification.values() if isinstance(value, Tensor)]
@@ -185,7 +186,7 @@ def test_continuous_draws_anew_each_time() -> None:
     kept = []
     for step in (3, 3, 4):
         made = field()
-        policy.step_post_backward(*made, policy.initialize_state(), step)
+        policy.after_step(FieldPruner(*made), policy.initialize_state(), step)
         kept.append(made[0]["means"].detach())
     assert torch.equal(kept[0], kept[1])
     assert not torch.equal(kept[0], kept[2])
@@ -196,18 +197,16 @@ def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> 
     params, optimizers = made
     params["means"].data[5] = torch.nan
     params["opacities"].data[[5, 9]] = torch.inf
-    asked: list[int] = []
+    asked: list[tuple[int | None, int]] = []
 
-    def contribution() -> Tensor:
-        asked.append(len(params["means"]))
+    def contribute(count: int | None) -> Tensor:
+        asked.append((count, len(params["means"])))
         return torch.ones(len(params["means"]))
 
     policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=0.5))
-    report = policy.step_post_backward(
-        params, optimizers, policy.initialize_state(), 0, contribution=contribution, strategy_state=None
-    )
+    report = policy.after_step(FieldPruner(params, optimizers), policy.initialize_state(), 0, contribute)
     assert report is not None
-    assert asked == [98]
+    assert asked == [(49, 98)]
     assert (report.before, report.dropped_nonfinite, report.after) == (100, 2, 49)
     assert "2 were NaN or infinite" in report.summary()
     assert all(value.isfinite().all() for value in params.values())
@@ -220,7 +219,7 @@ def test_the_state_of_densification_is_sliced_along() -> None:
     config = PruningConfig(prune_at=0, score="opacity", selection="top", redistribution="none", keep_ratio=0.1)
     opacities = made[0]["opacities"].detach().squeeze(1).clone()
     policy = make_schedule(config)
-    policy.step_post_backward(*made, policy.initialize_state(), 0, strategy_state=strategy_state)
+    policy.after_step(FieldPruner(*made, [strategy_state]), policy.initialize_state(), 0)
     assert strategy_state["grad2d"].tolist() == sorted((opacities[1:].topk(10).indices + 1).tolist())
     assert strategy_state["scene_scale"] == 2.0
 
@@ -228,7 +227,7 @@ def test_the_state_of_densification_is_sliced_along() -> None:
 def test_full_keep_ratio_keeps_all_and_asks_for_nothing() -> None:
     made = field(10)
     policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=1.0))
-    report = policy.step_post_backward(*made, policy.initialize_state(), 0)
+    report = policy.after_step(FieldPruner(*made), policy.initialize_state(), 0)
     assert report is not None
     assert (report.before, report.after, report.sigma) == (10, 10, None)
 
@@ -244,7 +243,7 @@ def test_a_failed_prune_leaves_field_and_state() -> None:
     policy = make_schedule(PruningConfig(prune_at=0))
     state = policy.initialize_state()
     with pytest.raises(DataError, match=r"contribution has shape \[9\] for 10 primitives"):
-        policy.step_post_backward(*made, state, 0, contribution=lambda: torch.ones(9))
+        policy.after_step(FieldPruner(*made), state, 0, lambda _: torch.ones(9))
     assert len(made[0]["means"]) == 10
     assert state["pruned_at"] == -1
 
@@ -254,9 +253,7 @@ def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
     params, optimizers = field()
     foreign = {**params, "means": Parameter(torch.zeros(100, 3))}
     with pytest.raises(DataError, match="optimizer of 'means'"):
-        policy.step_post_backward(
-            foreign, optimizers, policy.initialize_state(), 0, contribution=lambda: torch.ones(100)
-        )
+        policy.after_step(FieldPruner(foreign, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(100))
     assert len(foreign["means"]) == 100
 
 
@@ -265,7 +262,7 @@ def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
     params, optimizers = field(10)
     params["opacities"].data[:] = torch.nan
     with pytest.raises(DataError, match="none of 10 primitives is finite: the training has diverged"):
-        policy.step_post_backward(params, optimizers, policy.initialize_state(), 0)
+        policy.after_step(FieldPruner(params, optimizers), policy.initialize_state(), 0)
 
 
 def test_report_is_one_line_of_plain_numbers() -> None:

@@ -11,11 +11,11 @@ import torch
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians.field import Field
-from sundae_ns.pruning import PruningConfig
 from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.budget.search import Search
 from sundae_ns.training.densification import ChainStrategy, Densification
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.pruning_config import PruningConfig
 
 FIELD = {"field": {"means": torch.zeros(2, 3)}}
 
