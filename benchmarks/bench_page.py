@@ -30,9 +30,8 @@ from browser import WEBGPU, Browser, find_chromium, wait_for
 from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 
-from sundae_ns.api.packing import arrays_of_views, scene_of
+from sundae_ns.api.packing import cameras_of, scene_of
 from sundae_ns.api.page import write_page
-from sundae_ns.api.views import view_in_front
 from sundae_ns.scenes.packed import model_of
 from sundae_ns.storage.packing import PackedScene, container, read_scene
 from sundae_ns.storage.packing.scene import CAMERAS as STORED
@@ -75,8 +74,7 @@ def write_scaled(out: Path, scene: Path, side: int) -> PackedScene:
 
 def truths(scene: PackedScene) -> list[dict[str, NDArray[np.float32]]]:
     """``rgb`` and ``base_rgb`` of each camera, by Python."""
-    opened = scene_of(scene)
-    model, cameras = model_of(opened), arrays_of_views(opened.views or [view_in_front(opened)])
+    model, cameras = model_of(scene_of(scene)), cameras_of(scene)
     images = []
     for pose, lens, size in zip(*(cameras[name] for name in ("poses", "intrinsics", "sizes")), strict=True):
         fx, fy, cx, cy = lens.float().reshape(4, 1, 1)

@@ -32,8 +32,8 @@ from bench_page import SECONDS, SIDE, bundled, has_packages, psnr, scaled, truth
 from browser import Browser, find_chromium, wait_for
 from numpy.typing import NDArray
 
+from sundae_ns.api.packing import cameras_of
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.scenes.statement import cameras_of
 from sundae_ns.storage.packing import PackedScene, read_scene
 from sundae_ns.storage.viewers import write_for_viewers
 

@@ -21,7 +21,6 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
 from torch import Tensor
 
-from sundae_ns.api.scene import Scene
 from sundae_ns.callbacks import NerfstudioRun, training_views
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window
 from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, no_images_error, view_index
@@ -227,21 +226,6 @@ class SundaeModel(SplatfactoModel):
         self._start = Start()
         # Not SplatfactoModel's own loader, which replaces parameters and resets the step.
         return super(SplatfactoModel, self).load_state_dict(state_dict, **kwargs)
-
-    def hold(self, scene: Scene) -> None:
-        """Take over field and head of a finished scene, in place; parameters that it lacks become 0.
-
-        Args:
-            scene: of at most the model's SH degree, and with a head only if the model has one of its kind.
-        """
-        n = scene.num_primitives
-        for name, value in self.gauss_params.items():
-            value.data = value.data.new_zeros(n, *value.shape[1:])
-            if (found := scene.field.get(name)) is not None and found.numel():
-                value.data[:, : found.shape[1]] = found.detach().to(value.data)
-        if self.head is not None and scene.head is not None:
-            self.head.load_state_dict(scene.head.state_dict())
-        self.state.trained_focal = scene.trained_focal
 
     # ---------------------------------------------------------------------------------------------------- rendering
 

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sundae_ns.api.packing import is_frame, scene_of
 from sundae_ns.api.scene import Scene
+from sundae_ns.api.views import is_frame
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.compensation.head import SIZES
 from sundae_ns.data.capture import read_json
@@ -20,7 +20,6 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering.source import degree_in_use
 from sundae_ns.storage import is_nerfstudio_ply, ply_comments, read_ply
 from sundae_ns.storage.kinds import kind_of
-from sundae_ns.storage.packing import read_scene
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import model_options
 from sundae_ns.storage.runs.folder import find_config
@@ -55,6 +54,9 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     path = Path(path)
     kind, suffix = kind_of(path), path.suffix.lower()
     if kind == "packed" or suffix == ".sundae":
+        from sundae_ns.api.packing import scene_of  # its decoder needs a compiler, which other files do not
+        from sundae_ns.storage.packing import read_scene
+
         return scene_of(read_scene(path)).to(device)
     if kind == "ply" or suffix == ".ply":
         params = read_ply(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, get_args, get_type_hints
 
@@ -11,6 +10,7 @@ from torch import Tensor
 
 from sundae_ns.api.scene import Background, Scene
 from sundae_ns.api.sensitivity import sensitivity_of
+from sundae_ns.api.views import is_frame, is_number, view_in_front
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import PackError, SundaeError
 from sundae_ns.gaussians import FEATURES
@@ -85,6 +85,13 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
     )
 
 
+def cameras_of(packed: PackedScene) -> dict[str, Tensor]:
+    """The stored cameras, as arrays; one in front of the scene if there are none."""
+    if packed.cameras is not None and len(packed.cameras["poses"]):
+        return packed.cameras
+    return arrays_of_views([view_in_front(scene_of(packed))])
+
+
 def views_of_arrays(cameras: Mapping[str, Tensor] | None) -> tuple[View, ...]:
     """Cameras of a packed file as views, on the CPU; none for None."""
     if cameras is None:
@@ -121,25 +128,12 @@ def refusal(reason: str) -> PackError:
     return PackError(f"the packed scene states {reason}; update this program, or pack it again")
 
 
-def is_number(value: Any) -> bool:
-    """Whether a value of JSON is a finite number."""
-    return type(value) in (int, float) and math.isfinite(value)
-
-
 def one_of(stated: Mapping[str, Any], name: str, known: Sequence[Any]) -> Any:
     """A stated value that is one of the known ones."""
     value = stated.get(name)
     if value not in known:
         raise refusal(f"a {name} that is none of {', '.join(map(str, known))}")
     return value
-
-
-def is_frame(stated: Any) -> bool:
-    """Whether a value states a transform ``[3 or 4, 4]`` and a scale, from a capture's coordinates to a model's."""
-    if not isinstance(stated, dict) or not is_number(stated.get("scale")):
-        return False
-    rows = stated.get("transform")
-    return isinstance(rows, list) and all(isinstance(row, list) and all(map(is_number, row)) for row in rows)
 
 
 def whole(stated: Mapping[str, Any], name: str, least: int, most: int) -> int:

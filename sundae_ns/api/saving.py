@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sundae_ns.api.packing import contents_of
+from sundae_ns.api.opening import load
 from sundae_ns.api.page import write_page
 from sundae_ns.api.scene import Scene
 from sundae_ns.errors import ConfigError
-from sundae_ns.storage.packing import fit_scene, pack_bytes, write_scene
+from sundae_ns.storage.atomic import replacing
+from sundae_ns.storage.kinds import kind_of
 from sundae_ns.storage.viewers import FORMATS, ViewerFile, write_for_viewers
 
 SUFFIXES = (*FORMATS, ".sundae", ".html")
@@ -47,10 +48,27 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if upright:
         raise ConfigError(f"{suffix} files keep their coordinates; leave out upright")
-    if suffix == ".sundae":
-        write_scene(path, contents_of(scene))
-    else:
-        write_page(path, scene, pack_bytes(*fit_scene(contents_of(scene))), title=path.resolve().stem)
+    packed = _packed(scene)
+    if suffix == ".html":
+        write_page(path, scene, packed, title=path.resolve().stem)
+        return
+    with replacing(path) as partial:
+        partial.write_bytes(packed)
+
+
+def packed_file(path: Path) -> tuple[Scene, bytes]:
+    """A scene, and the packed file that holds it: a packed scene as it is, a file of primitives packed by the defaults."""
+    scene = load(path)
+    if kind_of(path) == "packed":
+        return scene, path.read_bytes()
+    return scene, _packed(scene)
+
+
+def _packed(scene: Scene) -> bytes:
+    from sundae_ns.api.packing import contents_of  # its encoder needs a compiler, which other files do not
+    from sundae_ns.storage.packing import fit_scene, pack_bytes
+
+    return pack_bytes(*fit_scene(contents_of(scene)))
 
 
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:

@@ -154,3 +154,16 @@ def _camera_path(content: dict[str, Any], where: str) -> list[View]:
         intrinsics = (focal, focal, width / 2, height / 2)
         views.append(View.from_pose(torch.from_numpy(pose), intrinsics, width, height))
     return views
+
+
+def is_frame(stated: Any) -> bool:
+    """Whether a value states a transform ``[3 or 4, 4]`` and a scale, from a capture's coordinates to a model's."""
+    if not isinstance(stated, dict) or not is_number(stated.get("scale")):
+        return False
+    rows = stated.get("transform")
+    return isinstance(rows, list) and all(isinstance(row, list) and all(map(is_number, row)) for row in rows)
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value of JSON is a finite number."""
+    return type(value) in (int, float) and math.isfinite(value)

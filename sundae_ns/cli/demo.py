@@ -94,13 +94,13 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
             from sundae_ns.api.page import write_page
             from sundae_ns.scenes.measure import frame_times, sizes
             from sundae_ns.scenes.opening import load_run
-            from sundae_ns.scenes.packed import packed_file
+            from sundae_ns.scenes.packed import packed_run
             from sundae_ns.storage.atomic import replacing
 
             opened = load_run(run / "config.yml")
             model, cameras = opened.model, opened.cameras
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
-            finished, packed = packed_file(run)
+            finished, packed = packed_run(run)
             with replacing(out / "scene.sundae") as partial:
                 partial.write_bytes(packed)
             write_page(out / "scene.html", finished, packed, title="sundae demo")

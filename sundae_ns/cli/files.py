@@ -84,15 +84,17 @@ def _export_page(scene: Path, out: Path, data: Path | None) -> int:
 def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     """A scene, and the packed file that holds it; a run, whose capture may have moved, is packed in memory."""
     from sundae_ns.storage.kinds import kind_of
+    from sundae_ns.storage.runs.config_file import check_run
 
-    if kind_of(path) == "packed" or path.suffix == ".sundae":
-        from sundae_ns.api.opening import load
+    if kind_of(path) is not None or path.suffix == ".sundae":
+        from sundae_ns.api.saving import packed_file
 
-        return load(path), path.read_bytes()
-    from sundae_ns.scenes.packed import packed_file
+        return packed_file(path)
+    check_run(path)  # before nerfstudio is imported, which takes seconds
+    from sundae_ns.scenes.packed import packed_run
 
     with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
-        return packed_file(path, data=data)
+        return packed_run(path, data=data)
 
 
 def prune(

@@ -17,11 +17,10 @@ from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.gpu.memory import naming_full_memory
-from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import View
 from sundae_ns.scenes.finetune_step import Through, TunedStep
 from sundae_ns.scenes.opening import open_pipeline
-from sundae_ns.scenes.packed import is_unpacked
+from sundae_ns.scenes.packed import is_unpacked, place
 from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import config_of
@@ -98,6 +97,8 @@ def finetune(
             f"{run} was saved during densification; train it to its end, or pack it without a fine-tune"
         )
     place(model, scene.field)
+    # Rounded quaternions have length 1, and gradients refer to them.
+    model.gauss_params["quats"].data = torch.nn.functional.normalize(model.gauss_params["quats"].data)
     for name, value in model.gauss_params.items():
         value.requires_grad_(name in codecs.field)
     codecs = codecs.to(model.device)
@@ -130,16 +131,6 @@ def finetune(
         meta={**scene.meta, "source": source},
     )
     return trained, codecs.to(torch.device("cpu"))
-
-
-def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
-    """Load a field into the model in its order; parameters that it lacks become 0."""
-    n = len(field["means"])
-    for name, value in model.gauss_params.items():
-        new = field.get(name)
-        value.data = value.data.new_zeros(n, *value.shape[1:]) if new is None else new.to(value.data)
-    # Rounded quaternions have length 1, and gradients refer to them.
-    model.gauss_params["quats"].data = torch.nn.functional.normalize(model.gauss_params["quats"].data)
 
 
 def _optimizer(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> torch.optim.Optimizer:

@@ -10,6 +10,7 @@ import copy
 import dataclasses
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -26,16 +27,15 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
 from sundae_ns.api.opening import FRAME_FILE, load
-from sundae_ns.api.packing import arrays_of_views, contents_of, is_frame, is_number, refusal, scene_of
+from sundae_ns.api.packing import cameras_of, contents_of, refusal, scene_of
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.views import view_in_front
+from sundae_ns.api.views import is_frame, is_number
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, no_images_error
 from sundae_ns.errors import CheckpointError, PackError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.scenes import stock
 from sundae_ns.storage.atomic import write_text, writing
-from sundae_ns.storage.kinds import kind_of
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import check_run, load_config
@@ -85,20 +85,9 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
     )
 
 
-def packed_file(path: Path, *, data: Path | None = None) -> tuple[Scene, bytes]:
-    """A scene, and the packed file that holds it: a packed scene as it is, anything else packed by the defaults.
-
-    Args:
-        path: a packed scene, a run, or a file of primitives.
-        data: the capture of a run, if it has moved.
-
-    Raises:
-        CheckpointError, DataError, PackError: it cannot be opened, or packed.
-    """
-    if kind_of(path) == "packed" or path.suffix == ".sundae":
-        return load(path), path.read_bytes()
-    single = path.is_file() and path.suffix.lower() in (".ply", ".spz", ".sog")
-    contents = contents_of(load(path)) if single else contents_of_run(path, data=data)
+def packed_run(run: Path, *, data: Path | None = None) -> tuple[Scene, bytes]:
+    """The scene of a finished run with its training cameras, and the packed file that holds it; see above for errors."""
+    contents = contents_of_run(run, data=data)
     return scene_of(contents), pack_bytes(*fit_scene(contents))
 
 
@@ -224,10 +213,32 @@ def model_of(scene: Scene) -> SundaeModel:
     seeds = (torch.eye(3)[:2], torch.zeros(2, 3))
     box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
     model: SundaeModel = config.setup(scene_box=box, num_train_data=0, metadata={}, seed_points=seeds)
-    model.hold(scene)
+    hold(model, scene)
     # A step at which all SH degrees are active and the head is enabled.
     model.step = max(degree, 1)
     return model.eval()
+
+
+def hold(model: SundaeModel, scene: Scene) -> None:
+    """Put a finished scene in place of a model's field and head.
+
+    Args:
+        model: of at least the scene's SH degree, and with a head of its kind if the scene has one.
+        scene: any device.
+    """
+    place(model, scene.field)
+    if model.head is not None and scene.head is not None:
+        model.head.load_state_dict(scene.head.state_dict())
+    model.state.trained_focal = scene.trained_focal
+
+
+def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
+    """Load a field into a model, in place and in the field's order; parameters and coefficients that it lacks become 0."""
+    for name, value in model.gauss_params.items():
+        new = value.data.new_zeros(len(field["means"]), *value.shape[1:])
+        if name in field:
+            new[:, : field[name].shape[1]] = field[name].detach().to(new)
+        value.data = new
 
 
 def capture_of(packed: PackedScene, data: Path) -> SundaeDatamanagerConfig:
@@ -276,9 +287,7 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
 
 def _transforms(packed: PackedScene) -> dict[str, Any]:
     """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
-    cameras = packed.cameras
-    if cameras is None or not len(cameras["poses"]):
-        cameras = arrays_of_views([view_in_front(scene_of(packed))])
+    cameras = cameras_of(packed)
     frames = []
     for i, pose in enumerate(cameras["poses"].double().tolist()):
         fx, fy, cx, cy = cameras["intrinsics"][i].tolist()

@@ -16,8 +16,8 @@ import torch
 
 from sundae_ns.errors import DataError, PackError
 from sundae_ns.evaluation import psnr
-from sundae_ns.scenes.finetune import place
 from sundae_ns.scenes.opening import open_pipeline, views_to_test
+from sundae_ns.scenes.packed import place
 from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene, write_fitted
 from sundae_ns.storage.packing.config import STEPS
 from sundae_ns.storage.runs.folder import config_of

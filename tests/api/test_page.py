@@ -25,9 +25,9 @@ from PIL import Image
 
 from sundae_ns.api.packing import scene_of
 from sundae_ns.api.page import page_of, render_first, write_page
+from sundae_ns.api.saving import packed_file
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
-from sundae_ns.scenes.packed import packed_file
 from sundae_ns.storage.packing import read_scene
 
 ROOT = Path(__file__).parents[2]

@@ -28,17 +28,20 @@ def run(*arguments: object) -> int:
     return caught.value.code
 
 
-def field(n: int = 200) -> dict[str, Tensor]:
+MODEL = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "black"}
+
+
+def field(n: int = 200, features: int = 0) -> dict[str, Tensor]:
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(n, 3, generator=generator)
-    made = from_points(points, points, sh_degree=1, num_features=3, generator=generator)
+    made = from_points(points, points, sh_degree=1, num_features=features, generator=generator)
     made["features_rest"] = torch.randn(n, 3, 3, generator=generator)
     return made
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
-    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": {"rasterize_mode": mode}}))
+    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": {**MODEL, "rasterize_mode": mode}}))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply") == 0
     found, truth = read_ply(tmp_path / "a.ply"), read_scene(tmp_path / "a.sundae").field
     assert all(torch.equal(found[name], truth[name]) for name in SPLAT_NAMES)
@@ -48,7 +51,7 @@ def test_export_of_a_packed_scene(tmp_path: Path, mode: str) -> None:
 
 @pytest.mark.parametrize("kind", [".spz", ".sog"])
 def test_export_to_other_formats(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
-    model = {"rasterize_mode": "antialiased", "sh_degree": 1}
+    model = {**MODEL, "rasterize_mode": "antialiased"}
     write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": model}))
     out = tmp_path / f"a{kind}"
     assert run("export", tmp_path / "a.sundae", "-o", out) == 0
@@ -105,7 +108,7 @@ def test_export_of_a_ply_of_nerfstudio_upright(tmp_path: Path) -> None:
 def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
     given = field()
     given["features_rest"] = given["features_rest"][:, :0]
-    write_scene(tmp_path / "a.sundae", PackedScene(given, meta={"model": {"sh_degree": 0}}))
+    write_scene(tmp_path / "a.sundae", PackedScene(given, meta={"model": {**MODEL, "sh_degree": 0}}))
     assert run("export", tmp_path / "a.sundae", "-o", tmp_path / "a.ply", "--upright") == 0
     truth = read_scene(tmp_path / "a.sundae").field
     found = read_ply(tmp_path / "a.ply")
@@ -115,7 +118,8 @@ def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [[], ["--score", "opacity", "--selection", "top"], ["--score", "response", "--selection", "band"]]
+    "options",
+    [["--views", "4"], ["--score", "opacity", "--selection", "top"], ["--score", "response", "--selection", "band"]],
 )
 def test_prune_does_not_change_kept_rows(
     tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
@@ -133,7 +137,7 @@ def test_prune_does_not_change_kept_rows(
     other = PlyElement.describe(np.array([(7,)], [("number", "<i4")]), "extra")
     PlyData([PlyElement.describe(more, "vertex"), other], comments=data.comments).write(str(source))
 
-    assert run("prune", source, "-o", out, "--keep", "0.25", *options) == 0
+    assert run("prune", source, "-o", out, "--keep", "0.25", "--no-merge", *options) == 0
     text = capsys.readouterr().out
     assert "50 of 200 primitives" in text
     assert "dropped 1 primitives that were not finite" in text
@@ -153,8 +157,10 @@ def test_prune_does_not_change_kept_rows(
     ("arguments", "message"),
     [
         (["prune", "nothing.ply", "-o", "a.ply"], "nothing.ply cannot be read"),
-        (["prune", "in.ply", "-o", "a.ply", "--keep", "0"], "keep_ratio is 0.0"),
-        (["prune", "in.ply", "-o", "a.spz"], "a.spz does not end in .ply"),
+        (["prune", "in.ply", "-o", "a.ply", "--keep", "0"], "keep is 0.0"),
+        (["prune", "in.ply", "-o", "a.splat"], "a.splat has no supported suffix"),
+        (["prune", "in.ply", "-o", "a.ply", "--keep", "0.1", "--count", "5"], "--keep and --count exclude each other"),
+        (["prune", "in.ply", "-o", "a.ply", "--count", "0"], "count is 0; give 1 or more"),
         (["prune", "none.ply", "-o", "a.ply"], "none.ply has 5 primitives, and none is finite; export it again"),
         (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 primitives, and none is finite; export it again"),
         (["export", "none.ply", "-o", "a.spz"], "none.ply has 5 primitives, and none is finite; export it again"),
@@ -168,9 +174,8 @@ def test_prune_does_not_change_kept_rows(
         (["export", "in.ply", "-o", "a.sog", "--upright"], "not in nerfstudio's coordinates"),
         (
             ["export", "in.bin", "-o", "a.ply"],
-            "in.bin is not a run's config.yml, or of another version (it is no text)",
+            "in.bin is no .spz; give a .ply",
         ),
-        (["prune", "in.sundae", "-o", "a.ply"], "in.sundae is a packed scene; sundae export makes a .ply of it"),
         (["pack", "in.sundae", "-o", "a.sundae"], "in.sundae is a packed scene; give the run that was packed"),
         (["pack", "in.ply", "-o", "a.sundae"], "in.ply is a .ply file; give the folder of a run"),
         (["unpack", "in.ply"], "in.ply is not a packed scene; give a file that sundae pack wrote"),
@@ -190,7 +195,7 @@ def test_refusals_are_one_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_ply(Path("in.ply"), field())
-    write_scene(Path("in.sundae"), PackedScene(field()))
+    write_scene(Path("in.sundae"), PackedScene(field(), meta={"model": MODEL}))
     Path("in.bin").write_bytes(b"\x1f\x8b\xff")
     write_ply(Path("none.ply"), {name: torch.full_like(value[:5], torch.nan) for name, value in field().items()})
     write_ply(Path("empty.ply"), {name: value[:0] for name, value in field().items()})
@@ -209,22 +214,24 @@ def without(package: str, words: list[str], folder: Path) -> subprocess.Complete
 
 
 def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> None:
-    write_scene(tmp_path / "a.sundae", PackedScene(field()))
+    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": MODEL}))
     write_kind(tmp_path / "head.sundae", KINDS["residual"])
     commands = [
         ["export", "a.sundae", "-o", "a.ply"],
         ["export", "a.ply", "-o", "a.spz"],
-        ["prune", "a.ply", "-o", "pruned.ply"],
+        ["prune", "a.ply", "-o", "pruned.ply", "--views", "4"],
+        ["prune", "a.spz", "-o", "pruned.sundae", "--count", "20", "--views", "4"],
+        ["export", "a.ply", "-o", "page.html"],
         ["export", "head.sundae", "-o", "head.html"],
     ]
     for words in commands:
         done = without("nerfstudio", words, tmp_path)
         assert done.returncode == 0, done.stderr
-        assert (tmp_path / words[-1]).stat().st_size > 0
+        assert (tmp_path / words[3]).stat().st_size > 0
 
 
 def test_an_existing_run_is_refused_without_nerfstudio(tmp_path: Path) -> None:
-    write_scene(tmp_path / "a.sundae", PackedScene(field()))
+    write_scene(tmp_path / "a.sundae", PackedScene(field(), meta={"model": MODEL}))
     run = tmp_path / "outputs" / "a" / "sundae" / "unpacked"
     run.mkdir(parents=True)
     (run / "config.yml").touch()
@@ -233,9 +240,7 @@ def test_an_existing_run_is_refused_without_nerfstudio(tmp_path: Path) -> None:
     assert "is a run already" in done.stderr
 
 
-@pytest.mark.parametrize(
-    "words", [["pack", "a.ply", "-o", "x"], ["view", "a.ply"], ["export", "gone", "-o", "x.html"]], ids=" ".join
-)
+@pytest.mark.parametrize("words", [["pack", "a.ply", "-o", "x"], ["export", "gone", "-o", "x.html"]], ids=" ".join)
 def test_what_is_no_run_is_refused_without_nerfstudio(tmp_path: Path, words: list[str]) -> None:
     write_ply(tmp_path / "a.ply", field())
     done = without("nerfstudio", words, tmp_path)
@@ -246,5 +251,5 @@ def test_what_is_no_run_is_refused_without_nerfstudio(tmp_path: Path, words: lis
 
 def test_fields_are_pruned_without_a_compiler(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", field())
-    done = without("numba", ["prune", "a.ply", "-o", "pruned.ply"], tmp_path)
+    done = without("numba", ["prune", "a.ply", "-o", "pruned.ply", "--views", "2"], tmp_path)
     assert done.returncode == 0, done.stderr

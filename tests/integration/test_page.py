@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from packed_scenes import KINDS, write_kind
 
 from sundae_ns.api.page import page_of, write_page
+from sundae_ns.api.saving import packed_file
 from sundae_ns.cli.view import serve
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.scenes.packed import packed_file
 from sundae_ns.storage.packing import read_scene, write_scene
 
 pytestmark = needs_chromium
