@@ -23,8 +23,9 @@ from PIL import Image
 from torch import Tensor
 from viser import transforms
 
-from sundae_ns.pruning import kept_count
-from sundae_ns.rendering import render
+from sundae_ns.pruning import kept_count, prune
+from sundae_ns.rendering import LocalField, render
+from sundae_ns.viewer import previewed_rule
 
 pytestmark = [pytest.mark.browser, needs_chromium]
 SIDE = 256
