@@ -41,6 +41,18 @@ def test_options_of_later_versions_have_their_defaults(tmp_path: Path) -> None:
     assert found.max_num_iterations == TrainerConfig().max_num_iterations
 
 
+def test_the_class_paths_of_earlier_runs_still_open(tmp_path: Path) -> None:
+    """``PruningConfig`` has moved; its options have stood side by side from the first."""
+    config = copy.deepcopy(all_methods["sundae-paper"])
+    text, path = yaml.dump(config), tmp_path / "config.yml"
+    now, before = "sundae_ns.training.pruning_config.PruningConfig", "sundae_ns.pruning.config.PruningConfig"
+    assert now in text
+    path.write_text(text.replace(now, before))
+    for found in (load_config(path), yaml.load(path.read_text(), Loader=yaml.Loader)):  # ours, and nerfstudio's
+        assert found.pipeline.model.pruning == config.pipeline.model.pruning
+        assert yaml.dump(found) == text
+
+
 HOSTILE = {
     "a call": "!!python/object/apply:os.mkdir ['{}']",
     "a new object": "!!python/object/new:os.mkdir\nargs: ['{}']",
