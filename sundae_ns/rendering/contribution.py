@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -66,15 +66,14 @@ def weights_by_batch(
     Yields:
         The batch, the view of this process, its primitives, and their weights ``[M]``.
     """
-    batches = source.batches(views)
+    batches: Iterable[ViewBatch] = source.batches(views)
     if progress:
         from nerfstudio.utils.rich_utils import CONSOLE  # programs without nerfstudio show no progress
         from rich.progress import track
 
-        count = source.num_batches(views)
-        batches = iter(track(batches, "Contribution of primitives", total=count, transient=True, console=CONSOLE))
+        batches = track(batches, "Contribution of primitives", transient=True, console=CONSOLE)
     for batch in batches:
-        view = batch.own.view()
+        view = batch.own.view
         primitives = source.primitives(view, settings, features=False, colors=keep_ratio is not None)
         yield batch, view, primitives, view_weights(primitives, view, background, settings, keep_ratio, batch.own.mask)
 
