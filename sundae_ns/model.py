@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,23 +28,13 @@ from sundae_ns.evaluation import Lpips, psnr, ssim
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.rasterization import Backend, select_backend
-from sundae_ns.rendering import (
-    FieldSource,
-    FrameReplay,
-    Later,
-    LazyOutputs,
-    LocalField,
-    RenderSettings,
-    ShownResponse,
-    StepResolution,
-    View,
-    contribution,
-    cut,
-    empty_outputs,
-    late_outputs,
-    view_of,
-)
-from sundae_ns.rendering.render import SHOWN_BACKGROUNDS
+from sundae_ns.rendering.contribution import contribution
+from sundae_ns.rendering.lazy import Later, LazyOutputs
+from sundae_ns.rendering.outputs import ShownResponse, empty_outputs, late_outputs
+from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings
+from sundae_ns.rendering.replay import FrameReplay
+from sundae_ns.rendering.source import FieldSource, LocalField, StepResolution
+from sundae_ns.rendering.views import View, crop_image, view_of
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.training.build import build
 from sundae_ns.training.extension import Extension
@@ -131,7 +121,6 @@ class SundaeModel(SplatfactoModel):
         self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution)
         self.compensated = True
         """Whether images outside of a viewer get the head's correction."""
-        self._backend: Backend | None = None
         self._response = ShownResponse()
         self._replay = FrameReplay()
         self._views: dict[tuple[int | None, int], View] = {}
@@ -157,16 +146,14 @@ class SundaeModel(SplatfactoModel):
         """The head; None if the field has none."""
         return self.state.head
 
-    @property
+    @cached_property
     def backend(self) -> Backend:
         """The rasteriser, chosen once the device is known.
 
         Raises:
             BackendError: ``gsplat`` was asked for and cannot run here.
         """
-        if self._backend is None:
-            self._backend = select_backend(self.config.rasterizer, self.device)
-        return self._backend
+        return select_backend(self.config.rasterizer, self.device)
 
     @property
     def shown_background(self) -> Tensor:
@@ -299,9 +286,7 @@ class SundaeModel(SplatfactoModel):
         return late
 
     def contribution(self, datamanager: SundaeDatamanager, keep_ratio: float | None = None) -> Tensor:
-        """Blending weight of each primitive, summed over the pixels of the training views ``[N]``; see
-        :func:`sundae_ns.rendering.contribution`.
-        """
+        """Blending weight of each primitive over the training views ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
         views, settings = training_views(self, datamanager), self.render_settings(training=False)
         return contribution(self.source, views, self.background_color, settings, keep_ratio, progress=True)
 
@@ -367,14 +352,14 @@ class SundaeModel(SplatfactoModel):
         """The true image of outputs, over their background ``[H, W, 3]``; by default at the resolution of this step."""
         if NO_IMAGES in batch:
             raise no_images_error()
-        truth = cut(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
+        truth = crop_image(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
 
     def mask(self, batch: dict[str, Any], window: Window | None) -> Tensor | None:
         """Pixels of a batch that count, at the resolution of this step ``[H, W, 1]``; None for all."""
         if "mask" not in batch:
             return None
-        return cut(self._downscale_if_required(batch["mask"]).to(self.device), window).float()
+        return crop_image(self._downscale_if_required(batch["mask"]).to(self.device), window).float()
 
     def get_metrics_dict(  # type: ignore[override]
         self, outputs: dict[str, Any], batch: dict[str, Any]

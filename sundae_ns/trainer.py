@@ -32,18 +32,11 @@ from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
+from sundae_ns.training import run_length
 from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
 from sundae_ns.training.recorded import RecordedStep
-from sundae_ns.training.run_length import (
-    fit_to_length,
-    given_options,
-    resumed_config,
-    schedule_table,
-    steps_left,
-    take_options,
-)
 from sundae_ns.training.warning import warn
 
 
@@ -77,7 +70,7 @@ class SundaeTrainerConfig(TrainerConfig):
         table = Table(
             "part of training", "steps", title=f"{self.max_num_iterations:,}{scaled} steps", title_justify="left"
         )
-        for row in schedule_table(self):
+        for row in run_length.schedule_table(self):
             table.add_row(*row)
         CONSOLE.print(table)
 
@@ -106,16 +99,16 @@ class SundaeTrainerConfig(TrainerConfig):
         from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
 
         usual: Any = deepcopy(all_methods.get(str(self.method_name)))
-        given = given_options(words)
+        given = run_length.given_options(words)
         if self.load_dir is not None or self.load_checkpoint is not None:
-            run = resumed_config(self)
+            run = run_length.resumed_config(self)
             if isinstance(run, SundaeTrainerConfig) and usual is not None:
-                for line in take_options(self, run, usual, given):
+                for line in run_length.take_options(self, run, usual, given):
                     late = "; a prune that is done is not repeated" if ".pruning." in line else ""
                     warn(line + late)
                 self.schedule_length = self.schedule_length or run.schedule_length or run.max_num_iterations
                 if "max_num_iterations" not in given and self.max_num_iterations == usual.max_num_iterations:
-                    self.max_num_iterations = steps_left(self)
+                    self.max_num_iterations = run_length.steps_left(self)
             # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
             self.schedule_length = self.schedule_length or self.max_num_iterations
             return
@@ -126,7 +119,7 @@ class SundaeTrainerConfig(TrainerConfig):
                 f"the length of the run is {self.schedule_length}; give --max-num-iterations 30000, or fewer"
             )
         if usual is not None:
-            fit_to_length(self, usual, given)
+            run_length.fit_to_length(self, usual, given)
 
     def set_timestamp(self) -> None:
         """Name the run, unless ``--timestamp`` did; runs that start in the same second get different names."""
@@ -251,11 +244,10 @@ class SundaeTrainer(Trainer):
     def _recordable(self) -> bool:
         """Whether options allow to record training steps."""
         model, config = self.model, self.config
-        single = config.record_steps and model.source.replayable and not self.team.collective
+        single = config.record_steps and model.source.replayable
         plain = model.camera_optimizer.config.mode == "off" and not model.config.output_depth_during_training
-        usual = not (self.mixed_precision or config.log_gradients) and set(
-            self.gradient_accumulation_steps.values()
-        ) <= {1}
+        one_batch = set(self.gradient_accumulation_steps.values()) <= {1}
+        usual = one_batch and not (self.mixed_precision or config.log_gradients)
         adam = all(
             isinstance(options["optimizer"], FusedAdamConfig) and options["optimizer"].max_norm is None
             for name, options in config.optimizers.items()
@@ -294,9 +286,8 @@ class SundaeTrainer(Trainer):
         if number == 1:
             self._measured_from = time.perf_counter()
         elif number == 11:
-            warning = long_on_cpu(
-                (time.perf_counter() - self._measured_from) / 10, self.last_step - self._start_step - 11
-            )
+            seconds = (time.perf_counter() - self._measured_from) / 10
+            warning = long_on_cpu(seconds, self.last_step - self._start_step - 11)
             if warning is not None:
                 warn(warning)
 

@@ -24,7 +24,7 @@ from sundae_ns.rendering.views import View, view_of
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras as Capture
 
-ROUNDING = 1.02
+STEP_ROUNDING = 1.02
 """Factor on the bound of Adam's step: for rounding, and for moments from another number of ranks with other betas."""
 
 
@@ -141,4 +141,4 @@ def longest_step(optimizer: Optimizer) -> float:
     beta1, beta2 = group["betas"]
     if beta1**2 >= beta2 or beta2 >= 1:
         return math.inf
-    return ROUNDING * float(group["lr"]) * (1 - beta1) / math.sqrt((1 - beta2) * (1 - beta1**2 / beta2))
+    return STEP_ROUNDING * float(group["lr"]) * (1 - beta1) / math.sqrt((1 - beta2) * (1 - beta1**2 / beta2))
