@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, cast
 
+import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils import writer
@@ -18,7 +18,7 @@ from sundae_ns.training.extension import Extension, HeldOutView
 from sundae_ns.training.field_state import FieldState
 
 
-class Trained(Protocol):
+class ModelInTraining(Protocol):
     """What the callbacks need of the model."""
 
     state: FieldState
@@ -33,8 +33,8 @@ class Trained(Protocol):
     def view_of(self, camera: Cameras, downscale: int = 1) -> View:
         """The rasteriser's form of a camera."""
 
-    def target(self, image: Tensor, background: Tensor) -> Tensor:
-        """The true image at full resolution over a background ``[H, W, 3]``."""
+    def truth(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
+        """The true image of outputs, over their background ``[H, W, 3]``."""
 
     def render_settings(self, *, training: bool) -> RenderSettings:
         """Settings of images at this step."""
@@ -48,7 +48,7 @@ class NerfstudioRun:
         attributes: of nerfstudio's callbacks. Trainer and pipeline may be missing, as in a test.
     """
 
-    def __init__(self, model: Trained, attributes: TrainingCallbackAttributes) -> None:
+    def __init__(self, model: ModelInTraining, attributes: TrainingCallbackAttributes) -> None:
         self.model = model
         self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
         self._trainer = cast(Any, attributes.trainer)
@@ -125,7 +125,7 @@ class NerfstudioRun:
         """The held-out training views, loaded one at a time."""
         model = self.model
         for camera, batch in self._datamanager.holdout_views():
-            target = model.target(batch["image"], self.background)
+            target = model.truth(batch, {"background": self.background}, downscale=1)
             mask = batch["mask"].to(target.device).squeeze(-1) > 0 if "mask" in batch else None
             yield HeldOutView(model.view_of(camera), target, mask)
 
@@ -133,7 +133,8 @@ class NerfstudioRun:
         """Mean ``psnr`` and ``ssim`` over all test views."""
         if not self._datamanager.eval_dataset:
             return {}
-        self.source.agree(self.state)
+        if self._trainer is not None:
+            self._trainer.team.agree(self.state)
         results = self._pipeline.get_average_eval_image_metrics(step=self.state.step)
         return {name: results[name] for name in ("psnr", "ssim")}
 
@@ -185,6 +186,7 @@ class NerfstudioRun:
         writer.write_out_storage()
 
 
-def training_views(model: Trained, datamanager: SundaeDatamanager) -> list[TrainingView]:
+def training_views(model: ModelInTraining, datamanager: SundaeDatamanager) -> list[TrainingView]:
     """The training views of a datamanager that are not held out."""
-    return [TrainingView(partial(model.view_of, camera), mask) for camera, mask in datamanager.training_views()]
+    with torch.no_grad():  # a camera optimizer moves them
+        return [TrainingView(model.view_of(camera), mask) for camera, mask in datamanager.training_views()]

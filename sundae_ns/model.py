@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,23 +27,13 @@ from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, n
 from sundae_ns.evaluation import Lpips, psnr, ssim
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.rasterization import Backend, select_backend
-from sundae_ns.rendering import (
-    FieldSource,
-    FrameReplay,
-    Later,
-    LazyOutputs,
-    LocalField,
-    RenderSettings,
-    ShownResponse,
-    StepResolution,
-    View,
-    contribution,
-    cut,
-    empty_outputs,
-    late_outputs,
-    view_of,
-)
-from sundae_ns.rendering.render import SHOWN_BACKGROUNDS
+from sundae_ns.rendering.contribution import contribution
+from sundae_ns.rendering.lazy import Later, LazyOutputs
+from sundae_ns.rendering.outputs import ShownResponse, empty_outputs, late_outputs
+from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings
+from sundae_ns.rendering.replay import FrameReplay
+from sundae_ns.rendering.source import FieldSource, LocalField, StepResolution
+from sundae_ns.rendering.views import View, crop_image, view_of
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.training.build import build
 from sundae_ns.training.extension import Extension
@@ -51,7 +41,7 @@ from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.initial_field import Start
 from sundae_ns.training.losses import StepLosses
 from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.step import training_image
+from sundae_ns.training.step import StepInputs, TrainingStep, training_part
 from sundae_ns.viewer import ViewerControls
 
 
@@ -131,9 +121,10 @@ class SundaeModel(SplatfactoModel):
         self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution)
         self.compensated = True
         """Whether images outside of a viewer get the head's correction."""
-        self._backend: Backend | None = None
         self._response = ShownResponse()
         self._replay = FrameReplay()
+        self._views: dict[tuple[int | None, int], View] = {}
+        """Views of training cameras that do not move, by index and divisor of their sides."""
 
     # ---------------------------------------------------------------------------------------------------- the field
 
@@ -155,16 +146,14 @@ class SundaeModel(SplatfactoModel):
         """The head; None if the field has none."""
         return self.state.head
 
-    @property
+    @cached_property
     def backend(self) -> Backend:
         """The rasteriser, chosen once the device is known.
 
         Raises:
             BackendError: ``gsplat`` was asked for and cannot run here.
         """
-        if self._backend is None:
-            self._backend = select_backend(self.config.rasterizer, self.device)
-        return self._backend
+        return select_backend(self.config.rasterizer, self.device)
 
     @property
     def shown_background(self) -> Tensor:
@@ -266,20 +255,18 @@ class SundaeModel(SplatfactoModel):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
 
     def _training_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
-        background, at = self._get_background_color(), self.resolution(self.step)
-        rendered = training_image(
-            self.source,
-            self.state,
-            self.extensions,
-            partial(self.view_of, camera, at.downscale),
-            background,
-            self.render_settings(training=True),
-            index=view_index(camera),
-            at=at,
-            following=self.resolution(self.step + 1),
-            depth=self.config.output_depth_during_training,
-        )
-        return {**rendered.images, "background": background, "window": rendered.window}
+        background, state = self._get_background_color(), self.state
+        view, window = self._training_view(camera)
+        settings, depth = self.render_settings(training=True), self.config.output_depth_during_training
+        at = self.resolution(self.step)
+        images, splatted = self.training_step.images(view, background, settings, at=at, depth=depth)
+        state.info = splatted.info
+        # Now, while the GPU works on this step.
+        self.source.plan_next(self.resolution(self.step + 1), state.optimizers)
+        for extension in self.extensions:
+            extension.before_backward(state)
+        del images["feature_image"]
+        return {**images, "background": background, "window": window}
 
     def _shown_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
         background, view = self._get_background_color(), self.view_of(camera)
@@ -300,13 +287,33 @@ class SundaeModel(SplatfactoModel):
         return late
 
     def contribution(self, datamanager: SundaeDatamanager, count: int | None = None) -> Tensor:
-        """Blending weight of each primitive, summed over the pixels of the training views ``[N]``; see
-        :func:`sundae_ns.rendering.contribution`.
-        """
+        """Blending weight of each primitive over the training views ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
         views, settings = training_views(self, datamanager), self.render_settings(training=False)
         return contribution(self.source, views, self.background_color, settings, count, console=CONSOLE)
 
     # ----------------------------------------------------------------------------------------------------- training
+
+    @property
+    def training_step(self) -> TrainingStep:
+        """The training step; nerfstudio's loop and recordings run the same one."""
+        return TrainingStep(self.source, self.state, self.losses, self.state.field)
+
+    def _training_view(self, camera: Cameras) -> tuple[View, Window | None]:
+        """The part of a training camera that a step shows; views are kept, because copying one to a GPU waits for it."""
+        at = self.resolution(self.step)
+        key = view_index(camera), at.downscale
+        view = self._views.get(key)
+        if view is None:
+            view = self.view_of(camera, at.downscale)
+            if key[0] is not None and self.camera_optimizer.config.mode == "off":
+                self._views[key] = view
+        return training_part(self.state, view, at)
+
+    def step_inputs(self, camera: Cameras, batch: dict[str, Any]) -> StepInputs:
+        """What a step outside of nerfstudio's loop trains on, from a camera of shape ``(1,)`` and its batch."""
+        background, (view, window) = self._get_background_color(), self._training_view(camera)
+        target = self.truth(batch, {"background": background, "window": window})
+        return StepInputs(view, target, self.mask(batch, window), background, window)
 
     def _get_downscale_factor(self) -> int:
         return self.resolution(self.step).downscale if self.training else 1
@@ -342,22 +349,18 @@ class SundaeModel(SplatfactoModel):
         smaller: Tensor = image if factor == 1 else resize_image(image, factor)
         return smaller.to(self.device)
 
-    def target(self, image: Tensor, background: Tensor) -> Tensor:
-        """The true image at full resolution over a background ``[H, W, 3]``."""
-        return self.composite_with_background(self.get_gt_img(image, 1), background)
-
     def truth(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
-        """The truth of outputs, over their background ``[H, W, 3]``."""
+        """The true image of outputs, over their background ``[H, W, 3]``; by default at the resolution of this step."""
         if NO_IMAGES in batch:
             raise no_images_error()
-        truth = cut(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
+        truth = crop_image(self.get_gt_img(batch["image"], downscale), outputs.get("window"))
         return self.composite_with_background(truth, outputs["background"])
 
     def mask(self, batch: dict[str, Any], window: Window | None) -> Tensor | None:
         """Pixels of a batch that count, at the resolution of this step ``[H, W, 1]``; None for all."""
         if "mask" not in batch:
             return None
-        return cut(self._downscale_if_required(batch["mask"]).to(self.device), window).float()
+        return crop_image(self._downscale_if_required(batch["mask"]).to(self.device), window).float()
 
     def get_metrics_dict(  # type: ignore[override]
         self, outputs: dict[str, Any], batch: dict[str, Any]
@@ -381,7 +384,7 @@ class SundaeModel(SplatfactoModel):
     ) -> dict[str, Tensor]:
         """Loss of the image and, while the head is enabled, an L1 loss of the base colours."""
         target, mask = self.truth(batch, outputs), self.mask(batch, outputs.get("window"))
-        losses = self.losses(self.state, self.state.field, outputs["rgb"], outputs["base_rgb"], target, mask)
+        losses = self.training_step.terms(outputs, target, mask)
         if self.training:
             self.camera_optimizer.get_loss_dict(losses)
         return losses

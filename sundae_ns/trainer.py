@@ -9,7 +9,7 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,6 @@ from typing import Any, Literal, cast
 
 import torch
 import yaml
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import profiler, writer
@@ -27,24 +26,17 @@ from rich.table import Table
 from torch import Tensor
 
 from sundae_ns import distributed
-from sundae_ns.datamanager import SundaeDatamanager, check_before_training, view_index
+from sundae_ns.datamanager import SundaeDatamanager, check_before_training
 from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, ConfigError, StorageError, SundaeError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering import View
-from sundae_ns.rendering.render import RenderSettings
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
-from sundae_ns.storage.runs.config_file import load_config
-from sundae_ns.storage.runs.folder import find_config
-from sundae_ns.training.field_state import FieldState
+from sundae_ns.training import run_length
 from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
-from sundae_ns.training.recordable import StepInputs, StepResult
 from sundae_ns.training.recorded import RecordedStep
-from sundae_ns.training.run_length import fit_to_length, given_options, schedule_table, take_options
-from sundae_ns.training.step import training_view
 from sundae_ns.training.warning import warn
 
 
@@ -78,7 +70,7 @@ class SundaeTrainerConfig(TrainerConfig):
         table = Table(
             "part of training", "steps", title=f"{self.max_num_iterations:,}{scaled} steps", title_justify="left"
         )
-        for row in schedule_table(self):
+        for row in run_length.schedule_table(self):
             table.add_row(*row)
         CONSOLE.print(table)
 
@@ -107,16 +99,16 @@ class SundaeTrainerConfig(TrainerConfig):
         from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
 
         usual: Any = deepcopy(all_methods.get(str(self.method_name)))
-        given = given_options(words)
+        given = run_length.given_options(words)
         if self.load_dir is not None or self.load_checkpoint is not None:
-            run = self._resumed_run()
-            if run is not None and usual is not None:
-                for line in take_options(self, run, usual, given):
+            run = run_length.resumed_config(self)
+            if isinstance(run, SundaeTrainerConfig) and usual is not None:
+                for line in run_length.take_options(self, run, usual, given):
                     late = "; a prune that is done is not repeated" if ".pruning." in line else ""
                     warn(line + late)
                 self.schedule_length = self.schedule_length or run.schedule_length or run.max_num_iterations
                 if "max_num_iterations" not in given and self.max_num_iterations == usual.max_num_iterations:
-                    self.max_num_iterations = self._steps_left()
+                    self.max_num_iterations = run_length.steps_left(self)
             # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
             self.schedule_length = self.schedule_length or self.max_num_iterations
             return
@@ -127,36 +119,7 @@ class SundaeTrainerConfig(TrainerConfig):
                 f"the length of the run is {self.schedule_length}; give --max-num-iterations 30000, or fewer"
             )
         if usual is not None:
-            fit_to_length(self, usual, given)
-
-    def _steps_left(self) -> int:
-        """Steps from the checkpoint to resume to the end of the schedule.
-
-        Raises:
-            ConfigError: there are none.
-        """
-        place = self.load_dir or self.load_checkpoint
-        assert self.schedule_length is not None
-        assert place is not None
-        step = checkpoint.newest_step(place) if self.load_step is None else self.load_step
-        left = self.schedule_length if step is None else self.schedule_length - step - 1
-        if left < 1:
-            raise ConfigError(
-                f"the run has trained all of its {self.schedule_length:,} steps; give the number of further ones with "
-                "--max-num-iterations"
-            )
-        return left
-
-    def _resumed_run(self) -> SundaeTrainerConfig | None:
-        """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
-        place = self.load_dir or self.load_checkpoint
-        path = None if place is None else find_config(place)
-        try:
-            run = None if path is None else load_config(path)
-        except CheckpointError as error:
-            warn(f"{error}; the run is resumed with the options of this command")
-            return None
-        return run if isinstance(run, SundaeTrainerConfig) else None
+            run_length.fit_to_length(self, usual, given)
 
     def set_timestamp(self) -> None:
         """Name the run, unless ``--timestamp`` did; runs that start in the same second get different names."""
@@ -195,40 +158,6 @@ def _detached(result: tuple[Tensor, Mapping[str, Any], Mapping[str, Any]]) -> tu
     return loss.detach(), *values
 
 
-def recorded_outputs(
-    model: SundaeModel,
-    camera: Cameras,
-    batch: dict[str, Any],
-    step: Callable[[FieldState, StepInputs, RenderSettings], StepResult],
-    views: dict[tuple[int | None, int], View],
-) -> tuple[dict[str, Any], StepResult]:
-    """Train a whole step by a recording.
-
-    Args:
-        model: in training.
-        camera: of shape ``(1,)``.
-        batch: with the image, and the mask if there is one.
-        step: trains, by a recording where it can.
-        views: the views made so far, by index and divisor of their sides; cameras do not move.
-
-    Returns:
-        The outputs of :meth:`SundaeModel.get_outputs` in training but for depth, and the result of the step.
-    """
-    outputs: dict[str, Any] = {"background": model._get_background_color()}
-    at = model.resolution(model.step)
-    index = view_index(camera)
-    whole = views.get((index, at.downscale))
-    if whole is None:
-        whole = model.view_of(camera, at.downscale)
-        if index is not None:
-            views[index, at.downscale] = whole
-    view, outputs["window"] = training_view(model.source, model.state, lambda: whole, index=index, at=at)
-    truth, mask = model.truth(batch, outputs), model.mask(batch, outputs["window"])
-    inputs = StepInputs(view, truth, mask, outputs["background"])
-    result = step(model.state, inputs, model.render_settings(training=True))
-    return {**result.images, **outputs}, result
-
-
 class SundaeTrainer(Trainer):
     """Saves atomically, resumes from the newest whole checkpoint, and restores the random generators."""
 
@@ -241,7 +170,6 @@ class SundaeTrainer(Trainer):
         self.team.make_folder(self.base_dir)
         self._recorded: RecordedStep | None = None
         """Runs whole steps; None where they run kernel by kernel."""
-        self._views: dict[tuple[int | None, int], View] = {}
         self._result: Any = (torch.tensor(math.nan), {}, {})
         """Loss, its terms and metrics of the last step."""
         self._trained: int | None = None
@@ -285,7 +213,7 @@ class SundaeTrainer(Trainer):
         """Evaluate if it is due; every rank must run the head at the same scale."""
         every = ("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images")
         if any(step_check(step, getattr(self.config, name)) for name in every):
-            self.model.source.agree(self.model.state)
+            self.team.agree(self.model.state)
         super().eval_iteration(step)
 
     def train(self) -> None:
@@ -307,7 +235,7 @@ class SundaeTrainer(Trainer):
         if not self.model.state.resting:
             self._result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
         self._trained = step
-        self._foretell(step - self._start_step)
+        self._warn_if_long(step - self._start_step)
         self._stopped_by = self.team.agreed(self._interruption.number, step)
         if self._stopped_by:
             self.stop_training = True
@@ -316,11 +244,10 @@ class SundaeTrainer(Trainer):
     def _recordable(self) -> bool:
         """Whether options allow to record training steps."""
         model, config = self.model, self.config
-        single = config.record_steps and model.source.replayable and not self.team.collective
+        single = config.record_steps and model.source.replayable
         plain = model.camera_optimizer.config.mode == "off" and not model.config.output_depth_during_training
-        usual = not (self.mixed_precision or config.log_gradients) and set(
-            self.gradient_accumulation_steps.values()
-        ) <= {1}
+        one_batch = set(self.gradient_accumulation_steps.values()) <= {1}
+        usual = one_batch and not (self.mixed_precision or config.log_gradients)
         adam = all(
             isinstance(options["optimizer"], FusedAdamConfig) and options["optimizer"].max_norm is None
             for name, options in config.optimizers.items()
@@ -335,7 +262,8 @@ class SundaeTrainer(Trainer):
         model = self.model
         camera, batch = cast(SundaeDatamanager, self.pipeline.datamanager).next_train(step)
         try:
-            outputs, result = recorded_outputs(model, camera, batch, self._recorded, self._views)
+            inputs = model.step_inputs(camera, batch)
+            result = self._recorded(model.state, inputs, model.render_settings(training=True))
         except (BackendError, torch.cuda.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0]
             warn(f"training goes on without recordings, slower: {reason}")
@@ -348,18 +276,18 @@ class SundaeTrainer(Trainer):
         if step_check(step, self.config.logging.steps_per_log, run_at_zero=True):
             for name, scheduler in self.optimizers.schedulers.items():
                 writer.put_scalar(f"learning_rate/{name}", scheduler.get_last_lr()[0], step)
+        outputs = {**result.images, "background": inputs.background, "window": inputs.window}
         return result.loss, result.losses, model.get_metrics_dict(outputs, batch)
 
-    def _foretell(self, number: int) -> None:
+    def _warn_if_long(self, number: int) -> None:
         """On a CPU, warn of a training of hours once ten steps are measured; the first compiles, and the second warms up."""
         if self.config.machine.device_type != "cpu" or self.team.collective:
             return
         if number == 1:
             self._measured_from = time.perf_counter()
         elif number == 11:
-            warning = long_on_cpu(
-                (time.perf_counter() - self._measured_from) / 10, self.last_step - self._start_step - 11
-            )
+            seconds = (time.perf_counter() - self._measured_from) / 10
+            warning = long_on_cpu(seconds, self.last_step - self._start_step - 11)
             if warning is not None:
                 warn(warning)
 
@@ -408,7 +336,7 @@ class SundaeTrainer(Trainer):
             StorageError: no space or no right to write; older checkpoints stay.
         """
         model = self.model
-        model.source.agree(model.state)
+        self.team.agree(model.state)
         self.team.check_copies(model.head)
         own = {
             "step": step,

@@ -94,7 +94,7 @@ def prune_with_mask(
         seen = views if views is not None else scene.views or virtual_views(usable)
         weights = contribution(
             LocalField(field),
-            [TrainingView(lambda view=view: view.to(scene.device), None) for view in seen],  # type: ignore[misc]
+            [TrainingView(view.to(scene.device), None) for view in seen],
             scene.background,
             scene.settings(head=False),
             count=count if rule.uses_detail else None,

@@ -145,7 +145,7 @@ def own_kernels() -> Finding:
     options = (*traversal.OPTIONS, *traversal.definitions(torch.float32, 16))
     try:
         nvrtc.Kernel(traversal.SOURCE, traversal.KERNEL, device, options, traversal.BLOCK)
-        fused_loss.compiled(device)
+        fused_loss.loss_kernels(device)
         net = CompensationHead(HeadConfig()).net
         kernels.compiled(device, torch.bfloat16, kernels.definitions(net, True), kernels.FORWARD + kernels.BACKWARD)
     except BackendError as error:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -25,7 +24,7 @@ from sundae_ns.rendering.views import View, view_of
 if TYPE_CHECKING:
     from nerfstudio.cameras.cameras import Cameras as Capture
 
-ROUNDING = 1.02
+STEP_ROUNDING = 1.02
 """Factor on the bound of Adam's step: for rounding, and for moments from another number of ranks with other betas."""
 
 
@@ -40,17 +39,13 @@ class Timetable:
     def __init__(
         self, cameras: Capture, order: Callable[[int], int], device: torch.device | str, near_plane: float
     ) -> None:
-        self.rank, self.ranks = dist.get_rank(), dist.get_world_size()
+        self.ranks = dist.get_world_size()
         self._cameras, self._order, self._device, self._near_plane = cameras, order, device, near_plane
         self._table: _Table | None = None
 
     def views(self, step: int) -> list[int]:
         """Indices of the views of a step, by rank."""
         return [self._order(step * self.ranks + rank) for rank in range(self.ranks)]
-
-    def view(self, at: StepResolution) -> View:
-        """The whole view of this rank at a step."""
-        return self._table_of(at.downscale).views[self.views(at.step)[self.rank]]
 
     def cameras(self, at: StepResolution) -> Cameras:
         """The cameras of all ranks at a step, by rank; one launch, no collective."""
@@ -71,8 +66,8 @@ class Timetable:
         # Not before the first step: the datamanager corrects cameras in place when it undistorts images.
         if self._table is None or self._table.downscale != downscale:
             cameras = (self._cameras[i : i + 1] for i in range(len(self._cameras)))
-            views = [view_of(camera, "cpu", downscale=downscale) for camera in cameras]
             # On the host: on a GPU each of these small operations would cost a launch.
+            views = [view_of(camera, "cpu", downscale=downscale) for camera in cameras]
             rows = torch.stack([self._row_of(view) for view in views])
             self._table = _Table(downscale, views, rows.to(self._device))
         return self._table
@@ -86,13 +81,6 @@ class _Table:
     on_host: list[View]
     rows: Tensor
     """Rows of ``camera_row``, on the device ``[V, 33]``."""
-
-    @cached_property
-    def views(self) -> list[View]:
-        """The views on the device."""
-        poses = torch.stack([view.viewmat for view in self.on_host]).to(self.rows.device)
-        Ks = torch.stack([view.K for view in self.on_host]).to(self.rows.device)
-        return [view._replace(viewmat=pose, K=K) for view, pose, K in zip(self.on_host, poses, Ks)]
 
 
 @dataclass(frozen=True)
@@ -153,4 +141,4 @@ def longest_step(optimizer: Optimizer) -> float:
     beta1, beta2 = group["betas"]
     if beta1**2 >= beta2 or beta2 >= 1:
         return math.inf
-    return ROUNDING * float(group["lr"]) * (1 - beta1) / math.sqrt((1 - beta2) * (1 - beta1**2 / beta2))
+    return STEP_ROUNDING * float(group["lr"]) * (1 - beta1) / math.sqrt((1 - beta2) * (1 - beta1**2 / beta2))

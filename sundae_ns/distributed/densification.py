@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from sundae_ns.distributed.shards import DRIFT, Shards
-from sundae_ns.distributed.source import statistics_of
+from sundae_ns.distributed.source import send_statistics, statistics_of
 from sundae_ns.gaussians.parameters import num_primitives
 from sundae_ns.training.densification import CappedStrategy, ChainStrategy, Densification
 from sundae_ns.training.field_state import FieldState
@@ -15,6 +15,12 @@ class ShardedDensification(Densification):
     def __init__(self, strategy: CappedStrategy | ChainStrategy, shards: Shards) -> None:
         super().__init__(strategy)
         self.shards = shards
+
+    def before_backward(self, state: FieldState) -> None:
+        """Keep the gradients that densification reads, and let its statistics travel back with them."""
+        super().before_backward(state)
+        if state.densifying:
+            send_statistics(state.info, absgrad=isinstance(self.strategy, CappedStrategy) and self.strategy.absgrad)
 
     def densify(self, state: FieldState) -> None:
         """Densify every shard, and balance the ranks if the largest shard exceeds the mean by :data:`DRIFT`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -28,7 +28,6 @@ from sundae_ns.rendering.source import (
     ColorSettings,
     Primitives,
     StepResolution,
-    Trained,
     TrainingView,
     ViewBatch,
     colors_from,
@@ -38,13 +37,6 @@ from sundae_ns.training.densification import Statistics
 
 _GEOMETRY = ("means", "quats", "scales", "opacities")
 _COLORS = ("features_dc", "features_rest")
-
-
-class ReceivedPrimitives(Primitives):
-    """Primitives that this rank has received for one view."""
-
-    route: Route
-    """How they came."""
 
 
 class Exchange(NamedTuple):
@@ -89,7 +81,7 @@ class ShardedField:
         features: bool,
         colors: bool = True,
         at: StepResolution | None = None,
-    ) -> ReceivedPrimitives:
+    ) -> Primitives:
         """The primitives of all ranks that the view may see; differentiable. Collective.
 
         Args:
@@ -104,7 +96,7 @@ class ShardedField:
         rows = torch.cat([*(going[name] for name in names), colors_from(going, params, centers, settings)], dim=1)
         columns = [params[name].shape[1] for name in names]
         pieces = exchange(rows, route).split([*columns, 3], dim=1)
-        received = ReceivedPrimitives(zip([*names, "colors"], pieces))
+        received = Primitives(zip([*names, "colors"], pieces))
         received.route = route
         return received
 
@@ -119,12 +111,6 @@ class ShardedField:
             return Exchange(planned.cameras, planned.route(self.field))
         return _exchange_now(self.field, self.timetable.cameras(at))
 
-    def training_view(self, at: StepResolution, make: Callable[[], View], index: int | None) -> View:
-        """The view of this rank, from a table: to build it anew would wait for the GPU."""
-        expected = self.timetable.views(at.step)[self.shards.rank]
-        assert index == expected, f"view {index} was served at step {at.step}, the timetable has {expected}"
-        return self.timetable.view(at)
-
     @torch.no_grad()
     def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
         """Plan the exchange of a later step, for wherever the optimizers may move the field; wait for nothing. Collective.
@@ -138,53 +124,45 @@ class ShardedField:
         plan = plan_exchange(may_be_seen(self.field["means"], self.field["scales"], cameras.bounds, slack))
         self._planned = Ahead(at, cameras, plan, stamped(self.field))
 
-    # ------------------------------------------------------------------------------------------------------- training
-
-    def follow(self, primitives: Primitives, info: MutableMapping[str, Any], *, absgrad: bool) -> None:
-        """Let the statistics for densification travel back with the gradients; ``absgrad`` as in gsplat."""
-        assert isinstance(primitives, ReceivedPrimitives)
-        route = primitives.route
-
-        def statistics() -> Tensor:
-            centres, width, height = info["means2d"], info["width"], info["height"]
-            gradients = (centres.absgrad if absgrad else centres.grad)[0]
-            # With plain numbers: a tensor of them would be copied to the GPU, and waited for.
-            norms = torch.hypot(gradients[:, 0] * (width / 2), gradients[:, 1] * (height / 2))
-            return torch.stack([norms, (largest_axis(info["radii"][0]) / max(width, height)).to(norms)], dim=1)
-
-        route.ask = statistics
-        info["route"] = route
-
-    def agree(self, trained: Trained) -> None:
-        """Share the focal lengths that the head was trained on. Collective."""
-        trained.trained_focal = self.shards.widest(trained.trained_focal)
-
     # --------------------------------------------------------------------------------------------------- contribution
 
-    def num_batches(self, views: Sequence[TrainingView]) -> int:
-        """Number of rounds of one view for each rank."""
-        return -(-len(views) // self.shards.ranks)
-
-    def batches(self, views: Sequence[TrainingView]) -> Iterator[ViewBatch]:
+    def batches(self, views: Sequence[TrainingView]) -> list[ViewBatch]:
         """One view for each rank at a time. The last view is repeated if views run out, and not counted."""
-        shards = self.shards
-        for first in range(0, len(views), shards.ranks):
-            own = views[min(first + shards.rank, len(views) - 1)]
-            yield ViewBatch(own, min(shards.ranks, len(views) - first))
+        rank, ranks, count = self.shards.rank, self.shards.ranks, len(views)
+        firsts = range(0, count, ranks)
+        return [ViewBatch(views[min(first + rank, count - 1)], min(ranks, count - first)) for first in firsts]
 
     @torch.no_grad()
     def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
         """Return the values to the ranks that hold the primitives, and add them view by view. Collective."""
-        assert isinstance(primitives, ReceivedPrimitives)
         route = primitives.route
+        assert route is not None
         returned = give_back(values[:, None], route)[:, 0]
         by_view = zip(route.ids.split(route.sent), returned.split(route.sent))
         for ids, added in list(by_view)[: batch.num_views]:
             total[ids] += added
 
 
+def send_statistics(info: Mapping[str, Any], *, absgrad: bool) -> None:
+    """Let the statistics for densification travel back with the gradients of a training image.
+
+    Args:
+        info: of :func:`sundae_ns.rendering.render`.
+        absgrad: whether gradients of the projected centres are summed absolutely.
+    """
+
+    def statistics() -> Tensor:
+        centres, width, height = info["means2d"], info["width"], info["height"]
+        gradients = (centres.absgrad if absgrad else centres.grad)[0]
+        # With plain numbers: a tensor of them would be copied to the GPU, and waited for.
+        norms = torch.hypot(gradients[:, 0] * (width / 2), gradients[:, 1] * (height / 2))
+        return torch.stack([norms, (largest_axis(info["radii"][0]) / max(width, height)).to(norms)], dim=1)
+
+    info["route"].ask = statistics
+
+
 def statistics_of(info: Mapping[str, Any]) -> Statistics:
-    """Statistics of this rank's primitives in the views of all ranks, arranged by :meth:`ShardedField.follow`."""
+    """Statistics of this rank's primitives in the views of all ranks, sent by :func:`send_statistics`."""
     route: Route = info["route"]
     assert route.told is not None
     return Statistics(route.ids, *route.told.unbind(dim=1))

@@ -70,6 +70,9 @@ class OneProcess:
         """The optimizers that ``make`` builds."""
         return make()
 
+    def agree(self, state: FieldState) -> None:
+        """Nothing to share."""
+
     def check_copies(self, head: CompensationHead | None) -> None:
         """Nothing to compare."""
 
@@ -169,6 +172,10 @@ class Ranks(OneProcess):
         optimizers = SharedOptimizers(config.copy(), groups)
         scale_rates(optimizers, names, self.count)
         return optimizers
+
+    def agree(self, state: FieldState) -> None:
+        """Share what each rank has noted by itself: the focal lengths that the head was trained on."""
+        state.trained_focal = self.shards.widest(state.trained_focal)
 
     def check_copies(self, head: CompensationHead | None) -> None:
         """Warn if the copies of the head differ between ranks."""

@@ -49,7 +49,7 @@ def split_evenly(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Ten
     return new.to(opacities), scales * (old / total)[:, None].to(scales)
 
 
-def draw(weights: Tensor, count: int) -> Tensor:
+def draw_sources(weights: Tensor, count: int) -> Tensor:
     """Indices ``[count]`` drawn with replacement in proportion to ``weights`` ``[M]``, with torch's global generator.
 
     By inversion in float64, because ``torch.multinomial`` takes at most 2^24 weights.
@@ -76,7 +76,7 @@ def relocate(
     targets, alive = dead.nonzero().squeeze(1), (~dead).nonzero().squeeze(1)
     if len(targets) == 0 or len(alive) == 0:
         return 0
-    sources = alive[draw(params["opacities"][alive].sigmoid().flatten(), len(targets))]
+    sources = alive[draw_sources(params["opacities"][alive].sigmoid().flatten(), len(targets))]
     _split_sources(params, sources, min_opacity)
     for name, value in params.items():
         value.data[targets] = value.data[sources]
@@ -100,7 +100,7 @@ def grow(
     """
     if count <= 0:
         return
-    sources = draw(params["opacities"].sigmoid().flatten(), count)
+    sources = draw_sources(params["opacities"].sigmoid().flatten(), count)
     _split_sources(params, sources, min_opacity)
 
     def longer(value: Tensor) -> Tensor:

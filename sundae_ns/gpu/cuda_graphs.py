@@ -19,7 +19,7 @@ MAX_GRAPHS = 4
 RECORD_AT = 3
 """Requests in a row after which a key is recorded: a viewer that is being resized never repeats a size."""
 
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
 
 _abandoned: list[torch.cuda.CUDAGraph] = []
 """Unfinished graphs, kept alive because torch may still refer to them."""
@@ -76,8 +76,8 @@ def _side_stream(device: torch.device) -> torch.cuda.Stream:
 
 
 def record(
-    run: Callable[[], Result], device: torch.device, share_memory_with: torch.cuda.CUDAGraph | None = None
-) -> tuple[torch.cuda.CUDAGraph, Result]:
+    run: Callable[[], _Result], device: torch.device, share_memory_with: torch.cuda.CUDAGraph | None = None
+) -> tuple[torch.cuda.CUDAGraph, _Result]:
     """Record the GPU work of ``run`` without executing it.
 
     Args:
@@ -134,18 +134,18 @@ def _abandon(graph: torch.cuda.CUDAGraph, pool: tuple[int, int]) -> None:
     _abandoned.append(graph)
 
 
-class GraphCache(Generic[Result]):
+class GraphCache(Generic[_Result]):
     """Recorded graphs by key: the least recently used one is dropped."""
 
     def __init__(self) -> None:
-        self._graphs: OrderedDict[Hashable, Result] = OrderedDict()
+        self._graphs: OrderedDict[Hashable, _Result] = OrderedDict()
         self._last: Hashable = None
         self._repeats = 0
 
     def __len__(self) -> int:
         return len(self._graphs)
 
-    def get(self, key: Hashable, make: Callable[[], Result]) -> Result | None:
+    def get(self, key: Hashable, make: Callable[[], _Result]) -> _Result | None:
         """The graph for ``key``, recorded by ``make`` at its :data:`RECORD_AT`-th request in a row; None before."""
         self._repeats = self._repeats + 1 if key == self._last else 1
         self._last = key
@@ -158,7 +158,7 @@ class GraphCache(Generic[Result]):
         self._graphs.move_to_end(key)
         return self._graphs[key]
 
-    def put(self, key: Hashable, graph: Result) -> None:
+    def put(self, key: Hashable, graph: _Result) -> None:
         """Replace the graph of a cached key."""
         self._graphs[key] = graph
 

@@ -1,4 +1,4 @@
-"""Adam for one parameter in one kernel, with the learning rate in memory, so that a CUDA graph can record it.
+"""Adam with the learning rates in memory, so that a CUDA graph can record it; one kernel for a parameter.
 
 torch's fused Adam gives each block of threads 65,536 numbers. A pruned field has a few such pieces for a parameter, and most
 of the GPU waits; here a block has 1,024.
@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -59,13 +61,56 @@ def definitions() -> tuple[str, ...]:
     return (f"-DPER_THREAD={PER_THREAD}",)
 
 
+class Update(NamedTuple):
+    """What a step of Adam changes of one parameter, and its gradient. The first four have one shape and layout."""
+
+    value: Tensor
+    """The parameter, float32."""
+    gradient: Tensor
+    mean: Tensor
+    """Running mean of gradients (``exp_avg``)."""
+    square: Tensor
+    """Running mean of their squares (``exp_avg_sq``)."""
+    step: Tensor
+    """Number of updates so far ``[]``."""
+
+
+@torch.no_grad()
+def adam_step(groups: Sequence[tuple[Mapping[str, Any], Sequence[Update]]], rates: Tensor, skip: Tensor | None) -> None:
+    """A step of ``torch.optim.Adam`` with ``fused``, but for rates in memory and any number of optimizers.
+
+    Args:
+        groups: options of each group of parameters, as the optimizer holds them, and its updates.
+        rates: learning rates of the groups ``[G]``.
+        skip: not 0 to change nothing, float ``[]``; None for 0.
+    """
+    steps = [one.step for _, updates in groups for one in updates]
+    torch._foreach_add_(steps, 1)
+    for rate, (options, updates) in zip(rates, groups, strict=True):
+        if len(updates) == 1 and updates[0].value.is_cuda and options["weight_decay"] == 0:
+            adam(updates[0], rate, skip, betas=options["betas"], eps=options["eps"])
+        elif updates:
+            values, gradients, means, squares, counts = ([one[column] for one in updates] for column in range(5))
+            beta1, beta2 = options["betas"]
+            update = torch._fused_adamw_ if options.get("decoupled_weight_decay") else torch._fused_adam_
+            update(
+                *(values, gradients, means, squares, [], counts),
+                lr=rate,
+                beta1=beta1,
+                beta2=beta2,
+                weight_decay=options["weight_decay"],
+                eps=options["eps"],
+                amsgrad=False,
+                maximize=False,
+                found_inf=skip,
+            )
+    if skip is not None:
+        torch._foreach_sub_(steps, [skip] * len(steps))
+
+
 @torch.no_grad()
 def adam(
-    value: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    step: Tensor,
+    update: Update,
     rate: Tensor,
     skip: Tensor | None,
     *,
@@ -76,11 +121,7 @@ def adam(
     """Update a parameter in place (Kingma & Ba 2015), as ``torch.optim.Adam`` does without weight decay.
 
     Args:
-        value: the parameter; float32 on a CUDA device, contiguous, fewer than 2^31 numbers.
-        gradient: its gradient, with the shape and layout of ``value``.
-        mean: running mean of gradients (``exp_avg``), likewise.
-        square: running mean of their squares (``exp_avg_sq``), likewise.
-        step: number of this update, from 1 on ``[]``.
+        update: on a CUDA device, contiguous, fewer than 2^31 numbers; ``step`` is the number of this update, from 1 on.
         rate: learning rate ``[]``.
         skip: not 0 to change nothing ``[]``; None for 0.
         betas: decay rates of both means.
@@ -90,10 +131,10 @@ def adam(
     Raises:
         BackendError: the kernel cannot be compiled or loaded.
     """
-    launch = _compiled(value.device) if launch is None else launch
+    launch = _compiled(update.value.device) if launch is None else launch
     logs = [math.log(beta) if beta > 0 else -math.inf for beta in betas]
-    tensors = [value, gradient, mean, square, step, rate, skip]
-    launch(-(-value.numel() // PER_THREAD), [value.numel(), *tensors, *betas, *logs, eps])
+    count = update.value.numel()
+    launch(-(-count // PER_THREAD), [count, *update, rate, skip, *betas, *logs, eps])
 
 
 @functools.cache

@@ -195,7 +195,7 @@ def definitions() -> tuple[str, ...]:
 
 
 @functools.cache
-def compiled(device: torch.device) -> Launches:
+def loss_kernels(device: torch.device) -> Launches:
     """The kernels for a CUDA device, compiled on the first call.
 
     Raises:
@@ -238,7 +238,7 @@ def fused_loss(
                 f"the fused loss cannot compare {each.dtype} {list(each.shape)} with {target.dtype} "
                 f"{list(target.shape)}; pass float32 [H, W, 3] of one size, at least {WINDOW} px per side"
             )
-    launches = compiled(image.device) if launches is None else launches
+    launches = loss_kernels(image.device) if launches is None else launches
     weights = (1 - weight if l1_weight is None else l1_weight, weight)
     return cast("tuple[Tensor, Tensor | None]", _Loss.apply(image, base, target.detach(), weights, launches))
 

@@ -14,7 +14,7 @@ from sundae_ns.rendering.source import (
     TrainingView,
     ViewBatch,
 )
-from sundae_ns.rendering.views import View, cut, view_of, zoomed
+from sundae_ns.rendering.views import View, crop_image, view_of, zoomed
 
 __all__ = [
     "ColorSettings",
@@ -32,7 +32,7 @@ __all__ = [
     "ViewBatch",
     "compensate",
     "contribution",
-    "cut",
+    "crop_image",
     "draw",
     "empty_outputs",
     "late_outputs",

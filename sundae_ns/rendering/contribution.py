@@ -64,10 +64,9 @@ def weights_by_batch(
     """
     batches: Iterable[ViewBatch] = source.batches(views)
     if console is not None:
-        length = source.num_batches(views)
-        batches = track(batches, "Contribution of primitives", total=length, transient=True, console=console)
+        batches = track(batches, "Contribution of primitives", transient=True, console=console)
     for batch in batches:
-        view, mask = batch.own.view(), batch.own.mask
+        view, mask = batch.own
         if mask is not None and tuple(mask.shape) != (view.height, view.width, 1):
             raise DataError(
                 f"a mask is {list(mask.shape)} but its view is {view.width} x {view.height} px; "

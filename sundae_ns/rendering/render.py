@@ -12,7 +12,7 @@ from torch import Tensor
 from sundae_ns.compensation import CompensationHead, ScalePlan, over_phases, plan, resize
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rasterization import Rasterization, rasterize
-from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, FieldSource, Primitives
+from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, FieldSource, Primitives, StepResolution
 from sundae_ns.rendering.views import View
 
 SHOWN_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -127,8 +127,9 @@ def render(
     settings: RenderSettings,
     *,
     depth: bool = True,
+    at: StepResolution | None = None,
 ) -> tuple[dict[str, Any], Rasterization]:
-    """The images of one view.
+    """The images of one view: primitives, one splatting pass, and the head. With several ranks, collective.
 
     An image of another scale than the head was trained at is rendered at the trained scale too, and gets the resized
     correction (:mod:`sundae_ns.compensation.scale`).
@@ -139,13 +140,16 @@ def render(
         background: colour ``[3]``.
         settings: everything else; ``head=None`` leaves the head out.
         depth: whether to render depth.
+        at: the step, for a training image; None outside of training.
 
     Returns:
-        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result.
+        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result; its ``info``
+        has the ``route`` of the primitives.
     """
     head = settings.head
-    primitives = source.primitives(view, settings, features=head is not None)
+    primitives = source.primitives(view, settings, features=head is not None, at=at)
     images, splatted = draw(primitives, view, background, settings, depth=depth)
+    splatted.info["route"] = primitives.route
     if head is None:
         return images, splatted
     zoom, weight = ScalePlan(1.0, 1.0) if settings.training else scale_plan(view, settings.trained_focal)

@@ -23,7 +23,7 @@ from sundae_ns.rendering.render import RenderSettings, render, scale_plan
 from sundae_ns.rendering.source import FieldSource, degree_in_use
 from sundae_ns.rendering.views import View
 
-SPARE = 1.5
+SPARE_CAPACITY = 1.5
 """Capacity for tile and primitive pairs, as a multiple of those of the recorded view. Another view may have more."""
 
 REPLAYED = ("rgb", "base_rgb", "accumulation")
@@ -96,7 +96,7 @@ class FrameReplay:
             return None
         images, needed = _replay(frame, view, background)
         if needed > frame.capacity:
-            frame = record_frame(capacity=int(SPARE * needed))
+            frame = record_frame(capacity=int(SPARE_CAPACITY * needed))
             self._frames.put(key, frame)
             images, _ = _replay(frame, view, background)
         return images
@@ -145,7 +145,7 @@ def _record(
             measured = Capacity()
             with warm_up(device):
                 run(measured)
-            capacity = int(SPARE * max(int(needed) for needed in measured.needed)) + 1
+            capacity = int(SPARE_CAPACITY * max(int(needed) for needed in measured.needed)) + 1
         with warm_up(device):
             run(Capacity(capacity))
 

@@ -1,14 +1,14 @@
 """Where a view gets its primitives from: the field of this process, or shards on several GPUs.
 
-:func:`sundae_ns.rendering.render.render` and everything that trains takes a :class:`FieldSource`. Only the place that makes
-the source knows how many processes hold the field.
+:func:`sundae_ns.rendering.render.render` takes a :class:`FieldSource`. Only the place that makes the source knows how many
+processes hold the field.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 from torch import Tensor
 from torch.optim import Optimizer
@@ -16,6 +16,9 @@ from torch.optim import Optimizer
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization import Backend, harmonic_colors
 from sundae_ns.rendering.views import View
+
+if TYPE_CHECKING:
+    from sundae_ns.rasterization.sharded import Route
 
 NEAR_PLANE = 0.01
 """Distance of the near plane, world units."""
@@ -37,8 +40,8 @@ class StepResolution(NamedTuple):
 class TrainingView(NamedTuple):
     """A training view for passes that do not train."""
 
-    view: Callable[[], View]
-    """Makes the camera."""
+    view: View
+    """The camera."""
     mask: Tensor | None
     """Pixels that count, bool ``[H, W, 1]``; None for all."""
 
@@ -55,6 +58,9 @@ class ViewBatch(NamedTuple):
 class Primitives(dict[str, Tensor]):
     """Parameters of the primitives that one view needs ``[M, ...]``, and their ``colors`` from its camera ``[M, 3]``."""
 
+    route: Route | None = None
+    """How they came from other ranks; None for primitives of this process."""
+
 
 @dataclass(frozen=True)
 class ColorSettings:
@@ -63,12 +69,6 @@ class ColorSettings:
     backend: Backend
     active_sh_degree: int | None = None
     """Highest SH degree in use; None for the degree of the field."""
-
-
-class Trained(Protocol):
-    """State of a field in training, as far as a source shares it between ranks."""
-
-    trained_focal: tuple[float, float] | None
 
 
 class FieldSource(Protocol):
@@ -109,28 +109,10 @@ class FieldSource(Protocol):
             at: the step, for a training image; None outside of training.
         """
 
-    def training_view(self, at: StepResolution, make: Callable[[], View], index: int | None) -> View:
-        """The camera of this process at a training step.
-
-        Args:
-            at: the step.
-            make: builds it from the camera that was served.
-            index: of the training view that was served.
-        """
-
     def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
         """Prepare the next training step while the GPU works on this one."""
 
-    def follow(self, primitives: Primitives, info: dict[str, Any], *, absgrad: bool) -> None:
-        """Arrange that densification finds its statistics in ``info`` after the backward pass."""
-
-    def agree(self, trained: Trained) -> None:
-        """Share between ranks what each has noted by itself: the focal lengths that the head was trained on."""
-
-    def num_batches(self, views: Sequence[TrainingView]) -> int:
-        """Number of batches that :meth:`batches` yields."""
-
-    def batches(self, views: Sequence[TrainingView]) -> Iterator[ViewBatch]:
+    def batches(self, views: Sequence[TrainingView]) -> Sequence[ViewBatch]:
         """The views in batches of one for each process, in order."""
 
     def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
@@ -195,26 +177,12 @@ class LocalField:
             primitives["colors"] = colors_from(self.field, self.field, view.center, settings)
         return primitives
 
-    def training_view(self, at: StepResolution, make: Callable[[], View], index: int | None) -> View:
-        """The camera that was served."""
-        return make()
-
     def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
         """Nothing to prepare."""
 
-    def follow(self, primitives: Primitives, info: dict[str, Any], *, absgrad: bool) -> None:
-        """Nothing to arrange: ``info`` holds the gradients of this process."""
-
-    def agree(self, trained: Trained) -> None:
-        """Nothing to share."""
-
-    def num_batches(self, views: Sequence[TrainingView]) -> int:
-        """One for each view."""
-        return len(views)
-
-    def batches(self, views: Sequence[TrainingView]) -> Iterator[ViewBatch]:
+    def batches(self, views: Sequence[TrainingView]) -> list[ViewBatch]:
         """One view at a time."""
-        return (ViewBatch(view, 1) for view in views)
+        return [ViewBatch(view, 1) for view in views]
 
     def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
         """Add the values, one for each primitive."""

@@ -172,7 +172,7 @@ def _numbers(camera: Cameras) -> list[float]:
     return torch.cat([part.detach().flatten() for part in parts]).tolist()  # type: ignore[no-any-return]
 
 
-def cut(image: Tensor, window: Window | None) -> Tensor:
+def crop_image(image: Tensor, window: Window | None) -> Tensor:
     """A window of an image ``[H, W, C]``; None for the whole image."""
     if window is None:
         return image

@@ -17,14 +17,12 @@ from torch import Tensor
 
 from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.gpu.memory import naming_full_memory
-from sundae_ns.rendering import View
 from sundae_ns.scenes.finetune_step import Through, TunedStep
 from sundae_ns.scenes.opening import open_pipeline
 from sundae_ns.scenes.packed import is_unpacked, place
 from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import config_of
-from sundae_ns.trainer import recorded_outputs
 from sundae_ns.training.optimizers import NetworkAdamConfig
 
 RATES = {
@@ -110,7 +108,6 @@ def finetune(
     optimizer = _optimizer(field.exact, head.exact)
     highest = [float(group["lr"]) for group in optimizer.param_groups]
     step = TunedStep(model, codecs, field, head, optimizer, rate / numbers)
-    views: dict[tuple[int | None, int], View] = {}
     generators = [torch.cuda.current_device()] if model.device.type == "cuda" else []
     with naming_full_memory(lambda: model.num_points), torch.random.fork_rng(generators):
         torch.manual_seed(opened.config.machine.seed)  # of random backgrounds
@@ -120,7 +117,7 @@ def finetune(
             if weights:
                 model.step = at  # chooses the window of a large image
             camera, batch = pipeline.datamanager.next_train(at)
-            result = recorded_outputs(model, camera, batch, step, views)[1]
+            result = step(model.state, model.step_inputs(camera, batch), model.render_settings(training=True))
             if progress is not None:
                 progress(result.loss)
     source = {**scene.meta.get("source", {}), "finetuned": steps}

@@ -1,4 +1,4 @@
-"""One step of a fine-tune: rounding, rendering, losses, the rate and Adam, as one CUDA graph where that is possible.
+"""One step of a fine-tune: rounding, the training step, the rate and Adam, as one CUDA graph where that is possible.
 
 The model holds rounded values, the ones that a reader decodes. Adam moves exact values beside them, by the gradients at the
 rounded ones (the straight-through estimator of Bengio, Leonard and Courville, 2013). So losses and rasteriser do not know of
@@ -8,27 +8,23 @@ rounding.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
-from sundae_ns.gpu.cuda_graphs import record, warm_up
 from sundae_ns.model import SundaeModel
-from sundae_ns.rasterization import Capacity, RecordableGsplat
+from sundae_ns.rasterization import Capacity
 from sundae_ns.rendering.render import RenderSettings
 from sundae_ns.storage.packing import Codecs
 from sundae_ns.storage.packing.rate import estimated_bits
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.recordable import SPARE_PAIRS, NeededPairs, StepInputs, StepResult, forward
+from sundae_ns.training.recordings import StepRecordings
+from sundae_ns.training.step import StepInputs, StepResult
 
 _log = logging.getLogger(__name__)
-
-MAX_RECORDINGS = 8
-"""Image sizes that are recorded; others run kernel by kernel."""
 
 
 class Through(NamedTuple):
@@ -68,17 +64,8 @@ class Through(NamedTuple):
             value.grad = gradient
 
 
-class _Recording(NamedTuple):
-    graph: torch.cuda.CUDAGraph
-    inputs: StepInputs
-    """The graph reads them here."""
-    result: StepResult
-    pairs: int
-    """Tile/primitive pairs that fit."""
-
-
 class TunedStep:
-    """Steps of a fine-tune. The first step of an image size runs kernel by kernel, later ones replay.
+    """Steps of a fine-tune.
 
     Args:
         model: shows the rounded values; its other parameters do not change.
@@ -101,10 +88,7 @@ class TunedStep:
         self._model, self._codecs, self._field, self._head = model, codecs, field, head
         self._optimizer, self._rate = optimizer, rate
         self._can_record = model.device.type == "cuda" and model.backend.name == "gsplat"
-        self._recordings: dict[Hashable, _Recording] = {}
-        self._warm: set[Hashable] = set()
-        self._pairs = NeededPairs()
-        self._emphasis = 1.0
+        self._recordings = StepRecordings()
 
     def __call__(self, state: FieldState, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Train on one image.
@@ -113,58 +97,23 @@ class TunedStep:
             torch.cuda.OutOfMemoryError: the GPU's memory is full.
         """
         if self._can_record:
+            self._recordings.keep_for(self._model.losses.emphasis(state))
+            kind = (inputs.view.width, inputs.view.height, inputs.mask is not None)
             try:
-                return self._replayed(inputs, settings)
+                return self._recordings.run(self._run, inputs, settings, kind=kind)
             except BackendError as error:
                 _log.warning("the fine-tune runs kernel by kernel, slower: %s", error)
                 self._can_record = False
         return self._run(inputs, settings, None)
 
-    def _replayed(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
-        emphasis = self._model.losses.emphasis(self._model.state)
-        if emphasis != self._emphasis:  # recordings hold the number
-            self._recordings.clear()
-            self._emphasis = emphasis
-        kind = (inputs.view.width, inputs.view.height, inputs.mask is not None)
-        recording = self._recordings.get(kind)
-        if kind not in self._warm or (recording is None and len(self._recordings) >= MAX_RECORDINGS):
-            self._warm.add(kind)
-            return self._run_once(inputs, settings)
-        most = self._pairs.most
-        if recording is None or most > recording.pairs:
-            recording = self._recordings[kind] = self._recorded(inputs, settings, int(SPARE_PAIRS * most) + 1)
-        inputs.copy_to(recording.inputs)
-        recording.graph.replay()
-        return recording.result
-
-    def _run_once(self, inputs: StepInputs, settings: RenderSettings) -> StepResult:
-        """Run kernel by kernel, on the stream of the recordings, and count the pairs."""
-        capacity = Capacity()
-        with warm_up(self._model.device):
-            result = self._run(inputs, replace(settings, backend=RecordableGsplat(capacity)), None)
-        self._pairs.count(capacity, self._model.device)
-        return result
-
-    def _recorded(self, inputs: StepInputs, settings: RenderSettings, pairs: int) -> _Recording:
-        own = inputs.clone()
-
-        def step() -> StepResult:
-            capacity = Capacity(pairs)
-            return self._run(own, replace(settings, backend=RecordableGsplat(capacity)), capacity)
-
-        last = next(reversed(self._recordings.values()), None)
-        graph, result = record(step, self._model.device, share_memory_with=None if last is None else last.graph)
-        return _Recording(graph, own, result, pairs)
-
     def _run(self, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None) -> StepResult:
         """One step; all of its work is recorded."""
         self._field.show()
         self._head.show()
-        state = self._model.state
-        loss, _, result = forward(self._model.source, state, state.field, self._model.losses, inputs, settings)
+        loss, _, result = self._model.training_step(inputs, settings)
         self._set_gradients(loss)
         # torch's Adam reads this name: it changes nothing where it is 1.
-        self._optimizer.found_inf = self._pairs.overflow(capacity)  # type: ignore[attr-defined]
+        self._optimizer.found_inf = self._recordings.overflow(capacity)  # type: ignore[attr-defined]
         self._optimizer.step()
         return result
 

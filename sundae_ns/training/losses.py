@@ -14,7 +14,7 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
-from sundae_ns.gpu.fused_loss import WINDOW, compiled, fused_loss
+from sundae_ns.gpu.fused_loss import WINDOW, fused_loss, loss_kernels
 from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.similarity import mean_ssim
@@ -198,7 +198,7 @@ def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_
 def _kernel_runs(device: torch.device) -> bool:
     """Whether the kernel runs on a device; logs the reason once if it does not."""
     try:
-        compiled(device)
+        loss_kernels(device)
     except BackendError as error:
         _log.warning("SSIM runs as convolutions, not in its kernel, on %s: %s", device, error)
         return False

@@ -12,7 +12,11 @@ from collections.abc import Collection, Iterable, Sequence
 from copy import deepcopy
 from typing import Any
 
-from sundae_ns.errors import ConfigError
+from sundae_ns.errors import CheckpointError, ConfigError
+from sundae_ns.storage.runs import checkpoint
+from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.runs.folder import find_config
+from sundae_ns.training.warning import warn
 
 SCHEDULE = {
     "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval refine_every",
@@ -114,6 +118,33 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
                 raise ConfigError(f"{line}, which cannot change; leave the option out")
             differing.append(line)
     return differing
+
+
+def resumed_config(config: Any) -> Any:
+    """The configuration of the run that ``config`` resumes; None if it cannot be read, which is warned of."""
+    path = find_config(config.load_dir or config.load_checkpoint)
+    try:
+        return None if path is None else load_config(path)
+    except CheckpointError as error:
+        warn(f"{error}; the run is resumed with the options of this command")
+        return None
+
+
+def steps_left(config: Any) -> int:
+    """Steps from the checkpoint that ``config`` resumes to the end of its schedule.
+
+    Raises:
+        ConfigError: there are none.
+    """
+    step, length = config.load_step, config.schedule_length
+    if step is None:
+        step = checkpoint.newest_step(config.load_dir or config.load_checkpoint)
+    left: int = length if step is None else length - step - 1
+    if left < 1:
+        raise ConfigError(
+            f"the run has trained all of its {length:,} steps; give the number of further ones with --max-num-iterations"
+        )
+    return left
 
 
 def schedule_table(config: Any) -> list[tuple[str, str]]:

@@ -1,89 +1,124 @@
-"""One training step as far as the model owns it: the image of a training view, ready for the loss."""
+"""The training step: from a view to its loss. Every training runs this one.
+
+nerfstudio asks for images and losses in two calls, and runs the backward pass and the optimizers itself. Recorded steps and
+fine-tunes run both halves in one call. Several ranks give another source of primitives.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor
 
 from sundae_ns.compensation import Window, training_window
-from sundae_ns.rendering.render import RenderSettings, compensate, draw
+from sundae_ns.rasterization import Rasterization
+from sundae_ns.rendering.render import RenderSettings, render
 from sundae_ns.rendering.source import FieldSource, StepResolution
 from sundae_ns.rendering.views import View
-from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.losses import StepLosses
 
 
 @dataclass(frozen=True)
-class TrainingImage:
-    """The images of a training view and the part of it that they show."""
+class StepInputs:
+    """What a step trains on."""
 
-    images: dict[str, Any]
-    """``rgb, base_rgb, depth, accumulation``, each ``[H, W, C]``."""
-    window: Window | None
-    """The part of the training image; None for the whole image."""
+    view: View
+    target: Tensor
+    """The true image over the background ``[H, W, 3]``."""
+    mask: Tensor | None
+    """Pixels that count, float ``[H, W, 1]``; None for all."""
+    background: Tensor
+    """Colour ``[3]``."""
+    window: Window | None = None
+    """The part of the training image that is shown; None for the whole image."""
+    rates: Tensor | None = None
+    """Learning rates of the groups of parameters ``[G]``; None where the optimizer holds them."""
+
+    def _tensors(self) -> list[Tensor]:
+        tensors = (self.view.viewmat, self.view.K, self.target, self.background, self.mask, self.rates)
+        return [value.detach() for value in tensors if value is not None]
+
+    def clone(self) -> StepInputs:
+        """A copy, so that a recording reads it where it stays."""
+        copies = [value.clone(memory_format=torch.contiguous_format) for value in self._tensors()]
+        viewmat, K, target, background, *rest = copies
+        mask, rates = (None if one is None else rest.pop(0) for one in (self.mask, self.rates))
+        view = self.view._replace(viewmat=viewmat, K=K)
+        return StepInputs(view, target, mask, background, self.window, rates)
+
+    def copy_to(self, other: StepInputs) -> None:
+        """Write these into the inputs of a recording."""
+        torch._foreach_copy_(other._tensors(), self._tensors())
 
 
-def training_view(
-    source: FieldSource, state: FieldState, make_view: Callable[[], View], *, index: int | None, at: StepResolution
-) -> tuple[View, Window | None]:
-    """The view of a step, and the part of the training image that it shows; None for the whole image.
+@dataclass(frozen=True)
+class StepResult:
+    """Images and losses of a step; the next step overwrites them."""
+
+    images: dict[str, Tensor]
+    """``rgb``, ``base_rgb`` and ``accumulation``, each ``[H, W, C]``."""
+    losses: dict[str, Tensor]
+    """Terms of the loss ``[]``."""
+    loss: Tensor
+    """Their sum ``[]``."""
+
+
+def training_part(state: FieldState, view: View, at: StepResolution) -> tuple[View, Window | None]:
+    """The part of a training view that a step shows, and its window; None for the whole image.
 
     Args:
-        source: of the primitives.
         state: the field in training; it remembers the focal lengths that the head is trained on.
-        make_view: builds the whole view from the camera that was served.
-        index: of the training view that was served; None if the camera does not say.
+        view: the whole view.
         at: resolution at this step.
     """
-    view = source.training_view(at, make_view, index)
     if state.head_enabled and at.downscale == 1:
         state.remember_focal(view.focal)
     window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
     return view if window is None else view.cut(window), window
 
 
-def training_image(
-    source: FieldSource,
-    state: FieldState,
-    extensions: Sequence[Extension],
-    make_view: Callable[[], View],
-    background: Tensor,
-    settings: RenderSettings,
-    *,
-    index: int | None,
-    at: StepResolution,
-    following: StepResolution,
-    depth: bool,
-) -> TrainingImage:
-    """Render the training view of a step. With several ranks, collective.
+class TrainingStep(NamedTuple):
+    """The step of a field, from a view to its loss."""
 
-    Args:
-        source: of the primitives.
-        state: the field in training; its ``info`` is set.
-        extensions: told before the backward pass.
-        make_view: builds the whole view from the camera that was served.
-        background: colour ``[3]``.
-        settings: of training.
-        index: of the training view that was served; None if the camera does not say.
-        at: resolution at this step.
-        following: resolution at the next step, as far as it is known now.
-        depth: whether to render depth.
-    """
-    view, window = training_view(source, state, make_view, index=index, at=at)
-    head = settings.head
-    primitives = source.primitives(view, settings, features=head is not None, at=at)
-    images, splatted = draw(primitives, view, background, settings, depth=depth)
-    if head is not None:
-        images["rgb"] = compensate(head, images["base_rgb"], splatted, background, training=True)
-    state.info = splatted.info
-    if state.densifying:
-        source.follow(primitives, state.info, absgrad=settings.absgrad)
-    # Now, while the GPU works on this step.
-    source.plan_next(following, state.optimizers)
-    for extension in extensions:
-        extension.before_backward(state)
-    del images["feature_image"]
-    return TrainingImage(images, window)
+    source: FieldSource
+    """Where the view gets its primitives from."""
+    state: FieldState
+    """Says what is enabled at this step."""
+    losses: StepLosses
+    """Terms of the loss."""
+    params: Mapping[str, Tensor]
+    """Trained parameters, for the terms that see them."""
+
+    def images(
+        self,
+        view: View,
+        background: Tensor,
+        settings: RenderSettings,
+        *,
+        at: StepResolution | None = None,
+        depth: bool = False,
+    ) -> tuple[dict[str, Any], Rasterization]:
+        """The first half: primitives, one splatting pass, and the head; see :func:`sundae_ns.rendering.render`."""
+        return render(self.source, view, background, settings, depth=depth, at=at)
+
+    def terms(self, images: Mapping[str, Tensor], target: Tensor, mask: Tensor | None) -> dict[str, Tensor]:
+        """The second half: the terms of the loss by name, each ``[]``; see :class:`StepInputs` for the arguments."""
+        return self.losses(self.state, self.params, images["rgb"], images["base_rgb"], target, mask)
+
+    def __call__(self, inputs: StepInputs, settings: RenderSettings) -> tuple[Tensor, Rasterization, StepResult]:
+        """Both halves.
+
+        Returns:
+            The loss ``[]`` with its graph, the rasteriser's result, and the detached result of the step.
+        """
+        with torch.enable_grad():
+            images, splatted = self.images(inputs.view, inputs.background, settings)
+            terms = self.terms(images, inputs.target, inputs.mask)
+            loss = functools.reduce(torch.add, terms.values())
+        shown = {name: images[name].detach() for name in ("rgb", "base_rgb", "accumulation")}
+        return loss, splatted, StepResult(shown, {name: value.detach() for name, value in terms.items()}, loss.detach())

@@ -35,7 +35,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "Imaginary 9000")
     monkeypatch.setattr("sundae_ns.gpu.nvrtc.Kernel", lambda *_: None)
     monkeypatch.setattr("sundae_ns.compensation.kernels.compiled", lambda *_: {})
-    monkeypatch.setattr("sundae_ns.gpu.fused_loss.compiled", lambda *_: None)
+    monkeypatch.setattr("sundae_ns.gpu.fused_loss.loss_kernels", lambda *_: None)
 
 
 def _kernels(monkeypatch: pytest.MonkeyPatch, problem: str | None) -> None:
@@ -100,7 +100,7 @@ def test_own_kernels(cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
     places = (
         "sundae_ns.gpu.nvrtc.Kernel",
         "sundae_ns.compensation.kernels.compiled",
-        "sundae_ns.gpu.fused_loss.compiled",
+        "sundae_ns.gpu.fused_loss.loss_kernels",
     )
     for place in places:
         with monkeypatch.context() as patch:

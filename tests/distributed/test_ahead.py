@@ -19,11 +19,11 @@ from torch.nn import Parameter
 from sundae_ns.compensation import training_window
 from sundae_ns.distributed import ShardedField, Shards
 from sundae_ns.distributed.ahead import Timetable, longest_step, slack_of_step
-from sundae_ns.distributed.source import statistics_of
+from sundae_ns.distributed.source import send_statistics, statistics_of
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization import rasterize, select_backend
 from sundae_ns.rasterization.sharded import camera_row
-from sundae_ns.rendering import ColorSettings, StepResolution, View, view_of
+from sundae_ns.rendering import ColorSettings, StepResolution, view_of
 from sundae_ns.training.densification import CappedStrategy
 from sundae_ns.training.losses import image_losses
 
@@ -80,13 +80,11 @@ def test_other_optimizers_are_not_planned_for() -> None:
 
 
 def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dist, "get_rank", lambda: 1)
     monkeypatch.setattr(dist, "get_world_size", lambda: 3)
     poses = torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(0))
     sides = torch.tensor([[64], [48], [64], [32], [80]])
     cameras = Cameras(poses, 50.0, 40.0, 33.0, 20.0, width=sides, height=sides - 10)
     timetable = Timetable(cameras, lambda image: (2 * image) % 5, "cpu", 0.02)
-    source = ShardedField(Shards("cpu"), Field({}), timetable)
     for at in (
         StepResolution(0, 1, 0),
         StepResolution(1, 1, 0),
@@ -99,23 +97,12 @@ def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPa
         indices = [(2 * (3 * at.step + rank)) % 5 for rank in range(3)]
         assert timetable.views(at.step) == indices
         views = [view_of(cameras[i : i + 1], "cpu", downscale=at.downscale) for i in indices]
-        own, expected = source.training_view(at, not_called, indices[1]), views[1]
-        assert (own.width, own.height, own.focal) == (expected.width, expected.height, expected.focal)
-        assert torch.equal(own.viewmat, expected.viewmat)
-        assert torch.equal(own.K, expected.K)
         known = timetable.cameras(at)
         for rank, view in enumerate(views):
             window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
             seen = view if window is None else view.cut(window)
             row = camera_row(seen.viewmat, seen.K, seen.width, seen.height, 0.02)
             assert torch.equal(torch.cat([known.centers[rank], known.bounds[rank].flatten()]), row)
-    for other in (timetable.views(0)[0], None):
-        with pytest.raises(AssertionError, match="timetable"):
-            source.training_view(StepResolution(0, 1, 0), not_called, other)
-
-
-def not_called() -> View:
-    raise AssertionError("a view built from the served camera waits for the GPU")
 
 
 @pytest.mark.gpu
@@ -152,10 +139,10 @@ def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None
         shards = Shards(device)
         source = ShardedField(shards, Field(params), Timetable(cameras, lambda image: 0, device, 0.01))
         shards.recount(params)
+        view = view_of(cameras, device)
         for step in range(3):
             at = StepResolution(step, 1, 0)
             assert (source._planned is not None) == (step > 0)
-            view = source.training_view(at, not_called, 0)
             if step > 0:  # in the first step kernels load, constants are made, and the ranks meet
                 forbid_waits()
             received = source.primitives(view, ColorSettings(backend), features=False, at=at)
@@ -173,7 +160,8 @@ def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None
             if step > 0:
                 forbid_waits()
             splat.info["means2d"].retain_grad()
-            source.follow(received, splat.info, absgrad=True)
+            splat.info["route"] = received.route
+            send_statistics(splat.info, absgrad=True)
             source.plan_next(StepResolution(step + 1, 1, 0), optimizers)
             image_losses(splat.colors, None, target, ssim, 0.2)[0].backward()  # type: ignore[no-untyped-call]
             strategy._update_state(params, state, {"statistics": statistics_of(splat.info)})

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from sundae_ns.gaussians.relocation import MAX_COPIES, draw, grow, jitter, relocate, split_evenly
+from sundae_ns.gaussians.relocation import MAX_COPIES, draw_sources, grow, jitter, relocate, split_evenly
 
 FIELD = {"means": (3,), "scales": (3,), "quats": (4,), "features_dc": (3,), "opacities": (1,)}
 
@@ -66,7 +66,7 @@ def test_split_evenly_agrees_with_gsplat() -> None:
 
 def test_draws_follow_the_weights() -> None:
     weights = torch.tensor([0.0, 1.0, 3.0, 0.0])
-    found = torch.bincount(draw(weights, 40_000), minlength=4)
+    found = torch.bincount(draw_sources(weights, 40_000), minlength=4)
     assert found[0] == found[3] == 0
     assert 0.23 < found[1] / 40_000 < 0.27
 

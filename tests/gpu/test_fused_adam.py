@@ -31,9 +31,8 @@ def test_it_follows_torch(launch: Any) -> None:
     for count in range(1, 30):
         gradient, rate = torch.randn(N) * scales, 0.01 / count
         step += 1
-        fused_adam.adam(
-            value, gradient, mean, square, step, torch.tensor(rate), None, betas=BETAS, eps=1e-15, launch=launch
-        )
+        update = fused_adam.Update(value, gradient, mean, square, step)
+        fused_adam.adam(update, torch.tensor(rate), None, betas=BETAS, eps=1e-15, launch=launch)
         optimizer.param_groups[0]["lr"], exact.grad = rate, gradient.double()
         optimizer.step()
     torch.testing.assert_close(value.double(), exact.detach(), rtol=0, atol=2e-6)
@@ -46,9 +45,10 @@ def test_a_skipped_step_changes_nothing(launch: Any) -> None:
     tensors = [torch.ones(N) for _ in range(4)]
     before = [value.clone() for value in tensors]
     one, rate = torch.ones(()), torch.tensor(0.1)
-    fused_adam.adam(*tensors, one, rate, one, betas=BETAS, eps=1e-8, launch=launch)
+    update = fused_adam.Update(*tensors, one)
+    fused_adam.adam(update, rate, one, betas=BETAS, eps=1e-8, launch=launch)
     assert all(torch.equal(value, old) for value, old in zip(tensors, before, strict=True))
-    fused_adam.adam(*tensors, one, rate, torch.zeros(()), betas=BETAS, eps=1e-8, launch=launch)
+    fused_adam.adam(update, rate, torch.zeros(()), betas=BETAS, eps=1e-8, launch=launch)
     assert (tensors[0] != before[0]).all()
 
 

@@ -18,7 +18,6 @@ from sundae_ns.cli import main
 from sundae_ns.cli.packing import pack
 from sundae_ns.errors import CheckpointError, ConfigError, MemoryExhaustedError
 from sundae_ns.evaluation import psnr
-from sundae_ns.model import SundaeModel
 from sundae_ns.scenes import finetune as packing_finetune
 from sundae_ns.scenes.finetune import finetune, rate_factor
 from sundae_ns.scenes.finetune_step import Through, TunedStep
@@ -67,19 +66,19 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
     # Ten times the rates for a twentieth of the steps.
     monkeypatch.setattr(packing_finetune, "RATES", {name: 10 * rate for name, rate in packing_finetune.RATES.items()})
     seen: list[dict[str, Tensor]] = []
-    train = packing_finetune.recorded_outputs
+    train = TunedStep.__call__
 
-    def watched(model: SundaeModel, *arguments: Any) -> Any:
-        found = train(model, *arguments)
-        seen.append({name: value.detach().clone() for name, value in model.named_parameters()})
+    def watched(step: TunedStep, *arguments: Any) -> Any:
+        found = train(step, *arguments)
+        seen.append({name: value.detach().clone() for name, value in step._model.named_parameters()})
         return found
 
     before = digests(tiny.folder)
     scene = contents_of_run(tiny.folder)
     losses: list[Tensor] = []
-    monkeypatch.setattr(packing_finetune, "recorded_outputs", watched)
+    monkeypatch.setattr(TunedStep, "__call__", watched)
     trained, codecs = finetune(tiny.folder, scene, COARSE, 60, progress=losses.append)
-    monkeypatch.setattr(packing_finetune, "recorded_outputs", train)
+    monkeypatch.setattr(TunedStep, "__call__", train)
     assert digests(tiny.folder) == before
     assert len(losses) == len(seen) == 60
     # Images are made of rounded values: rounding them again changes nothing.
@@ -234,21 +233,21 @@ def test_replayed_steps_train_the_same_scene(tiny: Any, monkeypatch: pytest.Monk
     """One training kernel by kernel, one by recordings: the same losses up to the order of sums."""
     scene = contents_of_run(tiny.folder)
     steps: list[TunedStep] = []
-    replayed = TunedStep._replayed
+    train = TunedStep.__call__
 
     def watched(step: TunedStep, *arguments: Any) -> Any:
         steps.append(step)
-        return replayed(step, *arguments)
+        return train(step, *arguments)
 
     def losses() -> list[float]:
         found: list[float] = []
         finetune(tiny.folder, scene, COARSE, 30, progress=lambda loss: found.append(loss.item()))
         return found
 
-    monkeypatch.setattr(TunedStep, "_replayed", watched)
+    monkeypatch.setattr(TunedStep, "__call__", watched)
     recorded = losses()
     assert len(steps) == 30
     assert steps[-1]._can_record
-    assert steps[-1]._recordings
+    assert steps[-1]._recordings._recordings
     monkeypatch.setattr(TunedStep, "__call__", lambda step, _, *arguments: step._run(*arguments, None))
     assert recorded == pytest.approx(losses(), rel=0.05)

@@ -12,8 +12,8 @@ from nerfstudio.utils import writer
 
 from sundae_ns.errors import BackendError
 from sundae_ns.storage.runs import checkpoint
-from sundae_ns.training.recordable import StepResult
 from sundae_ns.training.recorded import RecordedStep
+from sundae_ns.training.step import StepResult
 
 MakeTrainer = Callable[[Callable[[TrainerConfig], Any]], Trainer]
 

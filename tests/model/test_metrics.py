@@ -14,7 +14,7 @@ from torch import Tensor
 
 from sundae_ns.evaluation import psnr
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering.views import cut
+from sundae_ns.rendering.views import crop_image
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -53,7 +53,7 @@ def test_metrics_of_a_step_cost_nothing_until_they_are_looked_at(
     assert set(metrics) == {"psnr", "psnr_base", "gaussian_count"}
     assert not asked
     rgb, graph = outputs["rgb"].detach().clamp(0, 1), weakref.ref(outputs["rgb"])
-    truth = cut(batch()["image"].float() / 255, outputs["window"])  # as mirrored as the picture
+    truth = crop_image(batch()["image"].float() / 255, outputs["window"])  # as mirrored as the picture
     del outputs  # what the picture was made from goes with it
     assert graph() is None
     mse = ((rgb - truth) ** 2).mean()

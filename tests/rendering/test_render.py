@@ -19,7 +19,7 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.method_configs import sundae
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import LocalField, render
-from sundae_ns.rendering.views import cut
+from sundae_ns.rendering.views import crop_image
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -135,8 +135,8 @@ def test_a_mirrored_window_shows_the_mirror_image(
             assert error.max() < 0.02 * plain[name].max()
             assert (error > 2e-5).float().mean() < 0.005
     image = torch.rand(31, 47, 3)
-    assert torch.equal(cut(image, part._replace(mirrored=True)), cut(image, part).flip(1))
-    assert torch.equal(cut(image, part), image[3:23, 5:38])
+    assert torch.equal(crop_image(image, part._replace(mirrored=True)), crop_image(image, part).flip(1))
+    assert torch.equal(crop_image(image, part), image[3:23, 5:38])
 
 
 @torch.no_grad()

@@ -123,7 +123,7 @@ def test_a_view_of_more_pairs_than_there_is_room_for_is_recorded_again(
         model.get_outputs_for_camera(camera())
     recorder.needed = 121
     outputs = model.get_outputs_for_camera(camera())
-    assert recorder.recorded == [None, int(replay.SPARE * 121)]
+    assert recorder.recorded == [None, int(replay.SPARE_CAPACITY * 121)]
     assert outputs["rgb"].shape == (32, 40, 3)
     recorder.needed = 150
     model.get_outputs_for_camera(camera())

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from sundae_ns.gaussians.snapshot import narrow
 from sundae_ns.model import SundaeModel
-from sundae_ns.trainer import recorded_outputs
 from sundae_ns.training import buffers as buffers_module
-from sundae_ns.training import recorded as recorded_module
+from sundae_ns.training import recordings as recordings_module
 from sundae_ns.training.buffers import Buffers, start_moments, trained_parameters
 from sundae_ns.training.recorded import RecordedStep
+from sundae_ns.training.recordings import StepRecordings
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[..., Any]
@@ -34,7 +34,8 @@ class Recorded:
     def step(self, step: int) -> dict[str, Tensor]:
         self.model.train()
         self.training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, step)
-        _, result = recorded_outputs(self.model, self.camera, self.batch, self.recorded, {})
+        inputs = self.model.step_inputs(self.camera, self.batch)
+        result = self.recorded(self.model.state, inputs, self.model.render_settings(training=True))
         self.training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN_ITERATION, step)
         return result.losses
 
@@ -114,12 +115,13 @@ def test_no_recording_outlives_the_strength_of_the_correction_that_it_holds(
     """The head starts after step 3, so 4 images are seen 8 times at step 35."""
     _, one = both()
     for step in (0, 4, 5, 34, 35):
-        kept = one.recorded._recordings
+        held = one.recorded._recordings
+        kept = held._recordings
         if step > 5:
             kept["kind"] = object()  # type: ignore[assignment]
-            one.recorded._used["kind"] = 0
+            held._used["kind"] = 0
         one.step(step)
-        assert list(kept) == list(one.recorded._used) == ["kind"] * (step == 34)
+        assert list(kept) == list(held._used) == ["kind"] * (step == 34)
 
 
 @pytest.mark.gpu
@@ -145,7 +147,7 @@ def test_replayed_steps_train_the_same_field(
         assert recorded.model.num_points == pytest.approx(usual.model.num_points, rel=0.05)
     for pairs in late.values():
         assert sum(a for a, _ in pairs) == pytest.approx(sum(b for _, b in pairs), rel=0.1)
-    assert recorded.recorded._recordings
+    assert recorded.recorded._recordings._recordings
     assert recorded.training.live()
 
 
@@ -153,7 +155,7 @@ def test_replayed_steps_train_the_same_field(
 def test_a_step_without_room_for_its_pairs_changes_nothing(
     both: Callable[..., tuple[Any, Recorded]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorded_module, "SPARE_PAIRS", 0.5)
+    monkeypatch.setattr(recordings_module, "SPARE_PAIRS", 0.5)
     _, recorded = both("cuda", pruning={"mode": "off"})
     recorded.step(0)
     recorded.step(1)  # another SH degree, kernel by kernel again
@@ -167,7 +169,7 @@ def test_a_step_without_room_for_its_pairs_changes_nothing(
     assert all(torch.equal(recorded.model.gauss_params[name], value) for name, value in before.items())
     held = recorded.training.optimizers.optimizers["means"].state[recorded.model.gauss_params["means"]]
     assert [float(held["step"])] == steps
-    monkeypatch.setattr(recorded_module, "SPARE_PAIRS", 2.0)
+    monkeypatch.setattr(recordings_module, "SPARE_PAIRS", 2.0)
     recorded.step(3)
     torch.cuda.synchronize()
     assert not torch.equal(recorded.model.gauss_params["means"], before["means"])
@@ -175,30 +177,29 @@ def test_a_step_without_room_for_its_pairs_changes_nothing(
 
 def test_more_image_sizes_than_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last sizes run kernel by kernel until a recording has not been used for long; recording would take longer."""
-    step, made = RecordedStep(None), []  # type: ignore[arg-type]
+    recordings, made = StepRecordings(), []
 
     def recorded(*arguments: Any) -> SimpleNamespace:
         made.append(arguments[-1])
         return SimpleNamespace(pairs=arguments[-1])
 
-    monkeypatch.setattr(step, "_recorded", recorded)
-    step._pairs._on_host = torch.tensor(5)
-    held = SimpleNamespace(addresses=())
+    monkeypatch.setattr(recordings, "_recorded", recorded)
+    recordings._pairs._on_host = torch.tensor(5)
 
     def ask(kind: int) -> Any:
-        step._steps += 1
-        return step._recording(kind, None, held, None, None)  # type: ignore[arg-type]
+        recordings._steps += 1
+        return recordings._recording(None, None, None, kind, None)  # type: ignore[arg-type]
 
-    sizes = recorded_module.MAX_RECORDINGS
+    sizes = recordings_module.MAX_RECORDINGS
     for _ in range(3):
         assert all(ask(kind) is not None for kind in range(sizes))
         assert ask(sizes) is None
     assert made == [11] * sizes
-    step._pairs._on_host.fill_(12)  # a view needed more pairs than fit
+    recordings._pairs._on_host.fill_(12)  # a view needed more pairs than fit
     assert ask(0).pairs == 25
-    step._steps += recorded_module.UNUSED
+    recordings._steps += recordings_module.UNUSED
     assert ask(sizes) is not None
-    assert len(step._recordings) == sizes
+    assert len(recordings._recordings) == sizes
 
 
 def test_the_field_lies_in_the_buffers_and_unseen_rows_stay_as_they_are(

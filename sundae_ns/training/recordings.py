@@ -1,0 +1,201 @@
+"""Training steps as CUDA graphs: when to record one, and which to replay.
+
+A step is some two hundred small kernels. Launched one by one from Python they take several times as long as the GPU works.
+A graph launches them together. It reads its inputs where the last call has put them.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from sundae_ns.gpu.cuda_graphs import record, warm_up
+from sundae_ns.rasterization import Capacity, RecordableGsplat
+from sundae_ns.rendering.render import RenderSettings
+from sundae_ns.training.step import StepInputs, StepResult
+
+SPARE_PAIRS = 2.0
+"""Capacity for tile/primitive pairs, as a multiple of the most that a view has needed."""
+
+MAX_RECORDINGS = 8
+"""Recordings kept at a time: one for each image size and SH degree in use."""
+
+UNUSED = 1000
+"""Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by kernel,
+because recording takes longer than a step."""
+
+StepWork = Callable[[StepInputs, RenderSettings, Capacity | None], StepResult]
+"""The GPU work of a step, with the capacity of the rasteriser that is set; None for another rasteriser."""
+
+
+@dataclass(frozen=True)
+class _Recording:
+    graph: torch.cuda.CUDAGraph
+    inputs: StepInputs
+    """The graph reads them here."""
+    result: StepResult
+    """The graph writes it here."""
+    pairs: int
+    """Tile/primitive pairs that fit."""
+
+
+class StepRecordings:
+    """Runs training steps. The first of a kind runs kernel by kernel, because libraries choose and load kernels then.
+
+    Later ones replay. A step whose view has more tile/primitive pairs than fit changes nothing, and the next recording has
+    room for them.
+
+    Args:
+        record: False runs every step kernel by kernel, as a test does on a CPU.
+    """
+
+    def __init__(self, *, record: bool = True) -> None:
+        self._record = record
+        self._recordings: OrderedDict[Hashable, _Recording] = OrderedDict()
+        self._used: dict[Hashable, int] = {}
+        """Step at which a recording was last replayed."""
+        self._steps = 0
+        self._warm: set[Hashable] = set()
+        """Kinds of steps that have run kernel by kernel."""
+        self._pairs = NeededPairs()
+        self._constants: Hashable = None
+
+    def forget(self, *, pairs: bool = False) -> None:
+        """Drop all recordings; with ``pairs`` also measure again how many pairs a view needs."""
+        self._recordings.clear()
+        self._used.clear()
+        if pairs:
+            self._warm.clear()
+
+    def keep_for(self, constants: Hashable) -> None:
+        """Drop all recordings if numbers have changed that they hold as constants."""
+        if constants != self._constants:
+            self.forget()
+            self._constants = constants
+
+    def run(
+        self,
+        work: StepWork,
+        inputs: StepInputs,
+        settings: RenderSettings,
+        *,
+        kind: Hashable,
+        addresses: Hashable = None,
+    ) -> StepResult:
+        """Run a step, by a recording where there is one.
+
+        Args:
+            work: of the step.
+            inputs: of this step.
+            settings: of training images, with the backend gsplat for recording.
+            kind: decides on the kernels of the step.
+            addresses: of what a recording reads beside its inputs, where they may change.
+
+        Raises:
+            BackendError: the step cannot be recorded. Nothing has changed.
+            torch.cuda.OutOfMemoryError: the same.
+        """
+        recording = self._recording(work, inputs, settings, kind, addresses) if kind in self._warm else None
+        if recording is None:
+            result = self._kernel_by_kernel(work, inputs, settings)
+            self._warm.add(kind)
+        else:
+            inputs.copy_to(recording.inputs)
+            recording.graph.replay()
+            result = recording.result
+        self._steps += 1
+        return result
+
+    def overflow(self, capacity: Capacity | None) -> Tensor | None:
+        """1 if the lists of tiles were too short, so that the step must change nothing, else 0; float ``[]``."""
+        return self._pairs.overflow(capacity)
+
+    def _kernel_by_kernel(self, work: StepWork, inputs: StepInputs, settings: RenderSettings) -> StepResult:
+        """Run a step on the stream of the recordings."""
+        device = inputs.target.device
+        if device.type != "cuda":
+            return work(inputs, settings, None)
+        capacity = Capacity()
+        with warm_up(device):
+            result = work(inputs, replace(settings, backend=RecordableGsplat(capacity)), capacity)
+        self._pairs.count(capacity, device, anew=not self._warm)
+        return result
+
+    def _recording(
+        self, work: StepWork, inputs: StepInputs, settings: RenderSettings, kind: Hashable, addresses: Hashable
+    ) -> _Recording | None:
+        """The recording of a kind of steps; None if it has to run kernel by kernel."""
+        if not self._record:
+            return None
+        key, most = (kind, addresses), self._pairs.most
+        recording = self._recordings.get(key)
+        if recording is None and len(self._recordings) >= MAX_RECORDINGS:
+            oldest = next(iter(self._recordings))
+            if self._steps - self._used[oldest] < UNUSED:
+                return None
+            del self._recordings[oldest], self._used[oldest]
+        if recording is None or most > recording.pairs:
+            recording = self._recorded(work, inputs, settings, int(SPARE_PAIRS * most) + 1)
+            self._recordings[key] = recording
+        self._recordings.move_to_end(key)
+        self._used[key] = self._steps
+        return recording
+
+    def _recorded(self, work: StepWork, inputs: StepInputs, settings: RenderSettings, pairs: int) -> _Recording:
+        own = inputs.clone()
+
+        def step() -> StepResult:
+            capacity = Capacity(pairs)
+            return work(own, replace(settings, backend=RecordableGsplat(capacity)), capacity)
+
+        last = next(reversed(self._recordings.values()), None)
+        # Results are read before the next replay, so all recordings can work in the same memory.
+        graph, result = record(step, own.target.device, share_memory_with=None if last is None else last.graph)
+        return _Recording(graph, own, result, pairs)
+
+
+class NeededPairs:
+    """Most tile/primitive pairs that a view has needed, on the device and, some steps later, on the host."""
+
+    def __init__(self) -> None:
+        self._on_device: Tensor | None = None
+        """int64 ``[]``, as its pinned copy."""
+        self._on_host: Tensor | None = None
+
+    @property
+    def most(self) -> int:
+        """The number, as far as the host knows it."""
+        assert self._on_host is not None
+        return int(self._on_host)
+
+    def count(self, capacity: Capacity, device: torch.device, *, anew: bool) -> None:
+        """Count the pairs of a step that ran kernel by kernel, which waits for the GPU.
+
+        Args:
+            capacity: without a limit; it was rendered with.
+            device: of the step.
+            anew: forget the steps before.
+        """
+        needed = max(int(number) for number in capacity.needed)
+        if self._on_device is None or self._on_host is None:
+            self._on_device = torch.zeros((), dtype=torch.int64, device=device)
+            self._on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
+        most = needed if anew else max(needed, int(self._on_device))
+        self._on_device.fill_(most)
+        self._on_host.fill_(most)
+
+    @torch.no_grad()
+    def overflow(self, capacity: Capacity | None) -> Tensor | None:
+        """See :meth:`StepRecordings.overflow`."""
+        if capacity is None or capacity.pairs is None:
+            return None
+        assert self._on_device is not None
+        assert self._on_host is not None
+        needed = torch.stack(capacity.needed).amax()
+        torch.maximum(self._on_device, needed, out=self._on_device)
+        self._on_host.copy_(self._on_device, non_blocking=True)
+        return (needed > capacity.pairs).float()
