@@ -7,7 +7,7 @@ from pathlib import Path
 from sundae_ns.api.opening import load
 from sundae_ns.api.page import write_page
 from sundae_ns.api.scene import Scene
-from sundae_ns.errors import ConfigError
+from sundae_ns.errors import ConfigError, StorageError, writing
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.kinds import kind_of
 from sundae_ns.storage.viewers import FORMATS, ViewerFile, write_for_viewers
@@ -41,19 +41,21 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix in FORMATS:
-        save_for_viewers(scene, path, upright=upright)
-        return
     if suffix not in SUFFIXES:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    if upright:
+    if upright and suffix not in FORMATS:
         raise ConfigError(f"{suffix} files keep their coordinates; leave out upright")
-    packed = _packed(scene)
-    if suffix == ".html":
-        write_page(path, scene, packed, title=path.resolve().stem)
-        return
-    with replacing(path) as partial:
-        partial.write_bytes(packed)
+    if not path.parent.is_dir():
+        raise StorageError(f"{path.parent} is no folder; create it first, or choose another")
+    with writing(f"cannot write {path}"):
+        if suffix in FORMATS:
+            save_for_viewers(scene, path, upright=upright)
+        elif suffix == ".html":
+            write_page(path, scene, _packed(scene), title=path.resolve().stem)
+        else:
+            packed = _packed(scene)
+            with replacing(path) as partial:
+                partial.write_bytes(packed)
 
 
 def packed_file(path: Path) -> tuple[Scene, bytes]:

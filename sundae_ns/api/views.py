@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.data.capture import matrix, number, read_json, side
@@ -109,7 +108,7 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
-    frame = (scene.meta.get("frame") if scene is not None and scene.in_model_frame else None) or {}
+    transform, scale = _to_model(scene, content, path.name)
     views = []
     for i, entry in enumerate(frames):
         where = f"{path.name}, frame {i}"
@@ -117,20 +116,26 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
         pose = matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where)
         intrinsics = [number(stated.get(name), name, where, positive=name.startswith("fl")) for name in _INTRINSICS]
         size = [side(stated.get(name), name, where) for name in ("w", "h")]
-        views.append(View.from_pose(_moved(pose, frame), intrinsics, *size))
+        moved = transform[:3, :3] @ pose[:3]
+        moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
+        views.append(View.from_pose(torch.from_numpy(moved), intrinsics, *size))
     return CameraFile(views, None)
 
 
-def _moved(pose: np.ndarray, frame: dict[str, Any]) -> Tensor:
-    """A pose ``[3, 4]`` in the coordinates of a model, given the transform ``[3, 4]`` and scale that lead there."""
-    pose = pose[:3]
-    if frame:
-        transform = np.asarray(frame["transform"], np.float64)[:3]
-        pose = transform[:, :3] @ pose + np.concatenate([np.zeros((3, 3)), transform[:, 3:]], axis=1)
-        # A transform may scale; the axes of a camera have length 1.
-        pose[:, :3] /= np.linalg.norm(pose[:, :3], axis=0)
-        pose[:, 3] *= float(frame["scale"])
-    return torch.from_numpy(np.ascontiguousarray(pose))
+def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple[np.ndarray, float]:
+    """Transform ``[4, 4]`` and then scale, from the coordinates of a ``transforms.json`` to those of a scene.
+
+    A run states both from the coordinates before the transform that the file states as applied.
+    """
+    frame = scene.meta.get("frame") if scene is not None and scene.in_model_frame else None
+    if frame is None:
+        return np.eye(4), 1.0
+    transform, applied = np.eye(4), np.eye(4)
+    transform[:3] = np.asarray(frame["transform"], np.float64)[:3]
+    if "applied_transform" in content:
+        applied[:3] = matrix(content["applied_transform"], (3,), "applied_transform", where)
+    scale = float(frame["scale"]) / number(content.get("applied_scale", 1.0), "applied_scale", where, positive=True)
+    return transform @ np.linalg.inv(applied), scale
 
 
 def _camera_path(content: dict[str, Any], where: str) -> list[View]:

@@ -18,6 +18,7 @@ from sundae_ns.cli.bench import app as bench
 from sundae_ns.cli.files import export, prune
 from sundae_ns.cli.outputs import Overwrite, check_file, check_folder
 from sundae_ns.cli.packing import pack, unpack
+from sundae_ns.cli.render import render
 from sundae_ns.cli.run import run
 from sundae_ns.cli.train import train
 from sundae_ns.cli.view import view
@@ -35,7 +36,7 @@ ENVIRONMENT = {
 
 app = tyro.extras.SubcommandApp()
 app.command(bench, name="bench", help="Benchmark SUNDAE on this machine.")
-for command in (run, train, pack, unpack, export, view, prune):
+for command in (run, train, pack, unpack, export, view, render, prune):
     app.command(command)
 
 

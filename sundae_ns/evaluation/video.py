@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
 
 import torch
@@ -57,20 +58,23 @@ def side_by_side(row: ComparisonRow, tile: tuple[int, int], *, head: bool) -> Im
     return frame
 
 
-def write_video(path: Path, frames: Iterable[Image.Image]) -> int:
+def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second: float = FRAMES_PER_SECOND) -> int:
     """Write frames of one size as an MP4 (H.264), which browsers play; returns their number.
 
     PyAV brings its own encoder, so no ffmpeg is needed.
 
     Args:
         path: file to write, of any suffix.
-        frames: RGB images with even sides, rendered one at a time.
+        frames: RGB images of one size with even sides, rendered one at a time.
+        frames_per_second: speed.
     """
     import av
 
     count = 0
     with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
-        stream = container.add_stream("libx264", rate=FRAMES_PER_SECOND, options={"crf": "18"})
+        stream = container.add_stream(
+            "libx264", rate=Fraction(frames_per_second).limit_denominator(1001), options={"crf": "18"}
+        )
         stream.pix_fmt = "yuv420p"
         stream.codec_context.colorspace = _BT709
         for image in frames:

@@ -1,0 +1,95 @@
+"""``sundae render``: a scene as a picture or a video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from sundae_ns.cli.outputs import Overwrite, check_file
+
+if TYPE_CHECKING:
+    from sundae_ns.rendering import View
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+FRAMES_PER_SECOND = 24
+
+
+def render(
+    scene: Annotated[Path, tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    camera: Path | None = None,
+    view: int | None = None,
+    head: bool = True,
+    width: int | None = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Render a scene to a picture, or along a camera path to a video.
+
+    Args:
+        scene: a packed scene, a run, or a .ply, .spz or .sog.
+        out: picture (.png, .jpg or .webp) or video (.mp4) to write.
+        camera: a transforms.json or a camera path of the viewer; by default the cameras stored with the scene.
+        view: index of the camera for a picture; needed if there are several.
+        head: let the head correct the images.
+        width: width of the images in pixels; by default that of the camera.
+        overwrite: replace an existing file, once the new one is complete.
+    """
+    from PIL import Image
+    from rich.console import Console
+    from rich.progress import track
+
+    from sundae_ns.api import opening, rendering
+    from sundae_ns.api.views import CameraFile, read_cameras, view_in_front
+    from sundae_ns.errors import ConfigError, writing
+    from sundae_ns.evaluation.video import write_video
+    from sundae_ns.storage.atomic import replacing
+
+    suffix = out.suffix.lower()
+    if suffix not in (*PICTURES, ".mp4"):
+        raise ConfigError(f"{out} is neither a picture nor a video; name it {', '.join(PICTURES)} or .mp4")
+    if width is not None and width < 2:
+        raise ConfigError(f"width is {width}; give 2 pixels or more")
+    check_file(out, reads=[scene, camera], overwrite=overwrite)
+    opened = opening.load(scene)
+    if camera is not None:
+        cameras = read_cameras(camera, opened)
+    else:
+        cameras = CameraFile(list(opened.views) or [view_in_front(opened)], None)
+    views = [_resized(each, width, even=suffix == ".mp4") for each in cameras.views]
+
+    def picture(view: View) -> Image.Image:
+        image = rendering.render(opened, view, head=head).rgb
+        return Image.fromarray((image * 255).round().byte().cpu().numpy())
+
+    if suffix == ".mp4":
+        shown = track(views, "Rendering", transient=True, console=Console(stderr=True))
+        speed = cameras.frames_per_second or FRAMES_PER_SECOND
+        with writing(f"cannot write {out}"), replacing(out) as partial:
+            count = write_video(partial, (picture(each) for each in shown), frames_per_second=speed)
+        print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
+        return 0
+    chosen = _chosen(views, view)
+    with writing(f"cannot write {out}"), replacing(out) as partial:
+        picture(chosen).save(partial, format={".jpg": "jpeg"}.get(suffix, suffix[1:]))
+    print(f"{out}: {chosen.width} x {chosen.height} px")
+    return 0
+
+
+def _chosen(views: list[View], index: int | None) -> View:
+    from sundae_ns.errors import ConfigError
+
+    if index is None and len(views) > 1:
+        raise ConfigError(
+            f"there are {len(views)} cameras; choose one with --view 0 to {len(views) - 1}, or write an .mp4"
+        )
+    if not 0 <= (index or 0) < len(views):
+        raise ConfigError(f"there is no camera {index}; give --view 0 to {len(views) - 1}")
+    return views[index or 0]
+
+
+def _resized(view: View, width: int | None, *, even: bool) -> View:
+    """The camera with images of another width, and with even sides for a video, which stores colours at half the size."""
+    view = view if width is None else view.zoomed(width / view.width)
+    return view._replace(width=view.width // 2 * 2, height=view.height // 2 * 2) if even else view

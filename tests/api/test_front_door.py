@@ -1,0 +1,81 @@
+"""``import sundae_ns``: its names, its doctests, the lines of README, and that none of it needs nerfstudio."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from fields import random_field
+
+import sundae_ns as sn
+from sundae_ns.storage import write_ply
+
+ROOT = Path(__file__).parents[2]
+FUNCTIONS = ("load", "measure", "prune", "render", "save", "views_of", "virtual_views")
+WITHOUT_NERFSTUDIO = """
+import sys
+sys.modules["nerfstudio"] = None
+exec(sys.stdin.read())
+assert not any(name.split(".")[0] == "nerfstudio" and module for name, module in sys.modules.items())
+"""
+
+
+def five_lines(text: str) -> str:
+    """The Python of the page's first block that imports the library."""
+    blocks = re.findall(r"(?:^    .*\n|^\n)+", text, re.MULTILINE)
+    block = next(block for block in blocks if "import sundae_ns as sn" in block)
+    return "\n".join(line[4:] for line in block.splitlines())
+
+
+@pytest.fixture
+def garden(tmp_path: Path) -> Path:
+    field = random_field(200, features=0)
+    field["scales"] += 2
+    write_ply(tmp_path / "garden.ply", field)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", ["README.md", "sundae_ns/__init__.py"])
+def test_the_lines_of_the_pages_run_without_nerfstudio(page: str, garden: Path) -> None:
+    program = five_lines((ROOT / page).read_text())
+    for name in ("load", "prune", "render", "save"):
+        assert f"sn.{name}(" in program
+    code = [sys.executable, "-c", WITHOUT_NERFSTUDIO]
+    done = subprocess.run(code, input=program, cwd=garden, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert sn.load(garden / "small.sundae").num_primitives == 20
+
+
+def test_every_public_name_is_there_and_documented() -> None:
+    for name in sn.__all__:
+        value = getattr(sn, name)
+        assert inspect.getdoc(value), name
+        assert name in dir(sn)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        sn.nothing  # noqa: B018
+
+
+def test_names_are_imported_on_first_use() -> None:
+    code = "import sys, sundae_ns; sundae_ns.__version__; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("name", [*FUNCTIONS, "Scene", "View"])
+def test_doctests(name: str) -> None:
+    """Each public function has an example, and all examples run."""
+    module = importlib.import_module(getattr(sn, name).__module__)
+    finder = doctest.DocTestFinder(recurse=True)
+    found = [test for test in finder.find(getattr(sn, name), name, module=module, globs={}) if test.examples]
+    assert found, f"{name} has no example"
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
+    for test in found:
+        torch.manual_seed(0)
+        report: list[str] = []
+        assert runner.run(test, out=report.append).failed == 0, "".join(report)

@@ -1,0 +1,134 @@
+"""Cameras of files, and virtual ones."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from fields import random_field
+
+import sundae_ns as sn
+from sundae_ns.api.views import read_cameras
+from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.gaussians.field import Field
+
+FRAME = {"transform_matrix": [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]}
+LENS = {"fl_x": 50, "fl_y": 60, "cx": 32, "cy": 24, "w": 64, "h": 48}
+PATH = {
+    "render_width": 64,
+    "render_height": 48,
+    "fps": 12,
+    "camera_path": [{"camera_to_world": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 3, 0, 0, 0, 1], "fov": 90}],
+}
+
+
+def written(tmp_path: Path, content: Any) -> Path:
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def scene(**options: Any) -> sn.Scene:
+    return sn.Scene(Field(random_field(100, features=0)), **options)
+
+
+def test_a_transforms_file(tmp_path: Path) -> None:
+    path = written(tmp_path, {**LENS, "frames": [FRAME, {**FRAME, "fl_x": 70}]})
+    first, second = sn.views_of(tmp_path)
+    assert (first.width, first.height, first.focal) == (64, 48, 55)
+    assert float(second.K[0, 0]) == 70
+    torch.testing.assert_close(first.center, torch.tensor([0.0, 0, 3]))
+    # The camera looks along -z, so the origin is in the middle of the image.
+    seen = first.K @ first.viewmat[:3, 3]
+    torch.testing.assert_close(seen[:2] / seen[2], torch.tensor([32.0, 24.0]))
+    assert read_cameras(path).frames_per_second is None
+
+
+def test_a_camera_path(tmp_path: Path) -> None:
+    found = read_cameras(written(tmp_path, PATH))
+    (view,) = found.views
+    assert found.frames_per_second == 12
+    assert float(view.K[1, 1]) == pytest.approx(24)
+    torch.testing.assert_close(view.center, torch.tensor([0.0, 0, 3]))
+
+
+def test_cameras_of_a_capture_move_with_its_model(tmp_path: Path) -> None:
+    """As nerfstudio moves and scales them for training; those of a camera path are in the model's coordinates."""
+    turn = [[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
+    trained = scene(in_model_frame=True, meta={"frame": {"transform": turn, "scale": 0.5}})
+    path = written(tmp_path, {**LENS, "frames": [FRAME]})
+    torch.testing.assert_close(sn.views_of(path, trained)[0].center, torch.tensor([0.5, 1.0, 3.0]))
+    torch.testing.assert_close(sn.views_of(path, scene())[0].center, torch.tensor([0.0, 0, 3]))
+    # nerfstudio's transform begins before the one that a transforms.json states as applied.
+    applied = {"applied_transform": [[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0]], "applied_scale": 2.0}
+    path = written(tmp_path, {**LENS, **applied, "frames": [FRAME]})
+    torch.testing.assert_close(sn.views_of(path, trained)[0].center, torch.tensor([0.25, 0.25, 1.5]))
+    path = written(tmp_path, PATH)
+    torch.testing.assert_close(sn.views_of(path, trained)[0].center, torch.tensor([0.0, 0, 3]))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "does not hold a JSON object"),
+        ({}, "neither frames nor a camera_path"),
+        ({"frames": []}, "neither frames nor a camera_path"),
+        ({"frames": [FRAME]}, "fl_x"),
+        ({**LENS, "frames": [{}]}, "transform_matrix"),
+        ({**LENS, "frames": [7]}, "transform_matrix"),
+        ({**LENS, "w": 0, "frames": [FRAME]}, "w is 0"),
+        ({**PATH, "camera_path": []}, "empty camera_path"),
+        ({**PATH, "camera_type": "equirectangular"}, "equirectangular"),
+        ({**PATH, "camera_path": [{"camera_to_world": [1, 2]}]}, "camera_to_world"),
+        ({**PATH, "camera_path": [{**PATH["camera_path"][0], "fov": 200}]}, "below 180"),  # type: ignore[index]
+        ({**PATH, "fps": 0}, "fps"),
+    ],
+)
+def test_files_without_usable_cameras_are_refused_in_one_line(content: Any, message: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=message) as caught:
+        sn.views_of(written(tmp_path, content))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0)])
+@pytest.mark.parametrize("eye", [(1.0, -2.0, 0.5), (0.0, 0.0, 4.0), (0.0, 4.0, 0.0)])
+def test_a_camera_looks_at_its_target(eye: tuple[float, ...], up: tuple[float, ...]) -> None:
+    view = sn.View.look_at(eye, (0.0, 0.0, 0.0), up, fov=90, width=20, height=10)
+    x, y, z = view.viewmat[:3, 3].tolist()
+    assert (x, y) == (pytest.approx(0, abs=1e-6), pytest.approx(0, abs=1e-6))
+    assert z == pytest.approx(math.dist(eye, (0, 0, 0)))
+    torch.testing.assert_close(view.viewmat[:3, :3] @ view.viewmat[:3, :3].T, torch.eye(3))
+    assert torch.det(view.viewmat[:3, :3]) == pytest.approx(1)
+    torch.testing.assert_close(sn.View.from_pose(view.pose, (5, 5, 10, 5), 20, 10).viewmat, view.viewmat)
+    assert float(view.K[1, 1]) == pytest.approx(5)
+
+
+def test_virtual_views_are_the_same_for_a_seed_and_see_the_scene() -> None:
+    one, same, other = (sn.virtual_views(scene(), 16, seed=seed) for seed in (0, 0, 1))
+    assert all(torch.equal(a.viewmat, b.viewmat) for a, b in zip(one, same, strict=True))
+    assert not torch.equal(one[0].viewmat, other[0].viewmat)
+    seen = [float(sn.render(scene(), view).accumulation.max()) for view in one]
+    assert min(seen) > 0
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e6])
+def test_virtual_views_of_a_scene_of_any_size(factor: float) -> None:
+    moved = scene()
+    moved.field["means"] *= factor
+    apart = [view.center for view in sn.virtual_views(moved, 8)]
+    torch.testing.assert_close(
+        torch.stack(apart) / factor, torch.stack([v.center for v in sn.virtual_views(scene(), 8)])
+    )
+
+
+def test_virtual_views_that_see_nothing_are_refused() -> None:
+    with pytest.raises(ConfigError, match="see nothing"):
+        sn.virtual_views(scene(), 0)
+    broken = scene()
+    broken.field["means"][:] = torch.nan
+    with pytest.raises(DataError, match="no camera sees the scene"):
+        sn.virtual_views(broken)
