@@ -15,11 +15,10 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
-
-import tomllib
 
 ROOT = Path(__file__).parents[1]
 LOOK = """
