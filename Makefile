@@ -1,4 +1,4 @@
-# make demo: install, then train and evaluate the embedded scene.
+# make demo: install, then train and evaluate a small ray-traced scene.
 # make test: install if need be, then what CI runs.   make test-all: every seed, and the viewer's tests in a browser.
 # make coverage: lines that the tests run.   make mutants: small faults that the tests
 # notice, all in half an hour, or make mutants SAMPLE=40.

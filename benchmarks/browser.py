@@ -43,10 +43,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from ray_tracing import write_still_life
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
-
-from sundae_ns.data import write_embedded_capture
 
 FLAGS = """
 --headless=new --no-sandbox --no-first-run --disable-dev-shm-usage --disable-background-networking --disable-sync
@@ -575,7 +574,7 @@ def main() -> None:
         sys.exit("no Chromium here; apt-get install chromium")
     chance = random.Random(0)
     with tempfile.TemporaryDirectory() as folder:
-        scene = write_embedded_capture(
+        scene = write_still_life(
             Path(folder) / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1
         )
         words = ["ns-train", "sundae-tiny", "--data", scene, "--output-dir", Path(folder) / "out", "--vis", "viewer"]

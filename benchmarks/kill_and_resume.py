@@ -3,7 +3,7 @@
     python benchmarks/kill_and_resume.py                      # 20 kills: while saving, while pruning, at any time
     python benchmarks/kill_and_resume.py --kills 3 --seed 1
 
-Every run is nerfstudio's own training command on the embedded scene, in a process of its own. A server process without
+Every run is nerfstudio's own training command on a ray-traced scene, in a process of its own. A server process without
 threads imports nerfstudio once and forks the runs. Exits with 1 if any resumed run ended differently.
 """
 
@@ -32,13 +32,13 @@ import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.scripts import train
+from ray_tracing import write_still_life
 from rich.progress import track
 
 import sundae_ns.pruning.cutting
 import sundae_ns.storage.atomic
 import sundae_ns.storage.runs.checkpoint
 import sundae_ns.training.report
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import CheckpointError
 
 STEPS, SAVE_EVERY, PRUNE_AT = 70, 12, 36
@@ -205,7 +205,7 @@ def main() -> None:
     root = options.out or Path(tempfile.mkdtemp(prefix="kill-and-resume-"))
     root.mkdir(parents=True, exist_ok=True)
     log = root / "log"
-    write_embedded_capture(root / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
+    write_still_life(root / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
     arguments = ["sundae-tiny", "--data", str(root / "scene"), *OPTIONS]
     parsed = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)
 

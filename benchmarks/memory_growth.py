@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from ray_tracing import write_still_life
 
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.method_configs import sundae_tiny
 
 PRUNE_AT, SETTLE, EVERY = 60, 200, 50
@@ -36,7 +36,7 @@ def resident() -> int:
 
 
 def configured(options: argparse.Namespace, folder: Path) -> Any:
-    scene = write_embedded_capture(
+    scene = write_still_life(
         folder / "scene",
         train_views=8,
         test_views=2,

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from sundae_ns.data.capture import check_image, check_transforms, no_transforms, undecodable
 from sundae_ns.data.colmap import check_colmap
-from sundae_ns.errors import ConfigError, DataError, SundaeError
+from sundae_ns.errors import ConfigError, DataError, SundaeError, one_line
 from sundae_ns.storage.point_cloud import read_point_cloud
 from sundae_ns.training.warning import warn
 
@@ -29,7 +29,6 @@ DATASET_FRAME = "sundae_dataset_frame"
 
 NO_IMAGES = "sundae_no_images"
 """Key of a dataset's metadata and of a batch: cameras without images, which are grey."""
-
 
 LEAST_FOCAL, MOST_FOCAL = 0.01, 1000.0
 """Shortest and longest focal length in widths of the image: views of 178 and of 0.06 degrees."""
@@ -40,8 +39,8 @@ FARTHEST = 10_000
 def no_images_error(run: object = "this run") -> DataError:
     """The error for training or evaluating on the grey images of a run that was unpacked without its capture."""
     return DataError(
-        f"{run} was unpacked without its capture, so its cameras have no images to train or evaluate on; give the capture to "
-        "sundae unpack with --data"
+        f"{run} was unpacked without its capture, so its cameras have no images to train or evaluate on; "
+        "give the capture to sundae unpack with --data"
     )
 
 
@@ -92,29 +91,18 @@ def view_index(camera: Cameras) -> int | None:
 
 
 def capture_of(config: FullImageDatamanagerConfig) -> Path:
-    """Where the capture of a datamanager lies."""
+    """Path of a datamanager's capture."""
     return Path(config.dataparser.data if config.data is None else config.data)
 
 
 def check_before_training(config: Any) -> None:
-    """Check a capture before anything else of a training happens.
-
-    Args:
-        config: of a datamanager; only ours is checked.
-
-    Raises:
-        DataError: see :func:`check_capture`.
-    """
+    """Run :func:`check_capture` before anything else of a training, if the datamanager of ``config`` is ours."""
     if isinstance(config, SundaeDatamanagerConfig):
         check_capture(config.dataparser, capture_of(config), ("train", "val"), images=config.images)
 
 
 def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
-    """Check the poses and focal lengths of training images, in any units.
-
-    Args:
-        cameras: ``N`` cameras.
-        names: their images.
+    """Check the poses and focal lengths of cameras ``[N]`` of training images with these names, in any units.
 
     Returns:
         A warning on poses that are possible, but make no good scene; None without one.
@@ -124,15 +112,14 @@ def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
     """
     mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
     if mirrored.any():
-        first = names[int(mirrored.nonzero()[0])].name
         raise DataError(
-            f"the pose of {first} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses do); negate one column of "
-            "its rotation"
+            f"the pose of {names[_first(mirrored)].name} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses "
+            "do); negate one column of its rotation"
         )
     shares = cameras.fx / cameras.width.clamp_min(1)
     wrong = ((shares < LEAST_FOCAL) | (shares > MOST_FOCAL)).flatten()
     if wrong.any():
-        at = int(wrong.nonzero()[0])
+        at = _first(wrong)
         raise DataError(
             f"the focal length of {names[at].name} is {float(cameras.fx[at]):.3g} px and the image is "
             f"{int(cameras.width[at])} px wide, which no lens has; give the focal length in pixels"
@@ -144,12 +131,16 @@ def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
     usual = distances.median()
     far = distances > FARTHEST * usual.clamp_min(torch.finfo(usual.dtype).tiny)
     if usual > 0 and far.any():
-        first = names[int(far.nonzero()[0])].name
         return (
-            f"the camera of {first} is more than {FARTHEST:,} times as far away as most ({int(far.sum())} of {len(names)} "
-            "are); check the poses"
+            f"the camera of {names[_first(far)].name} is more than {FARTHEST:,} times as far away as most "
+            f"({int(far.sum())} of {len(names)} are); check the poses"
         )
     return None
+
+
+def _first(flags: Tensor) -> int:
+    """Index of the first True."""
+    return int(flags.nonzero()[0])
 
 
 def _fits(cameras: Cameras, device: torch.device) -> bool:
@@ -192,11 +183,10 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
 
 
 class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
-    """Serves whole images.
+    """The stock datamanager of whole images, which also caches them on machines without CUDA and can hold out views.
 
-    Beyond the stock datamanager: it caches images on machines without CUDA. The view of a step is a function of seed and
-    step, so a resumed run continues in the same order. It can hold out training views, and lists the others with their
-    masks. Training cameras stay on the CPU, where reading their sizes does not wait for the GPU.
+    The view of a step is a function of seed and step, so a resumed run continues in the same order. Training cameras
+    stay on the CPU, where reading their sizes does not wait for the GPU.
     """
 
     config: SundaeDatamanagerConfig
@@ -210,8 +200,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     ) -> None:
         if config.train_cameras_sampling_strategy != "random":
             raise ConfigError(
-                "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run would differ; "
-                "use random"
+                "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run would "
+                "differ; use random"
             )
         if config.holdout_every < 0 or config.holdout_every == 1:
             raise ConfigError(f"holdout-every is {config.holdout_every}; give 0 (none) or at least 2")
@@ -236,10 +226,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                 "size with --downscale-factor 1"
             ) from error
         except Exception as error:  # parsers raise many kinds, assertions too, with one meaning for the user
-            reason = " ".join(str(error).split())[:200] or type(error).__name__
-            raise DataError(f"{data} cannot be parsed ({reason}); check the capture") from error
-        self._order: tuple[int, list[int]] = (-1, [])
-        self._served = self.train_indices
+            raise DataError(f"{data} cannot be parsed ({one_line(error)}); check the capture") from error
+        self.hold_back(())
         self._cameras: dict[int, Cameras] = {}
         self.place: tuple[int, int] = (0, 1)
         """Rank of this process and number of ranks; each rank gets another view at a step."""
@@ -279,7 +267,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         """Hold out these of :attr:`train_indices` too, from the next step on, until the next call."""
         held_back = frozenset(indices)
         self._served = [index for index in self.train_indices if index not in held_back]
-        self._order = (-1, [])
+        self._order: tuple[int, list[int]] = (-1, [])  # pass over the views, and its order
 
     def view_of_step(self, step: int) -> int:
         """Index of the training view of ``step``: each pass over the views is a new permutation."""
@@ -343,8 +331,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             cache_images_device = "gpu"
         elif cache_images_device == "gpu" and not _fits(dataset.cameras, torch.device(self.device)):
             CONSOLE.print(
-                f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each step "
-                "copies one",
+                f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each "
+                "step copies one",
                 soft_wrap=True,
             )
             cache_images_device = "cpu"
@@ -352,8 +340,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         transparent = sum(batch["image"].shape[-1] == 4 for batch in loaded)
         if split == "train" and transparent:
             CONSOLE.print(
-                f"{transparent} of {len(loaded)} training images have an alpha channel: what is transparent is trained to be "
-                "empty space. To leave pixels out instead, give masks (mask_path in transforms.json)",
+                f"{transparent} of {len(loaded)} training images have an alpha channel: what is transparent is trained "
+                "to be empty space. To leave pixels out instead, give masks (mask_path in transforms.json)",
                 soft_wrap=True,
             )
         return loaded
@@ -364,11 +352,10 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             return
         scale = dataset.scale_factor
         masks: Sequence[Path | None] = dataset._dataparser_outputs.mask_filenames or [None] * len(dataset)
-        for index, (path, mask) in enumerate(zip(dataset.image_filenames, masks)):
+        widths, heights = dataset.cameras.width.flatten().tolist(), dataset.cameras.height.flatten().tolist()
+        for path, mask, *expected in zip(dataset.image_filenames, masks, widths, heights):
             full = check_image(path)
-            size = tuple(int(side * scale) for side in full)
-            camera = dataset.cameras[index]
-            expected = (int(camera.width.item()), int(camera.height.item()))
+            size = [int(side * scale) for side in full]
             if size != expected:
                 raise DataError(
                     f"{path.name} is {size[0]} x {size[1]} px but its camera says {expected[0]} x {expected[1]}; "

@@ -1,8 +1,7 @@
 """Errors shown to users: one line each, the cause first and then the remedy.
 
-All derive from :class:`SundaeError`, so the command line can print them without a traceback. Each also derives from the
-built-in exception that a caller would expect. Here, too, is what every reader and writer of files shares. This module
-imports nothing of the package.
+All derive from :class:`SundaeError`, which the command line prints without a traceback. Each also derives from the
+built-in exception that a caller would expect.
 """
 
 from __future__ import annotations
@@ -110,6 +109,11 @@ def _reason(error: Exception) -> str | None:
     return None
 
 
+def one_line(error: BaseException) -> str:
+    """Message of an error as one line of at most 200 characters; the name of its class if it has none."""
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
 def regular(path: Path) -> Path:
     """The path, unless reading it may never end.
 
@@ -150,8 +154,8 @@ def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError
     asked = f"cannot allocate {found[1]} more" if found else "cannot allocate more"
     return MemoryExhaustedError(
         f"the GPU's memory is full: {asked} with {primitives:,} primitives; "
-        "try --pipeline.datamanager.cache-images cpu "
-        "(images in host memory), --pipeline.datamanager.camera-res-scale-factor 0.5 (smaller images), or "
+        "try --pipeline.datamanager.cache-images cpu (images in host memory), "
+        "--pipeline.datamanager.camera-res-scale-factor 0.5 (smaller images), or "
         "--pipeline.model.pruning.mode continuous --pipeline.model.pruning.keep-ratio 0.5 "
         f"--pipeline.model.pruning.max-primitives {max(primitives // 2, 1)} (a lower peak); "
         "--load-dir resumes from the last checkpoint"
@@ -159,9 +163,9 @@ def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError
 
 
 def show_in_one_line() -> None:
-    """In a nerfstudio command (``ns-*``), end an uncaught :class:`SundaeError` with one line on stderr, and Ctrl-C with 130.
+    """In a nerfstudio command (``ns-*``), print an uncaught :class:`SundaeError` as one line; end Ctrl-C with code 130.
 
-    Other errors, other programs, and all errors when ``SUNDAE_TRACEBACK`` is set are shown as before.
+    Other errors and other programs stay as they are, and so does everything when ``SUNDAE_TRACEBACK`` is set.
     """
     if not Path(sys.argv[0]).name.startswith("ns-") or os.environ.get("SUNDAE_TRACEBACK"):
         return

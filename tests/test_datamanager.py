@@ -15,8 +15,8 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from PIL import Image
+from ray_tracing import write_still_life
 
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanager, SundaeDatamanagerConfig, check_cameras
 from sundae_ns.errors import ConfigError, DataError
 
@@ -26,7 +26,7 @@ VIEWS = 7
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("capture") / "scene"
-    return write_embedded_capture(out, train_views=VIEWS, test_views=2, width=20, height=16, points=60, samples=1)
+    return write_still_life(out, train_views=VIEWS, test_views=2, width=20, height=16, points=60, samples=1)
 
 
 @pytest.fixture

@@ -20,9 +20,9 @@ import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.plugins.types import MethodSpecification
+from ray_tracing import write_still_life
 
 from sundae_ns import method_configs
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, StorageError
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.storage.runs import checkpoint
@@ -339,7 +339,7 @@ def test_the_schedule_is_logged_and_saved(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(DataError, match="capture does not exist"):
         config.print_to_terminal()
     assert list(tmp_path.iterdir()) == []
-    write_embedded_capture(tmp_path / "capture", train_views=3, test_views=1, width=16, height=16, points=9, samples=1)
+    write_still_life(tmp_path / "capture", train_views=3, test_views=1, width=16, height=16, points=9, samples=1)
     config.print_to_terminal()
     config.save_config()
     shown = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""``sundae demo``: train and evaluate the embedded scene with nerfstudio's commands."""
+"""``sundae demo``: train and evaluate the shipped capture with nerfstudio's commands."""
 
 from __future__ import annotations
 
@@ -13,15 +13,13 @@ from rich.console import Console
 from rich.progress import Progress
 
 from sundae_ns.cli.process import console_script, percent_of, run_logged
-from sundae_ns.data import write_embedded_capture
-from sundae_ns.errors import ConfigError
+from sundae_ns.data import write_demo_capture
+from sundae_ns.errors import ConfigError, writing
 from sundae_ns.evaluation import ComparisonRow, report_text, save_comparison
 
 METHOD = "sundae-tiny"
 SHOWN = 3
 """Number of test views in the comparison image."""
-POINTS = 5000
-"""Size of the sparse cloud: a smaller one leaves too few points in the sky, which few views see."""
 BACKGROUND = "white"
 """Colour where no training view looks, above all beside the sky; a dark one shows as stains."""
 
@@ -44,7 +42,7 @@ def _comparison(renders: Path, out: Path) -> None:
 
 
 def run_demo(out: Path, steps: int | None = None, console: Console | None = None) -> int:
-    """Write the scene, train, evaluate, and print the results.
+    """Write the capture, train, evaluate, and print the results.
 
     Args:
         out: folder for scene, run, logs, images and web page; an earlier demo in it is replaced.
@@ -58,15 +56,12 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
     if steps is not None and steps < 1:
         raise ConfigError(f"steps is {steps}; give at least 1")
     console = console or Console()
-    out.mkdir(parents=True, exist_ok=True)
     scene, run = out / "scene", out / "runs" / "demo" / METHOD / "run"
     device = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "CPU"
-    console.print(f"SUNDAE demo on {device}: ray-trace a scene, train it with ns-train, evaluate it with ns-eval.")
+    console.print(f"SUNDAE demo on {device}: train a small scene with ns-train, evaluate it with ns-eval.")
+    with writing(f"cannot write to {out}"):
+        write_demo_capture(scene)
     with Progress(console=console, transient=True) as progress:
-        tracing = progress.add_task("Ray tracing the scene", total=None)
-        write_embedded_capture(
-            scene, points=POINTS, progress=lambda done, total: progress.update(tracing, completed=done, total=total)
-        )
         training = progress.add_task(f"ns-train {METHOD}", total=100)
 
         def show(line: str) -> None:

@@ -61,59 +61,15 @@ def doctor(compile: bool = False) -> int:  # noqa: A002
 
 
 @app.command
-def scene(
-    out: Annotated[Path, tyro.conf.Positional],
-    seed: int = 0,
-    train_views: int = 48,
-    test_views: int = 8,
-    width: int = 128,
-    height: int = 128,
-    points: int = 2000,
-    overwrite: Overwrite = False,
-) -> int:
-    """Write the embedded scene: a small ray-traced capture in nerfstudio's format, with a sparse point cloud.
-
-    Args:
-        out: folder to write; pass it to ns-train as --data.
-        seed: random seed of the whole scene; the same seed gives the same scene.
-        train_views: number of training images.
-        test_views: number of test images.
-        width: image width in pixels.
-        height: image height in pixels.
-        points: number of points in the sparse point cloud.
-        overwrite: replace an earlier scene in the folder.
-    """
-    from rich.progress import Progress
-
-    from sundae_ns.data import write_embedded_capture
-
-    check_folder(out, reads=[], overwrite=overwrite)
-    with Progress(transient=True) as progress, writing(f"cannot write to {out}"):
-        task = progress.add_task("Ray tracing", total=train_views + test_views)
-        write_embedded_capture(
-            out,
-            seed=seed,
-            train_views=train_views,
-            test_views=test_views,
-            width=width,
-            height=height,
-            points=points,
-            progress=lambda done, total: progress.update(task, completed=done, total=total),
-        )
-    print(f"wrote {train_views} training and {test_views} test views to {out}")
-    return 0
-
-
-@app.command
 def demo(
     out: Annotated[Path, tyro.conf.Positional] = Path(".demo"),
     steps: int | None = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Write the embedded scene, train it with ns-train, evaluate it with ns-eval, and print the results.
+    """Train a small scene with ns-train, evaluate it with ns-eval, and print the results.
 
     Args:
-        out: folder for the scene, the run and the images.
+        out: folder for the capture, the run and the images.
         steps: number of training steps; by default that of sundae-tiny.
         overwrite: replace an earlier demo in the folder.
     """

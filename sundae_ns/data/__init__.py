@@ -1,12 +1,7 @@
-"""Captures: checks before they are parsed, and the embedded capture for the demo and the tests. Floor 1.
-
-``capture`` and ``colmap`` check files of other programs. :func:`write_embedded_capture` ray-traces a still life and writes
-it as a nerfstudio data set. Its parts are ``shapes`` and ``textures`` (solids), ``still_life`` (the scene), ``cameras``,
-``tracer`` (images) and ``points`` (a sparse point cloud). ``camera_axes`` converts camera poses.
-"""
+"""Captures: checks of their files before a parser reads them, camera poses, and the demo's own capture."""
 
 from sundae_ns.data.capture import check_image, check_transforms
 from sundae_ns.data.colmap import check_colmap
-from sundae_ns.data.scene_folder import write_embedded_capture
+from sundae_ns.data.demo_capture import write_demo_capture
 
-__all__ = ["check_colmap", "check_image", "check_transforms", "write_embedded_capture"]
+__all__ = ["check_colmap", "check_image", "check_transforms", "write_demo_capture"]

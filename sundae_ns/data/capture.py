@@ -10,13 +10,14 @@ import json
 import math
 import shlex
 from collections.abc import Collection, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from sundae_ns.errors import DataError, regular
+from sundae_ns.errors import DataError, one_line, regular
 
 MAX_SIDE = 65535
 """Longest side of an image, in pixels: JPEG's limit."""
@@ -64,17 +65,27 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
     Raises:
         DataError: it has another shape, an entry that is not finite, or is singular.
     """
-    if not isinstance(value, list) or len(value) not in rows:
+    whole = isinstance(value, list) and len(value) in rows
+    if not whole or not all(isinstance(row, list) and len(row) == 4 for row in value):
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
-    for row in value:
-        if not isinstance(row, list) or len(row) != 4:
-            raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
-        for entry in row:
-            number(entry, name, where)
+    for entry in chain(*value):
+        number(entry, name, where)
     array = np.array(value, dtype=np.float64)
     if abs(np.linalg.det(array[:3, :3])) < 1e-9:
         raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
     return array
+
+
+def read_bytes(path: Path) -> bytes:
+    """Contents of a file.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        return regular(path).read_bytes()
+    except OSError as error:
+        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -83,13 +94,11 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         DataError: the file cannot be read or does not hold a JSON object.
     """
+    text = read_bytes(path)
     try:
-        content = json.loads(regular(path).read_bytes())
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+        content = json.loads(text)
     except (ValueError, RecursionError) as error:  # invalid UTF-8, endless digits, endless nesting
-        reason = " ".join(str(error).split())
-        raise DataError(f"{path} is not JSON ({reason[:120]}); write it again") from error
+        raise DataError(f"{path} is not JSON ({one_line(error)}); write it again") from error
     if not isinstance(content, dict):
         raise DataError(f"{path} does not hold a JSON object; give the transforms.json of a capture")
     return content
@@ -250,7 +259,7 @@ def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
         reason = error.strerror or ("it is not an image" if isinstance(error, Image.UnidentifiedImageError) else error)
         raise DataError(f"{path} cannot be read ({reason}); repair it or remove the view") from error
     except Exception as error:  # decoders raise many types; each means the same to the user
-        raise DataError(f"{path} is not a complete image ({_one_line(error)}); repair it or remove the view") from error
+        raise DataError(f"{path} is not a complete image ({one_line(error)}); repair it or remove the view") from error
     modes = ("1", "L") if mask else ("L", "RGB", "RGBA")
     if mode not in modes:
         wanted = "one channel of 8 bits" if mask else "RGB, RGBA or grey with 8 bits per channel"
@@ -262,11 +271,7 @@ def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
 
 def undecodable(path: Path, error: Exception) -> DataError:
     """The error for an image with a valid header and broken pixels."""
-    return DataError(f"{path} cannot be decoded ({_one_line(error)}); repair it or remove the view")
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    return DataError(f"{path} cannot be decoded ({one_line(error)}); repair it or remove the view")
 
 
 def _short(value: Any) -> str:

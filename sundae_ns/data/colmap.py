@@ -6,6 +6,7 @@ names and identifiers. The formats are those of COLMAP's documentation ("Output 
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import struct
@@ -13,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from sundae_ns.data.capture import number, side
-from sundae_ns.errors import DataError, regular
+from sundae_ns.data.capture import number, read_bytes, side
+from sundae_ns.errors import DataError, one_line
 
 # Identifier: name, number of parameters, number of focal lengths; only models that nerfstudio supports.
 _MODELS = {
@@ -28,12 +29,7 @@ _MODELS = {
 _CONVERT = "undistort the capture (colmap image_undistorter), or calibrate it with OPENCV"
 _SHELL = set('"$`\\\n')
 """Characters that end a quoted word: nerfstudio passes image names to a shell when it scales images down."""
-_CAMERA, _IMAGE, _POINT, _COUNT = (
-    struct.Struct("<iiQQ"),
-    struct.Struct("<i7di"),
-    struct.Struct("<Q3d3Bd"),
-    struct.Struct("<Q"),
-)
+_CAMERA, _IMAGE, _POINT, _COUNT = map(struct.Struct, ("<iiQQ", "<i7di", "<Q3d3Bd", "<Q"))
 _OBSERVATION, _TRACK = 24, 8
 _MAX_NAME = 4096
 
@@ -42,12 +38,7 @@ class _BinaryFile:
     """A binary file, read from front to back; reading past its end raises ``DataError``."""
 
     def __init__(self, path: Path) -> None:
-        self.name = path.name
-        try:
-            self.content = regular(path).read_bytes()
-        except OSError as error:
-            raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
-        self.position = 0
+        self.name, self.content, self.position = path.name, read_bytes(path), 0
 
     def take(self, layout: struct.Struct) -> tuple[float, ...]:
         """Read the values of ``layout``."""
@@ -199,8 +190,7 @@ def _errors_in_line(path: Path, index: int) -> Iterator[None]:
     except DataError:
         raise
     except (ValueError, IndexError, OverflowError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise DataError(f"{path.name}, line {index + 1} cannot be used ({reason}); export it again") from error
+        raise DataError(f"{path.name}, line {index + 1} cannot be used ({one_line(error)}); export it again") from error
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -209,10 +199,9 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _all_lines(path: Path) -> list[str]:
+    content = read_bytes(path)
     try:
-        return regular(path).read_text(encoding="utf-8").split("\n")
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
+        return io.StringIO(content.decode("utf-8"), newline=None).read().split("\n")  # any kind of line end
     except UnicodeDecodeError as error:
         raise DataError(f"{path} is not UTF-8 text; export it again") from error
 

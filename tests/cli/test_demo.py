@@ -49,10 +49,11 @@ def test_comparison_splits_the_images_of_ns_eval(tmp_path: Path) -> None:
 def test_no_step_is_refused_before_anything_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int | None, message: str
 ) -> None:
-    def make(*_: object, **__: object) -> None:
+    def make(scene: Path) -> None:
+        scene.mkdir(parents=True)
         raise SundaeError("made")
 
-    monkeypatch.setattr("sundae_ns.cli.demo.write_embedded_capture", make)
+    monkeypatch.setattr("sundae_ns.cli.demo.write_demo_capture", make)
     with pytest.raises(SundaeError, match=message) as error:
         run_demo(tmp_path / "demo", steps=steps)
     assert "\n" not in str(error.value)
@@ -73,7 +74,6 @@ def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
         os.kill(pids[0], 0)
 
 
-@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 has no safe path")
 def test_a_folder_named_like_a_package_does_not_replace_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "json").mkdir()
     (tmp_path / "json" / "__init__.py").write_text("raise RuntimeError")

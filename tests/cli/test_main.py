@@ -1,8 +1,7 @@
-"""The ``sundae`` command itself: the scene, help, and errors as one line."""
+"""The ``sundae`` command itself: help, and errors as one line."""
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -12,8 +11,6 @@ import pytest
 
 from sundae_ns.cli import main
 
-SMALL = ["--train-views", "3", "--test-views", "1", "--width", "20", "--height", "16", "--points", "15"]
-
 
 def run(*arguments: object) -> int:
     with pytest.raises(SystemExit) as caught:
@@ -22,34 +19,17 @@ def run(*arguments: object) -> int:
     return caught.value.code
 
 
-def test_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("scene", tmp_path / "scene", *SMALL) == 0
-    meta = json.loads((tmp_path / "scene" / "transforms.json").read_text())
-    assert (meta["w"], meta["h"], len(meta["frames"])) == (20, 16, 4)
-    assert len(meta["train_filenames"]) == 3
-    assert "wrote 3 training and 1 test views" in capsys.readouterr().out
-
-
-def test_the_seed_determines_the_scene(tmp_path: Path) -> None:
-    clouds = []
-    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        assert run("scene", tmp_path / name, "--seed", seed, *SMALL) == 0
-        clouds.append((tmp_path / name / "sparse_pc.ply").read_bytes())
-    assert clouds[0] == clouds[1]
-    assert clouds[0] != clouds[2]
-
-
 @pytest.mark.parametrize("wrong", ["foreign folder", "file", "option"])
 def test_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str], wrong: str) -> None:
-    out, more = tmp_path / "scene", list(SMALL)
+    out, more = tmp_path / "demo", []
     if wrong == "foreign folder":
         out.mkdir()
         (out / "thesis.txt").write_text("years of work")
     elif wrong == "file":
         out.write_text("years of work")
     else:
-        more[1] = "2"
-    assert run("scene", out, *more) == 2
+        more = ["--steps", "0"]
+    assert run("demo", out, *more) == 2
     captured = capsys.readouterr()
     (line,) = captured.err.strip().splitlines()
     assert line.startswith("sundae: ")
@@ -67,13 +47,11 @@ def test_other_errors_are_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
         main(["doctor"])
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["scene", "--help"], ["doctor", "--help"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["demo", "--help"], ["doctor", "--help"]])
 def test_help(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*arguments) == 0
     text = capsys.readouterr().out
-    for word in {"--help": ("scene", "doctor", "demo"), "scene": ("--train-views",), "doctor": ("--compile",)}[
-        arguments[0]
-    ]:
+    for word in {"--help": ("run", "doctor", "demo"), "demo": ("--steps",), "doctor": ("--compile",)}[arguments[0]]:
         assert word in text
 
 
@@ -86,7 +64,7 @@ def test_installed_command_and_its_exit_code(tmp_path: Path) -> None:
     command = Path(sys.executable).parent / "sundae"
     out = tmp_path / "file"
     out.touch()
-    result = subprocess.run([command, "scene", out], capture_output=True, text=True, check=False)
+    result = subprocess.run([command, "demo", out], capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert len(result.stderr.strip().splitlines()) == 1
 

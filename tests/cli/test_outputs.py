@@ -89,11 +89,11 @@ def test_an_existing_output_needs_overwrite(here: Path, refused: Refused, words:
     assert all(path.stat().st_mtime_ns > earlier for path, earlier in first.items() if path.is_file())
 
 
-@pytest.mark.parametrize("command", ["scene", "demo", "report", "bands"])
+@pytest.mark.parametrize("command", ["demo", "report", "bands"])
 def test_folders_with_files_need_overwrite(here: Path, refused: Refused, command: str) -> None:
     (here / "mine").mkdir()
     (here / "mine" / "thesis.txt").write_text("years of work")
-    words = [command, "mine"] if command in ("scene", "demo") else [command, "a.ply", "-o", "mine"]
+    words = [command, "mine"] if command == "demo" else [command, "a.ply", "-o", "mine"]
     assert "--overwrite" in refused(*words)
     assert [path.name for path in (here / "mine").iterdir()] == ["thesis.txt"]
 
@@ -165,7 +165,7 @@ def test_what_is_no_file_is_refused_at_once(here: Path, refused: Refused, words:
         ["prune", LONG, "-o", "x.ply"],
         ["export", "a.ply", "-o", LONG + ".spz"],
         ["pack", LONG, "-o", "x.sundae"],
-        ["scene", LONG],
+        ["demo", LONG],
         ["bands", "a.ply", "-o", LONG],
         ["report", LONG, "-o", "x"],
     ],
@@ -202,7 +202,7 @@ def full(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_full_disk_is_one_line(here: Path, full: Path, refused: Refused) -> None:
     for words in (
-        ["scene", full / "scene", "--train-views", "8", "--test-views", "2", "--width", "64", "--height", "64"],
+        ["demo", full / "demo"],
         ["prune", "a.ply", "--keep", "0.9", "-o", full / "a.ply"],
         ["bands", "a.ply", "-o", full / "bands"],
     ):
@@ -220,7 +220,7 @@ def test_a_full_disk_is_one_line(here: Path, full: Path, refused: Refused) -> No
 
 def test_a_full_disk_behind_stdout_is_one_line(here: Path) -> None:
     with open("/dev/full", "w") as nowhere:
-        command = [Path(sys.executable).parent / "sundae", "scene", "scene", "--train-views", "3", "--test-views", "1"]
+        command = [Path(sys.executable).parent / "sundae", "export", "a.sundae", "-o", "out.ply"]
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
         result = subprocess.run(
             command, stdout=nowhere, stderr=subprocess.PIPE, text=True, check=False, env=environment

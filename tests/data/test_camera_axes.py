@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from ray_tracing.cameras import Camera, look_at, project
 from torch import Tensor
 
 from sundae_ns.data.camera_axes import world_to_camera, world_to_camera_floats
-from sundae_ns.data.cameras import Camera, look_at, project
 
 
 def random_pose(seed: int) -> Tensor:
@@ -36,7 +36,7 @@ def test_a_point_in_front_and_below_has_positive_z_and_y() -> None:
     assert (world_to_camera(pose) @ point).tolist() == [0.5, 1.0, 3.0, 1.0]
 
 
-def test_depth_agrees_with_the_projection_of_the_embedded_capture() -> None:
+def test_depth_agrees_with_the_projection_of_the_ray_tracer() -> None:
     camera = Camera(look_at(np.array([3.0, 2.0, 1.0]), np.zeros(3)), focal=50.0, width=40, height=30)
     points = np.random.default_rng(0).normal(size=(20, 3))
     matrix = world_to_camera(torch.from_numpy(camera.camera_to_world[:3])).numpy()

@@ -25,7 +25,6 @@ import torch.distributed as dist
 from PIL import Image
 from torch.multiprocessing.spawn import ProcessExitedException
 
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.distributed import ShardedField, Shards
 from sundae_ns.distributed.checkpoints import state_of_rank
 from sundae_ns.distributed.shards import DRIFT
@@ -244,7 +243,9 @@ if __name__ == "__main__":
 def folder(tmp_path_factory: pytest.TempPathFactory, run_ranks: RunRanks) -> Path:
     """Runs of two ranks, trained once for all tests."""
     folder = tmp_path_factory.mktemp("ranks")
-    write_embedded_capture(folder / "scene", train_views=7, test_views=2, width=40, height=32, points=150)
+    from ray_tracing import write_still_life  # not above: ranks import this file without pytest's paths
+
+    write_still_life(folder / "scene", train_views=7, test_views=2, width=40, height=32, points=150)
     shutil.copytree(folder / "scene", folder / "masked")
     meta = json.loads((folder / "masked" / "transforms.json").read_text())
     mask = Image.new("L", (40, 32))
@@ -417,8 +418,9 @@ def test_signals_to_the_command_of_two_ranks(
 def test_ns_train_on_two_gpus(tmp_path: Path) -> None:
     """The command of users; the run opens on one GPU like any other."""
     from nerfstudio.utils.eval_utils import eval_setup
+    from ray_tracing import write_still_life
 
-    write_embedded_capture(tmp_path / "scene", train_views=12, test_views=3, width=64, height=48, points=300)
+    write_still_life(tmp_path / "scene", train_views=12, test_views=3, width=64, height=48, points=300)
     options = {
         "machine.num-devices": 2,
         "data": tmp_path / "scene",

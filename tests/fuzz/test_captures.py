@@ -21,9 +21,9 @@ from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
+from ray_tracing import write_still_life
 
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.data.colmap import check_colmap
 from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import DataError
@@ -36,9 +36,7 @@ SIZE = WIDTH, HEIGHT
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("capture") / "scene"
-    return write_embedded_capture(
-        out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40, samples=1
-    )
+    return write_still_life(out, train_views=VIEWS, test_views=1, width=WIDTH, height=HEIGHT, points=40, samples=1)
 
 
 def write_text_model(folder: Path, names: list[str]) -> None:

@@ -18,6 +18,7 @@ import pytest
 import yaml
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import profiler, writer
+from ray_tracing import write_still_life
 
 Call = Callable[..., "subprocess.CompletedProcess[str]"]
 CallHere = Callable[..., str]
@@ -114,8 +115,7 @@ def tiny(call: Call, once: Once) -> TinyRun:
     points, prune_at, save_every, steps, keep_ratio = 300, 45, 30, 120, 0.5
 
     def train(root: Path) -> None:
-        views = ("--train-views", 12, "--test-views", 3, "--width", 48, "--height", 48)
-        call("sundae", "scene", root / "scene", *views, "--points", points)
+        write_still_life(root / "scene", train_views=12, test_views=3, width=48, height=48, points=points)
         options = {
             "data": root / "scene",
             "output-dir": root / "outputs",

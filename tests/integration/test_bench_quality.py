@@ -113,7 +113,7 @@ def test_the_suite_trains_a_method_as_its_command_does(tiny: Any, tmp_path: Path
 
 
 def published(scene: Path, out: Path, *, factor: int) -> None:
-    """The embedded scene laid out as Mip-NeRF 360 is published: a COLMAP model of large pictures, and ``images_N``."""
+    """The still life laid out as Mip-NeRF 360 is published: a COLMAP model of large pictures, and ``images_N``."""
     meta = json.loads((scene / "transforms.json").read_text())
     width, height = factor * meta["w"] - 1, factor * meta["h"] - factor // 2  # rounded up, by a hair
     intrinsics = [factor * meta[name] for name in ("fl_x", "fl_y", "cx", "cy")]

@@ -12,8 +12,8 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
 from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from ray_tracing import write_still_life
 
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.method_configs import sundae
 from sundae_ns.scenes.cameras import training_cameras
@@ -31,9 +31,7 @@ def saved(folder: Path, parser: DataParserConfig, data: Path | None) -> Path:
 
 @pytest.mark.parametrize("where", ["datamanager", "parser"])
 def test_the_capture_that_the_run_names_is_read(tmp_path: Path, where: str) -> None:
-    scene = write_embedded_capture(
-        tmp_path / "scene", train_views=3, test_views=1, width=16, height=16, points=20, samples=1
-    )
+    scene = write_still_life(tmp_path / "scene", train_views=3, test_views=1, width=16, height=16, points=20, samples=1)
     here = where == "datamanager"
     parser = NerfstudioDataParserConfig() if here else NerfstudioDataParserConfig(data=scene)
     assert len(training_cameras(saved(tmp_path, parser, scene if here else None))) == 3

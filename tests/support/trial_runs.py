@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import Trainer
+from ray_tracing import write_still_life
 
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.method_configs import sundae
 
 STEPS, PRUNE_AT = 100, 40
@@ -18,7 +18,7 @@ LENGTH = 5
 
 
 def tiny_scene(folder: Path, views: int) -> Path:
-    return write_embedded_capture(
+    return write_still_life(
         folder / str(views), train_views=views, test_views=2, width=24, height=24, points=200, samples=1
     )
 

@@ -9,12 +9,11 @@ from unittest.mock import patch
 
 import numpy as np
 from PIL import Image
-
-from sundae_ns.data import scene_folder
-from sundae_ns.data.cameras import GOLDEN, Camera, look_at, orbit
-from sundae_ns.data.shapes import Array, Box
-from sundae_ns.data.textures import mix, value_noise
-from sundae_ns.data.tracer import Body, TracedScene
+from ray_tracing import capture
+from ray_tracing.cameras import GOLDEN, Camera, look_at, orbit
+from ray_tracing.shapes import Array, Box
+from ray_tracing.textures import mix, value_noise
+from ray_tracing.tracer import Body, TracedScene
 
 
 @dataclass(frozen=True)
@@ -50,16 +49,16 @@ def facing(count: int, *, width: int, height: int, rng: np.random.Generator) -> 
 
 
 def write_wall(out: Path, **options: int) -> Path:
-    """Write the wall in place of the still life; options of :func:`write_embedded_capture`."""
+    """Write the wall in place of the still life; options of :func:`write_still_life`."""
     parts: dict[str, Callable[..., object]] = {"still_life": wall, "orbit": facing}
-    with patch.multiple(scene_folder, **parts):
-        return scene_folder.write_embedded_capture(out, **options)
+    with patch.multiple(capture, **parts):
+        return capture.write_still_life(out, **options)
 
 
-def add_noise(capture: Path, deviation: float) -> None:
+def add_noise(folder: Path, deviation: float) -> None:
     """Add the noise of a sensor to all images, in [0, 1]."""
     rng = np.random.default_rng(5)
-    for path in sorted((capture / "images").glob("*.png")):
+    for path in sorted((folder / "images").glob("*.png")):
         image = np.asarray(Image.open(path)) / 255
         image = np.clip(image + rng.normal(scale=deviation, size=image.shape), 0, 1)
         Image.fromarray(np.round(image * 255).astype(np.uint8)).save(path)

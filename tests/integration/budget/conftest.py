@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 from budget_runs import Make, Run, set_up, tidy
+from ray_tracing import write_still_life
 
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.training import budget
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("budget") / "scene"
-    return write_embedded_capture(folder, train_views=12, test_views=2, width=24, height=24, points=200, samples=1)
+    return write_still_life(folder, train_views=12, test_views=2, width=24, height=24, points=200, samples=1)
 
 
 @pytest.fixture

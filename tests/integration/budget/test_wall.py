@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from budget_runs import tidy
 from nerfstudio.scripts.train import _set_random_seed
+from ray_tracing import write_still_life
 from walls import add_noise, write_wall
 
-from sundae_ns.data import write_embedded_capture
 from sundae_ns.method_configs import sundae_auto, sundae_tiny
 
 STEPS = 1500
@@ -65,7 +65,7 @@ def searched(write: Callable[..., Path], folder: Path) -> dict[str, Any]:
 @pytest.mark.long
 def test_a_plain_wall_comes_out_tiny(tmp_path: Path) -> None:
     """At the same allowed drop, a painted wall keeps a tenth of the still life's primitives, and a lower SH degree."""
-    still, wall = searched(write_embedded_capture, tmp_path), searched(write_wall, tmp_path)
+    still, wall = searched(write_still_life, tmp_path), searched(write_wall, tmp_path)
     assert 10 * wall["primitives"] <= still["primitives"]
     assert wall["degree"] < still["degree"]
     for found in (still, wall):

@@ -6,20 +6,18 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData
-
-from sundae_ns.data.cameras import Camera, in_frame, orbit, project
-from sundae_ns.data.points import sparse_points
-from sundae_ns.data.scene_folder import held_out_indices, write_embedded_capture
-from sundae_ns.data.still_life import still_life
-from sundae_ns.data.tracer import first_hits, render
-from sundae_ns.errors import ConfigError, DataError
+from ray_tracing.cameras import Camera, in_frame, orbit, project
+from ray_tracing.capture import held_out_indices, write_still_life
+from ray_tracing.points import sparse_points
+from ray_tracing.still_life import still_life
+from ray_tracing.tracer import first_hits, render
 
 SIZE = {"train_views": 12, "test_views": 2, "width": 128, "height": 96, "points": 400}
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    return write_embedded_capture(tmp_path_factory.mktemp("scene") / "new" / "folder", **SIZE)
+    return write_still_life(tmp_path_factory.mktemp("scene") / "new" / "folder", **SIZE)
 
 
 def _digest(folder):
@@ -38,8 +36,8 @@ def _points(scene):
 
 
 def test_same_seed_same_bytes(scene, tmp_path):
-    assert _digest(write_embedded_capture(tmp_path / "again", **SIZE)) == _digest(scene)
-    other = _digest(write_embedded_capture(tmp_path / "other", seed=1, **SIZE))
+    assert _digest(write_still_life(tmp_path / "again", **SIZE)) == _digest(scene)
+    other = _digest(write_still_life(tmp_path / "other", seed=1, **SIZE))
     assert other["images/frame_00001.png"] != _digest(scene)["images/frame_00001.png"]
     assert other["sparse_pc.ply"] != _digest(scene)["sparse_pc.ply"]
 
@@ -162,47 +160,8 @@ def test_noise_grows_with_the_distance():
     assert 0.1 < error[far].mean() < 0.4
 
 
-def test_progress_counts_views(tmp_path):
-    calls = []
-    size = {"train_views": 3, "test_views": 1, "width": 16, "height": 16, "points": 8}
-    write_embedded_capture(tmp_path, progress=lambda *call: calls.append(call), **size)
-    assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
-
-
-def test_earlier_capture_is_replaced_and_other_files_stay(tmp_path):
-    size = {"width": 16, "height": 16, "points": 8}
-    write_embedded_capture(tmp_path, train_views=4, test_views=1, **size)
-    (tmp_path / "notes.txt").write_text("mine")
-    write_embedded_capture(tmp_path, train_views=3, test_views=1, **size)
-    assert len(list((tmp_path / "images").iterdir())) == 4
-    assert (tmp_path / "notes.txt").read_text() == "mine"
-
-
-def test_folder_with_other_files_is_refused_and_unchanged(tmp_path):
-    (tmp_path / "transforms.json").write_text("{}")
-    before = _digest(tmp_path)
-    with pytest.raises(DataError, match="other files than an embedded capture"):
-        write_embedded_capture(tmp_path)
-    assert _digest(tmp_path) == before
-    with pytest.raises(DataError, match="is a file"):
-        write_embedded_capture(tmp_path / "transforms.json")
-
-
-def test_marker_cannot_delete_outside(tmp_path):
-    outside = tmp_path / "outside"
-    outside.write_text("mine")
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / ".sundae_scene.json").write_text(json.dumps({"files": ["../outside", str(outside)]}))
-    write_embedded_capture(out, train_views=3, test_views=1, width=16, height=16, points=8)
-    assert outside.read_text() == "mine"
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"train_views": 2}, {"test_views": 0}, {"width": 8}, {"points": 0}, {"test_views": 60}],
-)
-def test_impossible_options(tmp_path, wrong):
-    with pytest.raises(ConfigError):
-        write_embedded_capture(tmp_path / "scene", **wrong)
-    assert not (tmp_path / "scene").exists()
+def test_a_folder_with_images_is_refused_and_unchanged(scene):
+    before = _digest(scene)
+    with pytest.raises(FileExistsError):
+        write_still_life(scene, **SIZE)
+    assert _digest(scene) == before

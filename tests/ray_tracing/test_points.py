@@ -1,9 +1,8 @@
 import numpy as np
-
-from sundae_ns.data.cameras import in_frame, orbit, project
-from sundae_ns.data.points import sparse_points
-from sundae_ns.data.still_life import still_life
-from sundae_ns.data.tracer import first_hits, render
+from ray_tracing.cameras import in_frame, orbit, project
+from ray_tracing.points import sparse_points
+from ray_tracing.still_life import still_life
+from ray_tracing.tracer import first_hits, render
 
 
 def test_every_point_is_seen_by_two_cameras():

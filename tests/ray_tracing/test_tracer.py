@@ -1,7 +1,6 @@
 import numpy as np
-
-from sundae_ns.data.shapes import Box, Sphere
-from sundae_ns.data.tracer import Body, TracedScene, first_hits, shade
+from ray_tracing.shapes import Box, Sphere
+from ray_tracing.tracer import Body, TracedScene, first_hits, shade
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -1,6 +1,5 @@
 import numpy as np
-
-from sundae_ns.data.cameras import in_frame, look_at, orbit, pixel_rays, project
+from ray_tracing.cameras import in_frame, look_at, orbit, pixel_rays, project
 
 
 def _camera():

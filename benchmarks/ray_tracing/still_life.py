@@ -1,12 +1,12 @@
-"""The embedded scene: a still life of fine and smooth solids on a tiled plinth, before a far landscape."""
+"""A still life of fine and smooth solids on a tiled plinth, before a far landscape."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from sundae_ns.data.shapes import Array, Box, Cylinder, Sphere, Torus
-from sundae_ns.data.textures import Checker, Gradient, Landscape, Marble, Speckle, Spiral, Tiles, Wood
-from sundae_ns.data.tracer import Body, TracedScene
+from ray_tracing.shapes import Array, Box, Cylinder, Sphere, Torus
+from ray_tracing.textures import Checker, Gradient, Landscape, Marble, Speckle, Spiral, Tiles, Wood
+from ray_tracing.tracer import Body, TracedScene
 
 PLINTH_RADIUS = 2.1
 DOME_RADIUS = 24.0

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sundae_ns.data.shapes import Array
+from ray_tracing.shapes import Array
 
 FIELD_OF_VIEW = 50.0
 """Degrees, across the shorter side of the image."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sundae_ns.data.cameras import Camera, pixel_rays
-from sundae_ns.data.shapes import EPSILON, Array, Shape
-from sundae_ns.data.textures import Texture
+from ray_tracing.cameras import Camera, pixel_rays
+from ray_tracing.shapes import EPSILON, Array, Shape
+from ray_tracing.textures import Texture
 
 RAYS_PER_BLOCK = 1 << 15
 """Rays traced at once: few enough for the intermediate arrays to stay in a core's cache."""

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sundae_ns.data.cameras import Camera, in_frame, pixel_rays, project
-from sundae_ns.data.shapes import Array
-from sundae_ns.data.tracer import TracedScene, first_hits, shade
+from ray_tracing.cameras import Camera, in_frame, pixel_rays, project
+from ray_tracing.shapes import Array
+from ray_tracing.tracer import TracedScene, first_hits, shade
 
 MIN_VIEWS = 2
 """Cameras that must see a point: triangulation takes two rays."""

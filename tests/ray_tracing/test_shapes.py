@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-
-from sundae_ns.data.shapes import Box, Cylinder, Sphere, Torus
+from ray_tracing.shapes import Box, Cylinder, Sphere, Torus
 
 
 def _box_distance(shape, p):

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sundae_ns.data.shapes import Array
+from ray_tracing.shapes import Array
 
 Texture = Callable[[Array], Array]
 Color = tuple[float, float, float]
