@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
-from torch.nn import Parameter
-from torch.optim import Optimizer
 
 from sundae_ns.distributed.shards import Shards
 from sundae_ns.errors import SundaeError
@@ -22,18 +19,11 @@ from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.pruning.decision import diverged
 
 
+@dataclass(eq=False)
 class RankPruner(FieldPruner):
     """Prunes the shards of one field as one process prunes the whole; its verbs are collective."""
 
-    def __init__(
-        self,
-        shards: Shards,
-        params: MutableMapping[str, Parameter],
-        optimizers: Mapping[str, Optimizer],
-        states: Sequence[MutableMapping[str, Any]] = (),
-    ) -> None:
-        super().__init__(params, optimizers, states)
-        self.shards = shards
+    shards: Shards = field(kw_only=True)
 
     @property
     def total(self) -> int:

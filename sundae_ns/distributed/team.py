@@ -164,7 +164,7 @@ class Ranks(OneProcess):
                 strategy.see_each_image_after_resets(-(-num_images // self.count))
             return ShardedDensification(strategy, self.shards)
         if isinstance(extension, ScheduledPruning):
-            extension.pruner = partial(RankPruner, self.shards)
+            extension.pruner = partial(RankPruner, shards=self.shards)
         return extension
 
     def optimizers(self, make: Callable[[], Optimizers], config: Any, groups: Any, names: list[str]) -> Optimizers:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -17,22 +18,16 @@ from sundae_ns.pruning.decision import Decision, decide, diverged
 from sundae_ns.pruning.rule import PruneRule
 
 
+@dataclass(eq=False)
 class FieldPruner:
-    """Prunes the field of one process, in place; :class:`sundae_ns.distributed.pruning.RankPruner` does so over ranks.
+    """Prunes the field of one process, in place; :class:`sundae_ns.distributed.pruning.RankPruner` does so over ranks."""
 
-    Args:
-        params: the field, name to parameter ``[N, ...]``; its parameters are replaced.
-        optimizers: by parameter name, one parameter each; others are left alone.
-        states: running states on the same primitives; their tensors of N rows are sliced along.
-    """
-
-    def __init__(
-        self,
-        params: MutableMapping[str, Parameter],
-        optimizers: Mapping[str, Optimizer],
-        states: Sequence[MutableMapping[str, Any]] = (),
-    ) -> None:
-        self.params, self.optimizers, self.states = params, optimizers, states
+    params: MutableMapping[str, Parameter]
+    """The field, name to parameter ``[N, ...]``; its parameters are replaced."""
+    optimizers: Mapping[str, Optimizer]
+    """By parameter name, one parameter each; others are left alone."""
+    states: Sequence[MutableMapping[str, Any]] = ()
+    """Running states on the same primitives; their tensors of N rows are sliced along."""
 
     @property
     def total(self) -> int:

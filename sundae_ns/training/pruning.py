@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
@@ -45,7 +44,7 @@ class ScheduledPruning(Extension):
     def before_training(self, run: TrainingRun) -> None:
         """Warn if training ends before the prune or the head."""
         if run.last_step is not None:
-            self._warn_if_too_short(run, run.last_step)
+            _warn_if_too_short(run, self.schedule.config, run.last_step)
 
     def after_step(self, run: TrainingRun) -> None:
         """Prune if it is due, evaluate, report, and restart the learning rates.
@@ -92,56 +91,37 @@ class ScheduledPruning(Extension):
         """Report the peak, and warn if nothing was pruned; a budget search reports by itself."""
         report_peak(run)
         if not self._searching:
-            self._warn_if_too_short(run, run.state.step)
-
-    def _warn_if_too_short(self, run: TrainingRun, last_step: int) -> None:
-        """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
-        short = _shortage(run, self.schedule.config, last_step)
-        if short is None:
-            return
-        mend = "enable it" if short.option.startswith("head") else "prune"
-        # In steps of one image, as options count.
-        images = run.images_per_step
-        warn(
-            f"training ends after {(last_step + 1) * images:,} steps, and the {short.event} needs more than "
-            f"{short.step * images:,} ({short.option}): {short.consequence}; train longer, or {mend} earlier"
-        )
+            _warn_if_too_short(run, self.schedule.config, run.state.step)
 
 
-class _Shortage(NamedTuple):
-    """Something that a training is too short for."""
-
-    event: str
-    step: int
-    """Step that it needs more than."""
-    option: str
-    """Option that sets this step."""
-    consequence: str
-
-
-def _shortage(run: TrainingRun, pruning: PruningConfig, last_step: int) -> _Shortage | None:
-    """What a training that ends with this step is too short for."""
+def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:
+    """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
     state = run.state
-    warm = state.offset > 0
-    first, target = pruning.first_prune, pruning.target_primitives
+    # A warm start is pruned at once.
+    first = pruning.first_prune if state.offset == 0 else None
+    target, pruned = pruning.target_primitives, state.pruning["num_prunes"]
     begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
     # A head whose start is not known yet is decided upon elsewhere.
     scheduled = state.head is not None and math.isfinite(state.head_starts_at)
     idle = scheduled and last_step + state.offset <= state.head_starts_at
     and_head = ", and the head stays disabled" if idle else ""
-    # A warm start is pruned at once.
-    if first is not None and not warm:
-        if last_step < first and not state.pruning["num_prunes"]:
-            return _Shortage("first prune", first, f"pruning.{begins}", "nothing is pruned" + and_head)
-        reached = state.pruning["num_prunes"] and target is not None and run.source.total <= target
-        if last_step < pruning.last_due and not reached:
-            found = "more primitives are left than asked for" + and_head
-            return _Shortage("last prune", pruning.last_due, f"pruning.{ends}", found)
-    if not idle:
-        return None
-    option = "head.start-at" if state.head_starts_at != pruning.settled_at else f"pruning.{ends}"
-    # The head is enabled in the steps after that one.
-    return _Shortage("head", int(state.head_starts_at) + 1 - state.offset, option, "it stays disabled")
+    reached = pruned and target is not None and run.source.total <= target
+    if first is not None and last_step < first and not pruned:
+        event, step, option, found = "first prune", first, f"pruning.{begins}", "nothing is pruned" + and_head
+    elif first is not None and last_step < pruning.last_due and not reached:
+        event, step, option = "last prune", pruning.last_due, f"pruning.{ends}"
+        found = "more primitives are left than asked for" + and_head
+    elif idle:
+        # The head is enabled in the steps after that one.
+        event, step, found = "head", int(state.head_starts_at) + 1 - state.offset, "it stays disabled"
+        option = "head.start-at" if state.head_starts_at != pruning.settled_at else f"pruning.{ends}"
+    else:
+        return
+    images = run.images_per_step  # options count steps of one image
+    warn(
+        f"training ends after {(last_step + 1) * images:,} steps, and the {event} needs more than {step * images:,} "
+        f"({option}): {found}; train longer, or {'enable it' if option.startswith('head') else 'prune'} earlier"
+    )
 
 
 def _evaluated(run: TrainingRun, label: str) -> dict[str, float]:

@@ -30,18 +30,18 @@ Contribute = Callable[[int | None], Tensor]
 
 @dataclass(frozen=True)
 class PruningSchedule:
-    """Base of the schedules: subclasses say when a prune is due, and how many primitives it keeps."""
+    """Never prunes; the running state still records the peak. Subclasses say when a prune is due, and how many it keeps."""
 
     config: PruningConfig
     """Options; not changed."""
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
         """Whether a field of ``n`` primitives is to be pruned after this step."""
-        raise NotImplementedError
+        return False
 
     def target(self, n: int) -> int:
         """Number of primitives that a prune keeps of ``n`` finite ones. The one place that decides this number."""
-        raise NotImplementedError
+        return n
 
     def rule_at(self, step: int) -> PruneRule:
         """Rule of the prune at a step."""
@@ -82,18 +82,6 @@ class PruningSchedule:
             pruner.add(lacking, LEAST_OPACITY)
             state["peak"] = max(state["peak"], pruner.total)
         return report
-
-
-class NoPruning(PruningSchedule):
-    """Never prunes; the running state still records the peak."""
-
-    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """Never."""
-        return False
-
-    def target(self, n: int) -> int:
-        """All of them."""
-        return n
 
 
 class OneShotPruning(PruningSchedule):
@@ -155,8 +143,8 @@ def make_schedule(config: PruningConfig) -> PruningSchedule:
     """
     config.validate()
     # In auto mode the budget search prunes; the schedule only records the peak.
-    schedules = {"off": NoPruning, "auto": NoPruning, "one-shot": OneShotPruning, "continuous": ContinuousPruning}
-    return schedules[config.mode](config)
+    schedules = {"one-shot": OneShotPruning, "continuous": ContinuousPruning}
+    return schedules.get(config.mode, PruningSchedule)(config)
 
 
 def prune_to(

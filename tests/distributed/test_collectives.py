@@ -459,8 +459,8 @@ def check_pruning(shards: Shards, **options: Any) -> None:
         asked.append(count)
         return weights[counts["grad2d"]]
 
-    report = schedule.after_step(RankPruner(shards, params, optimizers, [counts]), state, 2, contribute)
-    assert asked == [round(0.3 * 199)] * config.uses_contribution
+    report = schedule.after_step(RankPruner(params, optimizers, [counts], shards=shards), state, 2, contribute)
+    assert asked == [round(0.3 * 199) if config.uses_detail else None] * config.uses_contribution
 
     alone = shard_of(whole, 0, 200)
     own_optimizers, own_counts = adams(alone, 0), {"grad2d": torch.arange(200)}
@@ -489,7 +489,7 @@ def check_refusal(shards: Shards) -> None:
     shards.recount(params)
     schedule = make_schedule(PruningConfig(prune_at=1, keep_ratio=0.3))
     with pytest.raises(ConfigError, match="pass over the training views"):
-        schedule.after_step(RankPruner(shards, params, {}), schedule.initialize_state(), 2)
+        schedule.after_step(RankPruner(params, {}, shards=shards), schedule.initialize_state(), 2)
 
 
 def check_averages(shards: Shards) -> None:

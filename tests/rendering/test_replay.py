@@ -175,7 +175,8 @@ def test_a_part_of_a_field_is_never_recorded(
     box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
     for _ in range(2 * RECORD_AT):
         cropped = model.get_outputs_for_camera(camera(), obb_box=box)["rgb"]
-    half = SimpleNamespace(mask=torch.arange(60) % 2 == 0, values=None)
+    mask = torch.arange(60) % 2 == 0
+    half = SimpleNamespace(field=model.state.field.rows(mask), decision=SimpleNamespace(mask=mask))
     monkeypatch.setattr(model.viewer_controls, "preview", lambda: half)
     for _ in range(2 * RECORD_AT):
         previewed = model.get_outputs_for_camera(camera())["rgb"]

@@ -20,7 +20,6 @@ from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.report import PruneReport
 from sundae_ns.training.schedules import (
     ContinuousPruning,
-    NoPruning,
     OneShotPruning,
     PruningSchedule,
     make_schedule,
@@ -323,7 +322,7 @@ def test_continuous_prunes_a_step_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mode", "kind"), [("one-shot", OneShotPruning), ("continuous", ContinuousPruning), ("off", NoPruning)]
+    ("mode", "kind"), [("one-shot", OneShotPruning), ("continuous", ContinuousPruning), ("off", PruningSchedule)]
 )
 def test_mode_names_the_policy(mode: Any, kind: type[PruningSchedule]) -> None:
     assert type(make_schedule(PruningConfig(mode=mode))) is kind
