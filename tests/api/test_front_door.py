@@ -62,6 +62,12 @@ def test_every_public_name_is_there_and_documented() -> None:
         sn.nothing  # noqa: B018
 
 
+def test_the_page_of_the_library_lists_every_name() -> None:
+    page = (ROOT / "docs" / "api.md").read_text()
+    assert sorted(re.findall(r"^::: sundae_ns\.(\w+)$", page, re.MULTILINE)) == sorted(sn.__all__)
+    assert all(f"[`{name}`](#{name.lower()})" in page for name in sn.__all__)
+
+
 def test_names_are_imported_on_first_use() -> None:
     code = "import sys, sundae_ns; sundae_ns.__version__; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,39 @@
+"""Make a splat scene of any program smaller, without its photos.
+
+    python examples/prune_ply.py garden.ply small.ply --keep 0.25
+
+The output is .ply, .spz, .sog or .sundae, by its suffix.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+import sundae_ns as sn
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, help=".ply, .spz, .sog, .sundae, or a run of ns-train")
+    parser.add_argument("out", type=Path, help="file to write")
+    parser.add_argument("--keep", type=float, default=0.25, help="share of the primitives to keep")
+    parser.add_argument("--views", type=int, default=128, help="virtual cameras that say what is seen")
+    options = parser.parse_args()
+
+    scene = sn.load(options.scene, device="cuda" if torch.cuda.is_available() else "cpu")
+    views = sn.virtual_views(scene, options.views)
+    small = sn.prune(scene, keep=options.keep, views=views, progress=True)
+    sn.save(small, options.out)
+
+    # Other views than those that chose, so that the figure is honest.
+    quality = sn.measure(small, scene, sn.virtual_views(scene, 16, seed=1))
+    size = options.out.stat().st_size / 1e6
+    print(f"{small.num_primitives:,} of {scene.num_primitives:,} primitives, {size:.2f} MB")
+    print(f"PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f} against the whole scene, in 16 virtual views")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""Render a packed scene to a picture: with its head, without it, and what the head changes.
+
+python examples/render_packed.py scene.sundae picture.png --view 0
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+from PIL import Image
+
+import sundae_ns as sn
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path, help="file of sundae pack")
+    parser.add_argument("out", type=Path, help="picture to write")
+    parser.add_argument("--view", type=int, default=0, help="index of a camera stored with the scene")
+    options = parser.parse_args()
+
+    scene = sn.load(options.scene, device="cuda" if torch.cuda.is_available() else "cpu")
+    view = scene.views[options.view] if scene.views else sn.virtual_views(scene, 1, size=512)[0]
+    rendering = sn.render(scene, view)
+    change = (rendering.rgb - rendering.base_rgb).abs() * 5
+    row = torch.cat([rendering.rgb, rendering.base_rgb, change.clamp(0, 1)], dim=1)
+    Image.fromarray((row * 255).round().byte().cpu().numpy()).save(options.out)
+    print(f"{scene}: image, base colours, and five times their difference, in {options.out}")
+
+
+if __name__ == "__main__":
+    main()
