@@ -23,12 +23,12 @@ from typing import Any
 
 import torch
 from bench_pack import commit
+from harness.job import configure, without_lpips
+from harness.plan import Job, parser_of
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 
-from sundae_ns.cli.bench.job import configure, without_lpips
-from sundae_ns.cli.bench.plan import Job, parser_of
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.opening import views_to_test
 from sundae_ns.storage.runs.fingerprint import fingerprint

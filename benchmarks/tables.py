@@ -20,8 +20,9 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from sundae_ns.cli.bench.results import spread
-from sundae_ns.cli.bench.today import EARLIER, SHARE, is_of_today
+from harness.results import spread
+from harness.today import EARLIER, SHARE, is_of_today
+
 from sundae_ns.evaluation import COLUMNS, csv_text
 from sundae_ns.evaluation.document import number, table
 

@@ -16,7 +16,7 @@ import tyro
 
 from sundae_ns.cli.outputs import check_folder
 from sundae_ns.cli.process import run_in_group
-from sundae_ns.cli.train import Method, command
+from sundae_ns.cli.train import command
 from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 
 Matching = Literal["exhaustive", "sequential", "vocab_tree"]
@@ -52,7 +52,7 @@ class Project:
     photos: Path
     """Folder of photos, or a capture."""
     out: Path
-    method: Method
+    method: str
     keep: float | None
     steps: int | None
     matching: Matching
@@ -211,7 +211,7 @@ class Project:
 def run(
     photos: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    method: Method = "sundae",
+    method: str = "sundae",
     keep: float | None = None,
     steps: int | None = None,
     matching: Matching = "exhaustive",
@@ -224,7 +224,7 @@ def run(
     Args:
         photos: folder of photos, or a capture, which has poses already.
         out: folder for the capture, the run, eval.json, scene.sundae, scene.html and the report; created if missing.
-        method: method of ns-train; sundae-tiny suits small images and a CPU.
+        method: as of sundae train; sundae-tiny suits small images and a CPU.
         keep: share of the primitives to keep, in (0, 1]; by default that of the method.
         steps: number of training steps; by default that of the method.
         matching: photos that COLMAP compares: all pairs, neighbours by name (for frames of a video), or similar ones

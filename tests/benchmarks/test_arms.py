@@ -1,14 +1,14 @@
-"""Arms of ``sundae bench quality``: read from a file, checked before anything is trained, and made into commands."""
+"""Arms of a comparison: read from a file, checked before anything is trained, and made into commands."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
+from harness.arms import DEFAULT_FILE, Entry, choose_arms, read_entries
+from harness.job import configure
+from harness.plan import Arm, Job, plan_scene
 
-from sundae_ns.cli.bench.arms import DEFAULT_FILE, Entry, choose_arms, read_entries
-from sundae_ns.cli.bench.job import configure
-from sundae_ns.cli.bench.plan import Arm, Job, plan_scene
 from sundae_ns.errors import ConfigError
 
 DEFAULTS = [
@@ -47,7 +47,7 @@ def chosen(path: Path, scale: float = 1.0) -> dict[str, Arm]:
 
 
 def jobs_of(arms: dict[str, Arm]) -> dict[str, Job]:
-    jobs = plan_scene("fox", Path("fox"), (), list(arms.values()), keep_ratios=[0.1], seeds=[42], repeat_at=[])
+    jobs = plan_scene(Path("fox"), (), list(arms.values()), keep_ratios=[0.1], seeds=[42], repeat_at=[])
     return {job.arm: job for job in jobs}
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 import yaml
 
-from sundae_ns.cli.bench.plan import WARM_UP, Arm, Kind, Words
+from harness.plan import WARM_UP, Arm, Kind, Words
 from sundae_ns.errors import ConfigError
 
 DEFAULT_FILE = Path(__file__).with_name("arms.yaml")

@@ -16,11 +16,10 @@ import pytest
 import tyro
 from bench_jobs import measured
 from csv_rows import read_rows
+from harness import today
+from harness.plan import Job
+from harness.today import fingerprints
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
-
-from sundae_ns.cli.bench import today
-from sundae_ns.cli.bench.plan import Job
-from sundae_ns.cli.bench.today import fingerprints
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "benchmarks"

@@ -8,8 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sundae_ns.cli.bench.paper import DATASETS, PRINTED
-from sundae_ns.cli.bench.plan import Arm
+from harness.plan import Arm
 from sundae_ns.errors import DataError
 from sundae_ns.evaluation import csv_text
 from sundae_ns.evaluation.document import METRICS, number, table
@@ -49,7 +48,7 @@ def write_results(out: Path, results: Sequence[Result], page: str) -> None:
     write_text(out / "table.md", page)
 
 
-def _group(results: Sequence[Result], arms: Sequence[Arm]) -> dict[tuple[str, str, float | None], list[Result]]:
+def group(results: Sequence[Result], arms: Sequence[Arm]) -> dict[tuple[str, str, float | None], list[Result]]:
     """Results by scene, arm and share; in the order of scenes, shares and arms, warm-ups first."""
     groups: dict[tuple[str, str, float | None], list[Result]] = {}
     for result in results:
@@ -68,18 +67,18 @@ def _alike(
             yield arm, ratio, [r for r in own if len(r["measured"]["configurations"]) == count]
 
 
-def _percent(ratio: float | None) -> str:
+def percent(ratio: float | None) -> str:
     return "" if ratio is None else f"{100 * ratio:g}%"
 
 
 def spread(values: Sequence[float | None], digits: int) -> str:
     """Mean and, of several, the standard deviation: ``29.03 ± 0.12``; a dash if one is missing."""
-    mean = number(_mean(values), digits)
+    mean = number(mean_of(values), digits)
     known = [value for value in values if value is not None]
     return mean if len(known) < max(len(values), 2) else f"{mean} ± {number(statistics.stdev(known), digits)}"
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
+def mean_of(values: Sequence[float | None]) -> float | None:
     """Mean; None unless all values are known."""
     known = [value for value in values if value is not None]
     return statistics.fmean(known) if known and len(known) == len(values) else None
@@ -105,14 +104,14 @@ def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -
     heads += ["ms a frame", "training, s"]
     for scene in dict.fromkeys(result["job"]["scene"] for result in results):
         rows = []
-        for arm, ratio, own in _alike(_group([r for r in results if r["job"]["scene"] == scene], arms)):
+        for arm, ratio, own in _alike(group([r for r in results if r["job"]["scene"] == scene], arms)):
             ways = [r["measured"]["configurations"] for r in own]
             for place in range(len(ways[0])):
                 chosen = [way[place] for way in ways]
                 head = "no head" if len(ways[0]) == 1 else chosen[0]["name"]
                 rows.append(
                     [
-                        *(arm, head, _percent(ratio), str(len(own))),
+                        *(arm, head, percent(ratio), str(len(own))),
                         spread([r["measured"]["primitives"] for r in own], 0),
                         *(spread([c["mean"][metric] for c in chosen], digits) for metric, digits in METRICS),
                         spread([c["bytes"] / MEGABYTE for c in chosen], 1),
@@ -140,101 +139,3 @@ def _described(arms: Sequence[Arm]) -> list[str]:
             f"- `{arm.name}`: `{arm.method}` {starts[arm.kind]}, {arm.steps:,} steps" + (options and f"; {options}")
         )
     return lines
-
-
-def paper_page(results: Sequence[Result], arms: Sequence[Arm], missing: Sequence[str], command: str) -> str:
-    """The paper's scenes at its keep ratios: measured figures beside printed ones, then :func:`quality_page`."""
-    groups = _group([r for r in results if r["job"]["kind"] != "warm-up"], arms)
-    columns = list(dict.fromkeys((arm, ratio) for _, arm, ratio in groups))
-    lines = ["# The paper's scenes", ""]
-    lines += [
-        "Figures in italics are printed in the paper, not measured by us: it may resize images otherwise, and use another",
-        "variant of SSIM. Measured: means over the test views, head enabled. A data set has a mean only if all its scenes are",
-        "measured; the paper's 3DGS rows of Mip-NeRF 360 are means over nine scenes, not seven.",
-    ]
-    shares = [0.01, 0.1, 0.3, 0.5]
-    for place, (metric, name, digits) in enumerate((("psnr", "PSNR, dB", 2), ("ssim", "SSIM", 4))):
-
-        def printed(where: str, place: int = place, digits: int = digits) -> list[str]:
-            own = PRINTED.get(where, {})
-            return [f"*{number(own[s][place], min(digits, 3))}*" if s in own else "-" for s in shares]
-
-        heads = ["scene", *(f"{arm} {_percent(ratio)}".rstrip() for arm, ratio in columns)]
-        heads += [f"*paper {share:.0%}*" for share in shares]
-        rows = []
-        for dataset, members in DATASETS.items():
-            by_arm: dict[tuple[str, float | None], list[float | None]] = {arm: [] for arm in columns}
-            for scene in members:
-                cells = []
-                for arm in columns:
-                    own = groups.get((scene, *arm), [])
-                    values = [r["measured"]["configurations"][0]["mean"][metric] for r in own]
-                    by_arm[arm].append(_mean(values))
-                    cells.append(spread(values, digits))
-                rows.append([scene, *cells, *printed(scene)])
-            means = [spread([_mean(values)], digits) for values in by_arm.values()]
-            rows.append([f"**{dataset}**", *means, *printed(dataset)])
-        lines += ["", f"## {name}", "", *table(heads, rows, words=1)]
-    if missing:
-        lines += ["", f"Missing: {', '.join(missing)}."]
-    return "\n".join([*lines, "", quality_page(results, arms, command)])
-
-
-def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str], command: str) -> str:
-    """All captures: seconds of trainings, packed bytes, then :func:`quality_page`.
-
-    Args:
-        results: of all jobs.
-        arms: the sides of the comparison, in the order of the lines.
-        left_out: reasons by capture or by job.
-        command: the command that wrote the page.
-    """
-    lines = ["# All methods on every capture", ""]
-    if left_out:
-        lines += ["## Left out", ""]
-        # The output of a training that failed ends with the cause.
-        lines += [*(f"- {name}: {reason.splitlines()[-1]}" for name, reason in left_out.items()), ""]
-    heads = ["capture", "arm", "keep", "seeds", "steps", "training, s", "PSNR, dB", "SSIM"]
-    heads += ["primitives", "MiB at most", "GPU"]
-    lines += [
-        "## Training",
-        "",
-        "Trainings from scratch, each alone on its GPU; nothing is evaluated or saved meanwhile.",
-        "",
-    ]
-    trained = [r for r in results if r["job"]["kind"] in ("whole", "mcmc") and r["measured"]["train_s"] is not None]
-    rows = []
-    for (scene, arm, ratio), own in _group(trained, arms).items():
-        measured, full = [r["measured"] for r in own], [r["measured"]["configurations"][0]["mean"] for r in own]
-        rows.append(
-            [
-                *(scene, arm, _percent(ratio), str(len(own)), f"{measured[0]['steps']:,}"),
-                spread([m["train_s"] for m in measured], 0),
-                *(spread([mean[metric] for mean in full], digits) for metric, digits in METRICS[:2]),
-                spread([m["primitives"] for m in measured], 0),
-                number(_mean([m["peak_vram_mib"] for m in measured]), 0),
-                ", ".join(sorted({m["gpu"] or "CPU" for m in measured})),
-            ]
-        )
-    lines += [
-        *table(heads, rows),
-        "",
-        "## Packing",
-        "",
-        "By the defaults of `sundae pack`; errors on all test views.",
-        "",
-    ]
-    heads = ["capture", "arm", "keep", "seeds", "primitives", "packed, MB", "PSNR of the run", "packed"]
-    heads += ["SSIM of the run", "packed"]
-    rows = []
-    for (scene, arm, ratio), own in _group([r for r in results if r.get("packed")], arms).items():
-        full = [r["measured"]["configurations"][0]["mean"] for r in own]
-        pairs = [
-            spread([figures[metric] for figures in place], digits)
-            for metric, digits in METRICS[:2]
-            for place in (full, [r["packed"] for r in own])
-        ]
-        count = spread([r["measured"]["primitives"] for r in own], 0)
-        size = spread([r["packed"]["bytes"] / MEGABYTE for r in own], 2)
-        rows.append([scene, arm, _percent(ratio), str(len(own)), count, size, *pairs])
-    return "\n".join([*lines, *table(heads, rows), "", quality_page(results, arms, command)])
