@@ -159,7 +159,7 @@ def measure(rank: int, ranks: int, meeting: str, options: argparse.Namespace, ex
 
 
 def job_of(options: argparse.Namespace, extra: list[str]) -> Job:
-    """The training as a job of ``sundae bench``."""
+    """The training as a job of a comparison."""
     data = options.data.resolve()
     steps = options.steps
     if steps is None:

@@ -2,7 +2,7 @@
 
     python benchmarks/tables.py            # rewrite every table between its markers
     python benchmarks/tables.py quality    # print one table
-    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what ``sundae bench suite -o DIR`` measured
+    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what ``suite.py CAPTURES -o DIR`` measured
 
 A page holds the markers ``<!-- table: NAME -->`` and ``<!-- end of table -->``; the lines between them are made here.
 ``tests/test_benchmarks.py`` checks that every page is current. A row whose options are not those that its arm has today
@@ -313,7 +313,7 @@ def with_tables(text: str) -> str:
 
 
 def take_over(results: Path) -> None:
-    """Replace rows of runs.csv, frames, training times and packs by those of ``sundae bench suite``.
+    """Replace rows of runs.csv, frames, training times and packs by those of ``suite.py``.
 
     Other rows stay, but for earlier defaults at other seeds of what was measured.
 

@@ -77,7 +77,7 @@ def document(
     if any(run.has_head for run in runs):
         lines += [
             "With the head off, the same field shows its base colours, although it was trained with a head. A field that is",
-            "trained without a head is another run; `sundae bench quality` trains and measures one.",
+            "trained without a head is another run: train one with `--pipeline.model.head.mode off`.",
             "",
         ]
     if notes:

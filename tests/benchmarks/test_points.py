@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
-
-from sundae_ns.errors import DataError
-from sundae_ns.evaluation import (
+from harness.points import (
+    BACKGROUND,
     Projection,
     draw_points,
     points_sheet,
@@ -19,7 +17,9 @@ from sundae_ns.evaluation import (
     project_through_camera,
     response_histogram,
 )
-from sundae_ns.evaluation.points import BACKGROUND
+from torch import Tensor
+
+from sundae_ns.errors import DataError
 
 RED, BLUE = torch.tensor([[255, 0, 0], [0, 0, 255]], dtype=torch.uint8)
 K = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]])
@@ -129,7 +129,7 @@ def test_a_sheet_has_a_panel_for_each_projection_and_set() -> None:
 @pytest.fixture
 def drawings(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
     """The last figure that was drawn."""
-    import sundae_ns.evaluation.points as module
+    import harness.points as module
 
     kept: list[Any] = []
     original = module._rendered

@@ -1,4 +1,8 @@
-"""``sundae bands``: the primitives that the paper's high-pass, low-pass and combined rules keep."""
+"""Show the primitives that the paper's high-pass, low-pass and combined rules keep: point clouds, images and statistics.
+
+python benchmarks/bands.py RUN -o DIR
+python benchmarks/bands.py RUN -o DIR --keep-ratio 0.05 0.2 --view 12
+"""
 
 from __future__ import annotations
 
@@ -6,22 +10,25 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
-from PIL.Image import Image
-from rich.console import Console
-from rich.progress import Progress
-from torch import Tensor
-
-from sundae_ns.errors import ConfigError, DataError, SundaeError
-from sundae_ns.evaluation import (
+import tyro
+from harness.points import (
     Projection,
     points_sheet,
     project_along_axes,
     project_through_camera,
     response_histogram,
 )
+from harness.script import run_script
+from PIL.Image import Image
+from rich.console import Console
+from rich.progress import Progress
+from torch import Tensor
+
+from sundae_ns.cli.outputs import Overwrite, check_folder
+from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
@@ -158,6 +165,35 @@ def _visible(projection: Projection) -> int:
     return int(((projection.depth > 0) & inside).sum())
 
 
+def bands(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    keep_ratio: tuple[float, ...] = (0.01, 0.1, 0.3),
+    signal: Literal["positions", "attributes"] = "positions",
+    gamma: float = 0.5,
+    neighbors: int = 16,
+    bandwidth: Literal["robust", "literal"] = "robust",
+    view: int | None = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Write point clouds, images and ``bands.json`` of a field; the exit code.
+
+    Args:
+        run: a run of sundae or splatfacto (its folder, config.yml or a checkpoint), or a 3DGS .ply file.
+        out: folder to write; created if missing.
+        keep_ratio: shares of the primitives to keep, each in (0, 1].
+        signal: graph signal to filter: positions, as in the paper, or position, colour, opacity and size.
+        gamma: share of the kept primitives that the combined rule takes from the largest responses.
+        neighbors: maximum number of neighbours of a primitive in the graph.
+        bandwidth: rule that sets radius and width of the graph's edge weights; literal is the paper's.
+        view: index of the training view to draw; by default the one with the most primitives.
+        overwrite: replace the files of an earlier command in the folder.
+    """
+    check_folder(out, reads=[run], overwrite=overwrite)
+    config = PruningConfig(signal=signal, gamma=gamma, num_neighbors=neighbors, bandwidth=bandwidth)
+    return run_bands(run, out, keep_ratios=keep_ratio, config=config, view=view)
+
+
 def run_bands(
     source: Path,
     out: Path,
@@ -259,3 +295,7 @@ def run_bands(
         )
     console.print(f"wrote bands.json and {len(files)} files to {out}", highlight=False)
     return 0
+
+
+if __name__ == "__main__":
+    run_script(bands, __doc__)
