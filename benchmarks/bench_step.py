@@ -180,8 +180,10 @@ def rasterizers(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
     def draw(name: BackendName, device: str, dtype: torch.dtype, gradients: bool = True) -> list[Tensor]:
         leaves = [value.to(device, dtype).requires_grad_(gradients) for value in scene]
-        placed = [value.to(device, dtype) for value in camera]
-        view = rasterize(*leaves, *placed, size, size, backend=select_backend(name, device))
+        viewmat, K = (value.to(device, dtype) for value in camera)
+        means, quats, scales, opacities, colors = leaves
+        backend = select_backend(name, device)
+        view = rasterize(means, quats, scales, opacities, colors, viewmat, K, size, size, backend=backend)
         if not gradients:
             return [view.colors]
         return [view.colors.detach(), *torch.autograd.grad(view.colors, leaves, weights.to(device, dtype))]

@@ -46,7 +46,8 @@ PROFILED = 100
 
 def steps_of(options: argparse.Namespace, arm: str) -> int:
     """Length of a training: by default that of the method."""
-    return int(options.steps or all_methods[ARMS[arm][0]].max_num_iterations)
+    config: Any = all_methods[ARMS[arm][0]]
+    return int(options.steps or config.max_num_iterations)
 
 
 def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:

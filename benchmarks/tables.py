@@ -177,7 +177,8 @@ def speed() -> list[str]:
 
 def flicker() -> list[str]:
     """Squared errors of warped frames without the least of head and base colours, and their quotients."""
-    apart, rows = (1, 7), {}
+    apart = (1, 7)
+    rows: dict[str, dict[int, list[str]]] = {}
     for line in lines_of("flicker.jsonl"):
         cells = rows.setdefault(named(line["config"], is_of_today(line)), {})
         cells[line["frames_apart"]] = [
@@ -323,8 +324,7 @@ def take_over(results: Path) -> None:
     found = [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]
     measured = [_rounded({**result["measured"], "command": _public(result["measured"]["command"])}) for result in found]
     rows = list(csv.DictReader(csv_text(measured).splitlines()))
-    places = ("scene", "variant", "keep_ratio", "seed")
-    kept = _merged(lines_of("runs.csv"), rows, places)
+    kept = _merged(lines_of("runs.csv"), rows, ("scene", "variant", "keep_ratio", "seed"))
     with (RESULTS / "runs.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()

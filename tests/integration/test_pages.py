@@ -7,6 +7,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -68,11 +69,10 @@ def test_commands_run_as_they_stand(page: Path, tiny: Any, tmp_path: Path, monke
     shutil.copytree(tiny.scene, "CAPTURE")
 
     def run(program: str, *words: str) -> None:
+        script = partial(runpy.run_path, str(ROOT / words[0]), run_name="__main__")
+        monkeypatch.setattr(sys, "argv", [*words])
         with pytest.raises(SystemExit) as caught:
-            if program == "python":
-                monkeypatch.setattr(sys, "argv", [*words])
-                runpy.run_path(str(ROOT / words[0]), run_name="__main__")
-            main(words)
+            script() if program == "python" else main(words)
         assert caught.value.code == 0, words
 
     run("sundae", "export", "RUN", "-o", "other.ply")
