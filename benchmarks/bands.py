@@ -20,6 +20,7 @@ from harness.points import (
     project_along_axes,
     project_through_camera,
     response_histogram,
+    write_points,
 )
 from harness.script import run_script
 from PIL.Image import Image
@@ -33,7 +34,7 @@ from sundae_ns.gaussians import finite_mask
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import PruningConfig, band_rule, decide, field_graph, kept_count, response
-from sundae_ns.storage import replacing, write_point_cloud, write_text
+from sundae_ns.storage import replacing, write_text
 from sundae_ns.storage.atomic import writing
 from sundae_ns.storage.kinds import kind_of
 from sundae_ns.storage.runs.checkpoint import read_field
@@ -242,7 +243,7 @@ def run_bands(
 
         def cloud(name: str, mask: Tensor | None = None) -> None:
             rows = slice(None) if mask is None else mask
-            write_point_cloud(out / name, params["means"][rows], colors[rows], scalars={"response": scalar[rows]})
+            write_points(out / name, params["means"][rows], colors[rows], scalar[rows])
             files.append(name)
 
         def save_png(name: str, image: Image) -> None:
