@@ -1,4 +1,4 @@
-"""Show the primitives that the paper's high-pass, low-pass and combined rules keep: point clouds, images and statistics.
+"""Show the primitives that the paper's high-pass, low-pass and combined rules keep: point clouds, images, figures.
 
 python benchmarks/bands.py RUN -o DIR
 python benchmarks/bands.py RUN -o DIR --keep-ratio 0.05 0.2 --view 12
@@ -14,6 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 import tyro
+from PIL.Image import Image
+from rich.console import Console
+from rich.progress import Progress
+from torch import Tensor
+
 from harness.points import (
     Projection,
     points_sheet,
@@ -23,11 +28,6 @@ from harness.points import (
     write_points,
 )
 from harness.script import run_script
-from PIL.Image import Image
-from rich.console import Console
-from rich.progress import Progress
-from torch import Tensor
-
 from sundae_ns.cli.outputs import Overwrite, check_folder
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians import finite_mask
@@ -62,9 +62,9 @@ def band_masks(
 ) -> dict[str, Tensor]:
     """The primitives that each rule keeps, bool ``[N]`` by the names of :data:`RULES`.
 
-    All rules rank the primitives by the magnitude of their high-pass response, as the paper does. The high-pass rule keeps
-    the largest, the low-pass rule the smallest, and the combined rule a share ``gamma`` of the largest and the rest of the
-    smallest.
+    All rules rank the primitives by the magnitude of their high-pass response, as the paper does. The high-pass rule
+    keeps the largest, the low-pass rule the smallest, and the combined rule a share ``gamma`` of the largest and the
+    rest of the smallest.
 
     Args:
         params: the field, all finite.

@@ -1,16 +1,17 @@
-"""Time the neighbour graph of many points and its high-pass response, with their errors; print one JSON line for each row.
+"""Time the neighbour graph of many points and its high-pass response, with their errors; print a JSON line for each row.
 
     python benchmarks/bench_graph.py --points 5000000 --device cuda
     python benchmarks/bench_graph.py --points 1000000 --distributions field clusters duplicates uniform --sample 0
     python benchmarks/bench_graph.py --points 10000000 --device cuda --field RUN
 
-Seconds are medians; the clock waits for the device. ``index_mismatches`` counts rows of neighbours that differ from those of
-scipy's k-d tree beyond ties, in a sample of the points. ``--sample 0`` compares every row and times scipy as well.
-``response_rel_error`` is relative to the same in float64; ``isolation_mismatches`` counts points that are isolated in one
-precision only. ``peak_mib`` is the memory of a build beyond that of the points. Lines belong in results/graph.jsonl.
+Seconds are medians; the clock waits for the device. ``index_mismatches`` counts rows of neighbours that differ from
+those of scipy's k-d tree beyond ties, in a sample of the points. ``--sample 0`` compares every row and times scipy as
+well. ``response_rel_error`` is relative to the same in float64; ``isolation_mismatches`` counts points that are
+isolated in one precision only. ``peak_mib`` is the memory of a build beyond that of the points. Lines belong in
+results/graph.jsonl.
 
-- field: like a trained field. A thousand discs of equal counts, 0.001 to 3 units wide and a fiftieth as thick; one point in
-  50 floats up to 100 units away, one in 100 is a clone of another.
+- field: like a trained field. A thousand discs of equal counts, 0.001 to 3 units wide and a fiftieth as thick; one
+  point in 50 floats up to 100 units away, one in 100 is a clone of another.
 - clusters: half in clusters of 1e-5, a quarter in clusters of 1e-2, the rest spread over 1e3.
 - duplicates: as clusters, half of the points upon others.
 - uniform: in the unit cube.
@@ -130,8 +131,8 @@ def measure(points: Tensor, device: str, repeats: int, sample: int) -> dict[str,
 def compare_with_scipy(points: NDArray[np.float64], found: NDArray[np.int64], rows: NDArray[Any]) -> tuple[float, int]:
     """Seconds of scipy's tree and its query, and the number of wrong rows of neighbours.
 
-    A row is right if its points are distinct, leave out the point itself, and lie at the true distances: then it differs
-    from scipy's in points of equal distance only.
+    A row is right if its points are distinct, leave out the point itself, and lie at the true distances. It
+    may differ from scipy's in points of equal distance.
 
     Args:
         points: positions ``[N, 3]``.

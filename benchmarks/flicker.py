@@ -3,10 +3,10 @@
     python benchmarks/flicker.py --load-config RUN
     python benchmarks/flicker.py --load-config RUN --phases 1 2 4 --json
 
-An earlier frame is warped onto a later one (Radl et al., SIGGRAPH 2024). Where both see the same surface, what is left of
-their difference is view dependence, error of the warp, and flicker. The first two are about the same in all methods, so the
-least squared error of a pixel over the methods is subtracted. StopThePop warps by optical flow; here depth and cameras are
-known. A sharper image leaves more of it than a blurred one, with the same flicker.
+An earlier frame is warped onto a later one (Radl et al., SIGGRAPH 2024). Where both see the same surface, what is left
+of their difference is view dependence, error of the warp, and flicker. The first two are about the same in all methods,
+so the least squared error of a pixel over the methods is subtracted. StopThePop warps by optical flow; here depth and
+cameras are known. A sharper image leaves more of it than a blurred one, with the same flicker.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from typing import Annotated, Literal, NamedTuple
 import torch
 import torch.nn.functional as F
 import tyro
-from harness.script import run_script
 from nerfstudio.cameras.cameras import Cameras
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from torch import Tensor
 
+from harness.script import run_script
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.evaluation import without_nan
 from sundae_ns.evaluation.document import number
@@ -142,7 +142,7 @@ class FlickerFigures:
     mse_base: float
     """The same of base colours."""
     excess: float
-    """:attr:`mse` without the least over all measured frames, of base colours and of each number of runs, at each pixel."""
+    """:attr:`mse` without the least of each pixel over all measured images: base colours, and each number of runs."""
     excess_base: float
     """:attr:`mse_base` without this least."""
     seen: float

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+
 from harness.job import perform
 from harness.plan import Job, job_folder
 from harness.script import run_script

@@ -23,10 +23,10 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from harness.job import configure
-from harness.plan import Job, parser_of
 from nerfstudio.scripts.train import _set_random_seed
 
+from harness.job import configure
+from harness.plan import Job, parser_of
 from sundae_ns.evaluation import psnr
 from sundae_ns.storage.runs import checkpoint
 

@@ -2,11 +2,11 @@
 
     python benchmarks/paper.py ARCHIVES -o DIR
 
-ARCHIVES holds the unpacked archives (360_v2, tandt, db), or the scenes themselves. Images as in papers: images_4 outdoors
-and images_2 indoors of Mip-NeRF 360, every eighth for test.
+ARCHIVES holds the unpacked archives (360_v2, tandt, db), or the scenes themselves. Images as in papers: images_4
+outdoors and images_2 indoors of Mip-NeRF 360, every eighth for test.
 
-Yang et al., "Spectrally Pruned Gaussian Fields with Neural Compensation", 2024. Times are omitted: they come from another
-machine and were taken without synchronisation.
+Yang et al., "Spectrally Pruned Gaussian Fields with Neural Compensation", 2024. Times are omitted: they come from
+another machine and were taken without synchronisation.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rich.console import Console
+from rich.markup import escape
+
 from harness.arms import choose_arms
 from harness.plan import Arm, Job, parser_of, plan_scene
 from harness.results import Result, group, mean_of, percent, quality_page, spread
 from harness.run import Options, Runner, check_out, compare
 from harness.script import run_script
-from rich.console import Console
-from rich.markup import escape
-
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.evaluation.document import METRICS, number, table
 
@@ -122,13 +122,13 @@ def plan_paper(options: PaperOptions, arms: Sequence[Arm]) -> tuple[list[Job], l
 
 
 def paper_page(results: Sequence[Result], arms: Sequence[Arm], missing: Sequence[str], command: str) -> str:
-    """The paper's scenes at its keep ratios: measured figures beside printed ones, then the page of ``quality_page``."""
+    """The paper's scenes at its keep ratios: measured figures beside printed ones, then :func:`quality_page`."""
     groups = group([result for result in results if result["job"]["kind"] != "warm-up"], arms)
     lines = ["# The paper's scenes", ""]
     lines += [
-        "Figures in italics are printed in the paper, not measured by us: it may resize images otherwise, and use another",
-        "variant of SSIM. Measured: means over the test views, head enabled. A data set has a mean only if all its scenes are",
-        "measured; the paper's 3DGS rows of Mip-NeRF 360 are means over nine scenes, not seven.",
+        "Figures in italics are printed in the paper, not measured by us: it may resize images otherwise, and use",
+        "another variant of SSIM. Measured: means over the test views, head enabled. A data set has a mean only if all",
+        "its scenes are measured; the paper's 3DGS rows of Mip-NeRF 360 are means over nine scenes, not seven.",
     ]
     for place, title in enumerate(("PSNR, dB", "SSIM")):
         lines += ["", f"## {title}", "", *_beside_printed(groups, place)]

@@ -3,8 +3,8 @@
     python benchmarks/quality.py CAPTURE -o DIR
     python benchmarks/quality.py CAPTURE -o DIR --arms MINE.yaml sundae --keep-ratios 0.1 --seeds 42
 
-MINE.yaml has arms of your own, as benchmarks/harness/arms.yaml has the default ones: a list of names, each with a method
-of ns-train (of this package, splatfacto, or mcmc for 3DGS-MCMC) and options of ns-train, if it needs them.
+MINE.yaml has arms of your own, as benchmarks/harness/arms.yaml has the default ones: a list of names, each with a
+method of ns-train (of this package, splatfacto, or mcmc for 3DGS-MCMC) and options of ns-train, if it needs them.
 
 Methods that prune once share a warm-up of each seed, and prune at every share of --keep-ratios. Other methods train
 from scratch. Methods and options are checked before anything is trained.
@@ -18,12 +18,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from rich.console import Console
+
 from harness.arms import choose_arms
 from harness.plan import parser_of, plan_scene
 from harness.results import Result, quality_page
 from harness.run import Options, Runner, check_out, compare
 from harness.script import run_script
-from rich.console import Console
 
 
 @dataclass(frozen=True, kw_only=True)

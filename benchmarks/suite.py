@@ -14,14 +14,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rich.console import Console
+from rich.markup import escape
+
 from harness.arms import choose_arms
 from harness.plan import Arm, Job, Words, jobs_of_shard, parser_of, plan_scene
 from harness.results import Result, group, mean_of, percent, quality_page, spread
 from harness.run import Options, Runner, check_out, compare, first_jobs
 from harness.script import run_script
-from rich.console import Console
-from rich.markup import escape
-
 from sundae_ns.errors import DataError
 from sundae_ns.evaluation.document import METRICS, number, table
 from sundae_ns.evaluation.measured import MEGABYTE
@@ -119,7 +119,6 @@ def check(data: Path, parser: Words, method: str) -> None:
     """
     # Late, since it loads the trainer.
     from harness.job import parse
-
     from sundae_ns.datamanager import check_before_training
 
     check_before_training(parse((method, "--data", str(data), *parser)).pipeline.datamanager)  # type: ignore[arg-type]

@@ -2,7 +2,8 @@
 
     python benchmarks/tables.py            # rewrite every table between its markers
     python benchmarks/tables.py quality    # print one table
-    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what ``suite.py CAPTURES -o DIR`` measured
+    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what ``suite.py CAPTURES -o DIR``
+    measured
 
 A page holds the markers ``<!-- table: NAME -->`` and ``<!-- end of table -->``; the lines between them are made here.
 ``tests/test_benchmarks.py`` checks that every page is current. A row whose options are not those that its arm has today
@@ -22,7 +23,6 @@ from typing import Any
 
 from harness.results import spread
 from harness.today import EARLIER, SHARE, is_of_today
-
 from sundae_ns.evaluation import COLUMNS, csv_text
 from sundae_ns.evaluation.document import number, table
 
@@ -62,7 +62,8 @@ def lines_of(name: str) -> list[dict[str, Any]]:
 def runs() -> list[dict[str, Any]]:
     """Rows of runs.csv by capture, in the order of :data:`METHODS` and of shares, a row for all seeds.
 
-    Numbers are means over the seeds, and None is an empty cell; ``psnr_cell`` and ``ssim_cell`` are texts with the spread.
+    Numbers are means over the seeds, and None is an empty cell; ``psnr_cell`` and ``ssim_cell`` are texts with the
+    spread.
     """
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in lines_of("runs.csv"):
@@ -310,7 +311,7 @@ def with_tables(text: str) -> str:
     return MARKED.sub(lambda found: found[1] + "\n".join(TABLES[found["name"]]()) + "\n" + found[3], text)
 
 
-# ------------------------------------------------------------------------------------------------------------- the suite
+# ------------------------------------------------------------------------------------------------------------ the suite
 
 
 def take_over(results: Path) -> None:

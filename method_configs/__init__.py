@@ -1,7 +1,7 @@
 """The methods that ``ns-train`` lists; all entry points of the package point here.
 
-Keep this import light and free of ``nerfstudio.configs.method_configs``: nerfstudio loads entry points while that module is
-half imported, and an error here breaks every ``ns-*`` command.
+Keep this import light and free of ``nerfstudio.configs.method_configs``: nerfstudio loads entry points while that
+module is half imported, and an error here breaks every ``ns-*`` command.
 """
 
 from sundae_ns.errors import show_in_one_line

@@ -148,13 +148,13 @@ sundae_100 = _keep(100)
 
 sundae_continuous = method(
     "sundae-continuous",
-    "SUNDAE with continuous pruning during densification: a lower peak of memory, with an optional cap and final number.",
+    "SUNDAE with continuous pruning during densification: a lower peak of memory, an optional cap and final number.",
     pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
 )
 
 sundae_auto = method(
     "sundae-auto",
-    "SUNDAE that searches its budget: the smallest field and head within 0.1 dB, or the best within bytes or primitives.",
+    "SUNDAE that searches its budget: the smallest field and head within 0.1 dB, or the best in bytes or primitives.",
     pruning=PruningConfig(mode="auto", stop=28000),
     head=HeadConfig(mode="residual"),
     datamanager={"holdout_every": 8},

@@ -82,8 +82,8 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
     Nothing is evaluated or saved while training is timed, whatever the method.
 
     Returns:
-        Plain values: ``job``; ``measured``; ``packed``, see :func:`pack`; ``alone``, whether no other job used the GPU. A
-        job that was not alone has no times.
+        Plain values: ``job``; ``measured``; ``packed``, see :func:`pack`; ``alone``, whether no other job used the GPU.
+        A job that was not alone has no times.
 
     Raises:
         BackendError: the method needs a CUDA device and there is none.

@@ -37,7 +37,7 @@ class Projection:
     name: str
     """Caption of the viewing direction; may be empty."""
     pixels: Tensor
-    """Column and row of each point ``[N, 2]``, in pixels, the first pixel's centre at 0.5. Points outside are not drawn."""
+    """Column and row of each point ``[N, 2]``, in pixels, the first pixel's centre at 0.5. Outside of it: not drawn."""
     depth: Tensor
     """Depth of each point ``[N]``. Nearer points hide others; points with depth <= 0 are not drawn."""
     width: int
@@ -63,8 +63,8 @@ def project_through_camera(points: Tensor, viewmat: Tensor, K: Tensor, width: in
 def project_along_axes(points: Tensor, side: int = 600) -> list[Projection]:
     """Three orthographic projections of points ``[N, 3]``: from above (along z), from the front (y) and the side (x).
 
-    The common scale fits 1.5 times the extent of the middle 70% of the points; a far background would shrink the rest to a
-    dot.
+    The common scale fits 1.5 times the extent of the middle 70% of the points; a far background would shrink the rest
+    to a dot.
 
     Args:
         points: centres, world units ``[N, 3]``.
@@ -174,8 +174,8 @@ def response_histogram(
 
     Args:
         magnitude: ``[N]``. Zeros and values that are not finite have no place on the axis; the title counts them.
-        thresholds: by caption, the largest magnitude that the low-pass rule keeps (drawn dashed) and the smallest that the
-            high-pass rule keeps (drawn solid); None draws no line.
+        thresholds: by caption, the largest magnitude that the low-pass rule keeps (drawn dashed) and the smallest that
+            the high-pass rule keeps (drawn solid); None draws no line.
     """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D

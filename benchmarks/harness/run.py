@@ -8,13 +8,14 @@ import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
+from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeElapsedColumn
 
 from harness.plan import Job, done_file, job_folder, jobs_of_shard
 from harness.results import Result, read_results, write_results
@@ -49,9 +50,9 @@ class Options:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """folder for jobs, results and tables; its finished jobs are not run again."""
     arms: tuple[str, ...] = ()
-    """files of arms (.yaml), and names of default arms: sundae, band (the paper's rule), contribution, random, each also with
-    -no-head; sundae-with-head, sundae-no-head-bytes; mcmc (from scratch to the same count), sundae-fast, sundae-auto,
-    splatfacto, splatfacto-7k."""
+    """files of arms (.yaml), and names of default arms: sundae, band (the paper's rule), contribution, random, each
+    also with -no-head; sundae-with-head, sundae-no-head-bytes; mcmc (from scratch to the same count), sundae-fast,
+    sundae-auto, splatfacto, splatfacto-7k."""
     keep_ratios: tuple[float, ...] = (0.1,)
     """shares of the warm-up's primitives to keep."""
     seeds: tuple[int, ...] = (42,)
@@ -176,7 +177,7 @@ def run_jobs(
                     if job.needs in failed:
                         raise SundaeError(f"its warm-up has failed: {job.needs}")
                     _describe(job, out)
-                    runner(job, out, lambda percent, task=task: progress.update(task, completed=percent))  # type: ignore[misc]
+                    runner(job, out, partial(_show, progress, task))
                 except SundaeError as error:
                     failed[job.key] = str(error)
                     text = f"[red]{escape(job.key)} failed:[/red] {escape(str(error))}"
@@ -186,6 +187,10 @@ def run_jobs(
                 progress.remove_task(task)
             progress.advance(everything)
     return failed
+
+
+def _show(progress: Progress, task: TaskID, percent: float) -> None:
+    progress.update(task, completed=percent)
 
 
 def first_jobs(jobs: Sequence[Job]) -> dict[str, str]:

@@ -22,7 +22,8 @@ def is_of_today(row: Mapping[str, Any]) -> bool:
     """Whether a row of ``runs.csv`` was measured with the options that its arm has today.
 
     Args:
-        row: with ``variant``, ``keep_ratio`` and ``fingerprint``, as text or as values; without one of them, it was not.
+        row: with ``variant``, ``keep_ratio`` and ``fingerprint``, as text or as values; without one of them, it was
+            not.
     """
     return row.get("fingerprint") in fingerprints(str(row.get("variant", "")), float(row.get("keep_ratio") or SHARE))
 

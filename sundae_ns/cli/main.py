@@ -129,7 +129,7 @@ def report(
     """Measure quality, speed and size of finished runs on their test views; write tables, plots and training curves.
 
     Args:
-        runs: runs of sundae or splatfacto (their folders or config.yml), and packed scenes. No code in them is executed.
+        runs: runs of sundae or splatfacto (their folders or config.yml), and packed scenes; no code in them runs.
         out: folder to write.
         data: folder of the capture, if it moved; packed scenes need it, because they do not record it.
         lpips_net: net of LPIPS, which is measured if its weights are on disk; values of different nets do not compare.
@@ -222,8 +222,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run ``sundae``."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:  # the process is the command's own
-        # Imports make a million objects that stay. To look for garbage among them takes a sixth of the start, and 0.6 s of
-        # the end.
+        # Imports make a million objects that stay. To look for garbage among them takes a sixth of the start, and 0.6 s
+        # of the end.
         gc.set_threshold(100_000)
         atexit.register(gc.freeze)
     exit_with(lambda: _dispatch(words), " ".join(words[:1]))

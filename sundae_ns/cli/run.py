@@ -198,8 +198,8 @@ class Project:
         for name, value in settings.items():
             if before.get(name) != value:
                 raise ConfigError(
-                    f"{self.out} was made with {name} {_shown(before.get(name))}, not {_shown(value)}; repeat the first "
-                    "command, or choose another folder"
+                    f"{self.out} was made with {name} {_shown(before.get(name))}, not {_shown(value)}; "
+                    "repeat the first command, or choose another folder"
                 )
 
 

@@ -53,9 +53,9 @@ class HeadConfig:
     """Architecture and arithmetic of the compensation head."""
 
     mode: Literal["auto", "residual", "features", "off"] = "auto"
-    """auto: residual, if held-out training views show after a short trial that it pays, else off. residual: the head adds a
-    correction to the spherical-harmonics image, which remains usable alone. features: the paper's, the head alone makes the
-    image from splatted features, over the background. off: no head."""
+    """auto: residual, if held-out training views show after a short trial that it pays, else off. residual: the head
+    adds a correction to the spherical-harmonics image, which remains usable alone. features: the paper's, the head
+    alone makes the image from splatted features, over the background. off: no head."""
     size: Literal["tiny", "compact", "wide", "small", "regular", "large"] = "wide"
     """Width of the U-Net: 0.5, 2, 2.5, 7.8, 31 or 124 MB in fp32. The last three are the paper's, whose default is
     regular; compact is small with at most 64 channels per level, wide has 64 on each."""

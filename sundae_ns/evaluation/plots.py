@@ -1,4 +1,4 @@
-"""Plots of a report. Each function draws the runs that it is given and writes one file, without global matplotlib state."""
+"""Plots of a report. Each function draws the runs that it is given and writes one file, without matplotlib's globals."""
 
 from __future__ import annotations
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 from bands import bands, base_colors
-from harness.script import run_script
 from PIL import Image
 from plyfile import PlyData
 from prunes import decide_share
 from torch import Tensor
 
+from harness.script import run_script
 from sundae_ns.gaussians import from_points
 from sundae_ns.pruning import PruningConfig, band_rule, response
 from sundae_ns.storage import read_ply, read_point_cloud, write_ply

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 import torch
+
 from harness import job as jobs
 from harness.plan import Job, done_file, job_folder
 from harness.run import JOB
-
 from sundae_ns.errors import BackendError, CheckpointError, DataError
 
 

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
+from torch import Tensor
+
 from harness.points import (
     BACKGROUND,
     Projection,
@@ -19,9 +22,6 @@ from harness.points import (
     response_histogram,
     write_points,
 )
-from plyfile import PlyData
-from torch import Tensor
-
 from sundae_ns.errors import DataError
 from sundae_ns.storage import read_point_cloud
 

@@ -14,14 +14,14 @@ import pytest
 import tyro
 from bench_jobs import Runner
 from csv_rows import read_rows
-from harness.arms import choose_arms
-from harness.plan import Arm, Job, jobs_of_shard, parser_of, plan_scene
-from harness.results import read_results, spread
 from paper import DATASETS, PRINTED, PaperOptions, find_scene, run_paper
 from quality import QualityOptions, run_quality
 from rich.console import Console
 from suite import SuiteOptions
 
+from harness.arms import choose_arms
+from harness.plan import Arm, Job, jobs_of_shard, parser_of, plan_scene
+from harness.results import read_results, spread
 from sundae_ns.errors import ConfigError, DataError, StorageError
 from sundae_ns.evaluation import COLUMNS
 
@@ -42,7 +42,7 @@ def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[i
     return code, text.getvalue()
 
 
-# --------------------------------------------------------------------------------------------------------------- options
+# -------------------------------------------------------------------------------------------------------------- options
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_page_names_the_command_of_the_whole(options: QualityOptions | PaperOp
     assert tyro.cli(type(options), args=words[2:]) == options
 
 
-# ----------------------------------------------------------------------------------------------------------------- plans
+# ---------------------------------------------------------------------------------------------------------------- plans
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,11 @@ import torch
 import tyro
 from bench_jobs import measured
 from csv_rows import read_rows
+from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
+
 from harness import today
 from harness.plan import Job
 from harness.today import fingerprints
-from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
-
 from sundae_ns.graphs import build_graph
 
 ROOT = Path(__file__).parents[2]
@@ -67,7 +67,7 @@ def test_help(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
             assert not missing, words
 
 
-# ---------------------------------------------------------------------------------------------------------------- results
+# -------------------------------------------------------------------------------------------------------------- results
 
 
 def test_results_are_small_and_can_be_read() -> None:
@@ -89,7 +89,7 @@ def test_commands_of_rows_are_ones_that_ns_train_takes() -> None:
         assert config.max_num_iterations == row.steps  # type: ignore[attr-defined]
 
 
-# ----------------------------------------------------------------------------------------------------------------- tables
+# --------------------------------------------------------------------------------------------------------------- tables
 
 
 def test_tables_of_all_pages_are_those_of_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,7 +239,7 @@ def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert {path.stem for path in tmp_path.iterdir()} == set(plots["PLOTS"])
 
 
-# ------------------------------------------------------------------------------------------------------------------ parts
+# ---------------------------------------------------------------------------------------------------------------- parts
 
 
 def test_parts_are_timed_beside_their_errors(
@@ -298,7 +298,7 @@ def test_wrong_neighbours_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bench["compare_with_scipy"](points, found, rows)[1] == 3
 
 
-# ---------------------------------------------------------------------------------------------------------------- mutants
+# -------------------------------------------------------------------------------------------------------------- mutants
 
 
 def test_rooms_of_mutants_name_modules_and_tests_that_exist() -> None:

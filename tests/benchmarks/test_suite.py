@@ -10,14 +10,14 @@ from typing import Any
 import pytest
 from bench_jobs import Runner, measured
 from csv_rows import read_rows
-from harness.alone import watched
-from harness.arms import choose_arms
-from harness.job import configure, fingerprint_of, without_times
-from harness.plan import Job, done_file
 from rich.console import Console
 from suite import ARMS as SUITE
 from suite import SuiteOptions, find_captures, plan_suite, run_suite
 
+from harness.alone import watched
+from harness.arms import choose_arms
+from harness.job import configure, fingerprint_of, without_times
+from harness.plan import Job, done_file
 from sundae_ns.errors import DataError
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
@@ -71,7 +71,7 @@ def lines_of(page: str, title: str) -> list[list[str]]:
     return rows[2:]
 
 
-# ------------------------------------------------------------------------------------------------------------------ plan
+# ----------------------------------------------------------------------------------------------------------------- plan
 
 
 def test_the_default_plan(captures: Path) -> None:
@@ -127,7 +127,7 @@ def test_folders_that_hold_no_captures(captures: Path, tmp_path: Path) -> None:
             find_captures(folder)
 
 
-# ----------------------------------------------------------------------------------------------------------- carried out
+# ---------------------------------------------------------------------------------------------------------- carried out
 
 
 def test_stopped_and_continued(captures: Path) -> None:

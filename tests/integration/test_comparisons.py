@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import pytest
 from csv_rows import read_rows
-from harness.arms import choose_arms
-from harness.job import fingerprint_of, perform
-from harness.plan import Job, parser_of, plan_scene
-from harness.results import read_results
 from paper import PaperOptions, run_paper
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from suite import SuiteOptions, run_suite
 
+from harness.arms import choose_arms
+from harness.job import fingerprint_of, perform
+from harness.plan import Job, parser_of, plan_scene
+from harness.results import read_results
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import open_scene
 

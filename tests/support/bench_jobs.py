@@ -8,7 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 
 from harness.plan import Job, done_file
-
 from sundae_ns.errors import SundaeError
 from sundae_ns.evaluation import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality
 

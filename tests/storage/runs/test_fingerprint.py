@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 import yaml
-from harness.job import parse
 
+from harness.job import parse
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.fingerprint import LEFT_OUT, LENGTH, fingerprint
 
