@@ -1,4 +1,4 @@
-"""Time the neighbour graph of many points and its high-pass response, with their errors; print a JSON line for each row.
+"""Time the neighbour graph of many points and its high-pass response, with their errors; print one JSON line a row.
 
     python benchmarks/bench_graph.py --points 5000000 --device cuda
     python benchmarks/bench_graph.py --points 1000000 --distributions field clusters duplicates uniform --sample 0

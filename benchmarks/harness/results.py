@@ -94,9 +94,9 @@ def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -
     """
     lines = ["# Comparison of quality", "", f"    {command}", ""]
     lines += [
-        "Mean over the seeds, ± their standard deviation. Arms that start from the warm-up of a method and a seed share",
-        "it; its training comes before theirs. Time, MB and errors of a line are of one rendering. Times are of jobs",
-        "that had their GPU to themselves.",
+        "Mean over the seeds, ± their standard deviation. Arms that start from the warm-up of a method and a seed",
+        "share it; its training comes before theirs. Time, MB and errors of a line are of one rendering. Times are",
+        "of jobs that had their GPU to themselves.",
         "",
         *_described(arms),
     ]

@@ -59,7 +59,7 @@ def document(
         f"  (11 x 11 window, no padding), FLIP is {VARIANT}, and LPIPS names its net.",
         "- Higher PSNR and SSIM are better; lower FLIP, LPIPS, ms and MB are better.",
         "- ms per frame is the median over the test views, synchronised with the device.",
-        "- MB are 1e6 bytes in fp32 of all that the configuration needs: with the head off, no network and no features.",
+        "- MB are 1e6 bytes in fp32 of all that the configuration needs: no network or features if the head is off.",
         "  For a packed scene it is the whole file.",
         "",
     ]

@@ -1,4 +1,4 @@
-"""Plots of a report. Each function draws the runs that it is given and writes one file, without matplotlib's globals."""
+"""Plots of a report. Each function draws its runs and writes one file, without matplotlib's global state."""
 
 from __future__ import annotations
 
