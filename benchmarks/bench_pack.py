@@ -65,7 +65,7 @@ def random_scene(n: int) -> PackedScene:
 
 
 def config_of(settings: list[str], finetuned: bool) -> PackConfig:
-    kinds = {field.name: type(field.default) for field in fields(PackConfig)}
+    kinds: dict[str, Any] = {field.name: type(field.default) for field in fields(PackConfig)}
     values: dict[str, Any] = dict(FINETUNED) if finetuned else {}
     for setting in settings:
         name, _, value = setting.partition("=")
@@ -118,7 +118,7 @@ def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
     sums = {name + suffix: 0.0 for name in names for suffix in ("", "_base")}
     for i in track(chosen, description="Rendering", transient=True):
         camera, truth = before.cameras[i], before.truths[i]
-        images: list[dict[str, Tensor]] = [model.get_outputs_for_camera(camera) for model in (before.model, after)]
+        images = [model.get_outputs_for_camera(camera) for model in (before.model, after)]
         for suffix, output in (("", "rgb"), ("_base", "base_rgb")):
             old, new = (image[output].clamp(0, 1) for image in images)
             # Errors of all views together: PSNR is their logarithm.

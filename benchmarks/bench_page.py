@@ -4,9 +4,9 @@
     python benchmarks/bench_page.py scene.sundae --side 800 --half
 
 It needs a Chromium, which renders in software here. The cameras and the sizes that the head was trained at are scaled
-together, so both renderers run the head at the size of the image. The page's images are bytes: rounding alone gives 58.9 dB.
-With ``--half`` the page's renderer also runs under Node in half precision, on an adapter that has it (``make browser``
-installs what it needs). Lines belong in results/page.jsonl, and ``make browser`` checks them.
+together, so both renderers run the head at the size of the image. The page's images are bytes: rounding alone gives
+58.9 dB. With ``--half`` the page's renderer also runs under Node in half precision, on an adapter that has it (``make
+browser`` installs what it needs). Lines belong in results/page.jsonl, and ``make browser`` checks them.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def scaled(scene: PackedScene, side: int) -> PackedScene:
 
 
 def write_scaled(out: Path, scene: Path, side: int) -> PackedScene:
-    """Write a file as :func:`scaled` changes it; its levels and steps are copied, so the page decodes those of the file."""
+    """Write a file as :func:`scaled` changes it; levels and steps are copied, so the page decodes those of the file."""
     small, header = scaled(read_scene(scene), side), container.read_header(scene)
     meta = {**header.meta, **small.meta}
     del meta["sections"]

@@ -1,17 +1,16 @@
-"""Time training steps, or a part alone: loss, heads, neighbour graph, rasterisers; print one JSON line for each row.
+"""Time training steps, or a part alone: loss, heads, rasterisers; print one JSON line for each row.
 
     python benchmarks/bench_step.py                            # sundae-tiny on a CPU, 128 x 128, 5,000 primitives
     python benchmarks/bench_step.py --primitives 20000 --size 256 --device cuda
     python benchmarks/bench_step.py loss --device cuda         # fused kernels and convolutions, with their errors
     python benchmarks/bench_step.py heads                      # on CUDA, each head as one CUDA graph
-    python benchmarks/bench_step.py graph --primitives 5000000 --device cuda
     python benchmarks/bench_step.py rasterizers --primitives 100000 --size 640
 
 A step is render, head, losses, backward pass and optimizers. Times are medians in milliseconds, device waited for.
 Errors of a loss are distances from the convolutions in float64; the gradient's is relative to its norm. Of the heads,
 ``ms_HxW`` is a frame in fp16 as the model runs it, ``ms_train_HxW`` forward and backward in bf16 with fp32 weights;
-``layers`` is the network layer by layer, without the kernels. Errors of the graph's response and of a rasteriser are
-distances from float64; gradients' are relative, the worst of all inputs.
+``layers`` is the network layer by layer, without the kernels. Errors of a rasteriser are distances from float64;
+gradients' are relative, the worst of all inputs.
 """
 
 from __future__ import annotations
@@ -33,9 +32,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import median_ms
-from sundae_ns.filters import high_pass
 from sundae_ns.gpu.cuda_graphs import record, warm_up
-from sundae_ns.graphs import build_graph
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.rasterization import BackendName, rasterize, select_backend
 from sundae_ns.training import losses
@@ -166,35 +163,6 @@ def _head_ms(config: HeadConfig, height: int, width: int) -> dict[str, float]:
     return found
 
 
-def graph(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """The graph of 16 neighbours of positions like a trained field's, and their high-pass response."""
-    n, g = options.primitives, torch.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=g, dtype=torch.float64)
-
-    # A thousand discs of equal counts, 0.001 to 3 units wide; one point in 50 is a floater, one in 100 a clone.
-    radii = 10 ** (3.5 * torch.rand(1000, generator=g, dtype=torch.float64) - 3)
-    axes = torch.linalg.qr(normal(1000, 3, 3)).Q * torch.stack([radii, radii, radii / 50], dim=1)[:, None, :]
-    disc = torch.randint(1000, (n,), generator=g)
-    positions = normal(1000, 3)[disc] + torch.einsum("nij,nj->ni", axes[disc], normal(n, 3))
-    positions[: n // 50] *= 30
-    positions[n // 2 : n // 2 + n // 100] = positions[-(n // 100) :]
-    points = positions.float().to(options.device)
-
-    def response(of: Tensor) -> Tensor:
-        return high_pass(build_graph(of, num_neighbors=16), of)
-
-    found, exact = response(points), response(points.double())
-    known = ~(found.isnan() | exact.isnan()).any(dim=1)
-    yield {
-        "points": n,
-        "ms_graph": round(median_ms(partial(build_graph, points, num_neighbors=16), device=options.device), 2),
-        "ms_graph_and_response": round(median_ms(partial(response, points), device=options.device), 2),
-        "response_rel_error": float((found - exact)[known].norm() / exact[known].norm()),
-    }
-
-
 def rasterizers(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """The rasterisers of the device on a random view of 16 channels, primitives of one to three pixels."""
     n, size, g = options.primitives, options.size, torch.Generator().manual_seed(0)
@@ -212,8 +180,10 @@ def rasterizers(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
     def draw(name: BackendName, device: str, dtype: torch.dtype, gradients: bool = True) -> list[Tensor]:
         leaves = [value.to(device, dtype).requires_grad_(gradients) for value in scene]
-        placed = [value.to(device, dtype) for value in camera]
-        view = rasterize(*leaves, *placed, size, size, backend=select_backend(name, device))
+        viewmat, K = (value.to(device, dtype) for value in camera)
+        means, quats, scales, opacities, colors = leaves
+        backend = select_backend(name, device)
+        view = rasterize(means, quats, scales, opacities, colors, viewmat, K, size, size, backend=backend)
         if not gradients:
             return [view.colors]
         return [view.colors.detach(), *torch.autograd.grad(view.colors, leaves, weights.to(device, dtype))]
@@ -242,9 +212,9 @@ def rasterizers(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = {"steps": steps, "loss": loss, "heads": heads, "graph": graph, "rasterizers": rasterizers}
+    parts = {"steps": steps, "loss": loss, "heads": heads, "rasterizers": rasterizers}
     parser.add_argument("part", nargs="?", choices=parts, default="steps")
-    parser.add_argument("--primitives", type=int, default=5000, help="of a step, graph or view")
+    parser.add_argument("--primitives", type=int, default=5000, help="of a step or view")
     parser.add_argument("--size", type=int, default=128, help="side of the image of a step or view, pixels")
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cpu; heads: cuda")
     parser.add_argument("--repeats", type=int, default=30, help="timed runs; their median counts")

@@ -3,10 +3,11 @@
     python benchmarks/bench_training.py CAPTURE --arms splatfacto sundae -o benchmarks/results/training_time.jsonl
     python benchmarks/bench_training.py CAPTURE --arms sundae --steps 3000
 
-Every arm trains in a process of its own, on images of full size on the GPU, with every 8th image for the test and the head
-as the method decides. Nothing is evaluated or saved while the clock runs; the clock waits for the GPU. ``gpu_busy_share`` is
-the share of 100 steps in which a kernel runs, before and after the prune (``--profile``: in a further training, because the
-profiler takes time). ``curve`` lists seconds, PSNR and SSIM of the test views on the way, measured with the clock stopped.
+Every arm trains in a process of its own, on images of full size on the GPU, with every 8th image for the test and the
+head as the method decides. Nothing is evaluated or saved while the clock runs; the clock waits for the GPU.
+``gpu_busy_share`` is the share of 100 steps in which a kernel runs, before and after the prune (``--profile``: in a
+further training, because the profiler takes time). ``curve`` lists seconds, PSNR and SSIM of the test views on the way,
+measured with the clock stopped.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.scripts.train import _set_random_seed
 
-from sundae_ns.cli.bench.job import configure, without_lpips
-from sundae_ns.cli.bench.plan import Job, parser_of
+from harness.job import configure, without_lpips
+from harness.plan import Job, parser_of
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.opening import views_to_test
 from sundae_ns.storage.runs.fingerprint import fingerprint
@@ -46,7 +47,8 @@ PROFILED = 100
 
 def steps_of(options: argparse.Namespace, arm: str) -> int:
     """Length of a training: by default that of the method."""
-    return int(options.steps or all_methods[ARMS[arm][0]].max_num_iterations)
+    config: Any = all_methods[ARMS[arm][0]]
+    return int(options.steps or config.max_num_iterations)
 
 
 def trainer_of(options: argparse.Namespace, arm: str, out: str) -> Any:

@@ -37,7 +37,8 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.storage.packing import PackedScene, read_scene
 from sundae_ns.storage.viewers import write_for_viewers
 
-PAGE = '<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><script type="module" src="viewers.js"></script>'
+PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
+<script type="module" src="viewers.js"></script>"""
 REACH = math.sqrt(2 * math.log(255))
 """Sigmas to where the alpha of an opaque primitive falls below 1/255."""
 Options = dict[str, dict[str, Any]]

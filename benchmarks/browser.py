@@ -36,7 +36,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -66,6 +66,9 @@ def find_chromium() -> str | None:
     """The first Chromium or Chrome on the path; None if there is none."""
     names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
     return next((path for path in map(shutil.which, names) if path), None)
+
+
+Opened = TypeVar("Opened", bound="Browser")
 
 
 class BrowserError(RuntimeError):
@@ -109,7 +112,7 @@ class Browser:
 
     # ------------------------------------------------------------------------------------------- life of the browser
 
-    def __enter__(self) -> Browser:
+    def __enter__(self: Opened) -> Opened:
         try:
             self._start()
         except BaseException:
@@ -543,7 +546,7 @@ class Server:
             self.process.wait()
 
 
-# --------------------------------------------------------------------------------------------------------------- training
+# ------------------------------------------------------------------------------------------------------------- training
 
 
 PRUNE_AT = 300

@@ -25,8 +25,8 @@ import torch
 import torch.distributed as dist
 from nerfstudio.scripts.train import _set_random_seed
 
-from sundae_ns.cli.bench.job import configure
-from sundae_ns.cli.bench.plan import Job, parser_of
+from harness.job import configure
+from harness.plan import Job, parser_of
 from sundae_ns.evaluation import psnr
 from sundae_ns.storage.runs import checkpoint
 
@@ -159,7 +159,7 @@ def measure(rank: int, ranks: int, meeting: str, options: argparse.Namespace, ex
 
 
 def job_of(options: argparse.Namespace, extra: list[str]) -> Job:
-    """The training as a job of ``sundae bench``."""
+    """The training as a job of a comparison."""
     data = options.data.resolve()
     steps = options.steps
     if steps is None:

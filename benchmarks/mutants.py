@@ -165,7 +165,7 @@ def change(tree: ast.AST, index: int, kind: str) -> str:
     return f"line {node.lineno}: {before}  ->  {ast.unparse(node)}"
 
 
-class Changed(importlib.abc.SourceLoader, importlib.abc.MetaPathFinder):
+class Changed(importlib.abc.SourceLoader, importlib.abc.MetaPathFinder):  # type: ignore[misc]
     """Imports one module of the package from a changed syntax tree."""
 
     def __init__(self, path: Path, tree: ast.AST) -> None:

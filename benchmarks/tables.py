@@ -2,7 +2,8 @@
 
     python benchmarks/tables.py            # rewrite every table between its markers
     python benchmarks/tables.py quality    # print one table
-    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what ``sundae bench suite -o DIR`` measured
+    python benchmarks/tables.py --suite DIR/results.jsonl    # first take over what ``suite.py CAPTURES -o DIR``
+    measured
 
 A page holds the markers ``<!-- table: NAME -->`` and ``<!-- end of table -->``; the lines between them are made here.
 ``tests/test_benchmarks.py`` checks that every page is current. A row whose options are not those that its arm has today
@@ -20,8 +21,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from sundae_ns.cli.bench.results import spread
-from sundae_ns.cli.bench.today import EARLIER, SHARE, is_of_today
+from harness.results import spread
+from harness.today import EARLIER, SHARE, is_of_today
 from sundae_ns.evaluation import COLUMNS, csv_text
 from sundae_ns.evaluation.document import number, table
 
@@ -61,7 +62,8 @@ def lines_of(name: str) -> list[dict[str, Any]]:
 def runs() -> list[dict[str, Any]]:
     """Rows of runs.csv by capture, in the order of :data:`METHODS` and of shares, a row for all seeds.
 
-    Numbers are means over the seeds, and None is an empty cell; ``psnr_cell`` and ``ssim_cell`` are texts with the spread.
+    Numbers are means over the seeds, and None is an empty cell; ``psnr_cell`` and ``ssim_cell`` are texts with the
+    spread.
     """
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in lines_of("runs.csv"):
@@ -176,7 +178,8 @@ def speed() -> list[str]:
 
 def flicker() -> list[str]:
     """Squared errors of warped frames without the least of head and base colours, and their quotients."""
-    apart, rows = (1, 7), {}
+    apart = (1, 7)
+    rows: dict[str, dict[int, list[str]]] = {}
     for line in lines_of("flicker.jsonl"):
         cells = rows.setdefault(named(line["config"], is_of_today(line)), {})
         cells[line["frames_apart"]] = [
@@ -308,11 +311,11 @@ def with_tables(text: str) -> str:
     return MARKED.sub(lambda found: found[1] + "\n".join(TABLES[found["name"]]()) + "\n" + found[3], text)
 
 
-# ------------------------------------------------------------------------------------------------------------- the suite
+# ------------------------------------------------------------------------------------------------------------ the suite
 
 
 def take_over(results: Path) -> None:
-    """Replace rows of runs.csv, frames, training times and packs by those of ``sundae bench suite``.
+    """Replace rows of runs.csv, frames, training times and packs by those of ``suite.py``.
 
     Other rows stay, but for earlier defaults at other seeds of what was measured.
 
@@ -322,8 +325,7 @@ def take_over(results: Path) -> None:
     found = [json.loads(line) for line in results.read_text(encoding="utf-8").splitlines()]
     measured = [_rounded({**result["measured"], "command": _public(result["measured"]["command"])}) for result in found]
     rows = list(csv.DictReader(csv_text(measured).splitlines()))
-    places = ("scene", "variant", "keep_ratio", "seed")
-    kept = _merged(lines_of("runs.csv"), rows, places)
+    kept = _merged(lines_of("runs.csv"), rows, ("scene", "variant", "keep_ratio", "seed"))
     with (RESULTS / "runs.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         writer.writeheader()

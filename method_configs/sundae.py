@@ -86,7 +86,7 @@ def method(
         name: name after ``ns-train``.
         description: line in ``ns-train --help``.
         pruning: options of pruning.
-        head: options of the head.
+        head: options of the head; by default those of :class:`HeadConfig`.
         steps: length of the run.
         plain_optimizers: see :func:`optimizers`.
         trainer: other options of the trainer.
@@ -135,10 +135,11 @@ def _keep(percent: int) -> MethodSpecification:
     description = (
         f"SUNDAE: spectrally pruned Gaussian field with neural compensation, keeps {percent}% of the primitives."
     )
-    return method(name, description, pruning=PruningConfig(keep_ratio=percent / 100), head=HeadConfig(mode="auto"))
+    return method(name, description, pruning=PruningConfig(keep_ratio=percent / 100))
 
 
 sundae = _keep(10)
+# The paper's shares; --pipeline.model.pruning.keep-ratio takes any other.
 sundae_1 = _keep(1)
 sundae_30 = _keep(30)
 sundae_50 = _keep(50)
@@ -147,15 +148,15 @@ sundae_100 = _keep(100)
 
 sundae_continuous = method(
     "sundae-continuous",
-    "SUNDAE with continuous pruning during densification: a lower peak of memory, with an optional cap and final number.",
+    "SUNDAE with continuous pruning during densification: a lower peak of memory, an optional cap and final number.",
     pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
-    head=HeadConfig(mode="auto"),
 )
 
 sundae_auto = method(
     "sundae-auto",
-    "SUNDAE that searches its budget: the smallest field and head within 0.1 dB, or the best within bytes or primitives.",
+    "SUNDAE that searches its budget: the smallest field and head within 0.1 dB, or the best in bytes or primitives.",
     pruning=PruningConfig(mode="auto", stop=28000),
+    head=HeadConfig(mode="residual"),
     datamanager={"holdout_every": 8},
 )
 
@@ -163,7 +164,6 @@ sundae_fast = method(
     "sundae-fast",
     "SUNDAE in the shortest time: 18,000 steps, pruned after a third of them.",
     pruning=PruningConfig(keep_ratio=0.1, prune_at=6000),
-    head=HeadConfig(mode="auto"),
     steps=18000,
     warmup_length=300,
     refine_every=60,
@@ -202,7 +202,7 @@ sundae_tiny = method(
     "sundae-tiny",
     "SUNDAE for a first look: small scenes, a few minutes on a CPU.",
     pruning=PruningConfig(keep_ratio=0.25, prune_at=600),
-    head=HeadConfig(size="tiny", pixel_unshuffle=1, num_features=5),
+    head=HeadConfig(mode="residual", size="tiny", pixel_unshuffle=1, num_features=5),
     steps=1200,
     trainer={"vis": "tensorboard", "steps_per_save": 400, "steps_per_eval_all_images": 10000},
     num_downscales=0,

@@ -60,7 +60,7 @@ def build(n: int = N, **pruning: Any) -> tuple[SundaeModel, Views]:
     rgb = torch.randint(0, 256, (n, 3), generator=generator, dtype=torch.uint8)
     config = SundaeModelConfig(
         pruning=PruningConfig(**{"prune_at": 3, "keep_ratio": 0.5, **pruning}),
-        head=HeadConfig(size="tiny", num_features=5, pixel_unshuffle=1),
+        head=HeadConfig(mode="residual", size="tiny", num_features=5, pixel_unshuffle=1),
         camera_optimizer=CameraOptimizerConfig(mode="off"),
         sh_degree=1,
         num_downscales=0,

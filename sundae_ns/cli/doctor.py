@@ -10,7 +10,6 @@ import re
 import shlex
 import shutil
 import subprocess
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -33,7 +32,7 @@ class Finding:
     detail: str
     fix: str = ""
     """Command or advice that fixes it."""
-    needed: bool = True
+    needed: bool = False
     """Whether training needs it."""
 
 
@@ -44,7 +43,7 @@ def versions() -> list[Finding]:
         try:
             findings.append(Finding(package, True, metadata.version(package)))
         except metadata.PackageNotFoundError:
-            findings.append(Finding(package, False, "not installed", f"pip install {package}"))
+            findings.append(Finding(package, False, "not installed", f"pip install {package}", needed=True))
     return findings
 
 
@@ -53,14 +52,14 @@ def cuda() -> Finding:
     if torch.cuda.is_available():
         return Finding("CUDA", True, f"{torch.cuda.get_device_name(0)}, torch built for {torch.version.cuda}")
     if torch.version.cuda is None:
-        return Finding("CUDA", False, "this torch is built without CUDA", "pip install torch==2.11.0", needed=False)
+        return Finding("CUDA", False, "this torch is built without CUDA", "pip install torch==2.11.0")
     fix = (
         "apt-get install nvidia-driver (Ubuntu: ubuntu-drivers install), then reboot; nvidia-smi shows whether it works"
     )
     least = LEAST_DRIVERS.get(torch.version.cuda.partition(".")[0])
     if least:
         fix += f", and its version: this torch is built for CUDA {torch.version.cuda}, which needs {least} or newer"
-    return Finding("CUDA", False, "no device that torch can use", fix, needed=False)
+    return Finding("CUDA", False, "no device that torch can use", fix)
 
 
 def nvcc() -> Finding:
@@ -80,14 +79,14 @@ def nvcc() -> Finding:
     found = Path(in_path) if in_path and not home else Path(home or "/usr/local/cuda") / "bin" / "nvcc"
     if not found.is_file():
         where = f" in {found.parent}, the folder that CUDA_HOME names" if home else ""
-        return Finding("nvcc", False, f"not found{where}; {purpose}", fix, needed=False)
+        return Finding("nvcc", False, f"not found{where}; {purpose}", fix)
     if not in_path:  # gsplat calls nvcc by name before torch builds
         detail = f"{found} is not in PATH; {purpose}"
-        return Finding("nvcc", False, detail, f"export PATH={found.parent}:$PATH", needed=False)
+        return Finding("nvcc", False, detail, f"export PATH={found.parent}:$PATH")
     release = _release_of(found)
     if built and release.partition(".")[0] != built.partition(".")[0]:
         detail = f"{found} has CUDA {release or 'of unknown version'}, this torch is built for {built}; {purpose}"
-        return Finding("nvcc", False, detail, fix, needed=False)
+        return Finding("nvcc", False, detail, fix)
     return Finding("nvcc", True, f"{found} {release}, for gsplat's kernels")
 
 
@@ -117,17 +116,17 @@ def kernels(compile_kernels: bool) -> Finding:
     """Whether gsplat's kernels run; ``compile_kernels`` builds missing ones."""
     if not torch.cuda.is_available():
         fix = "sundae doctor --compile, once there is a CUDA device"
-        return Finding("gsplat kernels", False, "need a CUDA device", fix, needed=False)
+        return Finding("gsplat kernels", False, "need a CUDA device", fix)
     if not compile_kernels and not kernels_built():
         fix = "sundae doctor --compile (takes minutes; otherwise the first training step builds them)"
-        return Finding("gsplat kernels", False, "not built yet", fix, needed=False)
+        return Finding("gsplat kernels", False, "not built yet", fix)
     from sundae_ns.errors import BackendError
     from sundae_ns.rasterization import select_backend
 
     try:
         select_backend("gsplat", "cuda")
     except BackendError as error:
-        return Finding("gsplat kernels", False, str(error), "sundae doctor --compile", needed=False)
+        return Finding("gsplat kernels", False, str(error), "sundae doctor --compile")
     return Finding("gsplat kernels", True, "working")
 
 
@@ -135,7 +134,7 @@ def own_kernels() -> Finding:
     """Whether this package's kernels compile and load: neighbour search, the loss, and the fused parts of the head."""
     name = "our kernels"
     if not torch.cuda.is_available():
-        return Finding(name, False, "need a CUDA device", "nothing; a CPU uses equivalent code", needed=False)
+        return Finding(name, False, "need a CUDA device", "nothing; a CPU uses equivalent code")
     from sundae_ns.compensation import CompensationHead, HeadConfig, kernels
     from sundae_ns.errors import BackendError
     from sundae_ns.gpu import fused_loss, nvrtc
@@ -151,7 +150,7 @@ def own_kernels() -> Finding:
     except BackendError as error:
         cause, fix = str(error).rsplit(": ", 1)
         detail = f"{cause}: neighbours are searched on the CPU; head and SSIM run layer by layer"
-        return Finding(name, False, detail, fix, needed=False)
+        return Finding(name, False, detail, fix)
     return Finding(name, True, "working")
 
 
@@ -167,7 +166,7 @@ def rasterizer(kernels_finding: Finding) -> Finding:
     elif problem := numba_problem():
         cause, fix = problem.rsplit("; ", 1)
         detail = f"auto selects reference, in plain PyTorch; it is several times slower than cpu. {cause}"
-        return Finding("rasteriser", False, detail, fix, needed=False)
+        return Finding("rasteriser", False, detail, fix)
     else:
         return Finding(
             "rasteriser", True, "auto selects cpu, compiled by numba; it suits small scenes, a capture needs CUDA"
@@ -182,14 +181,14 @@ def lpips() -> Finding:
     if lpips_weights_available():
         return Finding("LPIPS weights", True, "on disk")
     fix = f"curl --location --create-dirs --output {shlex.quote(str(lpips_weights_path()))} {lpips_weights_url()}"
-    return Finding("LPIPS weights", False, "missing; metrics leave out LPIPS", fix, needed=False)
+    return Finding("LPIPS weights", False, "missing; metrics leave out LPIPS", fix)
 
 
 def system_library(name: str, package: str) -> Finding:
     """Whether a library is installed that open3d loads, and with it ns-export."""
     if ctypes.util.find_library(name):
         return Finding(f"lib{name}", True, "found, for ns-export")
-    return Finding(f"lib{name}", False, "not found; ns-export needs it", f"apt-get install {package}", needed=False)
+    return Finding(f"lib{name}", False, "not found; ns-export needs it", f"apt-get install {package}")
 
 
 def program(name: str, command: str, purpose: str) -> Finding:
@@ -203,26 +202,26 @@ def program(name: str, command: str, purpose: str) -> Finding:
     found = shutil.which(command)
     if found:
         return Finding(name, True, f"{found}, for {purpose}")
-    return Finding(name, False, f"not found, for {purpose}", f"apt-get install {command}", needed=False)
+    return Finding(name, False, f"not found, for {purpose}", f"apt-get install {command}")
 
 
 def examine(compile_kernels: bool = False) -> list[Finding]:
     """All findings, in the order of the report."""
     kernels_finding = kernels(compile_kernels)
-    findings: list[Callable[[], Finding]] = [
-        cuda,
-        nvcc,
-        lambda: kernels_finding,
-        own_kernels,
-        lambda: rasterizer(kernels_finding),
-        lpips,
-        lambda: system_library("usb-1.0", "libusb-1.0-0"),
-        lambda: system_library("GL", "libgl1"),
-        lambda: program("COLMAP", "colmap", "ns-process-data, which makes captures from images and videos"),
+    return [
+        *versions(),
+        cuda(),
+        nvcc(),
+        kernels_finding,
+        own_kernels(),
+        rasterizer(kernels_finding),
+        lpips(),
+        system_library("usb-1.0", "libusb-1.0-0"),
+        system_library("GL", "libgl1"),
+        program("COLMAP", "colmap", "ns-process-data, which makes captures from images and videos"),
         # ns-render requires it even if it writes only images.
-        lambda: program("ffmpeg", "ffmpeg", "ns-process-data and ns-render"),
+        program("ffmpeg", "ffmpeg", "ns-process-data and ns-render"),
     ]
-    return versions() + [finding() for finding in findings]
 
 
 def run_doctor(compile_kernels: bool = False, console: Console | None = None) -> int:

@@ -7,14 +7,15 @@ import gc
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NoReturn
 
 import tyro
 
-from sundae_ns.cli.bench import app as bench
+from sundae_ns.cli.bench import bench
 from sundae_ns.cli.files import export, prune
 from sundae_ns.cli.outputs import Overwrite, check_file, check_folder
 from sundae_ns.cli.packing import pack, unpack
@@ -34,11 +35,6 @@ ENVIRONMENT = {
 }
 """Variables of threads and memory; those that the user has set stay."""
 
-app = tyro.extras.SubcommandApp()
-app.command(bench, name="bench", help="Benchmark SUNDAE on this machine.")
-for command in (run, train, pack, unpack, export, view, render, prune):
-    app.command(command)
-
 
 def _loading() -> AbstractContextManager[object]:
     """Shows that a command imports its modules, which takes seconds."""
@@ -47,7 +43,6 @@ def _loading() -> AbstractContextManager[object]:
     return Console(stderr=True).status("Loading")
 
 
-@app.command
 def doctor(compile: bool = False) -> int:  # noqa: A002
     """Check this machine, and print the command that installs or repairs each missing part.
 
@@ -60,13 +55,12 @@ def doctor(compile: bool = False) -> int:  # noqa: A002
     return run_doctor(compile_kernels=compile)
 
 
-@app.command
 def demo(
     out: Annotated[Path, tyro.conf.Positional] = Path(".demo"),
     steps: int | None = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Train a small scene with ns-train, evaluate it with ns-eval, and print the results.
+    """Write the embedded capture, train it with ns-train, evaluate it with ns-eval, and print the results.
 
     Args:
         out: folder for the capture, the run and the images.
@@ -80,7 +74,6 @@ def demo(
     return run_demo(out, steps=steps)
 
 
-@app.command
 def report(
     runs: Annotated[list[Path], tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
@@ -94,7 +87,7 @@ def report(
     """Measure quality, speed and size of finished runs on their test views; write tables, plots and training curves.
 
     Args:
-        runs: runs of sundae or splatfacto (their folders or config.yml), and packed scenes. No code in them is executed.
+        runs: runs of sundae or splatfacto (their folders or config.yml), and packed scenes; no code in them runs.
         out: folder to write.
         data: folder of the capture, if it moved; packed scenes need it, because they do not record it.
         lpips_net: net of LPIPS, which is measured if its weights are on disk; values of different nets do not compare.
@@ -115,57 +108,59 @@ def report(
     return run_report(runs, out, data=data, lpips_net=lpips_net, warmup=warmup, repeats=repeats, video=video)
 
 
-@app.command
-def bands(
-    run: Annotated[Path, tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    keep_ratio: tuple[float, ...] = (0.01, 0.1, 0.3),
-    signal: Literal["positions", "attributes"] = "positions",
-    gamma: float = 0.5,
-    neighbors: int = 16,
-    bandwidth: Literal["robust", "literal"] = "robust",
-    view: int | None = None,
-    overwrite: Overwrite = False,
-) -> int:
-    """Show the primitives that the high-pass, low-pass and combined rules keep: point clouds, images and statistics.
+COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
+    "run": (run, "photos to a packed scene, its report and its web page; resumes"),
+    "train": (train, "train by ns-train, with short options"),
+    "prune": (prune, "make any splat scene smaller, without its photos"),
+    "pack": (pack, "pack a finished run into one file"),
+    "unpack": (unpack, "unpack a scene into a run, for the commands of nerfstudio"),
+    "export": (export, "write a scene as a web page, .ply, .spz or .sog"),
+    "view": (view, "show a scene with its head in the browser"),
+    "render": (render, "render a scene to a picture, or a camera path to a video"),
+    "report": (report, "measure and compare finished runs: quality, speed, size"),
+    "bench": (bench, "time the frames of a run"),
+    "demo": (demo, "train and evaluate the embedded capture; takes minutes on a CPU"),
+    "doctor": (doctor, "check this machine, and say how to repair it"),
+}
+"""Commands with their lines in ``sundae --help``, which fits one screen."""
+
+
+def _help() -> str:
+    lines = ["usage: sundae COMMAND ...", "", "Small 3D Gaussian scenes by pruning and a compensation head.", ""]
+    lines += [f"  {name:<8} {line}" for name, (_, line) in COMMANDS.items()]
+    return "\n".join([*lines, "", "sundae COMMAND --help shows the options of a command."])
+
+
+def _dispatch(words: Sequence[str]) -> int:
+    """Run the command that the words name; its exit code."""
+    if words[:1] in (["-h"], ["--help"]):
+        print(_help())
+        return 0
+    if not words:
+        raise ConfigError("no command is given; sundae --help lists them")
+    if words[0] not in COMMANDS:
+        near = get_close_matches(words[0], COMMANDS, n=1)
+        raise ConfigError(f"there is no command {words[0]}; {f'use {near[0]}' if near else 'sundae --help lists them'}")
+    return tyro.cli(COMMANDS[words[0]][0], prog=f"sundae {words[0]}", args=words[1:])
+
+
+def exit_with(command: Callable[[], int], name: str) -> NoReturn:
+    """Run a command and exit with its code.
+
+    A :class:`SundaeError` is printed on one line, and the code is 2. An interrupt is 130.
 
     Args:
-        run: a run of sundae or splatfacto (its folder, config.yml or a checkpoint), or a 3DGS .ply file.
-        out: folder to write; created if missing.
-        keep_ratio: shares of the primitives to keep, each in (0, 1].
-        signal: graph signal to filter: positions, as in the paper, or position, colour, opacity and size.
-        gamma: share of the kept primitives that the combined rule takes from the largest responses.
-        neighbors: maximum number of neighbours of a primitive in the graph.
-        bandwidth: rule that sets radius and width of the graph's edge weights; literal is the paper's.
-        view: index of the training view to draw; by default the one with the most primitives.
-        overwrite: replace the files of an earlier command in the folder.
+        command: returns the code.
+        name: of the command, for errors of the file system.
     """
-    check_folder(out, reads=[run], overwrite=overwrite)
-    with _loading():
-        from sundae_ns.cli.bands import run_bands
-        from sundae_ns.pruning import PruneRule
-
-    rule = PruneRule(signal=signal, gamma=gamma, num_neighbors=neighbors, bandwidth=bandwidth)
-    return run_bands(run, out, shares=keep_ratio, rule=rule, view=view)
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run ``sundae``; a :class:`SundaeError` is printed on one line, and the exit code is 2."""
-    words = sys.argv[1:] if arguments is None else arguments
-    # Before torch is loaded, and for the commands that these run.
-    for name, value in ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
-    if arguments is None:  # the process is the command's own
-        # Imports make a million objects that stay. To look for garbage among them takes a sixth of the start, and 0.6 s of
-        # the end.
-        gc.set_threshold(100_000)
-        atexit.register(gc.freeze)
+    for variable, value in ENVIRONMENT.items():
+        os.environ.setdefault(variable, value)
     try:
         # Commands name the file that they cannot write; this covers the rest, such as a full disk behind stdout.
-        with warnings.catch_warnings(), writing(f"{' '.join(words[:1])} ended early"):
+        with warnings.catch_warnings(), writing(f"{name} ended early"):
             # Warnings of nerfstudio's imports, which users of sundae cannot fix.
             warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
-            code = app.cli(prog="sundae", description="SUNDAE for nerfstudio.", args=words)
+            code = command()
             sys.stdout.flush()
     except SundaeError as error:
         if os.environ.get("SUNDAE_TRACEBACK"):
@@ -178,4 +173,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("sundae: interrupted", file=sys.stderr)
         sys.exit(130)
-    sys.exit(code or 0)
+    sys.exit(code)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run ``sundae``."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:  # the process is the command's own
+        # Imports make a million objects that stay. To look for garbage among them takes a sixth of the start, and 0.6 s
+        # of the end.
+        gc.set_threshold(100_000)
+        atexit.register(gc.freeze)
+    exit_with(lambda: _dispatch(words), " ".join(words[:1]))

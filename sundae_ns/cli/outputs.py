@@ -58,24 +58,6 @@ def check_folder(out: Path, *, reads: Iterable[Path | None], overwrite: bool) ->
         raise StorageError(f"{out} holds files; choose another folder, or replace its files with --overwrite")
 
 
-def check_comparison(out: Path, *, reads: Iterable[Path]) -> None:
-    """Refuse a folder for the jobs and tables of a comparison that is something else, or belongs to what is compared.
-
-    Args:
-        out: the folder; a comparison that it holds goes on there.
-        reads: captures, or folders of captures.
-
-    Raises:
-        StorageError: the folder may not be written.
-    """
-    check_folder(out, reads=(), overwrite=True)
-    if any(_contains(out, path) or _contains(path, out) for path in reads):
-        raise StorageError(f"{out} belongs to what the command reads; choose another folder")
-    begun = any((out / name).is_dir() for name in ("jobs", "done")) or any(out.glob("*.jsonl"))
-    if out.is_dir() and any(out.iterdir()) and not begun:
-        raise StorageError(f"{out} holds files of something else; choose another folder")
-
-
 def _contains(outer: Path, inner: Path) -> bool:
     """Whether a path is another one, or lies in that folder; links count as what they point to."""
     return inner.resolve().is_relative_to(outer.resolve())

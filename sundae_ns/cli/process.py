@@ -35,8 +35,7 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
     Raises:
         SundaeError: the command failed; the message ends with the last lines of its output.
     """
-    # With the safe path, `python -m` does not import a sundae_ns from the current folder.
-    environment = {**os.environ, "COLUMNS": "160", "PYTHONSAFEPATH": "1"}
+    environment = {**os.environ, "COLUMNS": "160"}
     last: deque[str] = deque(maxlen=_TAIL)
     with open(log, "w", encoding="utf-8") as file:
         process = subprocess.Popen(

@@ -16,7 +16,7 @@ import tyro
 
 from sundae_ns.cli.outputs import check_folder
 from sundae_ns.cli.process import run_in_group
-from sundae_ns.cli.train import Method, command
+from sundae_ns.cli.train import command
 from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 
 Matching = Literal["exhaustive", "sequential", "vocab_tree"]
@@ -52,7 +52,7 @@ class Project:
     photos: Path
     """Folder of photos, or a capture."""
     out: Path
-    method: Method
+    method: str
     keep: float | None
     steps: int | None
     matching: Matching
@@ -80,25 +80,17 @@ class Project:
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
         evaluated, packed, page = self.out / "eval.json", self.out / "scene.sundae", self.out / "report" / "report.md"
-        web = self.out / "scene.html"
-        config = str(self.run / "config.yml")
-        data = ["--data", str(self.capture)]
+        web, config, data = self.out / "scene.html", self.run / "config.yml", ("--data", self.capture)
+
+        def step(name: str, result: Path, *words: object) -> Step:
+            return Step(name, lambda: list(map(str, words)), result.is_file, result)
+
         steps = [
             Step("train", self.train, self.trained),
-            Step(
-                "evaluate",
-                lambda: ["ns-eval", "--load-config", config, "--output-path", str(evaluated)],
-                evaluated.is_file,
-                evaluated,
-            ),
-            Step("pack", lambda: ["sundae", "pack", str(self.run), "-o", str(packed), *data], packed.is_file, packed),
-            Step(
-                "report",
-                lambda: ["sundae", "report", str(self.run), str(packed), *data, "-o", str(page.parent), "--overwrite"],
-                page.is_file,
-                page,
-            ),
-            Step("web page", lambda: ["sundae", "export", str(packed), "-o", str(web)], web.is_file, web),
+            step("evaluate", evaluated, "ns-eval", "--load-config", config, "--output-path", evaluated),
+            step("pack", packed, "sundae", "pack", self.run, "-o", packed, *data),
+            step("report", page, "sundae", "report", self.run, packed, *data, "-o", page.parent, "--overwrite"),
+            step("web page", web, "sundae", "export", packed, "-o", web),
         ]
         if self.capture != self.photos:
             posed = self.capture / "transforms.json"
@@ -107,6 +99,11 @@ class Project:
                 Step("largest model", self.poses_of_largest, self.is_largest, check=self.check_poses),
             ]
         return steps
+
+    def process_photos(self, *options: str) -> list[str]:
+        """Command that finds the camera poses, or reads them from one of COLMAP's models."""
+        words = ["ns-process-data", "images", "--data", str(self.photos), "--output-dir", str(self.capture)]
+        return [*words, *options]
 
     def poses(self) -> list[str]:
         """Command that finds the camera poses.
@@ -120,8 +117,7 @@ class Project:
                     f"{program} is not installed, which {purpose}; install it with `apt-get install {program}`, "
                     "or give a capture with poses"
                 )
-        words = ["ns-process-data", "images", "--data", str(self.photos), "--output-dir", str(self.capture)]
-        return [*words, "--matching-method", self.matching, *([] if _colmap_uses_gpu() else ["--no-gpu"])]
+        return self.process_photos("--matching-method", self.matching, *([] if _colmap_uses_gpu() else ["--no-gpu"]))
 
     def largest(self) -> Path:
         """Folder of the COLMAP model with the most photos; COLMAP makes several if it cannot join them into one."""
@@ -141,9 +137,8 @@ class Project:
 
     def poses_of_largest(self) -> list[str]:
         """Command that replaces the poses by those of the largest model."""
-        words = ["ns-process-data", "images", "--data", str(self.photos), "--output-dir", str(self.capture)]
-        model = self.largest().relative_to(self.capture)
-        return [*words, "--skip-image-processing", "--skip-colmap", "--colmap-model-path", str(model)]
+        model = str(self.largest().relative_to(self.capture))
+        return self.process_photos("--skip-image-processing", "--skip-colmap", "--colmap-model-path", model)
 
     def placed(self) -> int:
         """Number of photos with a pose."""
@@ -203,15 +198,15 @@ class Project:
         for name, value in settings.items():
             if before.get(name) != value:
                 raise ConfigError(
-                    f"{self.out} was made with {name} {_shown(before.get(name))}, not {_shown(value)}; repeat the first "
-                    "command, or choose another folder"
+                    f"{self.out} was made with {name} {_shown(before.get(name))}, not {_shown(value)}; "
+                    "repeat the first command, or choose another folder"
                 )
 
 
 def run(
     photos: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    method: Method = "sundae",
+    method: str = "sundae",
     keep: float | None = None,
     steps: int | None = None,
     matching: Matching = "exhaustive",
@@ -224,7 +219,7 @@ def run(
     Args:
         photos: folder of photos, or a capture, which has poses already.
         out: folder for the capture, the run, eval.json, scene.sundae, scene.html and the report; created if missing.
-        method: method of ns-train; sundae-tiny suits small images and a CPU.
+        method: as of sundae train; sundae-tiny suits small images and a CPU.
         keep: share of the primitives to keep, in (0, 1]; by default that of the method.
         steps: number of training steps; by default that of the method.
         matching: photos that COLMAP compares: all pairs, neighbours by name (for frames of a video), or similar ones

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import os
 import shlex
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from sundae_ns.cli.process import console_script
 from sundae_ns.errors import ConfigError, DataError
 
-Method = Literal["sundae", "sundae-auto", "sundae-paper", "sundae-tiny"]
+
+def methods() -> list[str]:
+    """Names of this package's methods in ``ns-train``."""
+    points = entry_points(group="nerfstudio.method_configs")
+    return sorted(point.name for point in points if point.value.startswith("sundae_ns."))
 
 
 def train(
     capture: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs"),
-    method: Method = "sundae",
+    method: str = "sundae",
     keep: float | None = None,
     steps: int | None = None,
 ) -> int:
@@ -27,7 +32,7 @@ def train(
     Args:
         capture: folder of the capture, as ns-process-data writes it.
         out: folder of runs.
-        method: method of ns-train; sundae-tiny suits small images and a CPU.
+        method: one of sundae, sundae-fast, -auto, -continuous, -paper; sundae-tiny suits small images and a CPU.
         keep: share of the primitives to keep, in (0, 1]; by default that of the method.
         steps: number of training steps; by default that of the method.
     """
@@ -37,15 +42,17 @@ def train(
     os.execvp(console_script(words[0]), words)
 
 
-def command(capture: Path, out: Path, method: Method, keep: float | None, steps: int | None) -> list[str]:
+def command(capture: Path, out: Path, method: str, keep: float | None, steps: int | None) -> list[str]:
     """The words of the command; options as in :func:`train`.
 
     Raises:
-        ConfigError: a number is out of range, or the method does not take a share.
+        ConfigError: there is no such method, a number is out of range, or the method does not take a share.
         DataError: the capture does not exist.
     """
     if not capture.exists():
         raise DataError(f"{capture} does not exist; give the folder of a capture")
+    if method not in methods():
+        raise ConfigError(f"{method} is no method of sundae; use one of {', '.join(methods())}")
     if keep is not None and not 0 < keep <= 1:
         raise ConfigError(f"keep is {keep}; give a share in (0, 1]")
     if keep is not None and method == "sundae-auto":

@@ -52,10 +52,10 @@ PRECISIONS = {"fp32": torch.float32, "bf16": torch.bfloat16, "fp16": torch.float
 class HeadConfig:
     """Architecture and arithmetic of the compensation head."""
 
-    mode: Literal["auto", "residual", "features", "off"] = "residual"
-    """auto: residual, if held-out training views show after a short trial that it pays, else off. residual: the head adds a
-    correction to the spherical-harmonics image, which remains usable alone. features: the paper's, the head alone makes the
-    image from splatted features, over the background. off: no head."""
+    mode: Literal["auto", "residual", "features", "off"] = "auto"
+    """auto: residual, if held-out training views show after a short trial that it pays, else off. residual: the head
+    adds a correction to the spherical-harmonics image, which remains usable alone. features: the paper's, the head
+    alone makes the image from splatted features, over the background. off: no head."""
     size: Literal["tiny", "compact", "wide", "small", "regular", "large"] = "wide"
     """Width of the U-Net: 0.5, 2, 2.5, 7.8, 31 or 124 MB in fp32. The last three are the paper's, whose default is
     regular; compact is small with at most 64 channels per level, wide has 64 on each."""
@@ -107,7 +107,7 @@ class CompensationHead(nn.Module):
     """Computes the compensated image (``I_hat = Phi(F)`` of the paper, and our residual variant).
 
     Args:
-        config: mode, size and arithmetic; modes off and auto are refused.
+        config: mode, size and arithmetic; mode auto makes a residual head, off is refused.
 
     Raises:
         ConfigError: the configuration is invalid.
@@ -118,9 +118,10 @@ class CompensationHead(nn.Module):
         self._build(config)
 
     def _build(self, config: HeadConfig) -> None:
+        config = config.resolved
         config.validate()
-        if config.mode in ("off", "auto"):
-            raise ConfigError(f"head.mode is {config.mode}, which is no compensation head; choose residual or features")
+        if config.mode == "off":
+            raise ConfigError("head.mode is off, which is no compensation head; choose residual or features")
         self.config = config
         # The residual head sees the colours and the accumulation beside the features.
         in_channels = config.num_features + (4 if config.mode == "residual" else 0)

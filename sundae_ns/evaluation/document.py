@@ -59,7 +59,7 @@ def document(
         f"  (11 x 11 window, no padding), FLIP is {VARIANT}, and LPIPS names its net.",
         "- Higher PSNR and SSIM are better; lower FLIP, LPIPS, ms and MB are better.",
         "- ms per frame is the median over the test views, synchronised with the device.",
-        "- MB are 1e6 bytes in fp32 of all that the configuration needs: with the head off, neither network nor features.",
+        "- MB are 1e6 bytes in fp32 of all that the configuration needs: no network or features if the head is off.",
         "  For a packed scene it is the whole file.",
         "",
     ]
@@ -76,8 +76,8 @@ def document(
         lines.append("")
     if any(run.has_head for run in runs):
         lines += [
-            "With the head off, the same field shows its base colours, although it was trained with a head. A field that is",
-            "trained without a head is another run; `sundae bench quality` trains and measures one.",
+            "With the head off, the same field shows its base colours, although it was trained with a head. To train a",
+            "field without a head is another run, with `--pipeline.model.head.mode off`.",
             "",
         ]
     if notes:

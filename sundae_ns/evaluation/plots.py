@@ -1,4 +1,4 @@
-"""Plots of a report. Each function draws the runs that it is given and writes one file, without global matplotlib state."""
+"""Plots of a report. Each function draws its runs and writes one file, without matplotlib's global state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from sundae_ns.evaluation.colors import PALETTE
 from sundae_ns.evaluation.measured import HEAD_ON, MEGABYTE, Configuration, Measured
 
 if TYPE_CHECKING:
@@ -23,6 +22,8 @@ if TYPE_CHECKING:
 Cost = Literal["size", "time", "primitives"]
 
 DPI = 110
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""Six colours that people with colour-vision deficiency can tell apart (Okabe and Ito, "Color Universal Design")."""
 MOST_SERIES = len(PALETTE)
 """Most runs in a plot whose lines only their colour tells apart."""
 _GRAY = "0.35"

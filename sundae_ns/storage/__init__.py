@@ -8,7 +8,6 @@ from sundae_ns.storage.point_cloud import (
     is_nerfstudio_ply,
     ply_comments,
     read_point_cloud,
-    write_point_cloud,
 )
 from sundae_ns.storage.sog import write_sog
 from sundae_ns.storage.spz import write_spz
@@ -27,7 +26,6 @@ __all__ = [
     "replacing",
     "similarity",
     "write_ply",
-    "write_point_cloud",
     "write_sog",
     "write_spz",
     "write_text",

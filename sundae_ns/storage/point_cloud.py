@@ -1,17 +1,13 @@
-"""Point clouds as .ply files, and the coordinate frame that a .ply states."""
+"""Point clouds of .ply files, and the coordinate frame that a .ply states."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import torch
-from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.errors import DataError, regular
-from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.ply import MAX_HEADER, load_ply, stack_columns
 
 MODEL_FRAME = "Coordinates: nerfstudio model"
@@ -42,33 +38,6 @@ def read_point_cloud(path: Path) -> tuple[Tensor, Tensor]:
         return points, torch.full_like(points, _GREY, dtype=torch.uint8)
     scale = 255 if kinds["red"] == "f" else 1
     return points, (stack_columns(vertex, channels) * scale).round().clamp(0, 255).to(torch.uint8)
-
-
-def write_point_cloud(
-    path: Path, points: Tensor, colors: Tensor, *, scalars: Mapping[str, Tensor] | None = None
-) -> None:
-    """Write coloured points as a binary .ply, atomically.
-
-    Args:
-        path: the file; its folder must exist.
-        points: positions ``[N, 3]``, stored as float32.
-        colors: ``[N, 3]`` uint8.
-        scalars: further properties by name, each ``[N]``, stored as float32.
-
-    Raises:
-        DataError: a tensor has the wrong shape.
-        StorageError: the disk is full or not writable.
-    """
-    n = len(points)
-    columns = {**dict(zip("xyz", points.T)), **dict(zip(("red", "green", "blue"), colors.T)), **(scalars or {})}
-    if points.shape != (n, 3) or colors.shape != (n, 3) or any(column.shape != (n,) for column in columns.values()):
-        shapes = ", ".join(str(list(value.shape)) for value in (points, colors, *(scalars or {}).values()))
-        raise DataError(f"points, colours and scalars have shapes {shapes}; pass [N, 3], [N, 3] and [N] each")
-    vertices = np.empty(n, [(name, "u1" if name in ("red", "green", "blue") else "<f4") for name in columns])
-    for name, column in columns.items():
-        vertices[name] = column.detach().cpu().numpy()
-    with replacing(path) as partial:
-        PlyData([PlyElement.describe(vertices, "vertex")], text=False, byte_order="<").write(str(partial))
 
 
 def ply_comments(path: Path) -> list[str]:

@@ -72,10 +72,3 @@ def test_an_interrupt_leaves_no_process_behind(tmp_path: Path) -> None:
         run_logged([sys.executable, "-c", code], tmp_path / "log.txt", interrupt)
     with pytest.raises(ProcessLookupError):
         os.kill(pids[0], 0)
-
-
-def test_a_folder_named_like_a_package_does_not_replace_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "json").mkdir()
-    (tmp_path / "json" / "__init__.py").write_text("raise RuntimeError")
-    monkeypatch.chdir(tmp_path)
-    run_logged([sys.executable, "-m", "json.tool", "--help"], tmp_path / "log")

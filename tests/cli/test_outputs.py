@@ -77,7 +77,6 @@ def test_no_command_writes_onto_its_input(
         (["prune", "a.ply", "--keep", "0.5"], "out.ply"),
         (["export", "a.ply"], "out.spz"),
         (["export", "a.sundae"], "out.ply"),
-        (["bands", "a.ply"], "out"),
     ],
 )
 def test_an_existing_output_needs_overwrite(here: Path, refused: Refused, words: list[str], out: str) -> None:
@@ -89,7 +88,7 @@ def test_an_existing_output_needs_overwrite(here: Path, refused: Refused, words:
     assert all(path.stat().st_mtime_ns > earlier for path, earlier in first.items() if path.is_file())
 
 
-@pytest.mark.parametrize("command", ["demo", "report", "bands"])
+@pytest.mark.parametrize("command", ["demo", "report"])
 def test_folders_with_files_need_overwrite(here: Path, refused: Refused, command: str) -> None:
     (here / "mine").mkdir()
     (here / "mine" / "thesis.txt").write_text("years of work")
@@ -99,8 +98,7 @@ def test_folders_with_files_need_overwrite(here: Path, refused: Refused, command
 
 
 def test_a_folder_that_holds_the_input_is_no_output(here: Path, refused: Refused) -> None:
-    for command in ("bands", "report"):
-        assert "holds what the command reads" in refused(command, "a.ply", "-o", ".", "--overwrite")
+    assert "holds what the command reads" in refused("report", "a.ply", "-o", ".", "--overwrite")
 
 
 def test_parts_of_a_run_are_no_output(here: Path) -> None:
@@ -136,12 +134,9 @@ def test_only_files_and_folders_are_replaced(here: Path) -> None:
         ["export", "run", "-o", "x.spz"],
         ["pack", "in", "-o", "x.sundae"],
         ["unpack", "in"],
-        ["bands", "in", "-o", "x"],
-        ["bands", "run", "-o", "x"],
         ["report", "in", "-o", "x"],
         ["report", "run", "-o", "x"],
         ["bench", "frame", "--load-config", "in"],
-        ["bench", "flicker", "--load-config", "in"],
     ],
 )
 @pytest.mark.parametrize("kind", ["pipe", "device"])
@@ -166,7 +161,6 @@ def test_what_is_no_file_is_refused_at_once(here: Path, refused: Refused, words:
         ["export", "a.ply", "-o", LONG + ".spz"],
         ["pack", LONG, "-o", "x.sundae"],
         ["demo", LONG],
-        ["bands", "a.ply", "-o", LONG],
         ["report", LONG, "-o", "x"],
     ],
 )
@@ -204,7 +198,6 @@ def test_a_full_disk_is_one_line(here: Path, full: Path, refused: Refused) -> No
     for words in (
         ["demo", full / "demo"],
         ["prune", "a.ply", "--keep", "0.9", "-o", full / "a.ply"],
-        ["bands", "a.ply", "-o", full / "bands"],
     ):
         line = refused(*words)
         assert "disk is full" in line
@@ -249,7 +242,6 @@ def test_a_reader_of_stdout_that_has_left_is_no_error(here: Path, unbuffered: st
         ["export", "a.ply", "-o", "x.spz"],
         ["export", "run", "-o", "x.ply"],
         ["prune", "a.ply", "-o", "x.ply"],
-        ["bands", "a.ply", "-o", "x"],
     ],
 )
 def test_commands_on_fields_import_no_nerfstudio(here: Path, words: list[str]) -> None:

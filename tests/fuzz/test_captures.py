@@ -481,7 +481,7 @@ def train_a_step(data: Path) -> None:
     metadata = datamanager.train_dataset.metadata
     points = metadata.get("points3D_xyz")
     config = SundaeModelConfig(
-        head=HeadConfig(size="tiny"),
+        head=HeadConfig(mode="residual", size="tiny"),
         camera_optimizer=CameraOptimizerConfig(mode="off"),
         sh_degree=1,
         num_random=50,

@@ -1,4 +1,4 @@
-"""``sundae bands`` on a finished run, from the cameras that nerfstudio gives to it."""
+"""``bands.py`` on a finished run, from the cameras that nerfstudio gives to it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from bands import bands
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from sundae_ns.cli import main
+from sundae_ns.errors import ConfigError
 from sundae_ns.scenes.cameras import training_cameras
 
 
@@ -28,9 +29,7 @@ def test_cameras_are_those_of_the_run(tiny: Any) -> None:
 
 @pytest.mark.parametrize("what", ["folder", "config", "checkpoints"])
 def test_points_lie_where_the_run_renders_them(tiny: Any, tmp_path: Path, what: str) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["bands", str(getattr(tiny, what)), "-o", str(tmp_path), "--keep-ratio", "0.5", "--view", "2"])
-    assert caught.value.code == 0
+    assert bands(getattr(tiny, what), tmp_path, keep_ratio=(0.5,), view=2) == 0
     result = json.loads((tmp_path / "bands.json").read_text())
     assert result["seen_from"] == "training view 2"
     assert result["primitives"] == result["bands"][0]["kept"]["high"] + result["bands"][0]["kept"]["low"]
@@ -39,8 +38,6 @@ def test_points_lie_where_the_run_renders_them(tiny: Any, tmp_path: Path, what: 
         assert len(np.unique(np.asarray(sheet).reshape(-1, 3), axis=0)) > 100
 
 
-def test_a_view_that_is_not_there(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["bands", str(tiny.folder), "-o", str(tmp_path), "--view", "12"])
-    assert caught.value.code == 2
-    assert "the run has 12, from 0 on" in capsys.readouterr().err
+def test_a_view_that_is_not_there(tiny: Any, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="the run has 12, from 0 on"):
+        bands(tiny.folder, tmp_path, view=12)

@@ -21,7 +21,6 @@ from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import Measured, psnr
 from sundae_ns.rendering import render, zoomed
-from sundae_ns.scenes.flicker import FRAMES, measure_flicker
 from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, rendered_as, sizes
 from sundae_ns.scenes.opening import Opened, load_run
 
@@ -222,46 +221,6 @@ def test_bench_frame_prints_null_for_undefined_figures(tiny: Any, capsys: pytest
     shown = capsys.readouterr().out
     assert "nan" not in shown
     assert "10x" in shown
-
-
-def test_bench_flicker_compares_the_head_with_base_colours(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["bench", "flicker", "--load-config", str(tiny.folder), "--places", "1"]
-    with pytest.raises(SystemExit) as caught:
-        main([*arguments, "--phases", "1", "4", "--json"])
-    assert caught.value.code == 0
-    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [(line["phases"], line["frames_apart"]) for line in lines] == [(1, 1), (1, 7), (4, 1), (4, 7)]
-    # One least for all rows, so that they compare.
-    for name in ("mse_base", "excess_base", "seen", "paths"):
-        assert [line[name] for line in lines[:2]] == [line[name] for line in lines[2:]]
-    assert lines[0]["paths"] == 1
-    assert lines[0]["mse"] != lines[2]["mse"]
-    for line in lines:
-        assert 0 < line["seen"] < 1
-        assert 0 < line["excess"] < line["mse"]
-        assert 0 < line["excess_base"] < line["mse_base"]
-        assert line["ratio"] == pytest.approx(line["excess"] / line["excess_base"])
-    with pytest.raises(SystemExit):
-        main(arguments)
-    assert "head / base" in capsys.readouterr().out
-
-
-def test_flicker_says_how_many_paths_there_were(tiny: Any) -> None:
-    run = load_run(tiny.config)
-    cameras = len(run.datamanager.train_dataset.cameras)
-    frames = []
-    found = measure_flicker(run, places=10 * cameras, progress=lambda: frames.append(1))
-    assert {one.paths for one in found} == {len(frames) / FRAMES}
-    assert 1 < found[0].paths <= cameras
-
-
-def test_flicker_needs_a_head_and_a_path(tiny: Any) -> None:
-    run = load_run(tiny.config)
-    with pytest.raises(ConfigError, match="at 0 places"):
-        measure_flicker(run, places=0)
-    run.model.state.head_starts_at = 10**9
-    with pytest.raises(ConfigError, match="has no head"):
-        measure_flicker(run)
 
 
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:

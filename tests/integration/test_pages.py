@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import runpy
 import shlex
 import shutil
+import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +24,11 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 ELSEWHERE = {
     "run PHOTOS": "trains 30,000 steps after COLMAP; test_run.py runs it with fewer, and poses from elsewhere",
     "train CAPTURE": "becomes ns-train, in place of this process; cli/test_train.py reads its command",
-    "bench quality": "trains a dozen runs; test_bench_quality.py runs it with two short ones",
-    "bench suite": "trains every method on every capture; cli/test_bench_suite.py runs it with jobs of its own",
-    "bench pape": "needs the archives of the paper's captures; cli/test_bench_quality.py reads its plan",
+    "python benchmarks/quality.py": "trains a dozen runs; test_comparisons.py runs it with two short ones",
+    "python benchmarks/suite.py": "trains every method on every capture; test_comparisons.py trains one method",
+    "python benchmarks/paper.py": "needs the archives of the paper's captures; test_comparisons.py makes two",
     "view scene.sundae": "serves until Ctrl-C; cli/test_view.py serves a page, and opens and ends it",
-    "report DIR/jobs/": "its runs are those of sundae bench quality; test_report.py reports on several runs",
+    "report DIR/jobs/": "its runs are those of a comparison; test_report.py reports on several runs",
     "ns-process-data images": "needs COLMAP; cli/test_run.py reads the same command of sundae run",
     "ns-train sundae --machine.num-devices 2": "needs two GPUs; distributed/test_whole_runs.py trains on two",
 }
@@ -35,10 +38,13 @@ SHORTER = {"--finetune": "2", "--view": "2", "--width": "32", "--height": "24", 
 """Values that suit a small run and a small scene."""
 
 
-def lines_of(page: Path, program: str = "sundae ") -> list[str]:
-    """Commands of programs whose name starts so, in indented blocks."""
+OURS = ("sundae ", "python benchmarks/")
+
+
+def lines_of(page: Path, *programs: str) -> list[str]:
+    """Commands that start so, in indented blocks."""
     lines = page.read_text(encoding="utf-8").replace("\\\n", " ").splitlines()
-    return [line.strip() for line in lines if line.startswith(f"    {program}")]
+    return [line.strip() for line in lines if line.startswith(tuple(f"    {program}" for program in programs))]
 
 
 def elsewhere(line: str) -> list[str]:
@@ -46,8 +52,8 @@ def elsewhere(line: str) -> list[str]:
     return [start for start in ELSEWHERE if line.removeprefix("sundae ").startswith(start)]
 
 
-def commands_of(page: Path, program: str = "sundae ") -> Iterator[list[str]]:
-    for line in lines_of(page, program):
+def commands_of(page: Path, *programs: str) -> Iterator[list[str]]:
+    for line in lines_of(page, *programs or OURS):
         if not elsewhere(line):
             words = [NAMES.get(word, word.replace("$RUN", "RUN")) for word in shlex.split(line, comments=True)]
             for option, value in SHORTER.items():
@@ -62,17 +68,19 @@ def test_commands_run_as_they_stand(page: Path, tiny: Any, tmp_path: Path, monke
     shutil.copytree(tiny.folder, "RUN")
     shutil.copytree(tiny.scene, "CAPTURE")
 
-    def run(*words: str) -> None:
+    def run(program: str, *words: str) -> None:
+        script = partial(runpy.run_path, str(ROOT / words[0]), run_name="__main__")
+        monkeypatch.setattr(sys, "argv", [*words])
         with pytest.raises(SystemExit) as caught:
-            main(words)
+            script() if program == "python" else main(words)
         assert caught.value.code == 0, words
 
-    run("export", "RUN", "-o", "other.ply")
+    run("sundae", "export", "RUN", "-o", "other.ply")
     commands = list(commands_of(page))
     if not any(words[1] == "pack" and "scene.sundae" in words for words in commands):  # then another page has made it
-        run("pack", "RUN", "-o", "scene.sundae")
+        run("sundae", "pack", "RUN", "-o", "scene.sundae")
     for words in commands:
-        run(*words[1:])
+        run(*words)
 
 
 def test_nothing_is_left_out_without_need() -> None:

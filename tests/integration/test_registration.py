@@ -11,6 +11,7 @@ import pytest
 import yaml
 from nerfstudio.plugins.types import MethodSpecification
 
+from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.model import SundaeModel
 
@@ -78,6 +79,12 @@ def test_rule_of_pruning(name: str) -> None:
     paper = ("response", "band", "none", "centres", "positions")
     expected = paper if name == "sundae-paper" else default
     assert tuple(getattr(pruning, option) for option in PRUNING) == expected
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_the_head_is_undecided_unless_a_method_says_otherwise(name: str) -> None:
+    modes = {"sundae-auto": "residual", "sundae-paper": "features", "sundae-tiny": "residual"}
+    assert ours()[name].config.pipeline.model.head.mode == modes.get(name, HeadConfig().mode)
 
 
 def test_methods_share_no_objects() -> None:

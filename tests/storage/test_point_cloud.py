@@ -4,7 +4,7 @@ import torch
 from plyfile import PlyData, PlyElement
 
 from sundae_ns.errors import DataError
-from sundae_ns.storage import MODEL_FRAME, is_nerfstudio_ply, read_point_cloud, write_point_cloud
+from sundae_ns.storage import MODEL_FRAME, is_nerfstudio_ply, read_point_cloud
 
 XYZ = np.array([[0.5, -1.25, 2.0], [3.0, 4.0, -5.5]], np.float32)
 RGB = np.array([[0, 128, 255], [10, 20, 30]], np.uint8)
@@ -56,24 +56,3 @@ def test_frame_of_the_coordinates(tmp_path):
     assert not is_nerfstudio_ply(_header(path, f"comment not {MODEL_FRAME}"))
     assert not is_nerfstudio_ply(_header(path, f"comment {MODEL_FRAME}", magic="txt"))
     assert not is_nerfstudio_ply(tmp_path / "gone.ply")
-
-
-def test_round_trip(tmp_path):
-    path, points, rgb = tmp_path / "a.ply", torch.from_numpy(XYZ), torch.from_numpy(RGB)
-    write_point_cloud(path, points, rgb, scalars={"response": torch.tensor([0.25, -1.0], dtype=torch.float64)})
-    found = read_point_cloud(path)
-    assert torch.equal(found[0], points)
-    assert torch.equal(found[1], rgb)
-    vertex = PlyData.read(str(path))["vertex"]
-    assert vertex["response"].tolist() == [0.25, -1.0]
-    assert [prop.name for prop in vertex.properties] == ["x", "y", "z", "red", "green", "blue", "response"]
-    write_point_cloud(path, points[:0], rgb[:0])
-    assert read_point_cloud(path)[0].shape == (0, 3)
-
-
-@pytest.mark.parametrize("shapes", [((2, 2), (2, 3), (2,)), ((2, 3), (3, 3), (2,)), ((2, 3), (2, 3), (1,))])
-def test_wrong_shapes_are_not_written(tmp_path, shapes):
-    points, rgb, scalar = (torch.zeros(shape) for shape in shapes)
-    with pytest.raises(DataError, match="have shapes"):
-        write_point_cloud(tmp_path / "a.ply", points, rgb.byte(), scalars={"s": scalar})
-    assert not list(tmp_path.iterdir())

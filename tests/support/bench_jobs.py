@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
-from sundae_ns.cli.bench.plan import Job, done_file
+from harness.plan import Job, done_file
 from sundae_ns.errors import SundaeError
 from sundae_ns.evaluation import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality
 

@@ -40,7 +40,9 @@ def _build(
 ) -> SundaeModel:
     config = SundaeModelConfig(
         pruning=PruningConfig(**{"prune_at": 3, "keep_ratio": 0.5, **(pruning or {})}),
-        head=HeadConfig(**{"size": "tiny", "num_features": 5, "pixel_unshuffle": 1, **(head or {})}),
+        head=HeadConfig(
+            **{"mode": "residual", "size": "tiny", "num_features": 5, "pixel_unshuffle": 1, **(head or {})}
+        ),
         camera_optimizer=CameraOptimizerConfig(mode="off"),
         **{"sh_degree": 1, "sh_degree_interval": 1, "num_downscales": 0, "background_color": "random", **options},
     )

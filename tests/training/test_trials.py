@@ -9,7 +9,7 @@ import pytest
 from models import Training
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.errors import CheckpointError, ConfigError
+from sundae_ns.errors import CheckpointError
 from sundae_ns.model import SundaeModel
 from sundae_ns.training.trials import ARMS, MOST_HELD_OUT, Progress, Trials, plan_trials
 
@@ -79,9 +79,9 @@ def test_an_undecided_head_is_residual_and_disabled(build: Build) -> None:
     assert not model.state.head_enabled
 
 
-def test_a_network_is_not_built_in_mode_auto() -> None:
-    with pytest.raises(ConfigError, match=r"head.mode is auto.*residual or features"):
-        CompensationHead(HeadConfig(mode="auto"))
+def test_a_head_is_undecided_by_default_and_then_residual() -> None:
+    assert HeadConfig().mode == "auto"
+    assert CompensationHead(HeadConfig()).config.mode == "residual"
 
 
 def test_a_removed_head_leaves_no_values_and_no_moments(build: Build) -> None:

@@ -41,4 +41,4 @@ def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     monkeypatch.setattr(
         budget.sizes, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
     )
-    return {"head": HeadConfig(size="small", pixel_unshuffle=1, num_features=13)}
+    return {"head": HeadConfig(mode="residual", size="small", pixel_unshuffle=1, num_features=13)}

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from sundae_ns.cli.bench.job import parse
+from harness.job import parse
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.fingerprint import LEFT_OUT, LENGTH, fingerprint
 

@@ -1,7 +1,4 @@
-"""One job of a comparison: trained by nerfstudio, saved, opened again from its files, and measured.
-
-``python -m sundae_ns.cli.bench.job OUT KEY`` does the job that ``OUT/jobs/KEY/job.json`` describes.
-"""
+"""One job of a comparison: trained by nerfstudio, saved, opened again from its files, and measured."""
 
 from __future__ import annotations
 
@@ -10,7 +7,6 @@ import gc
 import json
 import os
 import shutil
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
@@ -24,10 +20,10 @@ from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.scripts.train import _set_random_seed
 from nerfstudio.utils import profiler, writer
 
+from harness.alone import watched_gpu
+from harness.plan import Job, Words, done_file, job_folder
 from sundae_ns.api.opening import load
-from sundae_ns.cli.bench.alone import watched_gpu
-from sundae_ns.cli.bench.plan import SAID, Job, Words, done_file, job_folder
-from sundae_ns.errors import BackendError, CheckpointError, PackError, SundaeError
+from sundae_ns.errors import BackendError, CheckpointError, PackError
 from sundae_ns.evaluation import Lpips, Measured, lpips_weights_available
 from sundae_ns.model import SundaeModelConfig
 from sundae_ns.scenes.measure import measure_scene
@@ -87,8 +83,8 @@ def train_and_measure(job: Job, out: Path) -> dict[str, Any]:
     Nothing is evaluated or saved while training is timed, whatever the method.
 
     Returns:
-        Plain values: ``job``; ``measured``; ``packed``, see :func:`pack`; ``alone``, whether no other job used the GPU. A
-        job that was not alone has no times.
+        Plain values: ``job``; ``measured``; ``packed``, see :func:`pack`; ``alone``, whether no other job used the GPU.
+        A job that was not alone has no times.
 
     Raises:
         BackendError: the method needs a CUDA device and there is none.
@@ -128,7 +124,7 @@ def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
     try:
         report = write_fitted(path, *fit_scene(contents_of_run(opened.source), PackConfig()))
     except PackError as error:
-        print(f"{SAID}not packed: {error}")
+        print(f"not packed: {error}")
         return None
     model = model_of(load(path)).to(opened.model.device).eval()
     found = measure_scene(replace(opened, model=model, packed_bytes=report.bytes), label="", repeats=0, with_flip=False)
@@ -164,17 +160,8 @@ def _measured(job: Job, config: TrainerConfig, command: str) -> tuple[Opened, Me
     opened = open_scene(folder)
     lpips = Lpips(download=False) if lpips_weights_available() else None
     measured = measure_scene(opened, label=job.key, lpips=lpips, command=command)
-    measured = replace(
-        measured,
-        scene=job.scene,
-        variant=job.arm,
-        seed=job.seed,
-        train_s=seconds,
-        peak_vram_mib=peak,
-    )
-    if job.keep_ratio is not None:
-        measured = replace(measured, keep_ratio=job.keep_ratio)
-    return opened, measured
+    measured = replace(measured, scene=job.scene, variant=job.arm, seed=job.seed, train_s=seconds, peak_vram_mib=peak)
+    return opened, measured if job.keep_ratio is None else replace(measured, keep_ratio=job.keep_ratio)
 
 
 def configure(job: Job, out: Path) -> tuple[TrainerConfig, str]:
@@ -231,7 +218,7 @@ def _run_folder(out: Path, key: str | None) -> Path:
     result = read_result(done_file(out, str(key)))
     if result is None:
         raise CheckpointError(f"the warm-up {key} is not done; run the whole plan")
-    # Not the folder in the result: the comparison may have moved since.
+    # The folder in the result may be an old one: comparisons move.
     return job_folder(out, str(key)) / result["job"]["arm"] / result["job"]["method"] / "run"
 
 
@@ -266,23 +253,3 @@ def _forget() -> None:
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
-
-
-def read_job(path: Path) -> Job:
-    """A job from its ``job.json``, which ``bench.quality`` writes into its folder."""
-    plain = json.loads(path.read_text(encoding="utf-8"))
-    return Job(**{**plain, "options": tuple(plain["options"]), "parser": tuple(plain["parser"])})
-
-
-def main() -> None:
-    """Do one job; exit with 2 and one line on an error of this package."""
-    out, key = Path(sys.argv[1]), sys.argv[2]
-    try:
-        perform(read_job(job_folder(out, key) / "job.json"), out)
-    except SundaeError as error:
-        print(f"{SAID}{error}", file=sys.stderr)
-        sys.exit(2)
-
-
-if __name__ == "__main__":
-    main()

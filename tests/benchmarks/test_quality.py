@@ -1,4 +1,4 @@
-"""Plans of ``sundae bench quality`` and ``paper``, and how they are carried out, with a runner that trains nothing."""
+"""Plans of ``quality.py`` and ``paper.py``, and how they are carried out, with a runner that trains nothing."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ import pytest
 import tyro
 from bench_jobs import Runner
 from csv_rows import read_rows
+from paper import DATASETS, PRINTED, PaperOptions, find_scene, run_paper
+from quality import QualityOptions, run_quality
 from rich.console import Console
+from suite import SuiteOptions
 
-from sundae_ns.cli.bench.arms import choose_arms
-from sundae_ns.cli.bench.options import PaperOptions, QualityOptions, SuiteOptions
-from sundae_ns.cli.bench.paper import DATASETS, PRINTED, find_scene
-from sundae_ns.cli.bench.plan import Arm, Job, jobs_of_shard, parser_of, plan_scene
-from sundae_ns.cli.bench.quality import run_paper, run_quality
-from sundae_ns.cli.bench.results import read_results, spread
+from harness.arms import choose_arms
+from harness.plan import Arm, Job, jobs_of_shard, parser_of, plan_scene
+from harness.results import read_results, spread
 from sundae_ns.errors import ConfigError, DataError, StorageError
 from sundae_ns.evaluation import COLUMNS
 
@@ -38,33 +38,33 @@ def quality(capture: Path, out: Path, runner: Runner, **changed: Any) -> tuple[i
     text = StringIO()
     options: dict[str, Any] = {"arms": ("sundae", "random-no-head", "mcmc", "splatfacto"), **changed}
     console = Console(file=text, width=200, force_terminal=False)
-    code = run_quality(QualityOptions(scene=capture, out=out, **options), runner=runner, console=console)
+    code = run_quality(QualityOptions(folder=capture, out=out, **options), runner=runner, console=console)
     return code, text.getvalue()
 
 
-# --------------------------------------------------------------------------------------------------------------- options
+# -------------------------------------------------------------------------------------------------------------- options
 
 
 @pytest.mark.parametrize(
     "options",
     [
-        QualityOptions(scene=Path("a b"), out=Path("out")),
-        QualityOptions(scene=Path("a"), out=Path("o"), arms=("random", "my arms.yaml"), steps_scale=0.5, downscale=4),
-        PaperOptions(root=Path("a b"), out=Path("out")),
-        PaperOptions(root=Path("a"), out=Path("o"), scenes=("garden", "room"), seed=1, method="sundae-tiny"),
-        SuiteOptions(captures=Path("a b"), out=Path("out")),
-        SuiteOptions(captures=Path("a"), out=Path("o"), scenes=("fox",), keep_ratios=(0.01, 0.3), seeds=(1, 2)),
+        QualityOptions(folder=Path("a b"), out=Path("out")),
+        QualityOptions(folder=Path("a"), out=Path("o"), arms=("random", "my arms.yaml"), steps_scale=0.5, downscale=4),
+        PaperOptions(folder=Path("a b"), out=Path("out")),
+        PaperOptions(folder=Path("a"), out=Path("o"), scenes=("garden", "room"), seeds=(1,), method="sundae-tiny"),
+        SuiteOptions(folder=Path("a b"), out=Path("out")),
+        SuiteOptions(folder=Path("a"), out=Path("o"), scenes=("fox",), keep_ratios=(0.01, 0.3), seeds=(1, 2)),
     ],
 )
 def test_a_page_names_the_command_of_the_whole(options: QualityOptions | PaperOptions | SuiteOptions) -> None:
     part = replace(options, shard="2/3", jobs=True)
     assert part.command() == options.command()
     words = shlex.split(part.command())
-    assert words[:3] == ["sundae", "bench", type(options).__name__.removesuffix("Options").lower()]
-    assert tyro.cli(type(options), args=words[3:]) == options
+    assert words[:2] == ["python", f"benchmarks/{type(options).__name__.removesuffix('Options').lower()}.py"]
+    assert tyro.cli(type(options), args=words[2:]) == options
 
 
-# ----------------------------------------------------------------------------------------------------------------- plans
+# ---------------------------------------------------------------------------------------------------------------- plans
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def arms() -> list[Arm]:
 
 def plan(arms: list[Arm], **changed: Any) -> list[Job]:
     options: dict[str, Any] = {"keep_ratios": [0.01, 0.1], "seeds": [42, 43], "repeat_at": [0.1]}
-    return plan_scene("fox", Path("fox"), (), arms, **{**options, **changed})
+    return plan_scene(Path("fox"), (), arms, **{**options, **changed})
 
 
 def test_seeds_repeat_only_what_is_asked_for(arms: list[Arm]) -> None:
@@ -251,7 +251,7 @@ def test_folders_of_something_else_are_left_alone(capture: Path, tmp_path: Path)
         quality(capture, notes, Runner())
     assert (notes / "table.md").read_text() == "mine"
     for out in (capture, capture / "out", tmp_path):
-        with pytest.raises(StorageError, match="belongs to what the command reads"):
+        with pytest.raises(StorageError, match="what the command reads"):
             quality(capture, out, Runner())
     with pytest.raises(StorageError, match="is a file"):
         quality(capture, notes / "table.md", Runner())
@@ -313,7 +313,7 @@ def paper(root: Path, out: Path, runner: Runner, **changed: Any) -> tuple[int, s
     text = StringIO()
     options: dict[str, Any] = {"arms": ("sundae", "splatfacto"), **changed}
     console = Console(file=text, width=200, force_terminal=False)
-    return run_paper(PaperOptions(root=root, out=out, **options), runner=runner, console=console), text.getvalue()
+    return run_paper(PaperOptions(folder=root, out=out, **options), runner=runner, console=console), text.getvalue()
 
 
 def cells_of(page: str, first: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""Arms of ``sundae bench quality``: read from a file, checked before anything is trained, and made into commands."""
+"""Arms of a comparison: read from a file, checked before anything is trained, and made into commands."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from sundae_ns.cli.bench.arms import DEFAULT_FILE, Entry, choose_arms, read_entries
-from sundae_ns.cli.bench.job import configure
-from sundae_ns.cli.bench.plan import Arm, Job, plan_scene
+from harness.arms import DEFAULT_FILE, Entry, choose_arms, read_entries
+from harness.job import configure
+from harness.plan import Arm, Job, plan_scene
 from sundae_ns.errors import ConfigError
 
 DEFAULTS = [
@@ -47,11 +47,11 @@ def chosen(path: Path, scale: float = 1.0) -> dict[str, Arm]:
 
 
 def jobs_of(arms: dict[str, Arm]) -> dict[str, Job]:
-    jobs = plan_scene("fox", Path("fox"), (), list(arms.values()), keep_ratios=[0.1], seeds=[42], repeat_at=[])
+    jobs = plan_scene(Path("fox"), (), list(arms.values()), keep_ratios=[0.1], seeds=[42], repeat_at=[])
     return {job.arm: job for job in jobs}
 
 
-# -------------------------------------------------------------------------------------------------------- what a file says
+# ----------------------------------------------------------------------------------------------------- what a file says
 
 
 def test_a_file_of_arms(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
         read_entries(tmp_path / "mine.yaml")
 
 
-# ------------------------------------------------------------------------------------------------------------ what is chosen
+# ------------------------------------------------------------------------------------------------------- what is chosen
 
 
 def test_the_default_arms_are_a_file_like_any_other() -> None:
@@ -183,7 +183,7 @@ def test_lengths_come_from_the_method_times_a_factor(tmp_path: Path) -> None:
             choose_arms(["sundae"], method, scale)
 
 
-# ---------------------------------------------------------------------------------------------------------- what is trained
+# ------------------------------------------------------------------------------------------------------ what is trained
 
 
 def test_arms_of_a_file_become_commands_of_ns_train(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import csv
 import json
+import re
 import runpy
 import shutil
 import sys
@@ -12,17 +13,20 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 import tyro
 from bench_jobs import measured
 from csv_rows import read_rows
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
-from sundae_ns.cli.bench import today
-from sundae_ns.cli.bench.plan import Job
-from sundae_ns.cli.bench.today import fingerprints
+from harness import today
+from harness.plan import Job
+from harness.today import fingerprints
+from sundae_ns.graphs import build_graph
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "benchmarks"
 RESULTS = FOLDER / "results"
 SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py"))
@@ -45,19 +49,25 @@ def loaded(monkeypatch: pytest.MonkeyPatch, name: str) -> dict[str, Any]:
     return runpy.run_path(str(FOLDER / name))
 
 
-def test_there_are_at_most_a_dozen() -> None:
-    """Beside those that make tables and plots of the results, and captures."""
-    assert 0 < len({*SCRIPTS} - {"tables.py", "plot.py", "still_life.py"}) <= 12
+def test_they_are_few() -> None:
+    assert 0 < len(SCRIPTS) <= 24
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_help(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(monkeypatch, name, "--help") == 0
-    assert capsys.readouterr().out.startswith(f"usage: {name}")
-    assert f"python benchmarks/{name}" in (ast.get_docstring(ast.parse((FOLDER / name).read_text())) or "")
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: {name}")
+    about = ast.get_docstring(ast.parse((FOLDER / name).read_text())) or ""
+    assert f"python benchmarks/{name}" in about
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
+    for page in [about, *(page.read_text(encoding="utf-8") for page in pages)]:
+        for words in re.findall(rf"python benchmarks/{name}([^`\n#;]*)", page):
+            missing = [option for option in re.findall(r"--[a-z][\w-]*", words) if option not in text]
+            assert not missing, words
 
 
-# ---------------------------------------------------------------------------------------------------------------- results
+# -------------------------------------------------------------------------------------------------------------- results
 
 
 def test_results_are_small_and_can_be_read() -> None:
@@ -79,7 +89,7 @@ def test_commands_of_rows_are_ones_that_ns_train_takes() -> None:
         assert config.max_num_iterations == row.steps  # type: ignore[attr-defined]
 
 
-# ----------------------------------------------------------------------------------------------------------------- tables
+# --------------------------------------------------------------------------------------------------------------- tables
 
 
 def test_tables_of_all_pages_are_those_of_the_results(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -229,24 +239,66 @@ def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     assert {path.stem for path in tmp_path.iterdir()} == set(plots["PLOTS"])
 
 
-# ------------------------------------------------------------------------------------------------------------------ parts
+# ---------------------------------------------------------------------------------------------------------------- parts
 
 
 def test_parts_are_timed_beside_their_errors(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for part, errors in (("graph", ["response_rel_error"]), ("rasterizers", ["max_error", "gradient_error"])):
-        words = [part, "--primitives", "300", "--size", "24", "--repeats", "1"]
-        monkeypatch.setattr(sys, "argv", ["bench_step.py", *words])
-        loaded(monkeypatch, "bench_step.py")["main"]()
-        lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-        assert [line.get("rasterizer") for line in lines] == ([None] if part == "graph" else ["cpu", "reference"])
-        for line in lines:
-            assert all(0 < line[error] < 1e-3 for error in errors), line
-            assert all(value > 0 for name, value in line.items() if name.startswith("ms_"))
+    words = ["rasterizers", "--primitives", "300", "--size", "24", "--repeats", "1"]
+    monkeypatch.setattr(sys, "argv", ["bench_step.py", *words])
+    loaded(monkeypatch, "bench_step.py")["main"]()
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["rasterizer"] for line in lines] == ["cpu", "reference"]
+    for line in lines:
+        assert all(0 < line[error] < 1e-3 for error in ("max_error", "gradient_error")), line
+        assert all(value > 0 for name, value in line.items() if name.startswith("ms_"))
 
 
-# ---------------------------------------------------------------------------------------------------------------- mutants
+@pytest.mark.parametrize("sample", [0, 700])
+def test_the_graph_is_timed_beside_its_errors(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], sample: int
+) -> None:
+    names = ["field", "clusters", "duplicates", "uniform"]
+    words = [
+        "--points",
+        "4000",
+        "--repeats",
+        "2",
+        "--device",
+        "cpu",
+        "--sample",
+        str(sample),
+        "--distributions",
+        *names,
+    ]
+    monkeypatch.setattr(sys, "argv", ["bench_graph.py", *words])
+    loaded(monkeypatch, "bench_graph.py")["main"]()
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line["distribution"] for line in lines] == names
+    keys = json.loads((RESULTS / "graph.jsonl").read_text().splitlines()[0]).keys()
+    for line in lines:
+        assert line.keys() == keys
+        assert line["index_mismatches"] == 0
+        assert line["response_rel_error"] < 1e-6
+        assert all(line[name] > 0 for name in ("seconds", "graph_seconds", "response_seconds"))
+        assert (line["reference_seconds"] is None) == (line["speedup"] is None) == (sample > 0)
+
+
+def test_wrong_neighbours_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = loaded(monkeypatch, "bench_graph.py")
+    points = bench["cluster_points"](500, np.random.default_rng(0))
+    found = build_graph(torch.from_numpy(points), num_neighbors=bench["NEIGHBORS"]).indices.numpy()
+    rows = np.arange(0, 500, 2)
+    assert bench["compare_with_scipy"](points, found, rows)[1] == 0
+    found[4, 0] = 4  # the point itself
+    found[6, 0] = found[6, 1]  # one point twice
+    found[8, 0] = next(i for i in range(500) if i not in {8, *found[8]})  # a point farther away
+    found[9] = 9  # in no compared row
+    assert bench["compare_with_scipy"](points, found, rows)[1] == 3
+
+
+# -------------------------------------------------------------------------------------------------------------- mutants
 
 
 def test_rooms_of_mutants_name_modules_and_tests_that_exist() -> None:

@@ -1,31 +1,39 @@
-"""``sundae bands``: the primitives that the paper's high-pass, low-pass and combined rules keep."""
+"""Show the primitives that the paper's high-pass, low-pass and combined rules keep: point clouds, images, figures.
+
+python benchmarks/bands.py RUN -o DIR
+python benchmarks/bands.py RUN -o DIR --keep-ratio 0.05 0.2 --view 12
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
+import tyro
 from PIL.Image import Image
 from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
-from sundae_ns.errors import ConfigError, DataError, SundaeError
-from sundae_ns.evaluation import (
+from harness.points import (
     Projection,
     points_sheet,
     project_along_axes,
     project_through_camera,
     response_histogram,
+    write_points,
 )
+from harness.script import run_script
+from sundae_ns.cli.outputs import Overwrite, check_folder
+from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import PruneRule, band_rule, check_share, decide, field_graph, kept_count, response
-from sundae_ns.storage import replacing, write_point_cloud, write_text
+from sundae_ns.storage import replacing, write_text
 from sundae_ns.storage.atomic import writing
 from sundae_ns.storage.kinds import kind_of
 from sundae_ns.storage.runs.checkpoint import read_field
@@ -51,9 +59,9 @@ def base_colors(features_dc: Tensor) -> Tensor:
 def band_masks(params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph, count: int) -> dict[str, Tensor]:
     """The primitives that each rule keeps, bool ``[N]`` by the names of :data:`RULES`.
 
-    All rules rank the primitives by the magnitude of their high-pass response, as the paper does. The high-pass rule keeps
-    the largest, the low-pass rule the smallest, and the combined rule a share ``gamma`` of the largest and the rest of the
-    smallest.
+    All rules rank the primitives by the magnitude of their high-pass response, as the paper does. The high-pass rule
+    keeps the largest, the low-pass rule the smallest, and the combined rule a share ``gamma`` of the largest and the
+    rest of the smallest.
 
     Args:
         params: the field, all finite.
@@ -151,6 +159,35 @@ def _visible(projection: Projection) -> int:
     return int(((projection.depth > 0) & inside).sum())
 
 
+def bands(
+    run: Annotated[Path, tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    keep_ratio: tuple[float, ...] = (0.01, 0.1, 0.3),
+    signal: Literal["positions", "attributes"] = "positions",
+    gamma: float = 0.5,
+    neighbors: int = 16,
+    bandwidth: Literal["robust", "literal"] = "robust",
+    view: int | None = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Write point clouds, images and ``bands.json`` of a field; the exit code.
+
+    Args:
+        run: a run of sundae or splatfacto (its folder, config.yml or a checkpoint), or a 3DGS .ply file.
+        out: folder to write; created if missing.
+        keep_ratio: shares of the primitives to keep, each in (0, 1].
+        signal: graph signal to filter: positions, as in the paper, or position, colour, opacity and size.
+        gamma: share of the kept primitives that the combined rule takes from the largest responses.
+        neighbors: maximum number of neighbours of a primitive in the graph.
+        bandwidth: rule that sets radius and width of the graph's edge weights; literal is the paper's.
+        view: index of the training view to draw; by default the one with the most primitives.
+        overwrite: replace the files of an earlier command in the folder.
+    """
+    check_folder(out, reads=[run], overwrite=overwrite)
+    rule = PruneRule(signal=signal, gamma=gamma, num_neighbors=neighbors, bandwidth=bandwidth)
+    return run_bands(run, out, shares=keep_ratio, rule=rule, view=view)
+
+
 def run_bands(
     source: Path,
     out: Path,
@@ -200,7 +237,7 @@ def run_bands(
 
         def cloud(name: str, mask: Tensor | None = None) -> None:
             rows = slice(None) if mask is None else mask
-            write_point_cloud(out / name, params["means"][rows], colors[rows], scalars={"response": scalar[rows]})
+            write_points(out / name, params["means"][rows], colors[rows], scalar[rows])
             files.append(name)
 
         def save_png(name: str, image: Image) -> None:
@@ -251,3 +288,7 @@ def run_bands(
         )
     console.print(f"wrote bands.json and {len(files)} files to {out}", highlight=False)
     return 0
+
+
+if __name__ == "__main__":
+    run_script(bands, __doc__)

@@ -1,21 +1,22 @@
-"""``sundae bands`` on a field without a run: files, statistics and error messages."""
+"""``bands.py`` on a field without a run: files, statistics and error messages."""
 
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from bands import bands, base_colors
 from PIL import Image
 from plyfile import PlyData
 from prunes import decide_share
 from torch import Tensor
 
-from sundae_ns.cli import main
-from sundae_ns.cli.bands import base_colors
+from harness.script import run_script
 from sundae_ns.gaussians import from_points
 from sundae_ns.pruning import PruneRule, band_rule, response
 from sundae_ns.storage import read_ply, read_point_cloud, write_ply
@@ -23,9 +24,15 @@ from sundae_ns.storage import read_ply, read_point_cloud, write_ply
 N = 300
 
 
+@pytest.fixture(autouse=True)
+def _command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["bands.py"])
+
+
 def run(*arguments: object) -> int:
+    sys.argv[1:] = map(str, arguments)
     with pytest.raises(SystemExit) as caught:
-        main(["bands", *map(str, arguments)])
+        run_script(bands, "")
     assert isinstance(caught.value.code, int)
     return caught.value.code
 

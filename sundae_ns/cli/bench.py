@@ -2,56 +2,70 @@
 
 from __future__ import annotations
 
-import json as jsonlib
+import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stdout
-from dataclasses import replace
-from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import torch
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
+import tyro
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.evaluation import without_nan
-from sundae_ns.evaluation.document import number
-from sundae_ns.scenes.measure import measure_scene, rendered_as
-from sundae_ns.scenes.opening import Opened, load_run
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from sundae_ns.scenes.opening import Opened
 
 
-def run_frame(
+def bench(
+    measurement: Annotated[Literal["frame"], tyro.conf.Positional],
     load_config: Path,
-    *,
-    factors: Sequence[float],
-    precisions: Sequence[str],
-    phases: Sequence[int],
-    views: int | None,
-    repeats: int,
-    data: Path | None,
-    json: bool,
+    factors: tuple[float, ...] = (1.0,),
+    precisions: tuple[Literal["fp32", "bf16", "fp16"], ...] = (),
+    phases: tuple[Literal[1, 2, 4], ...] = (),
+    views: int | None = None,
+    repeats: int = 5,
+    data: Path | None = None,
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Measure and print; options are those of the command.
+    """Time the frames of a finished run: splat, head and whole frame, with the error of the timed frames.
 
-    Raises:
-        BackendError: a precision other than fp32 on a CPU.
-        CheckpointError: the run cannot be opened.
-        ConfigError: an option cannot work.
-        DataError: the capture is missing or has no test views.
+    The folder benchmarks/ of the repository has other measurements.
+
+    Args:
+        measurement: frame.
+        load_config: the run's folder, or its config.yml.
+        factors: on the sides of the images; the test images are resized alike.
+        precisions: arithmetic of the head; by default all three on CUDA, and fp32 on a CPU, the only one there.
+        phases: passes of the head for a frame, at as many offsets of its grid; by default those of the run.
+        views: number of test views to measure on, from the first; by default all.
+        repeats: timed runs of each view; their median counts.
+        data: folder of the capture, if it moved.
+        as_json: print one line of JSON for each size and precision, instead of a table.
     """
     if repeats < 1 or (views is not None and views < 1):
         raise ConfigError(f"{repeats} timed runs of {views} views measure nothing: use at least 1 of each")
+    from contextlib import redirect_stdout
+    from dataclasses import replace
+    from io import StringIO
+
+    import torch
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from sundae_ns.evaluation import without_nan
+    from sundae_ns.scenes.measure import rendered_as
+    from sundae_ns.scenes.opening import load_run
+
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
         run = load_run(load_config, data=data)
     run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
     device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
-    every = ("fp32", "bf16", "fp16") if device != "cpu" and run.model.head is not None else (None,)
-    wanted: Sequence[str | None] = precisions or every
-    runs = phases if run.model.head is not None and phases else (None,)
-    jobs = [(factor, precision, count) for factor in factors for precision in wanted for count in runs]
+    head = run.model.head is not None
+    every = ("fp32", "bf16", "fp16") if device != "cpu" and head else (None,)
+    runs = phases if head and phases else (None,)
+    jobs = [(factor, precision, count) for factor in factors for precision in precisions or every for count in runs]
     found: list[dict[str, Any]] = []
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Timing frames", total=len(jobs) * len(run.cameras))
@@ -60,17 +74,19 @@ def run_frame(
             with rendered_as(run, factor=factor, precision=precision, phases=count) as shown:
                 line |= {"repeats": repeats, **_figures(shown, repeats, lambda: progress.advance(task))}
             found.append(line)
-            if json:
+            if as_json:
                 rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in line.items()}
-                print(jsonlib.dumps(without_nan(rounded), allow_nan=False), flush=True)
-    if not json:
-        Console().print(_table(found, f"{run.model.num_points:,} primitives, {device}, {len(run.cameras)} test views"))
+                print(json.dumps(without_nan(rounded), allow_nan=False), flush=True)
+    if not as_json:
+        title = f"{run.model.num_points:,} primitives, {device}, {len(run.cameras)} test views"
+        Console().print(_table(found, title))
     return 0
 
 
-@torch.no_grad()
 def _figures(run: Opened, repeats: int, progress: Callable[[], None]) -> dict[str, Any]:
     """Speed of a configuration beside its error: means over the test views."""
+    from sundae_ns.scenes.measure import measure_scene
+
     measured = measure_scene(run, label="", repeats=repeats, with_flip=False, progress=progress)
     head = run.model.head
     full, base = measured.full, measured.base
@@ -89,6 +105,10 @@ def _figures(run: Opened, repeats: int, progress: Callable[[], None]) -> dict[st
 
 
 def _table(lines: Sequence[Mapping[str, Any]], title: str) -> Table:
+    from rich.table import Table
+
+    from sundae_ns.evaluation.document import number
+
     table = Table(title=title, caption="frame, splat and head in ms; off: without the head")
     for column in ("size", "head in", "runs", "frame", "splat", "head", "PSNR", "SSIM", "PSNR off", "SSIM off"):
         table.add_column(column, justify="right", no_wrap=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -10,8 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from sundae_ns.cli.bench import job as jobs
-from sundae_ns.cli.bench.plan import Job, done_file, job_folder
+from harness import job as jobs
+from harness.plan import Job, done_file, job_folder
+from harness.run import JOB
 from sundae_ns.errors import BackendError, CheckpointError, DataError
 
 
@@ -56,14 +58,14 @@ def test_its_process_ends_with_one_line(
     folder = job_folder(tmp_path, "a")
     folder.mkdir(parents=True)
     (folder / "job.json").write_text(json.dumps(asdict(a_job())))
-    assert jobs.read_job(folder / "job.json") == a_job()
 
-    def broken(*_: object) -> None:
+    def broken(job: Job, out: Path) -> None:
+        assert (job, out) == (a_job(), tmp_path)
         raise DataError("the capture is gone; say where it is")
 
     monkeypatch.setattr(jobs, "perform", broken)
-    monkeypatch.setattr(sys, "argv", ["job", str(tmp_path), "a"])
+    monkeypatch.setattr(sys, "argv", ["job.py", str(tmp_path), "a"])
     with pytest.raises(SystemExit) as raised:
-        jobs.main()
+        runpy.run_path(str(JOB), run_name="__main__")
     assert raised.value.code == 2
     assert capsys.readouterr().err == "sundae: the capture is gone; say where it is\n"

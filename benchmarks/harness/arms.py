@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 import yaml
 
-from sundae_ns.cli.bench.plan import WARM_UP, Arm, Kind, Words
+from harness.plan import WARM_UP, Arm, Kind, Words
 from sundae_ns.errors import ConfigError
 
 DEFAULT_FILE = Path(__file__).with_name("arms.yaml")
@@ -46,7 +46,8 @@ def choose_arms(words: Sequence[str], method: str, scale: float = 1.0, *, from_s
         words: names of default arms and files of arms (``.yaml``); none for all default arms.
         method: method of this package that prunes once, for arms without a method.
         scale: factor on all lengths of training.
-        from_scratch: train arms without options whole, as their command of ``ns-train`` does, not from a shared warm-up.
+        from_scratch: train arms without options whole, as their command of ``ns-train`` does, not from a shared
+            warm-up.
 
     Raises:
         ConfigError: a file, an arm, a method, an option or a length that cannot work.
@@ -66,7 +67,7 @@ def choose_arms(words: Sequence[str], method: str, scale: float = 1.0, *, from_s
     return [_checked(entry, method, scale, from_scratch) for entry in entries]
 
 
-# ----------------------------------------------------------------------------------------------------------------- files
+# ---------------------------------------------------------------------------------------------------------------- files
 
 
 def read_entries(path: Path) -> list[Entry]:
@@ -128,7 +129,7 @@ def _refuse_duplicates(names: Iterable[str], where: str) -> None:
         seen.add(name)
 
 
-# ---------------------------------------------------------------------------------------------------------------- checks
+# --------------------------------------------------------------------------------------------------------------- checks
 
 
 def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Arm:

@@ -33,8 +33,8 @@ def watched_gpu() -> Iterator[Callable[[], bool]]:
 def watched(path: Path) -> Iterator[Callable[[], bool]]:
     """Hold a device's file while a job runs; the value tells whether no other job has held it since the block began.
 
-    Every job adds a byte to the file: a job that ends before this one is noticed too. On Windows files have no such locks,
-    and every job counts as alone.
+    Every job adds a byte to the file: a job that ends before this one is noticed too. On Windows files have no such
+    locks, and every job counts as alone.
 
     Args:
         path: a file for each device.

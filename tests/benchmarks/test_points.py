@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
 from torch import Tensor
 
-from sundae_ns.errors import DataError
-from sundae_ns.evaluation import (
+from harness.points import (
+    BACKGROUND,
     Projection,
     draw_points,
     points_sheet,
     project_along_axes,
     project_through_camera,
     response_histogram,
+    write_points,
 )
-from sundae_ns.evaluation.points import BACKGROUND
+from sundae_ns.errors import DataError
+from sundae_ns.storage import read_point_cloud
 
 RED, BLUE = torch.tensor([[255, 0, 0], [0, 0, 255]], dtype=torch.uint8)
 K = torch.tensor([[100.0, 0.0, 50.0], [0.0, 100.0, 40.0], [0.0, 0.0, 1.0]])
@@ -129,7 +133,7 @@ def test_a_sheet_has_a_panel_for_each_projection_and_set() -> None:
 @pytest.fixture
 def drawings(monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
     """The last figure that was drawn."""
-    import sundae_ns.evaluation.points as module
+    import harness.points as module
 
     kept: list[Any] = []
     original = module._rendered
@@ -157,3 +161,14 @@ def test_a_histogram_counts_the_finite_positive_responses(drawings: Callable[[],
 def test_any_responses_have_a_histogram(values: list[float]) -> None:
     magnitude = torch.tensor(values, dtype=torch.float64)
     assert response_histogram(magnitude, thresholds={}).width > 500
+
+
+def test_points_come_back_with_their_colours_and_responses(tmp_path: Path) -> None:
+    path, points, colors = tmp_path / "a.ply", torch.rand(2, 3), torch.stack([RED, BLUE])
+    write_points(path, points, colors, torch.tensor([0.25, -1.0], dtype=torch.float64))
+    found = read_point_cloud(path)
+    assert torch.equal(found[0], points)
+    assert torch.equal(found[1], colors)
+    assert PlyData.read(str(path))["vertex"]["response"].tolist() == [0.25, -1.0]
+    write_points(path, points[:0], colors[:0], points[:0, 0])
+    assert read_point_cloud(path)[0].shape == (0, 3)

@@ -1,10 +1,12 @@
-"""``sundae bench quality`` and ``bench paper`` with tiny trainings: stopped and resumed, and published layouts."""
+"""``quality.py``, ``suite.py`` and ``paper.py`` with tiny trainings: stopped and resumed, and published layouts."""
 
 from __future__ import annotations
 
 import json
 import shutil
 import struct
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,19 +14,19 @@ from typing import Any
 import numpy as np
 import pytest
 from csv_rows import read_rows
+from paper import PaperOptions, run_paper
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from suite import SuiteOptions, run_suite
 
-from sundae_ns.cli import main
-from sundae_ns.cli.bench.arms import choose_arms
-from sundae_ns.cli.bench.job import fingerprint_of, perform
-from sundae_ns.cli.bench.options import PaperOptions, SuiteOptions
-from sundae_ns.cli.bench.plan import Job, parser_of, plan_scene
-from sundae_ns.cli.bench.quality import run_paper, run_suite
-from sundae_ns.cli.bench.results import read_results
+from harness.arms import choose_arms
+from harness.job import fingerprint_of, perform
+from harness.plan import Job, parser_of, plan_scene
+from harness.results import read_results
 from sundae_ns.scenes.measure import measure_scene
 from sundae_ns.scenes.opening import open_scene
 
+ROOT = Path(__file__).parents[2]
 SCALE, WARMUP = 0.02, 12
 WARM_UP = "sundae-tiny-warm-up"
 
@@ -34,10 +36,9 @@ def in_process(job: Job, out: Path, on_percent: Callable[[float], object]) -> No
     perform(job, out)
 
 
-def test_stopped_and_continued(tiny: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_stopped_and_continued(tiny: Any, tmp_path: Path) -> None:
     arms, out = ["sundae", "random-no-head", "mcmc"], tmp_path / "out"
     jobs = plan_scene(
-        tiny.scene.name,
         tiny.scene.resolve(),
         parser_of(tiny.scene),
         choose_arms(arms, "sundae-tiny", SCALE),
@@ -56,11 +57,12 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, capsys: pytest.Capture
     stamps = {path: path.stat().st_mtime_ns for path in (out / "done").iterdir()}
     assert len(stamps) == 3
 
-    options = ["--method", "sundae-tiny", "--steps-scale", SCALE, "--seeds", 42]
-    options += ["--keep-ratios", 0.5, "--repeat-at", 0.5, "--arms", *arms]
-    with pytest.raises(SystemExit) as caught:
-        main([str(word) for word in ("bench", "quality", tiny.scene, "-o", out, *options)])
-    assert caught.value.code == 0, capsys.readouterr().out
+    # In a process of its own: it starts another one for its job.
+    words = [sys.executable, ROOT / "benchmarks" / "quality.py", tiny.scene, "-o", out, "--arms", *arms]
+    words += ["--method", "sundae-tiny", "--steps-scale", SCALE, "--seeds", 42]
+    words += ["--keep-ratios", 0.5, "--repeat-at", 0.5]
+    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
     assert not leftover.exists()
     rows = {row.variant: row for row in read_rows(out / "results.csv")}
@@ -96,7 +98,7 @@ def test_the_suite_trains_a_method_as_its_command_does(tiny: Any, tmp_path: Path
     shutil.copytree(tiny.scene, captures / "still-life")
     (captures / "torn").mkdir()
     options = SuiteOptions(
-        captures=captures,
+        folder=captures,
         out=tmp_path / "out",
         arms=("sundae",),
         keep_ratios=(0.5,),
@@ -145,7 +147,7 @@ def test_a_scene_as_it_is_published(tiny: Any, tmp_path: Path) -> None:
     published(tiny.scene, tmp_path / "360_v2" / "bicycle", factor=4)
     published(tiny.scene, tmp_path / "360_v2" / "counter", factor=2)
     options = PaperOptions(
-        root=tmp_path,
+        folder=tmp_path,
         out=tmp_path / "out",
         arms=("sundae",),
         keep_ratios=(0.5,),

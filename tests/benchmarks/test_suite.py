@@ -1,4 +1,4 @@
-"""``sundae bench suite``: its plan, resuming, captures that are left out, its page, and jobs that share a GPU."""
+"""``suite.py``: its plan, resuming, captures that are left out, its page, and jobs that share a GPU."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ import pytest
 from bench_jobs import Runner, measured
 from csv_rows import read_rows
 from rich.console import Console
+from suite import ARMS as SUITE
+from suite import SuiteOptions, find_captures, plan_suite, run_suite
 
-from sundae_ns.cli.bench.alone import watched
-from sundae_ns.cli.bench.arms import choose_arms
-from sundae_ns.cli.bench.job import configure, fingerprint_of, without_times
-from sundae_ns.cli.bench.options import SUITE, SuiteOptions
-from sundae_ns.cli.bench.plan import Job, done_file
-from sundae_ns.cli.bench.quality import run_suite
-from sundae_ns.cli.bench.suite import find_captures, plan_suite
+from harness.alone import watched
+from harness.arms import choose_arms
+from harness.job import configure, fingerprint_of, without_times
+from harness.plan import Job, done_file
 from sundae_ns.errors import DataError
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
@@ -55,11 +54,11 @@ def suite(captures: Path, runner: Runner, **changed: Any) -> tuple[int, str]:
     text = StringIO()
     options: dict[str, Any] = {"arms": ARMS, "out": captures.parent / "out", **changed}
     console = Console(file=text, width=200, force_terminal=False)
-    return run_suite(SuiteOptions(captures=captures, **options), runner=runner, console=console), text.getvalue()
+    return run_suite(SuiteOptions(folder=captures, **options), runner=runner, console=console), text.getvalue()
 
 
 def plan(captures: Path, **changed: Any) -> list[Job]:
-    options = SuiteOptions(captures=captures, out=Path("out"), **changed)
+    options = SuiteOptions(folder=captures, out=Path("out"), **changed)
     jobs, left_out = plan_suite(options, choose_arms(options.arms, options.method, from_scratch=True))
     assert left_out == {}
     return jobs
@@ -72,7 +71,7 @@ def lines_of(page: str, title: str) -> list[list[str]]:
     return rows[2:]
 
 
-# ------------------------------------------------------------------------------------------------------------------ plan
+# ----------------------------------------------------------------------------------------------------------------- plan
 
 
 def test_the_default_plan(captures: Path) -> None:
@@ -128,7 +127,7 @@ def test_folders_that_hold_no_captures(captures: Path, tmp_path: Path) -> None:
             find_captures(folder)
 
 
-# ----------------------------------------------------------------------------------------------------------- carried out
+# ---------------------------------------------------------------------------------------------------------- carried out
 
 
 def test_stopped_and_continued(captures: Path) -> None:

@@ -8,9 +8,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from sundae_ns.cli.bench.arms import DEFAULT_FILE, choose_arms, read_entries
-from sundae_ns.cli.bench.job import fingerprint_of
-from sundae_ns.cli.bench.plan import WARM_UP, plan_scene
+from harness.arms import DEFAULT_FILE, choose_arms, read_entries
+from harness.job import fingerprint_of
+from harness.plan import WARM_UP, plan_scene
 
 EARLIER = "earlier default"
 """Words that mark a row which is not of today's default."""
@@ -22,7 +22,8 @@ def is_of_today(row: Mapping[str, Any]) -> bool:
     """Whether a row of ``runs.csv`` was measured with the options that its arm has today.
 
     Args:
-        row: with ``variant``, ``keep_ratio`` and ``fingerprint``, as text or as values; without one of them, it was not.
+        row: with ``variant``, ``keep_ratio`` and ``fingerprint``, as text or as values; without one of them, it was
+            not.
     """
     return row.get("fingerprint") in fingerprints(str(row.get("variant", "")), float(row.get("keep_ratio") or SHARE))
 
@@ -44,8 +45,6 @@ def fingerprints(arm: str, keep_ratio: float) -> frozenset[str]:
     jobs = [
         job
         for way in ways
-        for job in plan_scene(
-            "capture", Path("capture"), (), [way], keep_ratios=[keep_ratio], seeds=[42], repeat_at=[keep_ratio]
-        )
+        for job in plan_scene(Path("capture"), (), [way], keep_ratios=[keep_ratio], seeds=[42], repeat_at=[])
     ]
     return frozenset(fingerprint_of(job) for job in jobs if job.arm == arm)

@@ -17,8 +17,6 @@ Words: TypeAlias = tuple[str, ...]
 """Words of a command line."""
 
 WARM_UP = "warm-up"
-SAID = "sundae: "
-"""Start of the line in which a job says why it failed."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +26,7 @@ class Arm:
     name: str
     kind: Kind
     method: str
-    """What ``ns-train`` calls it."""
+    """Name of the method in ``ns-train``."""
     options: Mapping[str, Words] = field(default_factory=dict)
     """Options of ``ns-train`` by name, without the dashes."""
     steps: int = 30_000
@@ -55,7 +53,7 @@ class Job:
     data: str
     """Folder of the capture."""
     method: str
-    """What ``ns-train`` calls it."""
+    """Name of the method in ``ns-train``."""
     steps: int
     seed: int
     keep_ratio: float | None = None
@@ -101,7 +99,6 @@ def parser_of(data: Path, downscale: int = 1) -> Words:
 
 
 def plan_scene(
-    scene: str,
     data: Path,
     parser: Words,
     arms: Sequence[Arm],
@@ -113,8 +110,7 @@ def plan_scene(
     """All jobs on one capture, warm-ups before the jobs that need them.
 
     Args:
-        scene: its name in tables.
-        data: its folder.
+        data: folder of the capture; its name is the scene's name in tables.
         parser: from :func:`parser_of`.
         arms: the sides of the comparison; their names differ.
         keep_ratios: shares of the primitives to keep.
@@ -124,79 +120,47 @@ def plan_scene(
     Raises:
         ConfigError: a share or seed that cannot be.
     """
-    own = [arm.keep_ratio for arm in arms if arm.keep_ratio is not None]
-    _check(keep_ratios, seeds, repeat_at, own)
+    _check(keep_ratios, seeds, repeat_at, [arm.keep_ratio for arm in arms if arm.keep_ratio is not None])
     jobs: list[Job] = []
     for number, seed in enumerate(seeds):
+        base = Job("", "whole", data.name, "", str(data), "", 0, seed, parser=parser)
         warmups: dict[str, Job] = {}
         branches: list[Job] = []
         wholes: list[Job] = []
         for arm in arms:
             if arm.kind == "whole" and not arm.at_every_ratio:
-                wholes.append(_whole(scene, data, parser, arm, seed, None))
+                wholes.append(_job(base, arm, None))
                 continue
             for ratio in keep_ratios if arm.keep_ratio is None else (arm.keep_ratio,):
                 if number > 0 and ratio not in repeat_at:
                     continue
                 if arm.kind == "whole":
-                    wholes.append(_whole(scene, data, parser, arm, seed, ratio))
+                    wholes.append(_job(base, arm, ratio))
                 else:
-                    warmup = warmups.setdefault(arm.method, _warmup(scene, data, parser, arm, seed))
-                    branches.append(_branch(warmup, arm, ratio))
+                    warmup = warmups.setdefault(arm.method, _warmup(base, arm))
+                    branches.append(replace(_job(base, arm, ratio), needs=warmup.key))
         jobs += [*warmups.values(), *branches, *wholes]
     return jobs
 
 
-def _whole(scene: str, data: Path, parser: Words, arm: Arm, seed: int, ratio: float | None) -> Job:
-    """An arm that trains by itself from scratch, as its command does."""
-    share = {} if ratio is None else {"pipeline.model.pruning.keep-ratio": (f"{ratio:g}",)}
-    return Job(
-        key=f"{scene}-{arm.name}-{_percent(ratio)}s{seed}",
-        kind="whole",
-        scene=scene,
-        arm=arm.name,
-        data=str(data),
-        method=arm.method,
-        steps=arm.steps,
-        seed=seed,
-        keep_ratio=ratio,
-        options=_command({**share, **arm.options}),
-        parser=parser,
-    )
-
-
-def _percent(ratio: float | None) -> str:
-    """A share in a key."""
-    return "" if ratio is None else f"{100 * ratio:g}pct-"
-
-
-def _warmup(scene: str, data: Path, parser: Words, arm: Arm, seed: int) -> Job:
+def _warmup(base: Job, arm: Arm) -> Job:
     """The warm-up of an arm's method, without prune and head; the same for all arms of the method."""
     name = f"{arm.method}-{WARM_UP}"
-    options = {
+    options: dict[str, Words] = {
         "pipeline.model.pruning.mode": ("off",),
         "pipeline.model.head.mode": ("off",),
         "pipeline.model.stop-split-at": (str(arm.warmup),),
         "optimizers.means.scheduler.max-steps": (str(arm.total),),
         "schedule-length": (str(arm.total),),  # the first part of a whole run
     }
-    return Job(
-        key=f"{scene}-{name}-s{seed}",
-        kind="warm-up",
-        scene=scene,
-        arm=name,
-        data=str(data),
-        method=arm.method,
-        steps=arm.warmup,
-        seed=seed,
-        options=_command(options),
-        parser=parser,
-    )
+    key = f"{base.scene}-{name}-s{base.seed}"
+    words = _command(options)
+    return replace(base, key=key, kind="warm-up", arm=name, method=arm.method, steps=arm.warmup, options=words)
 
 
-def _branch(warmup: Job, arm: Arm, ratio: float) -> Job:
-    """An arm that starts from a warm-up, or MCMC with as many primitives, at one share."""
-    steps = str(arm.steps)
+def _job(base: Job, arm: Arm, ratio: float | None) -> Job:
+    """The training of an arm at one share, or at its own."""
+    steps, share = str(arm.steps), "" if ratio is None else f"{ratio:g}"
     options: dict[str, Words]
     if arm.kind == "mcmc":
         options = {
@@ -207,23 +171,25 @@ def _branch(warmup: Job, arm: Arm, ratio: float) -> Job:
             "pipeline.model.stop-split-at": (str(max(arm.steps * 5 // 6, 1)),),
             "optimizers.means.scheduler.max-steps": (steps,),
         }
-    else:
+    elif arm.kind == "branch":
         options = {
-            "pipeline.model.pruning.keep-ratio": (f"{ratio:g}",),
-            "pipeline.model.pruning.seed": (str(warmup.seed),),
+            "pipeline.model.pruning.keep-ratio": (share,),
+            "pipeline.model.pruning.seed": (str(base.seed),),
             # Rates decay over the branch.
             "optimizers.means.scheduler.max-steps": (steps,),
             "optimizers.compensation.scheduler.max-steps": (steps,),
             "pipeline.model.evaluate-prune": ("False",),
         }
+    else:
+        options = {} if ratio is None else {"pipeline.model.pruning.keep-ratio": (share,)}
     return replace(
-        warmup,
-        key=f"{warmup.scene}-{arm.name}-{_percent(ratio)}s{warmup.seed}",
-        kind="mcmc" if arm.kind == "mcmc" else "branch",
+        base,
+        key=f"{base.scene}-{arm.name}-{'' if ratio is None else f'{100 * ratio:g}pct-'}s{base.seed}",
+        kind=arm.kind,
         arm=arm.name,
+        method=arm.method,
         steps=arm.steps,
         keep_ratio=ratio,
-        needs=warmup.key,
         options=_command({**options, **arm.options}),
     )
 

@@ -1,20 +1,23 @@
-"""Images of the centres of primitives, and histograms of their filter responses."""
+"""Images and point clouds of the centres of primitives, and histograms of their filter responses."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.evaluation.colors import PALETTE
+from sundae_ns.evaluation.plots import PALETTE
+from sundae_ns.storage import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,7 +37,7 @@ class Projection:
     name: str
     """Caption of the viewing direction; may be empty."""
     pixels: Tensor
-    """Column and row of each point ``[N, 2]``, in pixels, the first pixel's centre at 0.5. Points outside are not drawn."""
+    """Column and row of each point ``[N, 2]``, in pixels, the first pixel's centre at 0.5. Outside of it: not drawn."""
     depth: Tensor
     """Depth of each point ``[N]``. Nearer points hide others; points with depth <= 0 are not drawn."""
     width: int
@@ -60,8 +63,8 @@ def project_through_camera(points: Tensor, viewmat: Tensor, K: Tensor, width: in
 def project_along_axes(points: Tensor, side: int = 600) -> list[Projection]:
     """Three orthographic projections of points ``[N, 3]``: from above (along z), from the front (y) and the side (x).
 
-    The common scale fits 1.5 times the extent of the middle 70% of the points; a far background would shrink the rest to a
-    dot.
+    The common scale fits 1.5 times the extent of the middle 70% of the points; a far background would shrink the rest
+    to a dot.
 
     Args:
         points: centres, world units ``[N, 3]``.
@@ -171,8 +174,8 @@ def response_histogram(
 
     Args:
         magnitude: ``[N]``. Zeros and values that are not finite have no place on the axis; the title counts them.
-        thresholds: by caption, the largest magnitude that the low-pass rule keeps (drawn dashed) and the smallest that the
-            high-pass rule keeps (drawn solid); None draws no line.
+        thresholds: by caption, the largest magnitude that the low-pass rule keeps (drawn dashed) and the smallest that
+            the high-pass rule keeps (drawn solid); None draws no line.
     """
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -211,6 +214,27 @@ def response_histogram(
             handles=handles, loc="outside right upper", title="keep ratio", fontsize=9, title_fontsize=9, frameon=False
         )
     return _rendered(figure)
+
+
+def write_points(path: Path, points: Tensor, colors: Tensor, response: Tensor) -> None:
+    """Write coloured points with their responses as a binary .ply, atomically.
+
+    Args:
+        path: the file; its folder must exist.
+        points: positions ``[N, 3]``, stored as float32.
+        colors: ``[N, 3]`` uint8.
+        response: ``[N]``, stored as float32.
+
+    Raises:
+        StorageError: the disk is full or not writable.
+    """
+    columns = {**dict(zip("xyz", points.T)), **dict(zip(("red", "green", "blue"), colors.T)), "response": response}
+    kinds = [(name, "u1" if column.dtype == torch.uint8 else "<f4") for name, column in columns.items()]
+    vertices = np.empty(len(points), kinds)
+    for name, column in columns.items():
+        vertices[name] = column.numpy()
+    with replacing(path) as partial:
+        PlyData([PlyElement.describe(vertices, "vertex")], text=False, byte_order="<").write(str(partial))
 
 
 def _rendered(figure: Figure) -> Image.Image:

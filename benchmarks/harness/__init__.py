@@ -1,0 +1,1 @@
+"""What the scripts of ``benchmarks/`` share: comparisons of methods that resume, and the ends of a command."""

@@ -1,0 +1,239 @@
+"""Carry out a comparison: jobs that can be stopped and resumed, and the tables of their results."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeElapsedColumn
+
+from harness.plan import Job, done_file, job_folder, jobs_of_shard
+from harness.results import Result, read_results, write_results
+from sundae_ns.cli.outputs import check_folder
+from sundae_ns.cli.process import percent_of, run_logged
+from sundae_ns.errors import ConfigError, StorageError, SundaeError, writing
+from sundae_ns.evaluation.document import table
+from sundae_ns.storage.atomic import write_text
+
+STOPPED = 130
+"""Exit code after an interrupt, as in shells."""
+JOB = Path(__file__).parents[1] / "job.py"
+"""Script that does one job."""
+ERROR = "sundae: "
+"""Start of the line in which a command reports an error of the package."""
+
+OnPercent = Callable[[float], object]
+Runner = Callable[[Job, Path, OnPercent], None]
+"""Runs one job, which writes its result to ``done/``."""
+Page = Callable[[Sequence[Result], Mapping[str, str]], str]
+"""Makes the page of all results, and of the reasons of failed jobs by key."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of every comparison."""
+
+    script: ClassVar[str]
+    """Name of the script."""
+    folder: Annotated[Path, tyro.conf.Positional]
+    """folder of a capture."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """folder for jobs, results and tables; its finished jobs are not run again."""
+    arms: tuple[str, ...] = ()
+    """files of arms (.yaml), and names of default arms: sundae, band (the paper's rule), contribution, random, each
+    also with -no-head; sundae-with-head, sundae-no-head-bytes; mcmc (from scratch to the same count), sundae-fast,
+    sundae-auto, splatfacto, splatfacto-7k."""
+    keep_ratios: tuple[float, ...] = (0.1,)
+    """shares of the warm-up's primitives to keep."""
+    seeds: tuple[int, ...] = (42,)
+    """the first for every job, the others for the shares of --repeat-at."""
+    repeat_at: tuple[float, ...] = (0.1,)
+    """shares that run with all seeds."""
+    method: str = "sundae"
+    """method of arms that name none; one of this package that prunes once."""
+    steps_scale: float = 1.0
+    """factor on all lengths, for a trial."""
+    shard: str = "1/1"
+    """i/n runs the i-th of n parts."""
+    jobs: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """only list the jobs, and which are done."""
+
+    def command(self) -> str:
+        """The command of the whole comparison, without the shard."""
+        words = ["python", f"benchmarks/{self.script}", str(self.folder), "-o", str(self.out)]
+        for field in fields(self):
+            value = getattr(self, field.name)
+            values = value if isinstance(value, tuple) else (value,)
+            if values and field.name not in ("folder", "out", "shard", "jobs"):
+                words += [f"--{field.name.replace('_', '-')}", *map(str, values)]
+        return shlex.join(words)
+
+
+def check_out(out: Path, *, reads: Iterable[Path]) -> None:
+    """Refuse a folder for a comparison that holds something else, or belongs to the captures.
+
+    Args:
+        out: the folder; a comparison that it holds continues there.
+        reads: captures, or folders of captures.
+
+    Raises:
+        StorageError: the folder may not be written.
+    """
+    reads = list(reads)
+    if any(out.resolve().is_relative_to(path.resolve()) for path in reads):
+        raise StorageError(f"{out} belongs to what the command reads; choose another folder")
+    check_folder(out, reads=reads, overwrite=True)
+    begun = any((out / name).is_dir() for name in ("jobs", "done")) or any(out.glob("*.jsonl"))
+    if out.is_dir() and any(out.iterdir()) and not begun:
+        raise StorageError(f"{out} holds files of something else; choose another folder")
+
+
+def compare(
+    plan: Sequence[Job],
+    options: Options,
+    page: Page,
+    runner: Runner | None,
+    console: Console,
+    *,
+    whole_captures: bool = False,
+) -> int:
+    """List the jobs, or run them and write the tables; the exit code, 1 if a job failed.
+
+    Args:
+        plan: all jobs, each after the one that it needs.
+        options: those of the command.
+        page: makes ``table.md``.
+        runner: runs a job; by default in a process of its own (:func:`spawn`).
+        console: for progress and messages.
+        whole_captures: leave a capture out whose first job fails: it is damaged, or too large for this machine.
+
+    Raises:
+        ConfigError: the shard has another form, or the folder holds results of other jobs with the same names.
+        StorageError: the folder cannot be written to.
+    """
+    out, jobs = options.out, jobs_of_shard(plan, options.shard)
+    if options.jobs:
+        show_jobs(jobs, out, console)
+        return 0
+    try:
+        failed = run_jobs(jobs, out, runner or spawn, console, whole_captures=whole_captures)
+    except KeyboardInterrupt:
+        console.print("stopped; the same command resumes", highlight=False)
+        return STOPPED
+    results = read_results(out)
+    if results:
+        write_results(out, results, page(results, failed))
+        console.print(f"wrote {out / 'table.md'}, results.csv and results.jsonl", highlight=False, soft_wrap=True)
+    if failed:
+        console.print(f"{len(failed)} jobs failed; the same command runs them again", highlight=False)
+    return 1 if failed else 0
+
+
+def show_jobs(jobs: Sequence[Job], out: Path, console: Console) -> None:
+    """List jobs, and mark finished ones."""
+    done = _finished(out)
+    rows = [[job.key, job.method, f"{job.steps:,}", job.needs or "", "done" if job.key in done else ""] for job in jobs]
+    for line in table(["job", "method", "steps", "needs", ""], rows):
+        console.print(line, highlight=False, soft_wrap=True)
+    console.print(f"{len(jobs)} jobs, {sum(job.key in done for job in jobs)} done", highlight=False)
+
+
+def run_jobs(
+    jobs: Sequence[Job], out: Path, runner: Runner, console: Console, *, whole_captures: bool = False
+) -> dict[str, str]:
+    """Run the jobs that are not done, one at a time; a job that fails stops only the jobs that need it.
+
+    Arguments and errors are those of :func:`compare`.
+
+    Returns:
+        The reason of each failure, by key.
+    """
+    done = _finished(out)
+    for job in jobs:
+        if job.key in done:
+            _check_same(job, done[job.key], out)
+    # Results may lie here without their runs, and a branch needs the run of its warm-up.
+    needed = {job.needs for job in jobs if job.key not in done}
+    done = {key: result for key, result in done.items() if key not in needed or done_file(out, key).exists()}
+    first = first_jobs(jobs) if whole_captures else {}
+    failed: dict[str, str] = {}
+    columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        everything = progress.add_task("Jobs", total=len(jobs))
+        for job in jobs:
+            if job.key not in done and first.get(job.scene) not in failed:
+                task = progress.add_task(escape(job.key), total=100)
+                try:
+                    if job.needs in failed:
+                        raise SundaeError(f"its warm-up has failed: {job.needs}")
+                    _describe(job, out)
+                    runner(job, out, partial(_show, progress, task))
+                except SundaeError as error:
+                    failed[job.key] = str(error)
+                    text = f"[red]{escape(job.key)} failed:[/red] {escape(str(error))}"
+                    console.print(text, highlight=False, soft_wrap=True)
+                    if first.get(job.scene) == job.key:
+                        console.print(f"[yellow]Left out: {escape(job.scene)}", highlight=False)
+                progress.remove_task(task)
+            progress.advance(everything)
+    return failed
+
+
+def _show(progress: Progress, task: TaskID, percent: float) -> None:
+    progress.update(task, completed=percent)
+
+
+def first_jobs(jobs: Sequence[Job]) -> dict[str, str]:
+    """Key of the first job of each capture."""
+    return {job.scene: job.key for job in reversed(jobs)}
+
+
+def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
+    """Run a job in a process of its own: memory, crashes and random numbers stay apart."""
+
+    def on_line(line: str) -> None:
+        percent = percent_of(line)
+        if percent is not None:
+            on_percent(percent)
+
+    # Another shard may wait for the same warm-up.
+    log = job_folder(out, job.key) / f"log-{os.getpid()}.txt"
+    try:
+        run_logged([sys.executable, str(JOB), str(out), job.key], log, on_line)
+    except SundaeError as error:
+        *_, last = str(error).splitlines()
+        if last.startswith(ERROR):  # an error of the package, complete in one line
+            raise SundaeError(f"{last.removeprefix(ERROR)} (log: {log})") from error
+        raise
+
+
+def _describe(job: Job, out: Path) -> None:
+    folder = job_folder(out, job.key)
+    with writing(f"cannot make {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / "job.json", json.dumps(asdict(job)) + "\n")
+
+
+def _finished(out: Path) -> dict[str, Result]:
+    return {result["job"]["key"]: result for result in read_results(out)}
+
+
+def _check_same(job: Job, result: Result, out: Path) -> None:
+    """Refuse the result of another job; the capture may have moved."""
+    ours, theirs = json.loads(json.dumps(asdict(job))), dict(result["job"])
+    odd = [name for name, value in ours.items() if name != "data" and theirs.get(name) != value]
+    if odd:
+        name = odd[0]
+        raise ConfigError(
+            f"{out} holds {job.key} with other {name} ({theirs.get(name)}, now {ours[name]}); give another folder"
+        )

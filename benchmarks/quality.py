@@ -1,0 +1,73 @@
+"""Compare methods and options on one capture: train and evaluate each arm. Stopped, the same command resumes.
+
+    python benchmarks/quality.py CAPTURE -o DIR
+    python benchmarks/quality.py CAPTURE -o DIR --arms MINE.yaml sundae --keep-ratios 0.1 --seeds 42
+
+MINE.yaml has arms of your own, as benchmarks/harness/arms.yaml has the default ones: a list of names, each with a
+method of ns-train (of this package, splatfacto, or mcmc for 3DGS-MCMC) and options of ns-train, if it needs them.
+
+Methods that prune once share a warm-up of each seed, and prune at every share of --keep-ratios. Other methods train
+from scratch. Methods and options are checked before anything is trained.
+
+Every finished job is a file of one line in DIR/done. Shards of a plan may run side by side, in one folder, or in
+several whose results.jsonl are concatenated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from rich.console import Console
+
+from harness.arms import choose_arms
+from harness.plan import parser_of, plan_scene
+from harness.results import Result, quality_page
+from harness.run import Options, Runner, check_out, compare
+from harness.script import run_script
+
+
+@dataclass(frozen=True, kw_only=True)
+class QualityOptions(Options):
+    """Options of the script."""
+
+    script = "quality.py"
+    keep_ratios: tuple[float, ...] = (0.01, 0.1)
+    seeds: tuple[int, ...] = (42, 43, 44)
+    downscale: int = 1
+    """use the images of images_2, images_4 ... (COLMAP layout)."""
+
+
+def run_quality(options: QualityOptions, runner: Runner | None = None, console: Console | None = None) -> int:
+    """Compare arms on one capture; the exit code.
+
+    Args:
+        options: those of the command.
+        runner: runs a job; by default in a process of its own.
+        console: for progress and messages.
+
+    Raises:
+        ConfigError: an option or an arm cannot work, or the folder holds results of other jobs with the same names.
+        DataError: the folder is no capture.
+        StorageError: the folder cannot be written to.
+    """
+    arms = choose_arms(options.arms, options.method, options.steps_scale)
+    check_out(options.out, reads=[options.folder])
+    data = options.folder.resolve()
+    plan = plan_scene(
+        data,
+        parser_of(data, options.downscale),
+        arms,
+        keep_ratios=options.keep_ratios,
+        seeds=options.seeds,
+        repeat_at=options.repeat_at,
+    )
+
+    def page(results: Sequence[Result], failed: Mapping[str, str]) -> str:
+        return quality_page(results, arms, options.command())
+
+    return compare(plan, options, page, runner, console or Console())
+
+
+if __name__ == "__main__":
+    run_script(QualityOptions, __doc__, run_quality)
