@@ -220,8 +220,7 @@ class SundaeModel(SplatfactoModel):
     def view_of(self, camera: Cameras, downscale: int = 1) -> View:
         """The rasteriser's form of a camera of shape ``(1,)``, moved by the camera optimizer while it trains."""
         optimizer = self.camera_optimizer
-        moved = self.training and optimizer.config.mode != "off"
-        pose = optimizer.apply_to_camera(camera) if moved else None
+        pose = optimizer.apply_to_camera(camera) if self.training and optimizer.config.mode != "off" else None
         return view_of(camera, self.device, pose=pose, downscale=downscale)
 
     def render_settings(self, *, training: bool) -> RenderSettings:
@@ -246,18 +245,16 @@ class SundaeModel(SplatfactoModel):
             camera: of shape ``(1,)``.
 
         Returns:
-            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``. Outside of training also ``features``
-            (principal components as colours) and ``response`` (spectral response of the visible primitives); all but the
-            first two are computed on access. In training also ``window``, the part that the images show, or None.
+            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``window``, the part
+            that the images show, or None. Outside of training see :func:`sundae_ns.rendering.outputs.late_outputs`.
         """
         with naming_full_memory(lambda: self.num_points):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
 
     def _training_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
-        background, state = self._get_background_color(), self.state
+        background, state, at = self._get_background_color(), self.state, self.resolution(self.step)
         view, window = self._training_view(camera)
         settings, depth = self.render_settings(training=True), self.config.output_depth_during_training
-        at = self.resolution(self.step)
         images, splatted = self.training_step.images(view, background, settings, at=at, depth=depth)
         state.info = splatted.info
         # Now, while the GPU works on this step.
@@ -332,8 +329,7 @@ class SundaeModel(SplatfactoModel):
     ) -> list[TrainingCallback]:
         """Callbacks that call the extensions."""
         self._start.announce()
-        backend = self.backend  # report an unusable rasteriser before the first step
-        CONSOLE.log(f"rasteriser: {backend.name} on {self.device}")
+        CONSOLE.log(f"rasteriser: {self.backend.name} on {self.device}")  # or an error, before the first step
         self.viewer_controls.training_field = True
         run = NerfstudioRun(self, training_callback_attributes)
         run.start()

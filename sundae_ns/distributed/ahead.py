@@ -18,7 +18,7 @@ from torch.optim import Adam, Optimizer
 
 from sundae_ns.compensation import training_window
 from sundae_ns.rasterization.sharded import Cameras, Plan, Route, Slack, camera_row, cameras_of
-from sundae_ns.rendering.source import StepResolution
+from sundae_ns.rendering.source import NEAR_PLANE, StepResolution
 from sundae_ns.rendering.views import View, view_of
 
 if TYPE_CHECKING:
@@ -32,15 +32,14 @@ class Timetable:
     """The views of all ranks at each training step.
 
     Args:
+        cameras: the training cameras.
         order: index of the view of the k-th image; the same on all ranks.
-        near_plane: distance of the near plane, world units.
+        device: of the cameras in a step.
     """
 
-    def __init__(
-        self, cameras: Capture, order: Callable[[int], int], device: torch.device | str, near_plane: float
-    ) -> None:
+    def __init__(self, cameras: Capture, order: Callable[[int], int], device: torch.device | str) -> None:
         self.ranks = dist.get_world_size()
-        self._cameras, self._order, self._device, self._near_plane = cameras, order, device, near_plane
+        self._cameras, self._order, self._device = cameras, order, device
         self._table: _Table | None = None
 
     def views(self, step: int) -> list[int]:
@@ -60,7 +59,7 @@ class Timetable:
         return self._row_of(view.cut(window)).to(self._device, non_blocking=True)
 
     def _row_of(self, view: View) -> Tensor:
-        return camera_row(view.viewmat, view.K, view.width, view.height, self._near_plane)
+        return camera_row(view.viewmat, view.K, view.width, view.height, NEAR_PLANE)
 
     def _table_of(self, downscale: int) -> _Table:
         # Not before the first step: the datamanager corrects cameras in place when it undistorts images.
@@ -99,20 +98,16 @@ class Ahead:
         Asserts that the field changed by one step of its optimizers only. Planning again is no way out, because one rank
         alone may see the change. Code that changes a field calls :meth:`sundae_ns.distributed.Shards.changed` on all ranks.
         """
-        for (held, place, version), now in zip(self.field, _plans_by(params)):
+        for (held, place, version), (now, now_at, now_version) in zip(self.field, stamped(params), strict=True):
             # A step of Adam raises a version by one; fused Adam does not raise it.
-            same = held is now and place == now.data_ptr() and now._version - version <= 1
+            same = held is now and place == now_at and now_version - version <= 1
             assert same, "the field has changed since the exchange was planned"
         return self.plan.route()
 
 
-def _plans_by(params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-    return params["means"], params["scales"]
-
-
 def stamped(params: Mapping[str, Tensor]) -> tuple[tuple[Tensor, int, int], ...]:
     """The tensors that a plan depends on, in the form of :attr:`Ahead.field`."""
-    return tuple((value, value.data_ptr(), value._version) for value in _plans_by(params))
+    return tuple((value, value.data_ptr(), value._version) for value in (params["means"], params["scales"]))
 
 
 def slack_of_step(optimizers: Mapping[str, Optimizer]) -> Slack | None:

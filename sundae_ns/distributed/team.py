@@ -25,7 +25,7 @@ from sundae_ns.distributed.pruning import GlobalPruning
 from sundae_ns.distributed.shards import Shards, bounds
 from sundae_ns.distributed.source import ShardedField
 from sundae_ns.distributed.start import check_options, without_viewer
-from sundae_ns.rendering.source import NEAR_PLANE, FieldSource
+from sundae_ns.rendering.source import FieldSource
 from sundae_ns.storage.atomic import writing
 from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.extension import Extension
@@ -150,7 +150,7 @@ class Ranks(OneProcess):
         take_shard(state, shards)
         random.seed(seed)
         cameras = datamanager.train_dataset.cameras
-        timetable = Timetable(cameras, datamanager.view_of_step, state.device, NEAR_PLANE)
+        timetable = Timetable(cameras, datamanager.view_of_step, state.device)
         sharded = ShardedField(shards, state.field, timetable)
         shards.on_change(sharded.forget_plan)
         datamanager.place = (shards.rank, shards.ranks)

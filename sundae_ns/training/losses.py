@@ -17,7 +17,6 @@ from sundae_ns.errors import BackendError
 from sundae_ns.gpu.fused_loss import WINDOW, fused_loss, loss_kernels
 from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.similarity import mean_ssim
 
 CHAIN_PRIOR = 0.01
 """Weights of opacities and scales in the loss of a chain (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
@@ -191,7 +190,8 @@ def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_
     ssim.win = ssim.win.to(target.device)  # once; each call would copy it and wait
     # Contiguous planes: convolutions of a large image with interleaved colours take much longer.
     planes, truth = (one.permute(2, 0, 1)[None].contiguous() for one in (image, target))
-    return l1_weight * (image - target).abs().mean() + weight * (1 - mean_ssim(planes, truth, ssim))
+    similarity: Tensor = ssim(planes, truth)
+    return l1_weight * (image - target).abs().mean() + weight * (1 - similarity)
 
 
 @functools.cache

@@ -34,7 +34,8 @@ LONGEST_RISE = 12
 
 _SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle")
 """Options of the model that the shapes in a checkpoint depend on."""
-_RESETS = "pipeline.model.reset_alpha_every"
+RESETS = "pipeline.model.reset_alpha_every"
+"""Counts rounds of densification, not steps."""
 _REFINE = "pipeline.model.refine_every"
 
 
@@ -49,7 +50,7 @@ def step_options(config: Any) -> list[str]:
     for group, parts in config.optimizers.items():
         if parts["scheduler"] is not None:
             names += [f"optimizers.{group}.scheduler.{name}" for name in ("max_steps", "warmup_steps")]
-    return [*names, _RESETS]
+    return [*names, RESETS]
 
 
 def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
@@ -72,8 +73,8 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
         steps_share = min(config.schedule_length / max(left, 1), 1.0)
     config.optimizers = deepcopy(config.optimizers)  # methods share them with every configuration that tyro makes
     for name in _free(config, usual, given):
-        value = _get(usual, name)
-        if name == _RESETS or not value:
+        value = option(usual, name)
+        if name == RESETS or not value:
             continue
         if name.endswith(".warmup_steps"):
             scaled = min(value, config.schedule_length // LONGEST_RISE)
@@ -81,8 +82,8 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
             scaled = max(round(value * (share if name.startswith("optimizers.") else steps_share)), 1)
         if name == _REFINE and model.warmup == "densify":
             scaled = max(scaled, min(value, LEAST_IMAGES))
-        _set(config, name, scaled)
-    if _RESETS in _free(config, usual, given):
+        set_option(config, name, scaled)
+    if RESETS in _free(config, usual, given):
         period = round(usual_model.reset_alpha_every * usual_model.refine_every * steps_share)
         never = model.stop_split_at // model.refine_every + 1
         model.reset_alpha_every = max(round(period / model.refine_every), 1) if period >= LEAST_RECOVERY else never
@@ -108,11 +109,11 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
     free = set(_free(config, usual, given, names))
     differing = []
     for name in dict.fromkeys(names):
-        theirs = _get(run, name)
+        theirs = option(run, name)
         if name in free:
-            _set(config, name, deepcopy(theirs))
-        elif _get(config, name) != theirs:
-            line = f"--{name.replace('_', '-')} is {_get(config, name)}; the run to resume has {theirs}"
+            set_option(config, name, deepcopy(theirs))
+        elif option(config, name) != theirs:
+            line = f"--{name.replace('_', '-')} is {option(config, name)}; the run to resume has {theirs}"
             # The state of a scheduler holds its options. Refused before config.yml is replaced.
             if name.removeprefix("pipeline.model.") in _SHAPES or name.startswith("optimizers."):
                 raise ConfigError(f"{line}, which cannot change; leave the option out")
@@ -211,7 +212,7 @@ def _rates(config: Any) -> str:
 def _free(config: Any, usual: Any, given: Collection[str], names: Sequence[str] | None = None) -> Sequence[str]:
     """Those of ``names``, by default the step options, that nobody set by hand."""
     names = step_options(usual) if names is None else names
-    return [name for name in names if name not in given and _get(config, name) == _get(usual, name)]
+    return [name for name in names if name not in given and option(config, name) == option(usual, name)]
 
 
 def _leaves(config: Any, prefix: str) -> list[str]:
@@ -226,12 +227,14 @@ def _leaves(config: Any, prefix: str) -> list[str]:
     return names
 
 
-def _get(config: Any, name: str) -> Any:
+def option(config: Any, name: str) -> Any:
+    """Value of the option of a dotted name; None if there is none."""
     for part in name.split("."):
         config = config.get(part) if isinstance(config, dict) else getattr(config, part, None)
     return config
 
 
-def _set(config: Any, name: str, value: Any) -> None:
+def set_option(config: Any, name: str, value: Any) -> None:
+    """Set the option of a dotted name."""
     owner, _, last = name.rpartition(".")
-    setattr(_get(config, owner), last, value)
+    setattr(option(config, owner), last, value)
