@@ -51,16 +51,12 @@ class _Held:
         groups = [
             (name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups
         ]
-        states = [
-            (optimizer.state, value, optimizer.state[value])
-            for _, optimizer, group in groups
-            for value in group["params"]
-        ]
-        statistics = [(name, value) for name, value in state.densification.items() if isinstance(value, Tensor)]
-        tensors = [
+        members = [(optimizer.state, value) for _, optimizer, group in groups for value in group["params"]]
+        states = [(held, value, held[value]) for held, value in members]
+        tensors: list[tuple[Mapping[Any, Any], Any, Any]] = [
             *states,
             *((state.field, name, state.field[name]) for name in trained),
-            *((state.densification, name, value) for name, value in statistics),
+            *((state.densification, *item) for item in state.densification.items() if isinstance(item[1], Tensor)),
         ]
         addresses = tuple(own[name].data_ptr() for _, _, own in states for name in (*MOMENTS, "step"))
         return cls(trained, growing, groups, tensors, (addresses, None if head is None else head.addresses()))
@@ -168,7 +164,8 @@ class RecordedStep:
         self, held: _Held, grads: Mapping[Tensor, Tensor | None]
     ) -> list[tuple[Mapping[str, Any], list[Update]]]:
         """Groups of parameters with their updates, on whole buffers."""
-        tensors, groups = self._buffers.tensors, []
+        tensors = self._buffers.tensors
+        groups: list[tuple[Mapping[str, Any], list[Update]]] = []
         for name, optimizer, group in held.groups:
             updates = []
             for value in group["params"]:

@@ -237,4 +237,4 @@ def option(config: Any, name: str) -> Any:
 def set_option(config: Any, name: str, value: Any) -> None:
     """Set the option of a dotted name."""
     owner, _, last = name.rpartition(".")
-    setattr(option(config, owner), last, value)
+    setattr(option(config, owner) if owner else config, last, value)
