@@ -40,8 +40,8 @@ FARTHEST = 10_000
 def no_images_error(run: object = "this run") -> DataError:
     """The error for training or evaluating on the grey images of a run that was unpacked without its capture."""
     return DataError(
-        f"{run} was unpacked without its capture, so its cameras have no images to train or evaluate on; give the capture to "
-        "sundae unpack with --data"
+        f"{run} was unpacked without its capture, so its cameras have no images to train or evaluate on; give the "
+        "capture to sundae unpack with --data"
     )
 
 
@@ -126,8 +126,8 @@ def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
     if mirrored.any():
         first = names[int(mirrored.nonzero()[0])].name
         raise DataError(
-            f"the pose of {first} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses do); negate one column of "
-            "its rotation"
+            f"the pose of {first} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses do); negate one column "
+            "of its rotation"
         )
     shares = cameras.fx / cameras.width.clamp_min(1)
     wrong = ((shares < LEAST_FOCAL) | (shares > MOST_FOCAL)).flatten()
@@ -146,8 +146,8 @@ def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
     if usual > 0 and far.any():
         first = names[int(far.nonzero()[0])].name
         return (
-            f"the camera of {first} is more than {FARTHEST:,} times as far away as most ({int(far.sum())} of {len(names)} "
-            "are); check the poses"
+            f"the camera of {first} is more than {FARTHEST:,} times as far away as most ({int(far.sum())} of "
+            f"{len(names)} are); check the poses"
         )
     return None
 
@@ -194,9 +194,9 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
 class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     """Serves whole images.
 
-    Beyond the stock datamanager: it caches images on machines without CUDA. The view of a step is a function of seed and
-    step, so a resumed run continues in the same order. It can hold out training views, and lists the others with their
-    masks. Training cameras stay on the CPU, where reading their sizes does not wait for the GPU.
+    Beyond the stock datamanager: it caches images on machines without CUDA. The view of a step is a function of seed
+    and step, so a resumed run continues in the same order. It can hold out training views, and lists the others with
+    their masks. Training cameras stay on the CPU, where reading their sizes does not wait for the GPU.
     """
 
     config: SundaeDatamanagerConfig
@@ -210,8 +210,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     ) -> None:
         if config.train_cameras_sampling_strategy != "random":
             raise ConfigError(
-                "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run would differ; "
-                "use random"
+                "train-cameras-sampling-strategy fps is not a function of seed and step, so a resumed run would "
+                "differ; use random"
             )
         if config.holdout_every < 0 or config.holdout_every == 1:
             raise ConfigError(f"holdout-every is {config.holdout_every}; give 0 (none) or at least 2")
@@ -343,8 +343,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             cache_images_device = "gpu"
         elif cache_images_device == "gpu" and not _fits(dataset.cameras, torch.device(self.device)):
             CONSOLE.print(
-                f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each step "
-                "copies one",
+                f"the {split} images need more than half of the free GPU memory: they stay in main memory, and each "
+                "step copies one",
                 soft_wrap=True,
             )
             cache_images_device = "cpu"
@@ -352,8 +352,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         transparent = sum(batch["image"].shape[-1] == 4 for batch in loaded)
         if split == "train" and transparent:
             CONSOLE.print(
-                f"{transparent} of {len(loaded)} training images have an alpha channel: what is transparent is trained to be "
-                "empty space. To leave pixels out instead, give masks (mask_path in transforms.json)",
+                f"{transparent} of {len(loaded)} training images have an alpha channel: what is transparent is trained "
+                "to be empty space. To leave pixels out instead, give masks (mask_path in transforms.json)",
                 soft_wrap=True,
             )
         return loaded

@@ -1,7 +1,7 @@
 """The SUNDAE model: splatfacto's field with spectral pruning and neural compensation.
 
-It connects nerfstudio to the rooms below: state, source of primitives, extensions, rendering. Module path and class names
-are written into every run's ``config.yml``, so moving them breaks saved runs.
+It connects nerfstudio to the rooms below: state, source of primitives, extensions, rendering. Module path and class
+names are written into every run's ``config.yml``, so moving them breaks saved runs.
 """
 
 from __future__ import annotations
@@ -233,7 +233,9 @@ class SundaeModel(SplatfactoModel):
         )
 
     @torch.no_grad()
-    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
+    def get_outputs_for_camera(  # type: ignore[override]
+        self, camera: Cameras, obb_box: OrientedBox | None = None
+    ) -> MutableMapping[str, Any]:
         """Render a camera, or the primitives in a box; unlike splatfacto's, this leaves the camera on its device."""
         self.set_crop(obb_box)
         return self.get_outputs(camera)
@@ -245,8 +247,8 @@ class SundaeModel(SplatfactoModel):
             camera: of shape ``(1,)``.
 
         Returns:
-            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``window``, the part
-            that the images show, or None. Outside of training see :func:`sundae_ns.rendering.outputs.late_outputs`.
+            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``window``, the
+            part that the images show, or None. See ``rendering.outputs.late_outputs`` for those outside of training.
         """
         with naming_full_memory(lambda: self.num_points):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
@@ -283,7 +285,7 @@ class SundaeModel(SplatfactoModel):
         return late
 
     def contribution(self, datamanager: SundaeDatamanager, keep_ratio: float | None = None) -> Tensor:
-        """Blending weight of each primitive over the training views ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
+        """Summed blending weight of each primitive ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
         views, settings = training_views(self, datamanager), self.render_settings(training=False)
         return contribution(self.source, views, self.background_color, settings, keep_ratio, progress=True)
 
@@ -295,14 +297,12 @@ class SundaeModel(SplatfactoModel):
         return TrainingStep(self.source, self.state, self.losses, self.state.field)
 
     def _training_view(self, camera: Cameras) -> tuple[View, Window | None]:
-        """The part of a training camera that a step shows; views are kept, because copying one to a GPU waits for it."""
+        """The part of a training camera that a step shows. Views are kept: copying one to a GPU waits for it."""
         at = self.resolution(self.step)
         key = view_index(camera), at.downscale
-        view = self._views.get(key)
-        if view is None:
-            view = self.view_of(camera, at.downscale)
-            if key[0] is not None and self.camera_optimizer.config.mode == "off":
-                self._views[key] = view
+        view = self._views.get(key) or self.view_of(camera, at.downscale)
+        if key[0] is not None and self.camera_optimizer.config.mode == "off":
+            self._views[key] = view
         return training_part(self.state, view, at)
 
     def step_inputs(self, camera: Cameras, batch: dict[str, Any]) -> StepInputs:

@@ -1,7 +1,7 @@
 """The exchange of the next step, planned during this step, so that no step begins with a wait for the GPU.
 
-The view of each rank is a function of the step, and Adam moves a parameter by a bounded multiple of its rate. So all ranks
-know the next cameras, and which primitives these may see, before the backward pass has finished.
+The view of each rank is a function of the step, and Adam moves a parameter by a bounded multiple of its rate. So all
+ranks know the next cameras, and which primitives these may see, before the backward pass has finished.
 """
 
 from __future__ import annotations
@@ -95,8 +95,9 @@ class Ahead:
     def route(self, params: Mapping[str, Tensor]) -> Route:
         """The route of the planned exchange; see :meth:`Plan.route`.
 
-        Asserts that the field changed by one step of its optimizers only. Planning again is no way out, because one rank
-        alone may see the change. Code that changes a field calls :meth:`sundae_ns.distributed.Shards.changed` on all ranks.
+        Asserts that the field changed by one step of its optimizers only. Planning again is no way out, because one
+        rank alone may see the change. Code that changes a field calls :meth:`sundae_ns.distributed.Shards.changed` on
+        all ranks.
         """
         for (held, place, version), (now, now_at, now_version) in zip(self.field, stamped(params), strict=True):
             # A step of Adam raises a version by one; fused Adam does not raise it.
@@ -123,12 +124,12 @@ def slack_of_step(optimizers: Mapping[str, Optimizer]) -> Slack | None:
 def longest_step(optimizer: Optimizer) -> float:
     """Bound on the change of any number of the parameter in one step; infinite if there is none.
 
-    Adam divides ``m = sum w_i g_i`` by the root of ``v = sum u_i g_i^2``. The weights are proportional to ``b1^(t-i)`` and
-    ``b2^(t-i)``, and sum to 1 each. By Cauchy and Schwarz the quotient is at most the root of ``sum w_i^2 / u_i``. With
-    ``q = b1^2 / b2`` this is the root of ``(1-b1)^2 / ((1-b2) (1-q))`` times ``(1-b2^t) (1-q^t) / (1-b1^t)^2``, and the latter
-    is at most 1, since ``b2^t + q^t >= 2 b1^t``. Gradients that grow by ``b2 / b1`` at each step come arbitrarily near: 7.3
-    times the rate for the usual betas. The lower bounds in section 2.1 of Kingma & Ba (2015) hold for sparse and for steady
-    gradients.
+    Adam divides ``m = sum w_i g_i`` by the root of ``v = sum u_i g_i^2``. The weights are proportional to ``b1^(t-i)``
+    and ``b2^(t-i)``, and sum to 1 each. By Cauchy and Schwarz the quotient is at most the root of ``sum w_i^2 / u_i``.
+    With ``q = b1^2 / b2`` this is the root of ``(1-b1)^2 / ((1-b2) (1-q))`` times ``(1-b2^t) (1-q^t) / (1-b1^t)^2``,
+    and the latter is at most 1, since ``b2^t + q^t >= 2 b1^t``. Gradients that grow by ``b2 / b1`` at each step come
+    arbitrarily near: 7.3 times the rate for the usual betas. The lower bounds in section 2.1 of Kingma & Ba (2015) hold
+    for sparse and for steady gradients.
     """
     (group,) = optimizer.param_groups
     if type(optimizer) is not Adam or group.get("decoupled_weight_decay"):

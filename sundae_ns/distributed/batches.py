@@ -48,8 +48,8 @@ def average_gradients(params: Iterable[Tensor]) -> None:
 def scale_rates(optimizers: Optimizers, names: Iterable[str], ranks: int) -> None:
     """Adapt Adam to batches of ``ranks`` images: rates times the square root, betas to that power.
 
-    Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024. The rule is for primitives, which
-    few images see. The head, whose weights every image uses, keeps its own rate.
+    Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024. The rule is for primitives,
+    which few images see. The head, whose weights every image uses, keeps its own rate.
     """
     for key in names:
         for group in optimizers.optimizers[key].param_groups:

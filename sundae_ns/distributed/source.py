@@ -77,7 +77,7 @@ class ShardedField:
         cameras, route = self._exchange(view, at)
         params = self.field
         names = [*_GEOMETRY, FEATURES] if features else list(_GEOMETRY)
-        # Selected for all cameras at once: the backward pass then fills one gradient for each parameter, not for each camera.
+        # For all cameras at once: the backward pass then fills one gradient for each parameter, not for each camera.
         going = {name: params[name].index_select(0, route.ids) for name in [*names, *_COLORS]}
         centers = cameras.centers.index_select(0, route.cameras)
         rows = torch.cat([*(going[name] for name in names), colors_from(going, params, centers, settings)], dim=1)
@@ -102,7 +102,7 @@ class ShardedField:
 
     @torch.no_grad()
     def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
-        """Plan the exchange of a later step, for wherever the optimizers may move the field; wait for nothing. Collective.
+        """Plan the exchange of a later step, wherever the optimizers may move the field; wait for nothing. Collective.
 
         Without a bound on the optimizers' step, the same on all ranks, nothing is planned.
         """

@@ -1,7 +1,7 @@
 """The processes that train together, one or several, behind one set of verbs.
 
-:class:`OneProcess` has nothing to share; :class:`Ranks` shards the field over the ranks of the default process group. The
-trainer calls the verbs and does not ask which of both it has.
+:class:`OneProcess` has nothing to share; :class:`Ranks` shards the field over the ranks of the default process group.
+The trainer calls the verbs and does not ask which of both it has.
 """
 
 from __future__ import annotations
@@ -182,8 +182,8 @@ class Ranks(OneProcess):
         apart = 0.0 if head is None else self.shards.apart(head.parameters())
         if apart != 0 and self.shards.rank == 0:
             warn(
-                f"the heads of the ranks differ by up to {apart:.2g}, which is a bug of sundae; the checkpoint holds the head "
-                "of the first rank, and resuming from it makes them equal"
+                f"the heads of the ranks differ by up to {apart:.2g}, which is a bug of sundae; the checkpoint holds "
+                "the head of the first rank, and resuming from it makes them equal"
             )
 
     def gathered(self, state: State, names: list[str]) -> State | None:

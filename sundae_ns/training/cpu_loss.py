@@ -1,8 +1,8 @@
 """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, L1 of its base colours, and gradients: one compiled loop each.
 
-The CPU's twin of :mod:`sundae_ns.gpu.fused_loss`. A row of an image ``[H, W, 3]`` is one run of interleaved colours, so a
-window takes every third number of it. Loops run over rows, each with a sum of its own, so results do not depend on the
-number of threads. Importing this module imports numba.
+The CPU's twin of :mod:`sundae_ns.gpu.fused_loss`. A row of an image ``[H, W, 3]`` is one run of interleaved colours, so
+a window takes every third number of it. Loops run over rows, each with a sum of its own, so results do not depend on
+the number of threads. Importing this module imports numba.
 """
 
 from __future__ import annotations

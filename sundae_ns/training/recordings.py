@@ -1,7 +1,7 @@
 """Training steps as CUDA graphs: when to record one, and which to replay.
 
-A step is some two hundred small kernels. Launched one by one from Python they take several times as long as the GPU works.
-A graph launches them together. It reads its inputs where the last call has put them.
+A step is some two hundred small kernels. Launched one by one from Python they take several times as long as the GPU
+works. A graph launches them together. It reads its inputs where the last call has put them.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ MAX_RECORDINGS = 8
 """Recordings kept at a time: one for each image size and SH degree in use."""
 
 UNUSED = 1000
-"""Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by kernel,
-because recording takes longer than a step."""
+"""Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by
+kernel, because recording takes longer than a step."""
 
 StepWork = Callable[[StepInputs, RenderSettings, Capacity | None], StepResult]
 """The GPU work of a step, with the capacity of the rasteriser that is set; None for another rasteriser."""
@@ -46,8 +46,8 @@ class _Recording:
 class StepRecordings:
     """Runs training steps. The first of a kind runs kernel by kernel, because libraries choose and load kernels then.
 
-    Later ones replay. A step whose view has more tile/primitive pairs than fit changes nothing, and the next recording has
-    room for them.
+    Later ones replay. A step whose view has more tile/primitive pairs than fit changes nothing, and the next recording
+    has room for them.
 
     Args:
         record: False runs every step kernel by kernel, as a test does on a CPU.

@@ -1,7 +1,7 @@
 """The schedule of a run: all options that count steps, and how they follow the length of the run.
 
-A method's options are written for the method's own length, 30,000 steps for ``sundae``. :func:`fit_to_length` scales those
-that nobody set by hand to another length; nothing else in the package knows a factor.
+A method's options are written for the method's own length, 30,000 steps for ``sundae``. :func:`fit_to_length` scales
+those that nobody set by hand to another length; nothing else in the package knows a factor.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from sundae_ns.storage.runs.folder import find_config
 from sundae_ns.training.warning import warn
 
 SCHEDULE = {
-    "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval refine_every",
+    "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval "
+    "refine_every",
     "pipeline.model.pruning": "prune_at start stop every search_every",
     "pipeline.model.head": "start_at",
 }
@@ -28,7 +29,7 @@ SCHEDULE = {
 LEAST_IMAGES = 50
 """Images that densification sees between two rounds, at least: fewer say too little of a primitive's gradient."""
 LEAST_RECOVERY = 1000
-"""Steps between two resets of the opacities, at least: shorter runs do without, because they have no time to recover."""
+"""Least steps between two resets of the opacities: shorter runs have no time to recover, and do without."""
 LONGEST_RISE = 12
 """A learning rate rises over at most this fraction of the run."""
 
@@ -40,7 +41,7 @@ _REFINE = "pipeline.model.refine_every"
 
 
 def given_options(words: Iterable[str]) -> frozenset[str]:
-    """Dotted names of the options in a command line: ``pipeline.model.sh_degree`` of ``--pipeline.model.sh-degree 2``."""
+    """Dotted names of the options in a command line: ``pipeline.model.sh_degree`` of ``--pipeline.model.sh-degree``."""
     return frozenset(re.split("[= ]", word[2:])[0].replace("-", "_") for word in words if word.startswith("--"))
 
 
@@ -90,7 +91,7 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
 
 
 def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> list[str]:
-    """Give a configuration the schedule and the model of the run that it resumes, but for options that were set by hand.
+    """Give a configuration schedule and model of the run that it resumes, but for options that were set by hand.
 
     Args:
         config: ``SundaeTrainerConfig``; its schedule and its model change.
@@ -143,7 +144,8 @@ def steps_left(config: Any) -> int:
     left: int = length if step is None else length - step - 1
     if left < 1:
         raise ConfigError(
-            f"the run has trained all of its {length:,} steps; give the number of further ones with --max-num-iterations"
+            f"the run has trained all of its {length:,} steps; give the number of further ones with "
+            "--max-num-iterations"
         )
     return left
 
