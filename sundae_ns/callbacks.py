@@ -49,24 +49,10 @@ class NerfstudioRun:
     """
 
     def __init__(self, model: ModelInTraining, attributes: TrainingCallbackAttributes) -> None:
-        self.model = model
+        self.model, self.state, self.source = model, model.state, model.source
+        self.background = model.shown_background
         self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
         self._trainer = cast(Any, attributes.trainer)
-
-    @property
-    def state(self) -> FieldState:
-        """The field in training."""
-        return self.model.state
-
-    @property
-    def source(self) -> FieldSource:
-        """Where views get their primitives from."""
-        return self.model.source
-
-    @property
-    def background(self) -> Tensor:
-        """Background of images that are not trained on ``[3]``."""
-        return self.model.shown_background
 
     @property
     def settings(self) -> RenderSettings:

@@ -1,7 +1,7 @@
 """The SUNDAE model: splatfacto's field with spectral pruning and neural compensation.
 
-It connects nerfstudio to the rooms below: state, source of primitives, extensions, rendering. Module path and class names
-are written into every run's ``config.yml``, so moving them breaks saved runs.
+It connects nerfstudio to the rooms below: state, source of primitives, extensions, rendering. Module path and class
+names are written into every run's ``config.yml``, so moving them breaks saved runs.
 """
 
 from __future__ import annotations
@@ -221,8 +221,7 @@ class SundaeModel(SplatfactoModel):
     def view_of(self, camera: Cameras, downscale: int = 1) -> View:
         """The rasteriser's form of a camera of shape ``(1,)``, moved by the camera optimizer while it trains."""
         optimizer = self.camera_optimizer
-        moved = self.training and optimizer.config.mode != "off"
-        pose = optimizer.apply_to_camera(camera) if moved else None
+        pose = optimizer.apply_to_camera(camera) if self.training and optimizer.config.mode != "off" else None
         return view_of(camera, self.device, pose=pose, downscale=downscale)
 
     def render_settings(self, *, training: bool) -> RenderSettings:
@@ -235,7 +234,9 @@ class SundaeModel(SplatfactoModel):
         )
 
     @torch.no_grad()
-    def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> MutableMapping[str, Any]:  # type: ignore[override]
+    def get_outputs_for_camera(  # type: ignore[override]
+        self, camera: Cameras, obb_box: OrientedBox | None = None
+    ) -> MutableMapping[str, Any]:
         """Render a camera, or the primitives in a box; unlike splatfacto's, this leaves the camera on its device."""
         self.set_crop(obb_box)
         return self.get_outputs(camera)
@@ -247,18 +248,16 @@ class SundaeModel(SplatfactoModel):
             camera: of shape ``(1,)``.
 
         Returns:
-            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``. Outside of training also ``features``
-            (principal components as colours) and ``response`` (spectral response of the visible primitives); all but the
-            first two are computed on access. In training also ``window``, the part that the images show, or None.
+            ``rgb, base_rgb, depth, accumulation, background``, each ``[H, W, C]``; in training also ``window``, the
+            part that the images show, or None. See ``rendering.outputs.late_outputs`` for those outside of training.
         """
         with naming_full_memory(lambda: self.num_points):
             return self._training_outputs(camera) if self.training else self._shown_outputs(camera)
 
     def _training_outputs(self, camera: Cameras) -> MutableMapping[str, Any]:
-        background, state = self._get_background_color(), self.state
+        background, state, at = self._get_background_color(), self.state, self.resolution(self.step)
         view, window = self._training_view(camera)
         settings, depth = self.render_settings(training=True), self.config.output_depth_during_training
-        at = self.resolution(self.step)
         images, splatted = self.training_step.images(view, background, settings, at=at, depth=depth)
         state.info = splatted.info
         # Now, while the GPU works on this step.
@@ -287,7 +286,7 @@ class SundaeModel(SplatfactoModel):
         return late
 
     def contribution(self, datamanager: SundaeDatamanager, count: int | None = None) -> Tensor:
-        """Blending weight of each primitive over the training views ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
+        """Summed blending weight of each primitive ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
         views, settings = training_views(self, datamanager), self.render_settings(training=False)
         return contribution(self.source, views, self.background_color, settings, count, console=CONSOLE)
 
@@ -299,14 +298,12 @@ class SundaeModel(SplatfactoModel):
         return TrainingStep(self.source, self.state, self.losses, self.state.field)
 
     def _training_view(self, camera: Cameras) -> tuple[View, Window | None]:
-        """The part of a training camera that a step shows; views are kept, because copying one to a GPU waits for it."""
+        """The part of a training camera that a step shows. Views are kept: copying one to a GPU waits for it."""
         at = self.resolution(self.step)
         key = view_index(camera), at.downscale
-        view = self._views.get(key)
-        if view is None:
-            view = self.view_of(camera, at.downscale)
-            if key[0] is not None and self.camera_optimizer.config.mode == "off":
-                self._views[key] = view
+        view = self._views.get(key) or self.view_of(camera, at.downscale)
+        if key[0] is not None and self.camera_optimizer.config.mode == "off":
+            self._views[key] = view
         return training_part(self.state, view, at)
 
     def step_inputs(self, camera: Cameras, batch: dict[str, Any]) -> StepInputs:
@@ -333,8 +330,7 @@ class SundaeModel(SplatfactoModel):
     ) -> list[TrainingCallback]:
         """Callbacks that call the extensions."""
         self._start.announce()
-        backend = self.backend  # report an unusable rasteriser before the first step
-        CONSOLE.log(f"rasteriser: {backend.name} on {self.device}")
+        CONSOLE.log(f"rasteriser: {self.backend.name} on {self.device}")  # or an error, before the first step
         self.viewer_controls.training_field = True
         run = NerfstudioRun(self, training_callback_attributes)
         run.start()

@@ -47,10 +47,10 @@ class SundaeTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: SundaeTrainer)
     record_steps: bool = True
     """On one CUDA device: record training steps as CUDA graphs, which saves most of Python's time. Steps that cannot be
-    recorded (camera optimizer, mixed precision, gradient accumulation or clipping) run kernel by kernel, with equal results."""
+    recorded (camera optimizer, mixed precision, gradient accumulation or clipping) run kernel by kernel."""
     schedule_length: int | None = None
     """Steps over which prune, densification, resolution and learning rates are spread, unless you set their options: by
-    default max_num_iterations, and the length of the run that is resumed. A larger number trains the first part only."""
+    default max_num_iterations, and the length of the run that is resumed. A larger number trains the first part."""
 
     def print_to_terminal(self) -> None:
         """Check the capture, make the schedule and log it; the other options are in ``config.yml``.
@@ -165,7 +165,7 @@ class SundaeTrainer(Trainer):
 
     def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         self.team = distributed.team_of(local_rank, world_size)
-        # nerfstudio sees one process. For more it would wrap the model in DDP, which breaks when the field changes its size.
+        # nerfstudio sees one process. For more it would use DDP, which breaks when the field changes its size.
         super().__init__(self.team.configured(config), local_rank, world_size=1)
         self.team.make_folder(self.base_dir)
         self._recorded: RecordedStep | None = None
@@ -280,7 +280,7 @@ class SundaeTrainer(Trainer):
         return result.loss, result.losses, model.get_metrics_dict(outputs, batch)
 
     def _warn_if_long(self, number: int) -> None:
-        """On a CPU, warn of a training of hours once ten steps are measured; the first compiles, and the second warms up."""
+        """On a CPU, warn of a training of hours, by ten steps; the first compiles, and the second warms up."""
         if self.config.machine.device_type != "cpu" or self.team.collective:
             return
         if number == 1:

@@ -1,7 +1,7 @@
 """The exchange of the next step, planned during this step, so that no step begins with a wait for the GPU.
 
-The view of each rank is a function of the step, and Adam moves a parameter by a bounded multiple of its rate. So all ranks
-know the next cameras, and which primitives these may see, before the backward pass has finished.
+The view of each rank is a function of the step, and Adam moves a parameter by a bounded multiple of its rate. So all
+ranks know the next cameras, and which primitives these may see, before the backward pass has finished.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch.optim import Adam, Optimizer
 
 from sundae_ns.compensation import training_window
 from sundae_ns.rasterization.sharded import Cameras, Plan, Route, Slack, camera_row, cameras_of
-from sundae_ns.rendering.source import StepResolution
+from sundae_ns.rendering.source import NEAR_PLANE, StepResolution
 from sundae_ns.rendering.views import View, view_of
 
 if TYPE_CHECKING:
@@ -32,15 +32,14 @@ class Timetable:
     """The views of all ranks at each training step.
 
     Args:
+        cameras: the training cameras.
         order: index of the view of the k-th image; the same on all ranks.
-        near_plane: distance of the near plane, world units.
+        device: of the cameras in a step.
     """
 
-    def __init__(
-        self, cameras: Capture, order: Callable[[int], int], device: torch.device | str, near_plane: float
-    ) -> None:
+    def __init__(self, cameras: Capture, order: Callable[[int], int], device: torch.device | str) -> None:
         self.ranks = dist.get_world_size()
-        self._cameras, self._order, self._device, self._near_plane = cameras, order, device, near_plane
+        self._cameras, self._order, self._device = cameras, order, device
         self._table: _Table | None = None
 
     def views(self, step: int) -> list[int]:
@@ -60,7 +59,7 @@ class Timetable:
         return self._row_of(view.cut(window)).to(self._device, non_blocking=True)
 
     def _row_of(self, view: View) -> Tensor:
-        return camera_row(view.viewmat, view.K, view.width, view.height, self._near_plane)
+        return camera_row(view.viewmat, view.K, view.width, view.height, NEAR_PLANE)
 
     def _table_of(self, downscale: int) -> _Table:
         # Not before the first step: the datamanager corrects cameras in place when it undistorts images.
@@ -96,23 +95,20 @@ class Ahead:
     def route(self, params: Mapping[str, Tensor]) -> Route:
         """The route of the planned exchange; see :meth:`Plan.route`.
 
-        Asserts that the field changed by one step of its optimizers only. Planning again is no way out, because one rank
-        alone may see the change. Code that changes a field calls :meth:`sundae_ns.distributed.Shards.changed` on all ranks.
+        Asserts that the field changed by one step of its optimizers only. Planning again is no way out, because one
+        rank alone may see the change. Code that changes a field calls :meth:`sundae_ns.distributed.Shards.changed` on
+        all ranks.
         """
-        for (held, place, version), now in zip(self.field, _plans_by(params)):
+        for (held, place, version), (now, now_at, now_version) in zip(self.field, stamped(params), strict=True):
             # A step of Adam raises a version by one; fused Adam does not raise it.
-            same = held is now and place == now.data_ptr() and now._version - version <= 1
+            same = held is now and place == now_at and now_version - version <= 1
             assert same, "the field has changed since the exchange was planned"
         return self.plan.route()
 
 
-def _plans_by(params: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-    return params["means"], params["scales"]
-
-
 def stamped(params: Mapping[str, Tensor]) -> tuple[tuple[Tensor, int, int], ...]:
     """The tensors that a plan depends on, in the form of :attr:`Ahead.field`."""
-    return tuple((value, value.data_ptr(), value._version) for value in _plans_by(params))
+    return tuple((value, value.data_ptr(), value._version) for value in (params["means"], params["scales"]))
 
 
 def slack_of_step(optimizers: Mapping[str, Optimizer]) -> Slack | None:
@@ -128,12 +124,12 @@ def slack_of_step(optimizers: Mapping[str, Optimizer]) -> Slack | None:
 def longest_step(optimizer: Optimizer) -> float:
     """Bound on the change of any number of the parameter in one step; infinite if there is none.
 
-    Adam divides ``m = sum w_i g_i`` by the root of ``v = sum u_i g_i^2``. The weights are proportional to ``b1^(t-i)`` and
-    ``b2^(t-i)``, and sum to 1 each. By Cauchy and Schwarz the quotient is at most the root of ``sum w_i^2 / u_i``. With
-    ``q = b1^2 / b2`` this is the root of ``(1-b1)^2 / ((1-b2) (1-q))`` times ``(1-b2^t) (1-q^t) / (1-b1^t)^2``, and the latter
-    is at most 1, since ``b2^t + q^t >= 2 b1^t``. Gradients that grow by ``b2 / b1`` at each step come arbitrarily near: 7.3
-    times the rate for the usual betas. The lower bounds in section 2.1 of Kingma & Ba (2015) hold for sparse and for steady
-    gradients.
+    Adam divides ``m = sum w_i g_i`` by the root of ``v = sum u_i g_i^2``. The weights are proportional to ``b1^(t-i)``
+    and ``b2^(t-i)``, and sum to 1 each. By Cauchy and Schwarz the quotient is at most the root of ``sum w_i^2 / u_i``.
+    With ``q = b1^2 / b2`` this is the root of ``(1-b1)^2 / ((1-b2) (1-q))`` times ``(1-b2^t) (1-q^t) / (1-b1^t)^2``,
+    and the latter is at most 1, since ``b2^t + q^t >= 2 b1^t``. Gradients that grow by ``b2 / b1`` at each step come
+    arbitrarily near: 7.3 times the rate for the usual betas. The lower bounds in section 2.1 of Kingma & Ba (2015) hold
+    for sparse and for steady gradients.
     """
     (group,) = optimizer.param_groups
     if type(optimizer) is not Adam or group.get("decoupled_weight_decay"):

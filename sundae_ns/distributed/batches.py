@@ -11,6 +11,8 @@ import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
 
+from sundae_ns.training.run_length import RESETS, option, set_option, step_options
+
 
 class SharedOptimizers(Optimizers):
     """nerfstudio's optimizers; gradients of replicated groups are averaged over the ranks."""
@@ -46,8 +48,8 @@ def average_gradients(params: Iterable[Tensor]) -> None:
 def scale_rates(optimizers: Optimizers, names: Iterable[str], ranks: int) -> None:
     """Adapt Adam to batches of ``ranks`` images: rates times the square root, betas to that power.
 
-    Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024. The rule is for primitives, which
-    few images see. The head, whose weights every image uses, keeps its own rate.
+    Source: Zhao et al., "On Scaling Up 3D Gaussian Splatting Training" (Grendel-GS), 2024. The rule is for primitives,
+    which few images see. The head, whose weights every image uses, keeps its own rate.
     """
     for key in names:
         for group in optimizers.optimizers[key].param_groups:
@@ -69,21 +71,15 @@ def scaled_group(group: Mapping[str, Any], factor: float) -> dict[str, Any]:
 def shorten(config: Any, ranks: int) -> Any:
     """A copy of a configuration with all steps divided by ``ranks``: the same number of images in larger batches."""
     config = deepcopy(config)
-    model = config.pipeline.model
-    steps: tuple[tuple[Any, str], ...] = (
-        (config, "max_num_iterations schedule_length steps_per_save steps_per_eval_image steps_per_eval_all_images"),
-        (model.pruning, "prune_at start stop every"),
-        (model.head, "start_at"),
-        (model, "warmup_length refine_every resolution_schedule sh_degree_interval stop_screen_size_at stop_split_at"),
+    run = (
+        "max_num_iterations",
+        "schedule_length",
+        "steps_per_save",
+        "steps_per_eval_image",
+        "steps_per_eval_all_images",
     )
-    for owner, names in steps:
-        for name in names.split():
-            value = getattr(owner, name)
-            if value:
-                setattr(owner, name, max(1, round(value / ranks)))
-    for group in config.optimizers.values():
-        scheduler = group["scheduler"]
-        if scheduler is not None:
-            scheduler.max_steps = max(1, round(scheduler.max_steps / ranks))
-            scheduler.warmup_steps = round(getattr(scheduler, "warmup_steps", 0) / ranks)
+    for name in [*run, *step_options(config)]:
+        value = option(config, name)
+        if value and name != RESETS:
+            set_option(config, name, max(1, round(value / ranks)))
     return config

@@ -116,8 +116,8 @@ class Shards:
     ) -> None:
         """Balance the ranks in the order of the rows; with a mask, keep the rows under it. Collective.
 
-        Parameters are replaced as by :func:`sundae_ns.gaussians.surgery.keep`: gradients are dropped, moments are kept, and
-        other holders of the old parameters must be refreshed.
+        Parameters are replaced as by :func:`sundae_ns.gaussians.surgery.keep`: gradients are dropped, moments are kept,
+        and other holders of the old parameters must be refreshed.
 
         Args:
             params: this rank's primitives ``[N_r, ...]``.

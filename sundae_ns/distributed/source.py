@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,19 +37,6 @@ from sundae_ns.training.densification import Statistics
 
 _GEOMETRY = ("means", "quats", "scales", "opacities")
 _COLORS = ("features_dc", "features_rest")
-
-
-class Exchange(NamedTuple):
-    """One exchange of primitives: the cameras of all ranks, and the route."""
-
-    cameras: Cameras
-    route: Route
-
-
-def _exchange_now(params: Mapping[str, Tensor], cameras: Cameras) -> Exchange:
-    with torch.no_grad():
-        seen = may_be_seen(params["means"], params["scales"], cameras.bounds)
-    return Exchange(cameras, plan_exchange(seen).route())
 
 
 class ShardedField:
@@ -90,7 +77,7 @@ class ShardedField:
         cameras, route = self._exchange(view, at)
         params = self.field
         names = [*_GEOMETRY, FEATURES] if features else list(_GEOMETRY)
-        # Selected for all cameras at once: the backward pass then fills one gradient for each parameter, not for each camera.
+        # For all cameras at once: the backward pass then fills one gradient for each parameter, not for each camera.
         going = {name: params[name].index_select(0, route.ids) for name in [*names, *_COLORS]}
         centers = cameras.centers.index_select(0, route.cameras)
         rows = torch.cat([*(going[name] for name in names), colors_from(going, params, centers, settings)], dim=1)
@@ -101,19 +88,21 @@ class ShardedField:
         return received
 
     @torch.no_grad()
-    def _exchange(self, view: View, at: StepResolution | None) -> Exchange:
-        """The exchange for a view. All ranks do the same, because plans are made and dropped in collectives."""
+    def _exchange(self, view: View, at: StepResolution | None) -> tuple[Cameras, Route]:
+        """The cameras of all ranks and the route. All ranks do the same: plans are made and dropped in collectives."""
         if at is None:
             cameras = gather_cameras(view.viewmat, view.K, view.width, view.height, NEAR_PLANE)
-            return _exchange_now(self.field, cameras)
-        planned, self._planned = self._planned, None
-        if planned is not None and planned.at == at:
-            return Exchange(planned.cameras, planned.route(self.field))
-        return _exchange_now(self.field, self.timetable.cameras(at))
+        else:
+            planned, self._planned = self._planned, None
+            if planned is not None and planned.at == at:
+                return planned.cameras, planned.route(self.field)
+            cameras = self.timetable.cameras(at)
+        seen = may_be_seen(self.field["means"], self.field["scales"], cameras.bounds)
+        return cameras, plan_exchange(seen).route()
 
     @torch.no_grad()
     def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
-        """Plan the exchange of a later step, for wherever the optimizers may move the field; wait for nothing. Collective.
+        """Plan the exchange of a later step, wherever the optimizers may move the field; wait for nothing. Collective.
 
         Without a bound on the optimizers' step, the same on all ranks, nothing is planned.
         """

@@ -1,7 +1,7 @@
 """The processes that train together, one or several, behind one set of verbs.
 
-:class:`OneProcess` has nothing to share; :class:`Ranks` shards the field over the ranks of the default process group. The
-trainer calls the verbs and does not ask which of both it has.
+:class:`OneProcess` has nothing to share; :class:`Ranks` shards the field over the ranks of the default process group.
+The trainer calls the verbs and does not ask which of both it has.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sundae_ns.distributed.pruning import RankPruner
 from sundae_ns.distributed.shards import Shards, bounds
 from sundae_ns.distributed.source import ShardedField
 from sundae_ns.distributed.start import check_options, without_viewer
-from sundae_ns.rendering.source import NEAR_PLANE, FieldSource
+from sundae_ns.rendering.source import FieldSource
 from sundae_ns.storage.atomic import writing
 from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.extension import Extension
@@ -151,7 +151,7 @@ class Ranks(OneProcess):
         take_shard(state, shards)
         random.seed(seed)
         cameras = datamanager.train_dataset.cameras
-        timetable = Timetable(cameras, datamanager.view_of_step, state.device, NEAR_PLANE)
+        timetable = Timetable(cameras, datamanager.view_of_step, state.device)
         sharded = ShardedField(shards, state.field, timetable)
         shards.on_change(sharded.forget_plan)
         datamanager.place = (shards.rank, shards.ranks)
@@ -182,8 +182,8 @@ class Ranks(OneProcess):
         apart = 0.0 if head is None else self.shards.apart(head.parameters())
         if apart != 0 and self.shards.rank == 0:
             warn(
-                f"the heads of the ranks differ by up to {apart:.2g}, which is a bug of sundae; the checkpoint holds the head "
-                "of the first rank, and resuming from it makes them equal"
+                f"the heads of the ranks differ by up to {apart:.2g}, which is a bug of sundae; the checkpoint holds "
+                "the head of the first rank, and resuming from it makes them equal"
             )
 
     def gathered(self, state: State, names: list[str]) -> State | None:

@@ -1,7 +1,7 @@
 """Adam with the learning rates in memory, so that a CUDA graph can record it; one kernel for a parameter.
 
-torch's fused Adam gives each block of threads 65,536 numbers. A pruned field has a few such pieces for a parameter, and most
-of the GPU waits; here a block has 1,024.
+torch's fused Adam gives each block of threads 65,536 numbers. A pruned field has a few such pieces for a parameter, and
+most of the GPU waits; here a block has 1,024.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ THREADS = 256
 PER_THREAD = 4
 
 SOURCE = r"""
-// A thread updates PER_THREAD numbers. `step` is the number of this update, from 1 on. Nothing changes where `skip` is not 0.
-// All reads are sent before the first is used, so that they wait for the memory together.
+// A thread updates PER_THREAD numbers. `step` is the number of this update, from 1 on. Nothing changes where `skip`
+// is not 0. All reads are sent before the first is used, so that they wait for the memory together.
 extern "C" __global__ void adam(int n, float* __restrict__ value, const float* __restrict__ gradient,
                                 float* __restrict__ mean, float* __restrict__ square, const float* __restrict__ step,
                                 const float* __restrict__ rate, const float* __restrict__ skip, double beta1,

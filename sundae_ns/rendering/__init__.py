@@ -1,8 +1,6 @@
 """From a field to images: views, sources of primitives, one splatting pass, the head, contribution, recorded frames."""
 
 from sundae_ns.rendering.contribution import contribution
-from sundae_ns.rendering.lazy import Later, LazyOutputs
-from sundae_ns.rendering.outputs import ShownResponse, empty_outputs, late_outputs
 from sundae_ns.rendering.render import RenderSettings, compensate, draw, render, scale_plan
 from sundae_ns.rendering.replay import FrameReplay
 from sundae_ns.rendering.source import (
@@ -14,28 +12,22 @@ from sundae_ns.rendering.source import (
     TrainingView,
     ViewBatch,
 )
-from sundae_ns.rendering.views import View, crop_image, view_of, zoomed
+from sundae_ns.rendering.views import View, view_of, zoomed
 
 __all__ = [
     "ColorSettings",
     "FieldSource",
     "FrameReplay",
-    "Later",
-    "LazyOutputs",
     "LocalField",
     "Primitives",
     "RenderSettings",
-    "ShownResponse",
     "StepResolution",
     "TrainingView",
     "View",
     "ViewBatch",
     "compensate",
     "contribution",
-    "crop_image",
     "draw",
-    "empty_outputs",
-    "late_outputs",
     "render",
     "scale_plan",
     "view_of",

@@ -21,8 +21,9 @@ class Later:
 class LazyOutputs(UserDict[str, Any]):
     """Named outputs. One that is :class:`Later` is computed on first access, without gradients, and then kept.
 
-    nerfstudio's commands read one or two outputs of a frame; the others cost nothing. Listing names, counting and ``in``
-    compute nothing. It is not a ``dict``, because ``dict(outputs)`` and ``{**outputs}`` would then skip the computation.
+    nerfstudio's commands read one or two outputs of a frame; the others cost nothing. Listing names, counting and
+    ``in`` compute nothing. It is not a ``dict``, because ``dict(outputs)`` and ``{**outputs}`` would then skip the
+    computation.
     """
 
     def __getitem__(self, name: str) -> Any:

@@ -16,7 +16,7 @@ from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, FieldSource, P
 from sundae_ns.rendering.views import View
 
 SHOWN_BACKGROUNDS = {"random": (0.1490, 0.1647, 0.2157), "black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-"""Backgrounds of images that are not trained on, by the option ``background_color``. For random it is the viewer's own."""
+"""Backgrounds of images that are not trained on, by the option ``background_color``; for random the viewer's."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ def draw(
         depth: whether to render depth.
 
     Returns:
-        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result. Without a
-        head ``rgb`` is ``base_rgb``.
+        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result. Without
+        a head ``rgb`` is ``base_rgb``.
     """
     channels = primitives["colors"]
     if settings.head is not None:
@@ -143,8 +143,8 @@ def render(
         at: the step, for a training image; None outside of training.
 
     Returns:
-        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result; its ``info``
-        has the ``route`` of the primitives.
+        ``rgb, base_rgb, depth, accumulation, feature_image``, each ``[H, W, C]``, and the rasteriser's result; its
+        ``info`` has the ``route`` of the primitives.
     """
     head = settings.head
     primitives = source.primitives(view, settings, features=head is not None, at=at)

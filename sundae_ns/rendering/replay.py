@@ -1,8 +1,8 @@
 """Frames of a finished field as recorded CUDA graphs, one for each image size.
 
-A frame is many small kernels, each launched from Python. A CUDA graph launches them together. A recorded frame reads its
-inputs where they were when it was recorded: the field, which may be trained meanwhile, the head's weights, and the three
-tensors that hold camera and background.
+A frame is many small kernels, each launched from Python. A CUDA graph launches them together. A recorded frame reads
+its inputs where they were when it was recorded: the field, which may be trained meanwhile, the head's weights, and the
+three tensors that hold camera and background.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class FrameReplay:
     def render(self, source: FieldSource, view: View, background: Tensor, settings: RenderSettings) -> dict[str, Any]:
         """The images of a view, as :func:`sundae_ns.rendering.render.render` makes them.
 
-        Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of a whole local field. Other frames,
-        and the first of a size, are rendered kernel by kernel. Both agree up to the order in which kernels sum.
+        Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of a whole local field. Other
+        frames, and the first of a size, are rendered kernel by kernel. Both agree up to the order in which kernels sum.
 
         Args:
             source: of the primitives.
@@ -102,7 +102,7 @@ class FrameReplay:
         return images
 
     def _key(self, source: FieldSource, view: View, settings: RenderSettings) -> object:
-        """What a recorded frame has fixed. The field is identified by its addresses, because these are what it reads."""
+        """What a recorded frame has fixed. Addresses identify the field, because the frame reads these."""
         field = source.field
         addresses = tuple((name, value.data_ptr(), value.shape) for name, value in field.items())
         if addresses != self._field:

@@ -1,7 +1,7 @@
 """Where a view gets its primitives from: the field of this process, or shards on several GPUs.
 
-:func:`sundae_ns.rendering.render.render` takes a :class:`FieldSource`. Only the place that makes the source knows how many
-processes hold the field.
+:func:`sundae_ns.rendering.render.render` takes a :class:`FieldSource`. Only the place that makes the source knows how
+many processes hold the field.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class ViewBatch(NamedTuple):
 
 
 class Primitives(dict[str, Tensor]):
-    """Parameters of the primitives that one view needs ``[M, ...]``, and their ``colors`` from its camera ``[M, 3]``."""
+    """Parameters of the primitives that a view needs ``[M, ...]``, and ``colors`` from its camera ``[M, 3]``."""
 
     route: Route | None = None
     """How they came from other ranks; None for primitives of this process."""

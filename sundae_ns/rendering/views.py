@@ -102,13 +102,13 @@ class View(NamedTuple):
     def zoomed(self, factor: float) -> View:
         """The camera with the same field of view and sides ``factor`` times as long."""
         width, height = _zoomed_size(self.width, self.height, factor)
-        # Scale by the rounded sizes, so that the edges of both images agree. Row by row, because a tensor of numbers would
-        # be copied to the device.
+        # Scale by the rounded sizes, so that the edges of both images agree. Row by row, because a tensor of numbers
+        # would be copied to the device.
         K = torch.stack([self.K[0] * (width / self.width), self.K[1] * (height / self.height), self.K[2]])
         return View(self.viewmat, K, width, height, self.focal * factor)
 
     def cut(self, window: Window) -> View:
-        """The camera of a window of the image. That of a mirrored one is a reflection: it sees what a mirror would show."""
+        """The camera of a window of the image. Of a mirrored one it sees what a mirror would show."""
         viewmat, K = self.viewmat, self.K.clone()
         K[0, 2] -= window.left
         K[1, 2] -= window.top
@@ -122,8 +122,8 @@ class View(NamedTuple):
 def zoomed(camera: Cameras, factor: float) -> Cameras:
     """nerfstudio's camera of shape ``(1,)`` with the same field of view and sides ``factor`` times as long.
 
-    Size and intrinsics are those of :meth:`View.zoomed`. nerfstudio's own method rounds the sides but not the intrinsics,
-    which moves the edges of the image against those of the resized truth.
+    Size and intrinsics are those of :meth:`View.zoomed`. nerfstudio's own method rounds the sides but not the
+    intrinsics, which moves the edges of the image against those of the resized truth.
     """
     before = int(camera.width), int(camera.height)
     width, height = _zoomed_size(*before, factor)

@@ -1,7 +1,7 @@
 """A short fine-tune of a finished run with the packer's rounding in the loop.
 
-Grids, bases and steps are fitted once before the first step, and the file is written with them: what was trained is what is
-stored.
+Grids, bases and steps are fitted once before the first step, and the file is written with them: what was trained is
+what is stored.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ training they hardly move."""
 RATE = 0.025
 """Loss for each bit per stored number: about what a bit less costs in quality at the steps of ``FINETUNED``."""
 RISE = 0.05
-"""Share of the steps in which rates rise, because Adam has no moments yet. Then they fall to 0, so that values settle."""
+"""Share of the steps in which rates rise, because Adam has no moments yet. Then they fall to 0."""
 
 
 def rate_factor(step: int, steps: int) -> float:
@@ -69,7 +69,7 @@ def finetune(
         steps: number of steps, at least 1.
         rate: added to the loss for each bit per stored number, of the field and of the head.
         data: the capture, if it has moved.
-        progress: called after each step with its loss ``[]``, which the next step overwrites; reading it waits for the GPU.
+        progress: called after each step with its loss ``[]``, which the next step overwrites.
 
     Returns:
         The trained scene, and its codecs for ``storage.packing.write_fitted``.

@@ -1,8 +1,8 @@
 """One step of a fine-tune: rounding, the training step, the rate and Adam, as one CUDA graph where that is possible.
 
-The model holds rounded values, the ones that a reader decodes. Adam moves exact values beside them, by the gradients at the
-rounded ones (the straight-through estimator of Bengio, Leonard and Courville, 2013). So losses and rasteriser do not know of
-rounding.
+The model holds rounded values, the ones that a reader decodes. Adam moves exact values beside them, by the gradients at
+the rounded ones (the straight-through estimator of Bengio, Leonard and Courville, 2013). So losses and rasteriser do
+not know of rounding.
 """
 
 from __future__ import annotations

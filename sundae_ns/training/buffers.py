@@ -1,8 +1,8 @@
 """Memory with room for more primitives than a field has, so that recorded work survives its growth.
 
-A CUDA graph reads and writes fixed addresses and a fixed number of primitives. :class:`Buffers` holds the parameters of a
-field, Adam's moments and the running state of densification at a capacity. The field's own tensors become the first N rows
-of these buffers; the rows beyond belong to primitives that no camera sees.
+A CUDA graph reads and writes fixed addresses and a fixed number of primitives. :class:`Buffers` holds the parameters of
+a field, Adam's moments and the running state of densification at a capacity. The field's own tensors become the first N
+rows of these buffers; the rows beyond belong to primitives that no camera sees.
 """
 
 from __future__ import annotations

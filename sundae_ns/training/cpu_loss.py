@@ -1,8 +1,8 @@
 """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, L1 of its base colours, and gradients: one compiled loop each.
 
-The CPU's twin of :mod:`sundae_ns.gpu.fused_loss`. A row of an image ``[H, W, 3]`` is one run of interleaved colours, so a
-window takes every third number of it. Loops run over rows, each with a sum of its own, so results do not depend on the
-number of threads. Importing this module imports numba.
+The CPU's twin of :mod:`sundae_ns.gpu.fused_loss`. A row of an image ``[H, W, 3]`` is one run of interleaved colours, so
+a window takes every third number of it. Loops run over rows, each with a sum of its own, so results do not depend on
+the number of threads. Importing this module imports numba.
 """
 
 from __future__ import annotations
@@ -31,20 +31,7 @@ _WEIGHTS = np.array([value / sum(_gaussian) for value in _gaussian], np.float32)
 def compiled_loss(
     image: Tensor, target: Tensor, weight: float, base: Tensor | None = None, l1_weight: float | None = None
 ) -> tuple[Tensor, Tensor | None]:
-    """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, and L1 of its base colours; once differentiable scalars.
-
-    L1 is the mean over all values. SSIM is pytorch_msssim's, over windows inside the image, with a data range of 1.
-
-    Args:
-        image: float32 on a CPU ``[H, W, 3]``, both sides at least ``WINDOW``.
-        target: target image, as ``image``; gets no gradient.
-        weight: weight of 1 - SSIM, in [0, 1].
-        base: base colours to compare with the target, as ``image``, or None.
-        l1_weight: weight of L1; None for ``1 - weight``.
-
-    Returns:
-        The loss, and the L1 of ``base`` or None; float32 ``[]`` each.
-    """
+    """:func:`sundae_ns.gpu.fused_loss.fused_loss` on a CPU; once differentiable, without checks of the images."""
     weights = (1 - weight if l1_weight is None else l1_weight, weight)
     return cast("tuple[Tensor, Tensor | None]", _Loss.apply(image, base, target.detach(), weights))
 

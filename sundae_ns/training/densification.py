@@ -32,7 +32,7 @@ COUNTED = "counted"
 def limit_growth(
     state: MutableMapping[str, Any], small: Tensor, capacity: int, threshold: float, radius: float | None
 ) -> None:
-    """Let at most ``capacity`` primitives be added: those with the highest gradients grow, others lose their statistics.
+    """Let at most ``capacity`` primitives be added, by the highest gradients; others lose their statistics.
 
     Args:
         state: of gsplat's strategy, with ``grad2d`` and ``count`` ``[N]``, and ``radii`` ``[N]`` where it is used.
@@ -109,7 +109,7 @@ class CappedStrategy(DefaultStrategy):
         """Let the field grow again only once opacities have recovered from a reset.
 
         Args:
-            steps: steps in which each image is seen once. If resets are closer together, growth waits for half of the time.
+            steps: steps in which each image is seen once. Growth waits for half of the time if resets are closer.
         """
         pause = steps + self.refine_every
         if self.reset_every >= self.refine_stop_iter:
@@ -124,7 +124,7 @@ class CappedStrategy(DefaultStrategy):
 
     @torch.no_grad()
     def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
-        """Add the statistics of a step; those of several ranks include rows of zeros, so that nothing waits for the GPU."""
+        """Add the statistics of a step; those of several ranks include rows of zeros, so that nothing waits."""
         if info.get(COUNTED):
             return
         found: Statistics | None = info.get("statistics")

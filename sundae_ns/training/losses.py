@@ -17,7 +17,6 @@ from sundae_ns.errors import BackendError
 from sundae_ns.gpu.fused_loss import WINDOW, fused_loss, loss_kernels
 from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.similarity import mean_ssim
 
 CHAIN_PRIOR = 0.01
 """Weights of opacities and scales in the loss of a chain (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
@@ -114,9 +113,9 @@ class StepLosses:
     def emphasis(self, state: FieldState) -> float:
         """How many times as strong as in images a residual head's correction is in the loss at this step.
 
-        With each pass over the training images a head learns more of them by heart, which it corrects in other views too. So
-        its correction shrinks (as an estimate does by James and Stein, 1961), the more the more often images are seen. It
-        shrinks at 8, 16, 32 ... passes, because recorded steps hold the number.
+        With each pass over the training images a head learns more of them by heart, which it corrects in other views
+        too. So its correction shrinks (as an estimate does by James and Stein, 1961), the more the more often images
+        are seen. It shrinks at 8, 16, 32 ... passes, because recorded steps hold the number.
         """
         head = state.head
         if (
@@ -191,7 +190,8 @@ def convolved_loss(image: Tensor, target: Tensor, ssim: SSIM, weight: float, l1_
     ssim.win = ssim.win.to(target.device)  # once; each call would copy it and wait
     # Contiguous planes: convolutions of a large image with interleaved colours take much longer.
     planes, truth = (one.permute(2, 0, 1)[None].contiguous() for one in (image, target))
-    return l1_weight * (image - target).abs().mean() + weight * (1 - mean_ssim(planes, truth, ssim))
+    similarity: Tensor = ssim(planes, truth)
+    return l1_weight * (image - target).abs().mean() + weight * (1 - similarity)
 
 
 @functools.cache

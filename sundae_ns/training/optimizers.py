@@ -19,7 +19,7 @@ class FusedAdamConfig(AdamOptimizerConfig):
     betas: tuple[float, float] = (0.9, 0.999)
     """Decay rates of the running means of gradients and of their squares."""
     decoupled: bool = False
-    """Whether weight decay shrinks the weights beside Adam's step (Loshchilov & Hutter 2019), not through the gradient."""
+    """Whether weight decay acts beside Adam's step (Loshchilov & Hutter 2019), not through the gradient."""
 
     def setup(self, params: Any) -> torch.optim.Optimizer:
         """Optimizer of one group of parameters."""
@@ -37,11 +37,12 @@ class FusedAdamConfig(AdamOptimizerConfig):
 class NetworkAdamConfig(FusedAdamConfig):
     """Adam for a network without normalisation layers, whose loss bursts at usual settings.
 
-    The output is a product of layers, so aligned steps of all weights multiply it. Two measures keep such steps short. The
-    mean of squares forgets fast and follows gradients that suddenly grow: with the usual betas a weight moves by 3.2 times
-    the rate at the first large gradient after small ones, and by up to 7.3 while they grow; with these by 0.4 and up to 1.2
-    (``sundae_ns.distributed.ahead.longest_step``). Weights of layers with many inputs get a smaller rate, because their sum
-    grows with the inputs (Yang et al. 2022, "Tensor Programs V"). Weight decay shrinks weights, not biases.
+    The output is a product of layers, so aligned steps of all weights multiply it. Two measures keep such steps short.
+    The mean of squares forgets fast and follows gradients that suddenly grow: with the usual betas a weight moves by
+    3.2 times the rate at the first large gradient after small ones, and by up to 7.3 while they grow; with these by 0.4
+    and up to 1.2 (``sundae_ns.distributed.ahead.longest_step``). Weights of layers with many inputs get a smaller rate,
+    because their sum grows with the inputs (Yang et al. 2022, "Tensor Programs V"). Weight decay shrinks weights, not
+    biases.
 
     Rates follow the shapes at setup: a head that is resized in training keeps them.
     """
@@ -49,8 +50,8 @@ class NetworkAdamConfig(FusedAdamConfig):
     betas: tuple[float, float] = (0.9, 0.95)
     """Decay rates of the running means of gradients and of their squares."""
     full_rate_inputs: int = 1152
-    """Weights with more inputs than this get a proportionally smaller rate. 1152 is 3 x 3 of 128 channels, the most in the
-    default head."""
+    """Weights with more inputs than this get a proportionally smaller rate. 1152 is 3 x 3 of 128 channels, the most in
+    the default head."""
     decoupled: bool = True
 
     def _groups(self, params: list[torch.Tensor]) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ LONG = 1800.0
 
 
 class ProgressWriter(LocalWriter):
-    """Prints a line every ten seconds. nerfstudio's own table moves the cursor, also in a log file, and knows no PSNR."""
+    """Prints a line every ten seconds. nerfstudio's table moves the cursor, even in a log file, and has no PSNR."""
 
     def __init__(self, config: Any, banner_messages: list[str] | None = None) -> None:
         super().__init__(config, banner_messages)
@@ -31,7 +31,7 @@ class ProgressWriter(LocalWriter):
         """Print a line if it is due.
 
         Args:
-            step: ignored; it belongs to nerfstudio's first event, which is the configuration after a start and a resume.
+            step: ignored; it belongs to nerfstudio's first event, which is the configuration after a start.
         """
         events = {event["name"]: event for event in EVENT_STORAGE}
         # nerfstudio measures every few steps only, and ten steps after a prune may take a minute on a CPU.
@@ -70,9 +70,9 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
     if seconds * left <= LONG:
         return None
     return (
-        f"this training runs on a CPU and takes at least {duration(seconds * left)} more ({1000 * seconds:.0f} ms a step). "
-        "sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images are faster: "
-        "end the command with nerfstudio-data --downscale-factor 4"
+        f"this training runs on a CPU and takes at least {duration(seconds * left)} more ({1000 * seconds:.0f} ms a "
+        "step). sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images are "
+        "faster: end the command with nerfstudio-data --downscale-factor 4"
     )
 
 

@@ -5,7 +5,7 @@ They run as CUDA graphs on one GPU. A graph reads fixed addresses, so the field 
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -40,10 +40,8 @@ class _Held:
     """Whether the buffers have spare rows."""
     groups: list[tuple[str, torch.optim.Optimizer, dict[str, Any]]]
     """Groups of parameters that a step trains: name of the optimizer, optimizer, group."""
-    parameters: list[tuple[str, Tensor]]
-    statistics: list[tuple[str, Tensor]]
-    states: Sequence[tuple[Mapping[Tensor, Any], Tensor, dict[str, Any]]]
-    """States of an optimizer, a parameter, and its state."""
+    tensors: list[tuple[Mapping[Any, Any], Any, Any]]
+    """Mapping, key and value of everything that surgery and restored snapshots replace."""
     addresses: Hashable
     """What a recording reads beside the buffers: the head's weights, and the counts of steps."""
 
@@ -53,18 +51,15 @@ class _Held:
         groups = [
             (name, state.optimizers[name], group) for name in names for group in state.optimizers[name].param_groups
         ]
-        values = [(optimizer, value) for _, optimizer, group in groups for value in group["params"]]
-        states = [(optimizer.state, value, optimizer.state[value]) for optimizer, value in values]
+        members = [(optimizer.state, value) for _, optimizer, group in groups for value in group["params"]]
+        states = [(held, value, held[value]) for held, value in members]
+        tensors: list[tuple[Mapping[Any, Any], Any, Any]] = [
+            *states,
+            *((state.field, name, state.field[name]) for name in trained),
+            *((state.densification, *item) for item in state.densification.items() if isinstance(item[1], Tensor)),
+        ]
         addresses = tuple(own[name].data_ptr() for _, _, own in states for name in (*MOMENTS, "step"))
-        return cls(
-            trained,
-            growing,
-            groups,
-            [(name, state.field[name]) for name in trained],
-            [(name, value) for name, value in state.densification.items() if isinstance(value, Tensor)],
-            states,
-            (addresses, None if head is None else head.addresses()),
-        )
+        return cls(trained, growing, groups, tensors, (addresses, None if head is None else head.addresses()))
 
     @property
     def rates(self) -> list[float]:
@@ -72,14 +67,12 @@ class _Held:
         return [float(group["lr"]) for _, _, group in self.groups]
 
     def unchanged(self, state: FieldState, settings: RenderSettings, *, growing: bool) -> bool:
-        """Whether the state still consists of these tensors; surgery and restored snapshots put new ones in their place."""
+        """Whether the state still consists of these tensors."""
         with_head = self.groups[-1][0] == HEAD
         return (
             growing == self.growing
             and with_head == (settings.head is not None)
-            and all(state.field[name] is value for name, value in self.parameters)
-            and all(state.densification.get(name) is value for name, value in self.statistics)
-            and all(states.get(value) is own for states, value, own in self.states)
+            and all(mapping.get(key) is value for mapping, key, value in self.tensors)
             and self.trained == trained_parameters(state)
         )
 
@@ -171,7 +164,8 @@ class RecordedStep:
         self, held: _Held, grads: Mapping[Tensor, Tensor | None]
     ) -> list[tuple[Mapping[str, Any], list[Update]]]:
         """Groups of parameters with their updates, on whole buffers."""
-        tensors, groups = self._buffers.tensors, []
+        tensors = self._buffers.tensors
+        groups: list[tuple[Mapping[str, Any], list[Update]]] = []
         for name, optimizer, group in held.groups:
             updates = []
             for value in group["params"]:

@@ -1,7 +1,7 @@
 """Training steps as CUDA graphs: when to record one, and which to replay.
 
-A step is some two hundred small kernels. Launched one by one from Python they take several times as long as the GPU works.
-A graph launches them together. It reads its inputs where the last call has put them.
+A step is some two hundred small kernels. Launched one by one from Python they take several times as long as the GPU
+works. A graph launches them together. It reads its inputs where the last call has put them.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ MAX_RECORDINGS = 8
 """Recordings kept at a time: one for each image size and SH degree in use."""
 
 UNUSED = 1000
-"""Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by kernel,
-because recording takes longer than a step."""
+"""Steps after which an unused recording makes room. Where more sizes are in use than fit, the others run kernel by
+kernel, because recording takes longer than a step."""
 
 StepWork = Callable[[StepInputs, RenderSettings, Capacity | None], StepResult]
 """The GPU work of a step, with the capacity of the rasteriser that is set; None for another rasteriser."""
@@ -46,8 +46,8 @@ class _Recording:
 class StepRecordings:
     """Runs training steps. The first of a kind runs kernel by kernel, because libraries choose and load kernels then.
 
-    Later ones replay. A step whose view has more tile/primitive pairs than fit changes nothing, and the next recording has
-    room for them.
+    Later ones replay. A step whose view has more tile/primitive pairs than fit changes nothing, and the next recording
+    has room for them.
 
     Args:
         record: False runs every step kernel by kernel, as a test does on a CPU.
@@ -61,7 +61,10 @@ class StepRecordings:
         self._steps = 0
         self._warm: set[Hashable] = set()
         """Kinds of steps that have run kernel by kernel."""
-        self._pairs = NeededPairs()
+        self._most: Tensor | None = None
+        """Most tile/primitive pairs that a view has needed, on the device, int64 ``[]``."""
+        self._most_on_host: Tensor | None = None
+        """Its pinned copy, some steps late."""
         self._constants: Hashable = None
 
     def forget(self, *, pairs: bool = False) -> None:
@@ -110,9 +113,31 @@ class StepRecordings:
         self._steps += 1
         return result
 
+    @torch.no_grad()
     def overflow(self, capacity: Capacity | None) -> Tensor | None:
-        """1 if the lists of tiles were too short, so that the step must change nothing, else 0; float ``[]``."""
-        return self._pairs.overflow(capacity)
+        """1 if the lists of tiles were too short, so that the step must change nothing, else 0; float ``[]``.
+
+        None without a limit.
+        """
+        if capacity is None or capacity.pairs is None:
+            return None
+        assert self._most is not None
+        assert self._most_on_host is not None
+        needed = torch.stack(capacity.needed).amax()
+        torch.maximum(self._most, needed, out=self._most)
+        self._most_on_host.copy_(self._most, non_blocking=True)
+        return (needed > capacity.pairs).float()
+
+    def _count(self, capacity: Capacity, device: torch.device) -> None:
+        """Count the pairs of a step that ran kernel by kernel, which waits for the GPU."""
+        most = max(int(number) for number in capacity.needed)
+        if self._most is None or self._most_on_host is None:
+            self._most = torch.zeros((), dtype=torch.int64, device=device)
+            self._most_on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
+        if self._warm:  # else forget the steps before
+            most = max(most, int(self._most))
+        self._most.fill_(most)
+        self._most_on_host.fill_(most)
 
     def _kernel_by_kernel(self, work: StepWork, inputs: StepInputs, settings: RenderSettings) -> StepResult:
         """Run a step on the stream of the recordings."""
@@ -122,7 +147,7 @@ class StepRecordings:
         capacity = Capacity()
         with warm_up(device):
             result = work(inputs, replace(settings, backend=RecordableGsplat(capacity)), capacity)
-        self._pairs.count(capacity, device, anew=not self._warm)
+        self._count(capacity, device)
         return result
 
     def _recording(
@@ -131,7 +156,8 @@ class StepRecordings:
         """The recording of a kind of steps; None if it has to run kernel by kernel."""
         if not self._record:
             return None
-        key, most = (kind, addresses), self._pairs.most
+        assert self._most_on_host is not None
+        key, most = (kind, addresses), int(self._most_on_host)
         recording = self._recordings.get(key)
         if recording is None and len(self._recordings) >= MAX_RECORDINGS:
             oldest = next(iter(self._recordings))
@@ -156,46 +182,3 @@ class StepRecordings:
         # Results are read before the next replay, so all recordings can work in the same memory.
         graph, result = record(step, own.target.device, share_memory_with=None if last is None else last.graph)
         return _Recording(graph, own, result, pairs)
-
-
-class NeededPairs:
-    """Most tile/primitive pairs that a view has needed, on the device and, some steps later, on the host."""
-
-    def __init__(self) -> None:
-        self._on_device: Tensor | None = None
-        """int64 ``[]``, as its pinned copy."""
-        self._on_host: Tensor | None = None
-
-    @property
-    def most(self) -> int:
-        """The number, as far as the host knows it."""
-        assert self._on_host is not None
-        return int(self._on_host)
-
-    def count(self, capacity: Capacity, device: torch.device, *, anew: bool) -> None:
-        """Count the pairs of a step that ran kernel by kernel, which waits for the GPU.
-
-        Args:
-            capacity: without a limit; it was rendered with.
-            device: of the step.
-            anew: forget the steps before.
-        """
-        needed = max(int(number) for number in capacity.needed)
-        if self._on_device is None or self._on_host is None:
-            self._on_device = torch.zeros((), dtype=torch.int64, device=device)
-            self._on_host = torch.zeros((), dtype=torch.int64, pin_memory=True)
-        most = needed if anew else max(needed, int(self._on_device))
-        self._on_device.fill_(most)
-        self._on_host.fill_(most)
-
-    @torch.no_grad()
-    def overflow(self, capacity: Capacity | None) -> Tensor | None:
-        """See :meth:`StepRecordings.overflow`."""
-        if capacity is None or capacity.pairs is None:
-            return None
-        assert self._on_device is not None
-        assert self._on_host is not None
-        needed = torch.stack(capacity.needed).amax()
-        torch.maximum(self._on_device, needed, out=self._on_device)
-        self._on_host.copy_(self._on_device, non_blocking=True)
-        return (needed > capacity.pairs).float()

@@ -1,7 +1,7 @@
 """The schedule of a run: all options that count steps, and how they follow the length of the run.
 
-A method's options are written for the method's own length, 30,000 steps for ``sundae``. :func:`fit_to_length` scales those
-that nobody set by hand to another length; nothing else in the package knows a factor.
+A method's options are written for the method's own length, 30,000 steps for ``sundae``. :func:`fit_to_length` scales
+those that nobody set by hand to another length; nothing else in the package knows a factor.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from sundae_ns.storage.runs.folder import find_config
 from sundae_ns.training.warning import warn
 
 SCHEDULE = {
-    "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval refine_every",
+    "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval "
+    "refine_every",
     "pipeline.model.pruning": "prune_at start stop every search_every",
     "pipeline.model.head": "start_at",
 }
@@ -28,18 +29,19 @@ SCHEDULE = {
 LEAST_IMAGES = 50
 """Images that densification sees between two rounds, at least: fewer say too little of a primitive's gradient."""
 LEAST_RECOVERY = 1000
-"""Steps between two resets of the opacities, at least: shorter runs do without, because they have no time to recover."""
+"""Least steps between two resets of the opacities: shorter runs have no time to recover, and do without."""
 LONGEST_RISE = 12
 """A learning rate rises over at most this fraction of the run."""
 
 _SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle")
 """Options of the model that the shapes in a checkpoint depend on."""
-_RESETS = "pipeline.model.reset_alpha_every"
+RESETS = "pipeline.model.reset_alpha_every"
+"""Counts rounds of densification, not steps."""
 _REFINE = "pipeline.model.refine_every"
 
 
 def given_options(words: Iterable[str]) -> frozenset[str]:
-    """Dotted names of the options in a command line: ``pipeline.model.sh_degree`` of ``--pipeline.model.sh-degree 2``."""
+    """Dotted names of the options in a command line: ``pipeline.model.sh_degree`` of ``--pipeline.model.sh-degree``."""
     return frozenset(re.split("[= ]", word[2:])[0].replace("-", "_") for word in words if word.startswith("--"))
 
 
@@ -49,7 +51,7 @@ def step_options(config: Any) -> list[str]:
     for group, parts in config.optimizers.items():
         if parts["scheduler"] is not None:
             names += [f"optimizers.{group}.scheduler.{name}" for name in ("max_steps", "warmup_steps")]
-    return [*names, _RESETS]
+    return [*names, RESETS]
 
 
 def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
@@ -72,8 +74,8 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
         steps_share = min(config.schedule_length / max(left, 1), 1.0)
     config.optimizers = deepcopy(config.optimizers)  # methods share them with every configuration that tyro makes
     for name in _free(config, usual, given):
-        value = _get(usual, name)
-        if name == _RESETS or not value:
+        value = option(usual, name)
+        if name == RESETS or not value:
             continue
         if name.endswith(".warmup_steps"):
             scaled = min(value, config.schedule_length // LONGEST_RISE)
@@ -81,15 +83,15 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
             scaled = max(round(value * (share if name.startswith("optimizers.") else steps_share)), 1)
         if name == _REFINE and model.warmup == "densify":
             scaled = max(scaled, min(value, LEAST_IMAGES))
-        _set(config, name, scaled)
-    if _RESETS in _free(config, usual, given):
+        set_option(config, name, scaled)
+    if RESETS in _free(config, usual, given):
         period = round(usual_model.reset_alpha_every * usual_model.refine_every * steps_share)
         never = model.stop_split_at // model.refine_every + 1
         model.reset_alpha_every = max(round(period / model.refine_every), 1) if period >= LEAST_RECOVERY else never
 
 
 def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> list[str]:
-    """Give a configuration the schedule and the model of the run that it resumes, but for options that were set by hand.
+    """Give a configuration schedule and model of the run that it resumes, but for options that were set by hand.
 
     Args:
         config: ``SundaeTrainerConfig``; its schedule and its model change.
@@ -108,11 +110,11 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
     free = set(_free(config, usual, given, names))
     differing = []
     for name in dict.fromkeys(names):
-        theirs = _get(run, name)
+        theirs = option(run, name)
         if name in free:
-            _set(config, name, deepcopy(theirs))
-        elif _get(config, name) != theirs:
-            line = f"--{name.replace('_', '-')} is {_get(config, name)}; the run to resume has {theirs}"
+            set_option(config, name, deepcopy(theirs))
+        elif option(config, name) != theirs:
+            line = f"--{name.replace('_', '-')} is {option(config, name)}; the run to resume has {theirs}"
             # The state of a scheduler holds its options. Refused before config.yml is replaced.
             if name.removeprefix("pipeline.model.") in _SHAPES or name.startswith("optimizers."):
                 raise ConfigError(f"{line}, which cannot change; leave the option out")
@@ -142,7 +144,8 @@ def steps_left(config: Any) -> int:
     left: int = length if step is None else length - step - 1
     if left < 1:
         raise ConfigError(
-            f"the run has trained all of its {length:,} steps; give the number of further ones with --max-num-iterations"
+            f"the run has trained all of its {length:,} steps; give the number of further ones with "
+            "--max-num-iterations"
         )
     return left
 
@@ -211,7 +214,7 @@ def _rates(config: Any) -> str:
 def _free(config: Any, usual: Any, given: Collection[str], names: Sequence[str] | None = None) -> Sequence[str]:
     """Those of ``names``, by default the step options, that nobody set by hand."""
     names = step_options(usual) if names is None else names
-    return [name for name in names if name not in given and _get(config, name) == _get(usual, name)]
+    return [name for name in names if name not in given and option(config, name) == option(usual, name)]
 
 
 def _leaves(config: Any, prefix: str) -> list[str]:
@@ -226,12 +229,14 @@ def _leaves(config: Any, prefix: str) -> list[str]:
     return names
 
 
-def _get(config: Any, name: str) -> Any:
+def option(config: Any, name: str) -> Any:
+    """Value of the option of a dotted name; None if there is none."""
     for part in name.split("."):
         config = config.get(part) if isinstance(config, dict) else getattr(config, part, None)
     return config
 
 
-def _set(config: Any, name: str, value: Any) -> None:
+def set_option(config: Any, name: str, value: Any) -> None:
+    """Set the option of a dotted name."""
     owner, _, last = name.rpartition(".")
-    setattr(_get(config, owner), last, value)
+    setattr(option(config, owner) if owner else config, last, value)

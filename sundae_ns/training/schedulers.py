@@ -1,7 +1,7 @@
 """Learning-rate schedules: exponential or cosine decay that can restart at the prune.
 
-nerfstudio's exponential decay leaves numpy numbers in its state, which a weights-only ``torch.load`` refuses from torch 2.6
-on. This one holds Python floats only.
+nerfstudio's exponential decay leaves numpy numbers in its state, which a weights-only ``torch.load`` refuses from torch
+2.6 on. This one holds Python floats only.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 DecayShape = Literal["exponential", "cosine"]
 
 SPARSE = 15_000
-"""In a pruned field of fewer primitives centres move faster: on surfaces, they are the root of the quotient farther apart."""
+"""In a pruned field of fewer primitives centres move faster: on surfaces, they are the root of the quotient farther
+apart."""
 MOST_FACTOR = 5.0
 """Largest factor on the rate of the centres, that of 600 primitives; nothing smaller was measured."""
 
@@ -26,9 +27,9 @@ MOST_FACTOR = 5.0
 class Decay:
     """Multiplier of the learning rate as a function of the step. Its state is plain numbers.
 
-    Before the prune the rate decays from 1 to ``final`` over ``max_steps``; with ``hold_until_prune`` it stays at 1. The prune
-    may restart it: a rise over ``warmup_steps``, then a decay from ``restart`` to ``final`` at ``max_steps``. ``shape`` is
-    exponential, or half a cosine (Loshchilov & Hutter 2017, "SGDR").
+    Before the prune the rate decays from 1 to ``final`` over ``max_steps``; with ``hold_until_prune`` it stays at 1.
+    The prune may restart it: a rise over ``warmup_steps``, then a decay from ``restart`` to ``final`` at ``max_steps``.
+    ``shape`` is exponential, or half a cosine (Loshchilov & Hutter 2017, "SGDR").
     """
 
     def __init__(
@@ -142,7 +143,8 @@ def limit_rise(schedulers: Mapping[str, LRScheduler], steps: int) -> None:
 
 
 def _decays(scheduler: LRScheduler) -> list[Decay]:
-    """The multipliers of a scheduler, each once: torch lists one for each group of parameters, and the groups share theirs."""
+    """The multipliers of a scheduler, each once: torch lists one for each group of parameters, and the groups share
+    theirs."""
     found = [one for one in getattr(scheduler, "lr_lambdas", []) if isinstance(one, Decay)]
     return list({id(one): one for one in found}.values())
 

@@ -1,7 +1,7 @@
 """The training step: from a view to its loss. Every training runs this one.
 
-nerfstudio asks for images and losses in two calls, and runs the backward pass and the optimizers itself. Recorded steps and
-fine-tunes run both halves in one call. Several ranks give another source of primitives.
+nerfstudio asks for images and losses in two calls, and runs the backward pass and the optimizers itself. Recorded steps
+and fine-tunes run both halves in one call. Several ranks give another source of primitives.
 """
 
 from __future__ import annotations

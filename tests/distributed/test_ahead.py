@@ -24,6 +24,7 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization import rasterize, select_backend
 from sundae_ns.rasterization.sharded import camera_row
 from sundae_ns.rendering import ColorSettings, StepResolution, view_of
+from sundae_ns.rendering.source import NEAR_PLANE
 from sundae_ns.training.densification import CappedStrategy
 from sundae_ns.training.losses import image_losses
 
@@ -84,7 +85,7 @@ def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPa
     poses = torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(0))
     sides = torch.tensor([[64], [48], [64], [32], [80]])
     cameras = Cameras(poses, 50.0, 40.0, 33.0, 20.0, width=sides, height=sides - 10)
-    timetable = Timetable(cameras, lambda image: (2 * image) % 5, "cpu", 0.02)
+    timetable = Timetable(cameras, lambda image: (2 * image) % 5, "cpu")
     for at in (
         StepResolution(0, 1, 0),
         StepResolution(1, 1, 0),
@@ -101,7 +102,7 @@ def test_the_timetable_knows_the_views_of_all_ranks(monkeypatch: pytest.MonkeyPa
         for rank, view in enumerate(views):
             window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
             seen = view if window is None else view.cut(window)
-            row = camera_row(seen.viewmat, seen.K, seen.width, seen.height, 0.02)
+            row = camera_row(seen.viewmat, seen.K, seen.width, seen.height, NEAR_PLANE)
             assert torch.equal(torch.cat([known.centers[rank], known.bounds[rank].flatten()]), row)
 
 
@@ -137,7 +138,7 @@ def learn(folder: Path, device: str, group: str, forbid_waits: Callable[[], None
     dist.init_process_group(group, init_method=f"file://{folder / 'meeting'}", rank=0, world_size=1)
     try:
         shards = Shards(device)
-        source = ShardedField(shards, Field(params), Timetable(cameras, lambda image: 0, device, 0.01))
+        source = ShardedField(shards, Field(params), Timetable(cameras, lambda image: 0, device))
         shards.recount(params)
         view = view_of(cameras, device)
         for step in range(3):

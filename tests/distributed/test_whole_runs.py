@@ -28,9 +28,9 @@ from torch.multiprocessing.spawn import ProcessExitedException
 from sundae_ns.distributed import ShardedField, Shards
 from sundae_ns.distributed.checkpoints import state_of_rank
 from sundae_ns.distributed.shards import DRIFT
-from sundae_ns.distributed.source import Exchange
 from sundae_ns.errors import rank_ended, show_in_one_line
 from sundae_ns.method_configs import sundae_tiny
+from sundae_ns.rasterization.sharded import Cameras, Route
 from sundae_ns.rendering import StepResolution, View
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
@@ -109,7 +109,7 @@ def check_training(shards: Shards, folder: Path) -> None:
     anew, averaged = [], []
     exchange, replace = ShardedField._exchange, RunningMean.replace
 
-    def noted(self: ShardedField, view: View, at: StepResolution | None) -> Exchange:
+    def noted(self: ShardedField, view: View, at: StepResolution | None) -> tuple[Cameras, Route]:
         if at is not None and (self._planned is None or self._planned.at != at):
             anew.append(at.step)
         return exchange(self, view, at)

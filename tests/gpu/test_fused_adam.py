@@ -45,7 +45,7 @@ def test_a_skipped_step_changes_nothing(launch: Any) -> None:
     tensors = [torch.ones(N) for _ in range(4)]
     before = [value.clone() for value in tensors]
     one, rate = torch.ones(()), torch.tensor(0.1)
-    update = fused_adam.Update(*tensors, one)
+    update = fused_adam.Update(tensors[0], tensors[1], tensors[2], tensors[3], one)
     fused_adam.adam(update, rate, one, betas=BETAS, eps=1e-8, launch=launch)
     assert all(torch.equal(value, old) for value, old in zip(tensors, before, strict=True))
     fused_adam.adam(update, rate, torch.zeros(()), betas=BETAS, eps=1e-8, launch=launch)

@@ -180,7 +180,7 @@ def test_missing_kernels_are_reported_once(monkeypatch: pytest.MonkeyPatch, capl
     def refuse(_: torch.device) -> Launches:
         raise BackendError("NVRTC fails: update torch")
 
-    monkeypatch.setattr(losses, "compiled", refuse)
+    monkeypatch.setattr(losses, "loss_kernels", refuse)
     losses._kernel_runs.cache_clear()
     device = torch.device("cpu")
     assert [losses._kernel_runs(device), losses._kernel_runs(device)] == [False, False]

@@ -258,7 +258,7 @@ class FullBackend:
 @pytest.mark.parametrize("training", [True, False], ids=["training", "rendering"])
 def test_full_memory_says_how_much_and_what_to_try(build: Build, camera: MakeCamera, training: bool) -> None:
     model = build().train(training)
-    model._backend = FullBackend()  # type: ignore[assignment]
+    model.backend = FullBackend()  # type: ignore[assignment]
     with pytest.raises(
         MemoryExhaustedError, match=rf"cannot allocate 2\.50 GiB more with {N} primitives; try"
     ) as caught:

@@ -184,7 +184,7 @@ def test_more_image_sizes_than_recordings(monkeypatch: pytest.MonkeyPatch) -> No
         return SimpleNamespace(pairs=arguments[-1])
 
     monkeypatch.setattr(recordings, "_recorded", recorded)
-    recordings._pairs._on_host = torch.tensor(5)
+    recordings._most_on_host = torch.tensor(5)
 
     def ask(kind: int) -> Any:
         recordings._steps += 1
@@ -195,7 +195,7 @@ def test_more_image_sizes_than_recordings(monkeypatch: pytest.MonkeyPatch) -> No
         assert all(ask(kind) is not None for kind in range(sizes))
         assert ask(sizes) is None
     assert made == [11] * sizes
-    recordings._pairs._on_host.fill_(12)  # a view needed more pairs than fit
+    recordings._most_on_host.fill_(12)  # a view needed more pairs than fit
     assert ask(0).pairs == 25
     recordings._steps += recordings_module.UNUSED
     assert ask(sizes) is not None
