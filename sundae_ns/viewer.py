@@ -176,10 +176,10 @@ class ViewerControls(torch.nn.Module):
         Graphs are built once for a field. The pass over the training views is repeated if the rule weights pixels by the
         count that stays. The caller holds nerfstudio's lock on the field, so training in another thread waits.
         """
-        share = round(float(self.keep_ratio.value), 6)
+        name, share = self.rule.value, round(float(self.keep_ratio.value), 6)
         if share >= 1 or not in_viewer():
             return None
-        asked = (self.rule.value, share)
+        asked = (name, share)
         with self._lock:
             if self._seen is None or not self._seen.matches(self._state, self.training_field):
                 self._seen = _FieldVersion(self._state, self.training_field)
@@ -187,11 +187,11 @@ class ViewerControls(torch.nn.Module):
             if self._found is None or self._found[0] != asked:
                 found: Pruned | None = None
                 try:
-                    found = self._prune(previewed_rule(self._configured, self.rule.value), share)
+                    found = self._prune(previewed_rule(self._configured, name), share)
                 except (SundaeError, torch.cuda.OutOfMemoryError) as error:
                     # An exception in the viewer's thread would end all rendering.
                     reason = " ".join(str(error).split())[:200]
-                    CONSOLE.log(f"[yellow]No preview of {self.rule.value}: {reason}")
+                    CONSOLE.log(f"[yellow]No preview of {name}: {reason}")
                 self._found = (asked, found)
             return self._found[1]
 

@@ -18,7 +18,7 @@ ROWS = 1 << 16
 
 
 @torch.no_grad()
-def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[str, Tensor]:
+def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[str, Tensor]:
     """Replace each group of primitives by one with the same moments.
 
     With weights w normalised within a group:
@@ -31,7 +31,7 @@ def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[st
 
     Args:
         params: the field, all finite, N primitives.
-        heir: index of the primitive that each one is merged into, int64 ``[N]``: its own index for a primitive that
+        label: index of the primitive that each one is merged into, int64 ``[N]``: its own index for a primitive that
             stays, -1 for one that is dropped, else the index of one that stays.
         weight: weight of each primitive in its group, not negative ``[N]``.
 
@@ -41,12 +41,12 @@ def merge(params: Mapping[str, Tensor], heir: Tensor, weight: Tensor) -> dict[st
         bit.
     """
     source = {name: value.detach().cpu() for name, value in params.items()}
-    heir, w = heir.cpu(), weight.detach().double().cpu().nan_to_num(0.0, posinf=0.0).clamp_min(0)
-    n = len(heir)
-    stays = heir == torch.arange(n)
+    label, w = label.cpu(), weight.detach().double().cpu().nan_to_num(0.0, posinf=0.0).clamp_min(0)
+    n = len(label)
+    stays = label == torch.arange(n)
     place = stays.cumsum(0) - 1
-    members = (heir >= 0).nonzero().squeeze(1)
-    group = place[heir[members]]
+    members = (label >= 0).nonzero().squeeze(1)
+    group = place[label[members]]
     count = int(stays.sum())
 
     def total(values: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from sundae_ns.pruning.edges import field_graph
 from sundae_ns.pruning.redistribution import merged
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response, score
-from sundae_ns.pruning.selection import select_band, select_random, select_sampled, select_top
+from sundae_ns.pruning.selection import select_band, select_sampled, select_top
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,13 +133,10 @@ def decide(
 def _select(values: Tensor, rule: PruneRule, count: int, points: Tensor) -> Tensor:
     if rule.selection == "systematic":
         return select_systematic(values, count, neighbor_order(points), rule.seed)
-    if rule.score == "random":
-        return select_random(len(values), count, rule.seed, values.device)
-    if rule.selection == "band":
-        return select_band(values, count, rule.gamma)
-    if rule.selection == "top":
-        return select_top(values, count)
-    return select_sampled(values, count, rule.seed)
+    # Equal scores have no ends to take from.
+    if rule.selection == "sampled" or rule.score == "random":
+        return select_sampled(values, count, rule.seed)
+    return select_band(values, count, rule.gamma) if rule.selection == "band" else select_top(values, count)
 
 
 def diverged(n: int) -> DataError:

@@ -27,13 +27,8 @@ class ShownResponse:
     """Spectral response of a field for display, kept until the field is pruned again."""
 
     def __init__(self) -> None:
-        # One tuple, because the viewer reads it from its own thread.
+        # The field, and its values. One tuple, because the viewer reads it from its own thread.
         self._last: tuple[FieldKey | None, Tensor | None] = (None, None)
-
-    @property
-    def of(self) -> FieldKey | None:
-        """The field whose response is kept; None before the first."""
-        return self._last[0]
 
     def values(self, field: Field, key: FieldKey | None, rule: PruneRule) -> Tensor | None:
         """Values in [0, 1] ``[N]``; None if there is no response, as for a single primitive without neighbours.

@@ -29,11 +29,11 @@ def covariance_of(params: dict[str, Tensor]) -> Tensor:
 
 def test_a_group_becomes_one_with_the_moments_of_the_mixture() -> None:
     params, w = field(), torch.rand(12, dtype=torch.float64)
-    heir = torch.tensor([0, 0, 0, 0, 4, 4, 6, 7, 7, 7, 0, -1])
-    found = merge(params, heir, w)
+    label = torch.tensor([0, 0, 0, 0, 4, 4, 6, 7, 7, 7, 0, -1])
+    found = merge(params, label, w)
     assert {name: value.shape for name, value in found.items()} == {k: (4, *v.shape[1:]) for k, v in params.items()}
     for place, owner in enumerate([0, 4, 6, 7]):
-        group = heir == owner
+        group = label == owner
         weight = w[group] / w[group].sum()
         mean = weight @ params["means"][group]
         offset = params["means"][group] - mean
@@ -75,34 +75,34 @@ def test_a_wall_of_small_primitives_absorbs_as_much_light_after_merging() -> Non
 
 
 def test_merging_commutes_with_rotation_scale_and_shift() -> None:
-    params, heir, w = field(), torch.tensor([0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, -1]), torch.rand(12)
+    params, label, w = field(), torch.tensor([0, 0, 0, 3, 3, 3, 6, 6, 6, 9, 9, -1]), torch.rand(12)
     turn = torch.randn(1, 4, dtype=torch.float64)
     R = rotation_matrices(turn)[0]
     moved = {**params, "means": 8 * params["means"] @ R.T + 100, "scales": params["scales"] + math.log(8)}
     moved["quats"] = quaternions(R @ rotation_matrices(params["quats"]))
-    before, after = merge(params, heir, w), merge(moved, heir, w)
+    before, after = merge(params, label, w), merge(moved, label, w)
     torch.testing.assert_close(after["means"], 8 * before["means"] @ R.T + 100)
     torch.testing.assert_close(covariance_of(after), 64 * R @ covariance_of(before) @ R.T)
     torch.testing.assert_close(after["opacities"], before["opacities"])
 
 
 def test_groups_without_weight_are_unchanged_and_the_scale_of_weights_is_irrelevant() -> None:
-    params, heir = field(), torch.tensor([0] * 6 + [6] * 6)
+    params, label = field(), torch.tensor([0] * 6 + [6] * 6)
     for w in (torch.zeros(12), torch.full((12,), torch.nan)):
-        found = merge(params, heir, w)
+        found = merge(params, label, w)
         assert all(torch.equal(found[name], params[name][[0, 6]]) for name in params)
     w = torch.rand(12, dtype=torch.float64)
-    small, plain = merge(params, heir, w * 1e-200), merge(params, heir, w)
+    small, plain = merge(params, label, w * 1e-200), merge(params, label, w)
     assert all(torch.allclose(small[name], plain[name]) for name in params)
 
 
 def test_weights_that_are_nan_infinite_or_negative_count_as_zero() -> None:
-    params, heir, w = field(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
+    params, label, w = field(), torch.tensor([0] * 6 + [6] * 6), torch.rand(12, dtype=torch.float64)
     w[[1, 7]] = 0
-    expected = merge(params, heir, w)
+    expected = merge(params, label, w)
     for odd in (torch.nan, torch.inf, -1.0):
         w[[1, 7]] = odd
-        found = merge(params, heir, w)
+        found = merge(params, label, w)
         assert all(torch.equal(found[name], expected[name]) for name in params), odd
 
 
@@ -179,12 +179,12 @@ def test_chunks_of_rows_give_the_same_result(monkeypatch: pytest.MonkeyPatch) ->
     params = field(50)
     indices = torch.randint(50, (50, 4))
     whole = overlap(params["means"], covariance_of(params), indices, least_width=0.1)
-    heir = torch.arange(50) // 5 * 5
-    merged = merge(params, heir, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    label = torch.arange(50) // 5 * 5
+    merged = merge(params, label, torch.rand(50, generator=torch.Generator().manual_seed(0)))
     monkeypatch.setattr("sundae_ns.gaussians.covariance.PAIRS", 30)
     monkeypatch.setattr("sundae_ns.gaussians.merging.ROWS", 7)
     assert torch.equal(overlap(params["means"], covariance_of(params), indices, least_width=0.1), whole)
-    again = merge(params, heir, torch.rand(50, generator=torch.Generator().manual_seed(0)))
+    again = merge(params, label, torch.rand(50, generator=torch.Generator().manual_seed(0)))
     assert all(torch.equal(again[name], merged[name]) for name in merged)
 
 

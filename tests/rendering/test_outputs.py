@@ -26,7 +26,7 @@ def test_outputs_that_nobody_asks_for_cost_nothing(
     monkeypatch.setattr(rendering, "rasterize", lambda *a, **kwargs: splatted.append(1) or rasterize(*a, **kwargs))
     outputs = model.get_outputs_for_camera(camera())
     assert outputs["rgb"].shape == outputs["base_rgb"].shape
-    assert (len(splatted), model._response.of) == (1, None)
+    assert (len(splatted), model._response._last[0]) == (1, None)
     assert outputs["response"].max() > 0
     assert len(splatted) == 2
 

@@ -130,15 +130,15 @@ def test_primitives_that_are_not_finite_are_removed_before_the_contribution(
         searched.field["opacities"].data[:2] = torch.nan
         return cut_to(searched, count)
 
-    def noted(searched: SearchedField, keep_ratio: float | None = None) -> Tensor:
-        asked.append((searched.count, keep_ratio))
-        return contribution(searched, keep_ratio)
+    def noted(searched: SearchedField, count: int | None = None) -> Tensor:
+        asked.append((searched.count, count))
+        return contribution(searched, count)
 
     monkeypatch.setattr(SearchedField, "cut_to", spoiled)
     monkeypatch.setattr(SearchedField, "contribution", noted)
     trainer = make(max_psnr_drop=None, max_primitives=37)
     trainer.train()
-    assert asked[0] == (198, 37 / 198)
+    assert asked[0] == (198, 37)
     assert trainer.pipeline.model.num_points == 37
     assert Run(trainer).found["dropped_nonfinite"] == 2
 
