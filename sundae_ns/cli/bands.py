@@ -51,9 +51,9 @@ def base_colors(features_dc: Tensor) -> Tensor:
 def band_masks(params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph, count: int) -> dict[str, Tensor]:
     """The primitives that each rule keeps, bool ``[N]`` by the names of :data:`RULES`.
 
-    All rules rank the primitives by the magnitude of their high-pass response, as the paper does. The high-pass rule keeps
-    the largest, the low-pass rule the smallest, and the combined rule a share ``gamma`` of the largest and the rest of the
-    smallest.
+    All rules rank the primitives by the magnitude of their high-pass response, as the paper does. The high-pass rule
+    keeps the largest, the low-pass rule the smallest, and the combined rule a share ``gamma`` of the largest and the
+    rest of the smallest.
 
     Args:
         params: the field, all finite.
