@@ -1,8 +1,8 @@
 """Controls of nerfstudio's viewer: the head's check box, and a preview of what a prune would keep.
 
-The preview never touches the field, nor the images of training and evaluation. It shows what the prune itself leaves, by
-the same decision; under a rule that merges, with the merged values. The head is disabled in a preview, because it was
-trained on all primitives of the field.
+The preview never touches the field, nor the images of training and evaluation. It shows what the prune itself leaves,
+by the same decision; under a rule that merges, with the merged values. The head is disabled in a preview, because it
+was trained on all primitives of the field.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def in_viewer() -> bool:
 def previewed_rule(configured: PruneRule, name: RuleName) -> PruneRule:
     """The rule of a name in the menu; everything that the name does not say is as configured.
 
-    ``band: both`` is the paper's rule with the configured gamma, ``band: high`` and ``band: low`` are its two ends. These,
-    opacity and random do not merge.
+    ``band: both`` is the paper's rule with the configured gamma, ``band: high`` and ``band: low`` are its two ends.
+    These, opacity and random do not merge.
     """
     if name == "opacity":
         return replace(configured, score="opacity", selection="top", redistribution="none")
@@ -173,8 +173,8 @@ class ViewerControls(torch.nn.Module):
     def preview(self) -> Pruned | None:
         """The previewed prune; None outside of the viewer, with the slider at 1, or if the rule cannot be applied.
 
-        Graphs are built once for a field. The pass over the training views is repeated if the rule weights pixels by the
-        count that stays. The caller holds nerfstudio's lock on the field, so training in another thread waits.
+        Graphs are built once for a field. The pass over the training views is repeated if the rule weights pixels by
+        the count that stays. The caller holds nerfstudio's lock on the field, so training in another thread waits.
         """
         name, share = self.rule.value, round(float(self.keep_ratio.value), 6)
         if share >= 1 or not in_viewer():

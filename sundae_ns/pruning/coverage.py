@@ -1,8 +1,8 @@
 """Systematic sampling: inclusion probabilities in proportion to scores, and one draw per stratum.
 
 Independent draws leave holes and clumps by chance. One draw per stratum, along an order in which neighbours follow each
-other, covers a field evenly and keeps the probability of each primitive. As in :mod:`sundae_ns.pruning.selection`, all work
-is done on the CPU in float64.
+other, covers a field evenly and keeps the probability of each primitive. As in :mod:`sundae_ns.pruning.selection`, all
+work is done on the CPU in float64.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
 def neighbor_order(points: Tensor) -> Tensor:
     """An order in which neighbours follow each other: the leaves of a balanced tree, int64 on the CPU ``[N]``.
 
-    Similar to a Morton curve, but cells are split at the median of their widest axis. A cluster of any size is resolved,
-    where a Morton code could put it into one cell.
+    Similar to a Morton curve, but cells are split at the median of their widest axis. A cluster of any size is
+    resolved, where a Morton code could put it into one cell.
 
     Args:
         points: finite positions ``[N, 3]``, N at least 1.
@@ -51,12 +51,12 @@ def neighbor_order(points: Tensor) -> Tensor:
 def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Tensor:
     """Draw one primitive in each stretch of an order over which the inclusion probabilities sum to one.
 
-    Systematic sampling with unequal probabilities (Madow, 1949): probabilities are summed along the order, and a primitive is
-    selected whenever the sum passes ``u + j``, with one random u for all j. Each primitive is selected with probability
-    ``min(1, c s_i)``, and any stretch of the order keeps its expected number, rounded up or down.
+    Systematic sampling with unequal probabilities (Madow, 1949): probabilities are summed along the order, and a
+    primitive is selected whenever the sum passes ``u + j``, with one random u for all j. Each primitive is selected
+    with probability ``min(1, c s_i)``, and any stretch of the order keeps its expected number, rounded up or down.
 
-    Infinite scores are selected first, then positive ones. Scores that are NaN or at most 0 are drawn uniformly, after all
-    others.
+    Infinite scores are selected first, then positive ones. Scores that are NaN or at most 0 are drawn uniformly, after
+    all others.
 
     Args:
         score: scores ``[N]``.
@@ -91,7 +91,7 @@ def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Te
 
 
 def _systematic_sample(probabilities: Tensor, count: int, start: float) -> Tensor:
-    """Indices of a systematic sample: where the sum of the probabilities passes ``start + j``; ``count`` different ones."""
+    """Indices ``[count]``, all different, at which the sum of the probabilities passes ``start + j``."""
     certain = probabilities >= 1
     places = (~certain).nonzero().squeeze(1)
     wanted = count - int(certain.sum())

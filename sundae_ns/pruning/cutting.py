@@ -20,7 +20,7 @@ from sundae_ns.pruning.rule import PruneRule
 
 @dataclass(eq=False)
 class FieldPruner:
-    """Prunes the field of one process, in place; :class:`sundae_ns.distributed.pruning.RankPruner` does so over ranks."""
+    """Prunes the field of one process in place; ``distributed.pruning.RankPruner`` does so over ranks."""
 
     params: MutableMapping[str, Parameter]
     """The field, name to parameter ``[N, ...]``; its parameters are replaced."""

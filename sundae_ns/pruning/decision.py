@@ -73,9 +73,9 @@ def decide(
 ) -> Decision:
     """Decide which primitives of a field to keep.
 
-    Primitives with a NaN or infinite parameter are dropped first; of the others exactly ``count`` stay. If that is all of
-    them, nothing is scored. In a field of at most ``num_neighbors`` primitives each is a neighbour of all others within
-    reach.
+    Primitives with a NaN or infinite parameter are dropped first; of the others exactly ``count`` stay. If that is all
+    of them, nothing is scored. In a field of at most ``num_neighbors`` primitives each is a neighbour of all others
+    within reach.
 
     Args:
         params: the field, N primitives.

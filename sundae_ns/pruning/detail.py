@@ -16,9 +16,9 @@ FLOOR = 0.25
 def pixel_detail(image: Tensor, cells: float) -> Tensor:
     """Local deviation of an image from its mean over a cell, as weights of the pixels.
 
-    A primitive covers a cell of about ``H W / cells`` pixels, and the deviation within a window of that size is the detail
-    that it cannot show. The squared error of n cells is least if their density is proportional to the gradient (minimise
-    ``int |grad f|^2 / density``), and in a smooth image the deviation is proportional to the gradient.
+    A primitive covers a cell of about ``H W / cells`` pixels, and the deviation within a window of that size is the
+    detail that it cannot show. The squared error of n cells is least if their density is proportional to the gradient
+    (minimise ``int |grad f|^2 / density``), and in a smooth image the deviation is proportional to the gradient.
 
     Args:
         image: colours in [0, 1], any device ``[H, W, C]``.

@@ -18,8 +18,8 @@ LEAST_WIDTH = 0.25
 """Width added to primitives when their overlap is measured, as a share of the graph's sigma: some are flat."""
 
 MOST_UNLIKE = 8.0
-"""Largest difference of colours that counts, in typical differences. Weights fall to e^-32 and stay positive; otherwise a
-primitive of an extreme colour would have no neighbour and could not be merged."""
+"""Largest difference of colours that counts, in typical differences. Weights fall to e^-32 and stay positive; otherwise
+a primitive of an extreme colour would have no neighbour and could not be merged."""
 
 
 def graph_inputs(params: Mapping[str, Tensor], rule: PruneRule) -> Mapping[str, Tensor]:
@@ -34,9 +34,10 @@ def graph_inputs(params: Mapping[str, Tensor], rule: PruneRule) -> Mapping[str, 
 def field_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGraph:
     """Neighbour graph of a field, with the weights and on the device that the rule asks for.
 
-    With ``centres``, as in the paper, weights fall with distance. ``appearance`` multiplies them by the overlap of the two
-    primitives (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean square
-    difference over all edges. As in a bilateral filter, primitives on two sides of an image edge are hardly neighbours.
+    With ``centres``, as in the paper, weights fall with distance. ``appearance`` multiplies them by the overlap of the
+    two primitives (Bhattacharyya) and by ``exp(-|c_i - c_j|^2 / (2 s^2))`` for their colours, s being the root mean
+    square difference over all edges. As in a bilateral filter, primitives on two sides of an image edge are hardly
+    neighbours.
 
     A field of at most ``num_neighbors`` primitives has the graph of all pairs within reach.
 

@@ -20,9 +20,9 @@ MOST_HOPS = 64
 def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
     """Voronoi label of each primitive: the index of the nearest kept primitive along the edges of the graph.
 
-    The length of an edge is ``-log W_ij``, so edges between primitives of different appearance are long if the graph weights
-    by appearance. All edges are relaxed at once, hop by hop (Bellman and Ford). Among equally near kept primitives the one
-    found in fewer hops wins, then the one over the earlier neighbour.
+    The length of an edge is ``-log W_ij``, so edges between primitives of different appearance are long if the graph
+    weights by appearance. All edges are relaxed at once, hop by hop (Bellman and Ford). Among equally near kept
+    primitives the one found in fewer hops wins, then the one over the earlier neighbour.
 
     Edges are followed from a primitive to its neighbours. Primitives that reach no kept one so follow edges in both
     directions: a thousand clones share the same few neighbours, and all of these may be dropped.

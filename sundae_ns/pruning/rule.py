@@ -13,29 +13,29 @@ from sundae_ns.graphs.neighbors import MOST_EXTENT
 class PruneRule:
     """How a prune ranks, selects and merges primitives.
 
-    The defaults are those of ``sundae``: systematic draws in proportion to the contribution to pixels with detail, and each
-    dropped primitive merged into a kept one. The paper's rule is ``selection="band", score="response",
+    The defaults are those of ``sundae``: systematic draws in proportion to the contribution to pixels with detail, and
+    each dropped primitive merged into a kept one. The paper's rule is ``selection="band", score="response",
     signal="positions", edges="centres", redistribution="none"``.
     """
 
     selection: Literal["sampled", "systematic", "band", "top"] = "systematic"
-    """How scores select primitives: one draw in each stretch of space (systematic), independent draws (sampled), the highest
-    scores (top), or both ends of the ranking as in the paper (band)."""
+    """How scores select primitives: one draw in each stretch of space (systematic), independent draws (sampled), the
+    highest scores (top), or both ends of the ranking as in the paper (band)."""
     score: Literal["response-contribution", "detail-contribution", "response", "contribution", "opacity", "random"] = (
         "detail-contribution"
     )
-    """Importance of a primitive: its blending weight over the training views (contribution), the same with pixels weighted by
-    the detail that the kept primitives cannot show (detail-contribution), its high-pass response, alone or times the
-    contribution, its opacity, or the same for all (random)."""
+    """Importance of a primitive: its blending weight over the training views (contribution), the same with pixels
+    weighted by the detail that the kept primitives cannot show (detail-contribution), its high-pass response, alone or
+    times the contribution, its opacity, or the same for all (random)."""
     signal: Literal["attributes", "positions"] = "attributes"
     """Signal of the response: position, colour, opacity and size (attributes), or positions alone as in the paper."""
     edges: Literal["centres", "appearance"] = "appearance"
-    """Weights of the graph: by distance, overlap and colour (appearance), or by distance alone as in the paper (centres)."""
+    """Weights of the graph: by distance, overlap and colour (appearance), or as in the paper by distance (centres)."""
     redistribution: Literal["none", "merge"] = "merge"
-    """Whether each dropped primitive is merged into the kept one that is nearest along the graph (merge), or discarded as in
-    the paper (none). A merge needs a pass over the training views."""
+    """Whether each dropped primitive is merged into the kept one that is nearest along the graph (merge), or discarded
+    as in the paper (none). A merge needs a pass over the training views."""
     gamma: float = 0.5
-    """Share of the kept primitives that the band selection takes from the high end, in [0, 1]; the others are the low end."""
+    """Share of the kept primitives that the band selection takes from the high end, in [0, 1]."""
     num_neighbors: int = 16
     """Most neighbours of a primitive in the graph."""
     graph_device: Literal["cpu", "field"] = "field"

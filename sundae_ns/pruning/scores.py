@@ -43,12 +43,13 @@ def score(
 ) -> Tensor:
     """Score of each primitive by the rule, float64 ``[N]``.
 
-    The response enters as the norm ``|f_i| = sqrt(pi_i)``. Its ranking is that of ``pi_i``, and sampling in proportion to the
-    norm gives the least expected error (Chen et al., "Fast Resampling of Three-Dimensional Point Clouds via Graphs", 2018).
+    The response enters as the norm ``|f_i| = sqrt(pi_i)``. Its ranking is that of ``pi_i``, and sampling in proportion
+    to the norm gives the least expected error (Chen et al., "Fast Resampling of Three-Dimensional Point Clouds via
+    Graphs", 2018).
 
     A primitive without neighbours has no response. Its ``response`` score is NaN, which every selection ranks last. For
-    ``response-contribution`` it gets the median response, so that its contribution decides: a large patch of sky stays and a
-    faint floater does not.
+    ``response-contribution`` it gets the median response, so that its contribution decides: a large patch of sky stays
+    and a faint floater does not.
 
     Args:
         params: the field, all finite, N primitives.

@@ -1,9 +1,9 @@
 """Exact selection: turn scores into a mask that keeps exactly a given number of primitives.
 
-All functions take scores ``[N]`` of any floating dtype on any device, and return a bool mask ``[N]`` on that device with
-exactly ``count`` True entries. Among equal scores the lower index is selected first. NaN means "unknown" and is selected
-last; ``+inf`` is the highest score. All work is done on the CPU in float64, so the same scores give the same mask on every
-device.
+All functions take scores ``[N]`` of any floating dtype on any device, and return a bool mask ``[N]`` on that device
+with exactly ``count`` True entries. Among equal scores the lower index is selected first. NaN means "unknown" and is
+selected last; ``+inf`` is the highest score. All work is done on the CPU in float64, so the same scores give the same
+mask on every device.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def select_top(score: Tensor, count: int) -> Tensor:
 def select_band(magnitude: Tensor, count: int, gamma: float) -> Tensor:
     """Select the ``round(gamma * count)`` highest magnitudes, and the lowest for the rest.
 
-    The paper's rule (paragraph "Controlling bandwidth with gamma"). The two ends never overlap. NaN magnitudes, those of
-    isolated primitives, belong to neither end.
+    The paper's rule (paragraph "Controlling bandwidth with gamma"). The two ends never overlap. NaN magnitudes, those
+    of isolated primitives, belong to neither end.
 
     Args:
         count: number of primitives to keep, 1 to N.

@@ -33,8 +33,8 @@ def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
 def _standardise(values: Tensor) -> Tensor:
     """Centre ``[N, C]`` on its medians and divide by the median norm; a constant group becomes 0.
 
-    A few floaters or saturated colours would dominate a mean or a variance, but not a median. If more than half of the rows
-    are equal, the median norm is 0 and the mean of the norms replaces it.
+    A few floaters or saturated colours would dominate a mean or a variance, but not a median. If more than half of the
+    rows are equal, the median norm is 0 and the mean of the norms replaces it.
     """
     centred = values - values.median(dim=0).values
     norms = torch.linalg.vector_norm(centred, dim=1, dtype=torch.float64)

@@ -34,8 +34,8 @@ def contribution(
         views: the training views.
         background: colour ``[3]``; fixed, so that the result does not depend on a random one.
         settings: how images are made.
-        count: number of primitives that a prune will keep. If given, pixels are weighted by the detail that these cannot
-            show (:func:`sundae_ns.pruning.detail.pixel_detail`).
+        count: number of primitives that a prune will keep. If given, pixels are weighted by the detail that these
+            cannot show (:func:`sundae_ns.pruning.detail.pixel_detail`).
         console: shows a progress bar; None for none.
 
     Raises:

@@ -19,8 +19,8 @@ class PruningConfig(PruneRule):
     """
 
     mode: Literal["one-shot", "continuous", "auto", "off"] = "one-shot"
-    """Prune once (one-shot, the paper's main strategy), periodically during densification for less peak memory (continuous),
-    down to a budget of PSNR, bytes or primitives (auto), or never (off)."""
+    """Prune once (one-shot, the paper's main strategy), periodically during densification for less peak memory
+    (continuous), down to a budget of PSNR, bytes or primitives (auto), or never (off)."""
     keep_ratio: float = 0.1
     """Share of the N primitives that one prune keeps, in (0, 1]: exactly round(keep_ratio * N)."""
     prune_at: int = 15000
@@ -32,20 +32,21 @@ class PruningConfig(PruneRule):
     every: int = 2000
     """Steps from one continuous prune to the next."""
     max_primitives: int | None = None
-    """Continuous: most primitives at any step, densification included; a prune keeps at most this many. Auto: most primitives
-    of the final field."""
+    """Continuous: most primitives at any step, densification included; a prune keeps at most this many. Auto: most
+    primitives of the final field."""
     target_primitives: int | None = None
-    """Continuous: each prune keeps exactly this many, instead of a share by the keep ratio. The final field has exactly this
-    many; if densification ends with fewer, primitives are added."""
+    """Continuous: each prune keeps exactly this many, instead of a share by the keep ratio. The final field has exactly
+    this many; if densification ends with fewer, primitives are added."""
     max_psnr_drop: float | None = None
-    """Auto: keep the fewest primitives that, after fine-tuning, lose at most this PSNR in dB against the field before pruning,
-    on held-out training views. 0.1 if no other budget is set."""
+    """Auto: keep the fewest primitives that, after fine-tuning, lose at most this PSNR in dB against the field before
+    pruning, on held-out training views. 0.1 if no other budget is set."""
     max_bytes: int | None = None
     """Auto: keep the most primitives that fit into this many bytes of parameters, head included."""
     search_every: int = 250
     """Auto: steps from one measurement on the held-out views to the next."""
     patience: int = 4
-    """Auto: measurements after which a cut that has not recovered is undone, unless half of its predicted gain suffices."""
+    """Auto: measurements after which a cut that has not recovered is undone, unless half of its predicted gain is
+    enough."""
 
     @property
     def tolerated_drop(self) -> float:

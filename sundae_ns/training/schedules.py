@@ -1,7 +1,7 @@
 """Pruning schedules: when a field is pruned, and to how many primitives.
 
-A schedule decides, a :class:`sundae_ns.pruning.cutting.FieldPruner` prunes. The running state is a dict of integers, so that
-a checkpoint can carry it: a resumed run neither prunes twice nor forgets its peak.
+A schedule decides, a :class:`sundae_ns.pruning.cutting.FieldPruner` prunes. The running state is a dict of integers,
+which checkpoints carry: a resumed run neither prunes twice nor forgets its peak.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ LEAST_OPACITY = 0.005
 """Lowest opacity of primitives that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
 
 Contribute = Callable[[int | None], Tensor]
-"""Renders the training views and returns the contribution of the pruner's primitives ``[N]``; the argument is ``count`` of
-:func:`sundae_ns.rendering.contribution`."""
+"""Renders the training views and returns the contribution of the pruner's primitives ``[N]``; the argument is ``count``
+of :func:`sundae_ns.rendering.contribution`."""
 
 
 @dataclass(frozen=True)
 class PruningSchedule:
-    """Never prunes; the running state still records the peak. Subclasses say when a prune is due, and how many it keeps."""
+    """Never prunes, and records the peak. Subclasses say when a prune is due, and how many it keeps."""
 
     config: PruningConfig
     """Options; not changed."""
@@ -99,10 +99,10 @@ class OneShotPruning(PruningSchedule):
 class ContinuousPruning(PruningSchedule):
     """Periodic pruning during densification, for a lower peak of memory.
 
-    The paper's alternative (section "Continuous Pruning as a Strategy"): each prune keeps ``keep_ratio``, so that the final
-    number is only roughly known. With ``target_primitives`` each prune goes down to exactly that number; the last one comes
-    after densification, so this is the final number. ``max_primitives`` is a cap on every prune, and on every step in
-    between through :class:`sundae_ns.training.densification.CappedStrategy`.
+    The paper's alternative (section "Continuous Pruning as a Strategy"): each prune keeps ``keep_ratio``, so that the
+    final number is only roughly known. With ``target_primitives`` each prune goes down to exactly that number; the last
+    one comes after densification, so this is the final number. ``max_primitives`` is a cap on every prune, and on every
+    step in between through :class:`sundae_ns.training.densification.CappedStrategy`.
     """
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
