@@ -6,7 +6,6 @@ Module path and class names are written into every run's ``config.yml``, so movi
 from __future__ import annotations
 
 import contextlib
-import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -242,8 +241,8 @@ class SundaeTrainer(Trainer):
         self._recorded: RecordedStep | None = None
         """Runs whole steps; None where they run kernel by kernel."""
         self._views: dict[tuple[int | None, int], View] = {}
-        self._result: Any = (torch.tensor(math.nan), {}, {})
-        """Loss, its terms and metrics of the last step."""
+        self._result: Any = None
+        """Loss, its terms and metrics of the last step that was trained."""
         self._trained: int | None = None
         """The last step that is trained."""
         self._stopped_by = 0
@@ -304,14 +303,27 @@ class SundaeTrainer(Trainer):
 
     def train_iteration(self, step: int) -> Any:
         """Train one step; several ranks agree on whether to stop after it."""
-        if not self.model.state.resting:
+        model = self.model
+        if all(extension.trains(model.state) for extension in model.extensions):
             self._result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
+        elif self._result is None:  # the run was resumed while training is paused
+            self._result = self._untrained(step)
         self._trained = step
         self._foretell(step - self._start_step)
         self._stopped_by = self.team.agreed(self._interruption.number, step)
         if self._stopped_by:
             self.stop_training = True
         return self._result
+
+    @torch.no_grad()
+    def _untrained(self, step: int) -> Any:
+        """Loss, its terms and metrics of the image of a step, without training on it."""
+        state = self.model.state
+        focal = state.trained_focal
+        with torch.random.fork_rng():
+            _, terms, metrics = self.pipeline.get_train_loss_dict(step)
+        state.trained_focal = focal
+        return _detached((torch.stack(list(terms.values())).sum(), terms, metrics))
 
     def _recordable(self) -> bool:
         """Whether options allow to record training steps."""

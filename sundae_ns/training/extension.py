@@ -1,4 +1,4 @@
-"""The protocol between training and its extensions: densification, pruning, the budget search."""
+"""The protocol between training and its extensions: densification, pruning, trials, the budget search."""
 
 from __future__ import annotations
 
@@ -97,6 +97,10 @@ class Extension:
 
     def before_training(self, run: TrainingRun) -> None:
         """Check options and warn, before the first step and after a checkpoint has been loaded."""
+
+    def trains(self, state: FieldState) -> bool:
+        """Whether this step trains; training is paused if one extension answers no."""
+        return True
 
     def before_backward(self, state: FieldState) -> None:
         """Prepare ``state.info`` of a training image for the backward pass."""

@@ -14,8 +14,10 @@ from budget_runs import same, tidy
 from nerfstudio.engine.trainer import Trainer
 from trial_runs import LENGTH, PRUNE_AT, STEPS, tiny_run, tiny_scene
 
-from sundae_ns.training import averaging, stopping, trials
+from sundae_ns.training import averaging
 from sundae_ns.training.heldout import HeldOutQuality
+from sundae_ns.training.trials import engine, stopping
+from sundae_ns.training.trials.head import HeadTrialProgress
 
 DECIDED = PRUNE_AT + 2 * LENGTH
 """Step of the decision, after trials of no head and of a head."""
@@ -34,8 +36,8 @@ def make(tmp_path: Path) -> Iterator[Make]:
 @pytest.fixture
 def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
     """Fixes PSNR and SSIM of the held-out views at a step; trials end without a head."""
-    monkeypatch.setattr(stopping, "EVERY", 1)
-    monkeypatch.setattr(trials.Progress, "best", lambda _: "plain")
+    monkeypatch.setattr(engine, "EVERY", 1)
+    monkeypatch.setattr(HeadTrialProgress, "best", lambda _: "plain")
 
     def fix(
         decibels: Callable[[int], float], similarity: Callable[[int], float] = lambda _: 0.5, held_out: int = 2
@@ -44,7 +46,7 @@ def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
             assert run.num_heldout == held_out
             return [HeldOutQuality(576, decibels(run.state.step), similarity(run.state.step))]
 
-        monkeypatch.setattr(stopping, "measure_heldout", measured)
+        monkeypatch.setattr(engine, "measure_heldout", measured)
 
     return fix
 
@@ -69,7 +71,7 @@ def _watched(trainer: Trainer) -> tuple[list[int], dict[int, torch.Tensor], dict
     return views, centres, rates
 
 
-def test_the_field_goes_back_trains_as_long_as_was_best_and_rests(make: Make, curve: Curve) -> None:
+def test_the_field_goes_back_trains_as_long_as_was_best_and_pauses(make: Make, curve: Curve) -> None:
     best = DECIDED + 2 * WINDOW
     curve(lambda step: 20 - 0.08 * abs(step - best) / WINDOW)
     trainer = make()
@@ -117,8 +119,8 @@ def test_the_mean_of_the_last_window_stays(make: Make, curve: Curve) -> None:
     assert not torch.equal(centres[STEPS - 1], own[-1])
 
 
-def test_a_rest_in_the_last_steps_is_not_averaged(make: Make, curve: Curve, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mean at the end of a run has counted weights before the rest began."""
+def test_a_pause_in_the_last_steps_is_not_averaged(make: Make, curve: Curve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mean at the end of a run has counted weights before the pause."""
     monkeypatch.setattr(averaging, "EVERY", 1)
     curve(lambda step: 20 - 0.08 * abs(step - DECIDED - 10 * WINDOW) / WINDOW)
     trainer = make()
