@@ -54,7 +54,7 @@ def write_record(run: TrainingRun, name: str, record: Mapping[str, Any]) -> None
     """Write a record as JSON to the run's folder, if there is one; numbers that are not finite become null."""
     if run.folder is not None:
         run.folder.mkdir(parents=True, exist_ok=True)
-        write_text(run.folder / name, json.dumps(without_nan(record), indent=2) + "\n")
+        write_text(run.folder / name, json.dumps(without_nan(record), indent=2, allow_nan=False) + "\n")
 
 
 def write_report(

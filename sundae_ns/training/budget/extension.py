@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from dataclasses import asdict
+from typing import Any
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -14,18 +15,17 @@ from torch import Tensor
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
 from sundae_ns.gaussians import from_points
-from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.pruning import PruningConfig
-from sundae_ns.storage import accounting, megabytes
-from sundae_ns.training.budget import heads, sizes
-from sundae_ns.training.budget.record import budget_of, write
-from sundae_ns.training.budget.search import NO_IMAGE, Point, Search
+from sundae_ns.storage import accounting, megabytes, stored_bytes
+from sundae_ns.training.budget import heads
+from sundae_ns.training.budget.search import NO_IMAGE, Point, SearchProgress
 from sundae_ns.training.budget.searched_field import SearchedField
 from sundae_ns.training.budget.sh_degree import flatten, lower_degree
 from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.report import PruneReport, write_report
+from sundae_ns.training.report import PruneReport, write_record, write_report
+from sundae_ns.training.trials.engine import TrialEngine
 from sundae_ns.training.warning import warn
 
 MAX_REJECTED = 5
@@ -34,17 +34,6 @@ TRIAL_EVALUATIONS = 3
 """Length of the training at one SH degree, in evaluations."""
 FLAT_SHARE = 0.25
 """Share of the tolerated drop that view-independent colours may cost when they are introduced."""
-
-
-class _Clock(NamedTuple):
-    """Time left in a phase."""
-
-    head_to_come: bool
-    """Whether a head may be enabled after it."""
-    left: int
-    """Training steps in which a cut must recover."""
-    over: bool
-    """Whether it is too late for another cut."""
 
 
 class BudgetSearch(Extension):
@@ -63,29 +52,23 @@ class BudgetSearch(Extension):
         self, config: PruningConfig, head: HeadConfig, densification: Densification, state: FieldState
     ) -> None:
         self.config = config
-        self.search = Search()
-        heads.follow(state, self.search)
+        self.search = SearchProgress()
         self._largest = None if head.mode == "off" else head
         self._densification = densification
-        self._accepted: dict[str, Snapshot] | None = None
-        self._fallback: dict[str, Snapshot] | None = None
+        self._engine = TrialEngine()
+        self._engine.enable_head(state, False)
         self._flat: Tensor | None = None
 
     @property
     def head_config(self) -> HeadConfig | None:
         """The chosen head, before that the largest one; None for none."""
-        return sizes.chosen_head(self.search, self._largest)
+        return heads.chosen_head(self.search, self._largest)
 
     # ------------------------------------------------------------------------------------------------- checkpoints
 
     def state_dict(self) -> dict[str, Any]:
         """Numbers of the search and, while it goes on, copies of the fields that it may return to."""
-        return {
-            "numbers": self.search.state(),
-            "accepted": self._accepted,
-            "fallback": self._fallback,
-            "flat": self._flat,
-        }
+        return {"numbers": self.search.state(), "engine": self._engine.state_dict(), "flat": self._flat}
 
     def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Give field and head the shapes of a checkpoint.
@@ -103,11 +86,11 @@ class BudgetSearch(Extension):
         """
         search = _search_of(saved)
         needed = {"accepted": search.trying, "fallback": search.phase in ("degrees", "head")}
-        if any(due and not isinstance(saved.get(name), Mapping) for name, due in needed.items()):
-            raise CheckpointError("the checkpoint lacks the field that its search would return to; give another")
-        self.search = search
-        self._accepted, self._fallback, self._flat = saved.get("accepted"), saved.get("fallback"), saved.get("flat")
-        heads.follow(state, search)
+        engine = TrialEngine()
+        engine.load_state_dict(state, saved.get("engine", {}))
+        engine.require(*(name for name, due in needed.items() if due), trial=False)
+        self.search, self._engine, self._flat = search, engine, saved.get("flat")
+        engine.enable_head(state, search.head)
 
     # ---------------------------------------------------------------------------------------------------- training
 
@@ -119,7 +102,7 @@ class BudgetSearch(Extension):
         """
         # With its own generator, because the random state of a checkpoint has been restored by now.
         origin, generator = torch.zeros(1, 3), torch.Generator()
-        least = sizes.bytes_of(from_points(origin, origin, sh_degree=0, num_features=0, generator=generator), None)
+        least = stored_bytes(from_points(origin, origin, sh_degree=0, num_features=0, generator=generator), None)
         if self.config.max_bytes is not None and self.config.max_bytes < least:
             raise ConfigError(
                 f"pruning.max-bytes is {self.config.max_bytes:,}, and one primitive takes {least}; give more"
@@ -151,7 +134,7 @@ class BudgetSearch(Extension):
             run.save()
             raise
         search.seconds += time.perf_counter() - started
-        write(searched, search)
+        self._write(searched)
 
     def _act(self, searched: SearchedField) -> bool:
         """Begin, end a trial, or evaluate if it is due; returns whether anything was due."""
@@ -189,7 +172,7 @@ class BudgetSearch(Extension):
             f"{megabytes(stored)}, SH degree {searched.field.sh_degree}, "
             f"{'with' if search.head else 'no'} head, {drop:+.3f} dB lost on {search.views} held-out views.{unfinished}"
         )
-        write(searched, search)
+        self._write(searched)
 
     # ---------------------------------------------------------------------------------------------------- the steps
 
@@ -215,7 +198,7 @@ class BudgetSearch(Extension):
         search.degree = searched.field.sh_degree
         if search.degree > 0 and not self._time_is_up(searched):
             search.phase = "degrees"
-            self._fallback = searched.state.snapshot(head=search.head)
+            self._keep("fallback", state)
             self._start_trial(searched, search.degree)
         else:
             self._after_degrees(searched)
@@ -227,7 +210,7 @@ class BudgetSearch(Extension):
             return
         self.search.begin("field", searched.count)
         value = searched.measure()
-        if self._clock(searched).over:
+        if self._clock(searched)[2]:
             self._end_phase(searched, value)
         else:
             self._cut_or_rest(searched, value)
@@ -236,13 +219,14 @@ class BudgetSearch(Extension):
         """Whether the search must end at this step. A run that ends before ``stop`` may be trained on."""
         return searched.state.schedule_step >= self.config.stop and searched.steps_left == 0
 
-    def _clock(self, searched: SearchedField) -> _Clock:
+    def _clock(self, searched: SearchedField) -> tuple[bool, int, bool]:
+        """Whether a head may be enabled after this phase, steps in which a cut must recover, whether another is too late."""
         config, search, step = self.config, self.search, searched.state.schedule_step
         # Half of the time belongs to the head, if one may be enabled.
         head_to_come = search.phase == "field" and heads.may_pay(searched, self._largest)
         deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
         left = deadline - step if head_to_come else searched.steps_left
-        return _Clock(head_to_come, left, self._is_over(searched, deadline, left))
+        return head_to_come, left, self._is_over(searched, deadline, left)
 
     def _is_over(self, searched: SearchedField, deadline: int, left: int) -> bool:
         """Whether too few steps are left to judge another cut."""
@@ -269,7 +253,7 @@ class BudgetSearch(Extension):
         if verdict == "waiting":
             return
         if verdict == "rejected":
-            self._restore(searched, self._accepted)
+            self._restore(searched, "accepted")
             value = search.before_cut
         # Do not wait for a head that does not help, or for a field while a head is to come.
         tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
@@ -285,7 +269,7 @@ class BudgetSearch(Extension):
         count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
         if count is None or searched.steps_left < config.search_every:  # no evaluation would judge it
             return
-        self._accepted = searched.state.snapshot(head=search.head)
+        self._keep("accepted", searched.state)
         self._count_dropped(searched.cut_to(count))
         search.cut(value, count, searched.state.schedule_step)
 
@@ -293,19 +277,18 @@ class BudgetSearch(Extension):
         search, step = self.search, searched.state.schedule_step
         too_late = self._is_over(searched, self.config.stop, searched.steps_left)
         if search.phase == "field" and heads.may_pay(searched, self._largest) and not too_late:
-            self._fallback = searched.state.snapshot(head=search.head)
+            self._keep("fallback", searched.state)
             search.begin("head", search.accepted)
             search.head_at, search.lost_at_join = step, search.steps_lost
-            heads.enable(searched, search, self._largest, searched.count)
+            self._choose_head(searched, searched.count)
             return
         if search.phase == "head":
-            assert self._fallback is not None
-            without = len(self._fallback["field"]["means"]["value"]) * searched.row
-            if value == NO_IMAGE or sizes.bytes_of(searched.field, self.head_config) >= without:
+            without = len(self._engine.kept["fallback"]["field"]["means"]["value"]) * searched.row
+            if value == NO_IMAGE or stored_bytes(searched.field, self.head_config) >= without:
                 search.steps_lost = search.lost_at_join + step - search.head_at
                 search.head = False
-                heads.follow(searched.state, search)
-                self._restore(searched, self._fallback)
+                self._engine.enable_head(searched.state, False)
+                self._restore(searched, "fallback")
         if not search.head and self._largest is not None:
             heads.remove(searched, search)
         self._done(searched)
@@ -320,11 +303,11 @@ class BudgetSearch(Extension):
                 raise DataError(
                     f"pruning.max-bytes is {config.max_bytes:,}, and one primitive takes {row:,}; give more"
                 )
-        if not heads.enable(searched, search, self._largest, count) and self._largest is not None:
+        if not self._choose_head(searched, count) and self._largest is not None:
             heads.remove(searched, search)
         if config.max_bytes is not None:
             head = self.head_config if search.head else None
-            count = accounting.rows_within(searched.field, config.max_bytes, lambda rows: sizes.bytes_of(rows, head))
+            count = accounting.rows_within(searched.field, config.max_bytes, lambda rows: stored_bytes(rows, head))
         if count < searched.count:
             self._count_dropped(searched.cut_to(count))
             search.cut_at = searched.state.schedule_step
@@ -334,7 +317,7 @@ class BudgetSearch(Extension):
     def _done(self, searched: SearchedField) -> None:
         search, state = self.search, searched.state
         search.phase = "done"
-        self._accepted = self._fallback = None
+        self._engine.kept = {}
         value = searched.measure() if searched.field.sh_degree > 0 else NO_IMAGE
         if value > NO_IMAGE:
             least = value - FLAT_SHARE * self.config.tolerated_drop
@@ -377,27 +360,30 @@ class BudgetSearch(Extension):
             # The run ends during the trial. The warm-up's own degree needs no proof.
             if search.degrees:
                 search.steps_lost += searched.state.schedule_step - search.cut_at
-                self._restore(searched, self._accepted)
+                self._restore(searched, "accepted")
             self._leave_trials(searched)
             return
         value = search.degrees[str(search.degree)] = self._measure_finite(searched)
         top = max(int(name) for name in search.degrees)
         if search.degree == search.lowest_degree(top, tolerated):
-            self._accepted = searched.state.snapshot(head=search.head) if value > NO_IMAGE else self._fallback
+            if value > NO_IMAGE:
+                self._keep("accepted", searched.state)
+            else:
+                self._engine.kept["accepted"] = self._engine.kept["fallback"]
         degree = search.next_degree(top, tolerated)
         if len(search.degrees) > 1 or value == NO_IMAGE:  # this trial, or the one that it has replaced
             search.steps_lost += searched.state.schedule_step - search.cut_at
         if degree is not None:
-            self._restore(searched, self._fallback)
+            self._restore(searched, "fallback")
             self._start_trial(searched, degree)
             return
         if search.degree != search.lowest_degree(top, tolerated) or value == NO_IMAGE:
-            self._restore(searched, self._accepted)
+            self._restore(searched, "accepted")
         self._leave_trials(searched)
 
     def _leave_trials(self, searched: SearchedField) -> None:
         search = self.search
-        self._fallback = None
+        del self._engine.kept["fallback"]
         if search.degrees:
             levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
             CONSOLE.log(f"SH degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
@@ -420,8 +406,18 @@ class BudgetSearch(Extension):
         if count:
             warn(f"removed {count} primitives that were not finite")
 
-    def _restore(self, searched: SearchedField, saved: Mapping[str, Snapshot] | None) -> None:
-        searched.restore(saved)
+    def _choose_head(self, searched: SearchedField, primitives: int) -> bool:
+        chosen = heads.choose(searched, self.search, self._largest, primitives)
+        self._engine.enable_head(searched.state, self.search.head)
+        return chosen
+
+    def _keep(self, name: str, state: FieldState) -> None:
+        self._engine.keep(name, state, head=self.search.head)
+
+    def _restore(self, searched: SearchedField, name: str) -> None:
+        self._engine.go_back(name, searched.state, rates=False)
+        # Whatever is cached by the number of prunes is stale.
+        searched.state.pruning["num_prunes"] += 1
         self.search.degree = searched.field.sh_degree
 
     def _point(self, searched: SearchedField, psnr: float, phase: str, verdict: str) -> Point:
@@ -430,15 +426,40 @@ class BudgetSearch(Extension):
             step=state.step,
             phase=phase,
             primitives=searched.count,
-            bytes=sizes.bytes_of(searched.field if head else searched.bare, self.head_config if head else None),
+            bytes=stored_bytes(searched.field if head else searched.bare, self.head_config if head else None),
             psnr=psnr,
             verdict=verdict,
             since_cut=state.schedule_step - self.search.cut_at,
         )
 
+    def _write(self, searched: SearchedField) -> None:
+        """Write curve, choice and cost of the search.
 
-def _search_of(saved: Mapping[str, Any]) -> Search:
+        Raises:
+            StorageError: no space or no right to write.
+        """
+        run, search = searched.run, self.search
+        if run.num_steps is None:
+            return
+        lost = search.steps_lost
+        cost = {"steps_lost": lost, "share_of_steps": lost / run.num_steps, "seconds": search.seconds}
+        budget = dict([budget_of(self.config)])
+        write_record(
+            run, "budget.json", {"budget": budget, **asdict(search), "primitives": searched.count, "cost": cost}
+        )
+
+
+def budget_of(config: PruningConfig) -> tuple[str, float]:
+    """Name and value of the option that sets the budget."""
+    for name in ("max_bytes", "max_primitives"):
+        value = getattr(config, name)
+        if value is not None:
+            return name, value
+    return "max_psnr_drop", config.tolerated_drop
+
+
+def _search_of(saved: Mapping[str, Any]) -> SearchProgress:
     """The search of a checkpoint."""
     if not isinstance(saved.get("numbers"), Mapping):
         raise CheckpointError("the checkpoint is of a run without a budget search; load it with its own method")
-    return Search.from_state(saved["numbers"])
+    return SearchProgress.from_state(saved["numbers"])

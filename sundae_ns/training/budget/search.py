@@ -59,7 +59,7 @@ class Point:
 
 
 @dataclass
-class Search:
+class SearchProgress:
     """State of a search: plain numbers and strings for a checkpoint."""
 
     phase: Phase = "before"
@@ -270,7 +270,7 @@ class Search:
         return asdict(self)
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> Search:
+    def from_state(cls, state: Mapping[str, Any]) -> SearchProgress:
         """Counterpart of :meth:`state`.
 
         Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -14,14 +14,13 @@ from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.sh_folding import mean_basis
-from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.pruning.cutting import cut, drop_nonfinite
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering.contribution import contribution, weights_by_batch
 from sundae_ns.rendering.source import TrainingView
+from sundae_ns.storage import bytes_of
 from sundae_ns.training.budget.search import NO_IMAGE
-from sundae_ns.training.budget.sizes import bytes_of
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import measure_heldout
@@ -61,7 +60,7 @@ class SearchedField:
     @property
     def row(self) -> int:
         """Bytes of a primitive without features."""
-        return bytes_of({name: value[:1] for name, value in self.bare.items()}, None)
+        return bytes_of({name: value[:1] for name, value in self.bare.items()})
 
     @property
     def steps_left(self) -> int:
@@ -139,13 +138,6 @@ class SearchedField:
             count=lambda n: min(count, n),
         )
         return decision.dropped_nonfinite
-
-    def restore(self, saved: Mapping[str, Snapshot] | None) -> None:
-        """Return to a snapshot."""
-        assert saved is not None
-        self.state.restore(saved)
-        # Whatever is cached by the number of prunes is stale.
-        self.state.pruning["num_prunes"] += 1
 
     def restart_rates(self, *, head: bool) -> None:
         """Restart the learning rates of the field, or those of the head."""

@@ -132,9 +132,7 @@ class EarlyStopping(Extension):
             if progress.lost:
                 self._go_back(run)
             elif run.state.schedule_step + self._window > progress.ends:
-                CONSOLE.log(
-                    f"step {run.state.step}: the held-out views lose nothing; training goes on, on all views"
-                )
+                CONSOLE.log(f"step {run.state.step}: the held-out views lose nothing; training goes on, on all views")
                 progress.phase = "done"
                 self._engine.end(run)
                 self._record(run, None)

@@ -15,7 +15,7 @@ from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import DataError
 from sundae_ns.training import budget
 from sundae_ns.training.budget import BudgetSearch
-from sundae_ns.training.budget.search import NO_IMAGE, Search
+from sundae_ns.training.budget.search import NO_IMAGE, SearchProgress
 from sundae_ns.training.budget.searched_field import SearchedField
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
@@ -108,7 +108,9 @@ def test_primitives_that_are_not_finite_are_removed_at_the_next_evaluation(
 
     spoil(monkeypatch, when, lambda state: state.field["features_dc"][:3])
     # Nothing is cut at once: the verdict of the next evaluation is "resting".
-    monkeypatch.setattr(Search, "next_count", lambda self, *_: 100 if self.looks > 1 and self.accepted == 197 else None)
+    monkeypatch.setattr(
+        SearchProgress, "next_count", lambda self, *_: 100 if self.looks > 1 and self.accepted == 197 else None
+    )
     trainer = make(max_psnr_drop=3.0)
     trainer.train()
     found = Run(trainer).found

@@ -30,7 +30,7 @@ from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.scenes.measure import sizes
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.training.budget import bytes_of, extension
-from sundae_ns.training.budget.search import Search
+from sundae_ns.training.budget.search import SearchProgress
 from sundae_ns.training.budget.searched_field import SearchedField
 from sundae_ns.training.field_state import FieldState
 
@@ -59,7 +59,7 @@ def test_it_cuts_and_keeps_the_target(done: Run) -> None:
     assert open_scene(done.folder).kept == found["primitives"] / 200
 
 
-def recovering(search: Search, at_last: float) -> Callable[[SearchedField], float]:
+def recovering(search: SearchProgress, at_last: float) -> Callable[[SearchedField], float]:
     """PSNR on held-out views: 20 dB for the whole field; a cut one is predicted to reach 19.5 dB, and does not."""
 
     def measure(searched: SearchedField) -> float:

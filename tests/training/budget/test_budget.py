@@ -13,7 +13,7 @@ from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.training.budget import BudgetSearch
-from sundae_ns.training.budget.search import Search
+from sundae_ns.training.budget.search import SearchProgress
 from sundae_ns.training.densification import ChainStrategy, Densification
 from sundae_ns.training.field_state import FieldState
 
@@ -32,7 +32,7 @@ def a_search(state: FieldState) -> BudgetSearch:
 
 
 def numbers(phase: str, *, trying: bool = False, **changes: Any) -> dict[str, Any]:
-    search = Search(reference=30.1, target=30.0)
+    search = SearchProgress(reference=30.1, target=30.0)
     search.begin(phase, 1000)  # type: ignore[arg-type]
     if trying:
         search.cut(30.2, 500, step=3)
