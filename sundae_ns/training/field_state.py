@@ -56,8 +56,8 @@ class FieldState:
     head_starts_at: float = math.inf
     """Step of the schedule after which the head is enabled."""
     uncounted: float = 0
-    """Images trained on since the head was enabled that do not count: the field went back to before them. Infinite in a trial
-    whose field may be dropped."""
+    """Images trained on since the head was enabled that do not count: the field went back to before them. Infinite in
+    a trial whose field may be dropped."""
     images_per_step: int = 1
     """Number of images in the batch of a step."""
     restored: int = 0

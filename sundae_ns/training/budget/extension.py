@@ -18,9 +18,9 @@ from sundae_ns.gaussians import from_points
 from sundae_ns.pruning import PruningConfig
 from sundae_ns.storage import accounting, megabytes, stored_bytes
 from sundae_ns.training.budget import heads
-from sundae_ns.training.budget.search import NO_IMAGE, Point, SearchProgress
+from sundae_ns.training.budget.search import NO_IMAGE, SearchProgress
 from sundae_ns.training.budget.searched_field import SearchedField
-from sundae_ns.training.budget.sh_degree import flatten, lower_degree
+from sundae_ns.training.budget.sh_degree import end_trial, flatten, start_trial, trained
 from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
@@ -30,8 +30,6 @@ from sundae_ns.training.warning import warn
 
 MAX_REJECTED = 5
 """Cuts that may be rejected, before and after the head is enabled."""
-TRIAL_EVALUATIONS = 3
-"""Length of the training at one SH degree, in evaluations."""
 FLAT_SHARE = 0.25
 """Share of the tolerated drop that view-independent colours may cost when they are introduced."""
 
@@ -59,10 +57,9 @@ class BudgetSearch(Extension):
         self._engine.enable_head(state, False)
         self._flat: Tensor | None = None
 
-    @property
-    def head_config(self) -> HeadConfig | None:
-        """The chosen head, before that the largest one; None for none."""
-        return heads.chosen_head(self.search, self._largest)
+    def searched(self, run: TrainingRun) -> SearchedField:
+        """The field of a run under this search."""
+        return SearchedField(run, self.config, self.search, self._engine)
 
     # ------------------------------------------------------------------------------------------------- checkpoints
 
@@ -120,7 +117,7 @@ class BudgetSearch(Extension):
             DataError: the budget is too small for one primitive, or the field cannot be scored. A checkpoint is saved first.
         """
         search = self.search
-        searched = SearchedField(run, self.config)
+        searched = self.searched(run)
         if self._flat is not None:
             rest = searched.field["features_rest"]
             self._flat = self._flat.to(rest.device)
@@ -141,8 +138,9 @@ class BudgetSearch(Extension):
         phase = self.search.phase
         if phase == "before" and searched.state.schedule_step >= self.config.prune_at:
             self._begin(searched)
-        elif phase == "degrees" and (self._trained(searched) or self._time_is_up(searched)):
-            self._end_trial(searched)
+        elif phase == "degrees" and (trained(searched) or self._time_is_up(searched)):
+            if end_trial(searched):
+                self._after_degrees(searched)
         elif phase in ("field", "head") and self._evaluation_is_due(searched):
             self._evaluate(searched)
         else:
@@ -155,8 +153,8 @@ class BudgetSearch(Extension):
         if search.phase == "before":
             warn("training ended before the budget search began (pruning.prune-at)")
             return
-        searched, state = SearchedField(run, config), run.state
-        end = self._point(searched, searched.measure(), "final", "reached")
+        searched, state = self.searched(run), run.state
+        end = searched.evaluation(searched.measure(), "final", "reached")
         drop, stored, count = search.reference - end.psnr, end.bytes, searched.count
         option, limit = budget_of(config)
         cost = {"max_psnr_drop": drop, "max_bytes": stored, "max_primitives": count}[option]
@@ -178,7 +176,7 @@ class BudgetSearch(Extension):
 
     def _begin(self, searched: SearchedField) -> None:
         search, state = self.search, searched.state
-        self._count_dropped(searched.drop_nonfinite())
+        searched.drop_nonfinite()
         # Densification has ended, and its statistics would not match a field that is restored with more primitives.
         self._densification.initialize(state)
         search.began, search.before = state.schedule_step, searched.count
@@ -198,8 +196,8 @@ class BudgetSearch(Extension):
         search.degree = searched.field.sh_degree
         if search.degree > 0 and not self._time_is_up(searched):
             search.phase = "degrees"
-            self._keep("fallback", state)
-            self._start_trial(searched, search.degree)
+            searched.keep("fallback")
+            start_trial(searched, search.degree)
         else:
             self._after_degrees(searched)
 
@@ -239,9 +237,9 @@ class BudgetSearch(Extension):
     def _evaluate(self, searched: SearchedField) -> None:
         search, config, state = self.search, self.config, searched.state
         head_to_come, left, over = self._clock(searched)
-        value = searched.measure() if search.trying else self._measure_finite(searched)
+        value = searched.measure() if search.trying else searched.measure_finite()
         verdict = search.judge(value, state.schedule_step, left, config.patience)
-        point = self._point(searched, value, search.phase, verdict)
+        point = searched.evaluation(value, search.phase, verdict)
         search.curve.append(point)
         CONSOLE.log(
             f"step {state.step}: {point.primitives:,} primitives, {value - search.target:+.3f} dB to the target, "
@@ -253,7 +251,7 @@ class BudgetSearch(Extension):
         if verdict == "waiting":
             return
         if verdict == "rejected":
-            self._restore(searched, "accepted")
+            searched.go_back("accepted")
             value = search.before_cut
         # Do not wait for a head that does not help, or for a field while a head is to come.
         tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
@@ -269,28 +267,28 @@ class BudgetSearch(Extension):
         count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
         if count is None or searched.steps_left < config.search_every:  # no evaluation would judge it
             return
-        self._keep("accepted", searched.state)
-        self._count_dropped(searched.cut_to(count))
+        searched.keep("accepted")
+        searched.cut_to(count)
         search.cut(value, count, searched.state.schedule_step)
 
     def _end_phase(self, searched: SearchedField, value: float) -> None:
         search, step = self.search, searched.state.schedule_step
         too_late = self._is_over(searched, self.config.stop, searched.steps_left)
         if search.phase == "field" and heads.may_pay(searched, self._largest) and not too_late:
-            self._keep("fallback", searched.state)
+            searched.keep("fallback")
             search.begin("head", search.accepted)
             search.head_at, search.lost_at_join = step, search.steps_lost
-            self._choose_head(searched, searched.count)
+            heads.enable(searched, self._largest, searched.count)
             return
         if search.phase == "head":
             without = len(self._engine.kept["fallback"]["field"]["means"]["value"]) * searched.row
-            if value == NO_IMAGE or stored_bytes(searched.field, self.head_config) >= without:
+            if value == NO_IMAGE or searched.stored >= without:
                 search.steps_lost = search.lost_at_join + step - search.head_at
                 search.head = False
                 self._engine.enable_head(searched.state, False)
-                self._restore(searched, "fallback")
+                searched.go_back("fallback")
         if not search.head and self._largest is not None:
-            heads.remove(searched, search)
+            heads.remove(searched)
         self._done(searched)
 
     def _fit(self, searched: SearchedField) -> None:
@@ -303,16 +301,16 @@ class BudgetSearch(Extension):
                 raise DataError(
                     f"pruning.max-bytes is {config.max_bytes:,}, and one primitive takes {row:,}; give more"
                 )
-        if not self._choose_head(searched, count) and self._largest is not None:
-            heads.remove(searched, search)
+        if not heads.enable(searched, self._largest, count) and self._largest is not None:
+            heads.remove(searched)
         if config.max_bytes is not None:
-            head = self.head_config if search.head else None
+            head = heads.chosen_head(search, self._largest) if search.head else None
             count = accounting.rows_within(searched.field, config.max_bytes, lambda rows: stored_bytes(rows, head))
         if count < searched.count:
-            self._count_dropped(searched.cut_to(count))
+            searched.cut_to(count)
             search.cut_at = searched.state.schedule_step
         search.accepted = searched.count
-        search.curve.append(self._point(searched, searched.measure(), "field", "cut"))
+        search.curve.append(searched.evaluation(searched.measure(), "field", "cut"))
 
     def _done(self, searched: SearchedField) -> None:
         search, state = self.search, searched.state
@@ -339,98 +337,6 @@ class BudgetSearch(Extension):
         )
         CONSOLE.log(report.summary())
         write_report(searched.run, report, before={}, after={})
-
-    # ------------------------------------------------------------------------------------------------- the SH degree
-
-    def _start_trial(self, searched: SearchedField, degree: int) -> None:
-        """Train on from the warm-up field at an SH degree."""
-        search = self.search
-        if degree < search.degree:
-            lower_degree(searched, degree)
-            search.degree = degree
-        search.cut_at = searched.state.schedule_step
-
-    def _trained(self, searched: SearchedField) -> bool:
-        """Whether a trial has been trained as long as all others."""
-        return searched.state.schedule_step - self.search.cut_at >= TRIAL_EVALUATIONS * self.config.search_every
-
-    def _end_trial(self, searched: SearchedField) -> None:
-        search, tolerated = self.search, self.config.tolerated_drop
-        if not self._trained(searched):
-            # The run ends during the trial. The warm-up's own degree needs no proof.
-            if search.degrees:
-                search.steps_lost += searched.state.schedule_step - search.cut_at
-                self._restore(searched, "accepted")
-            self._leave_trials(searched)
-            return
-        value = search.degrees[str(search.degree)] = self._measure_finite(searched)
-        top = max(int(name) for name in search.degrees)
-        if search.degree == search.lowest_degree(top, tolerated):
-            if value > NO_IMAGE:
-                self._keep("accepted", searched.state)
-            else:
-                self._engine.kept["accepted"] = self._engine.kept["fallback"]
-        degree = search.next_degree(top, tolerated)
-        if len(search.degrees) > 1 or value == NO_IMAGE:  # this trial, or the one that it has replaced
-            search.steps_lost += searched.state.schedule_step - search.cut_at
-        if degree is not None:
-            self._restore(searched, "fallback")
-            self._start_trial(searched, degree)
-            return
-        if search.degree != search.lowest_degree(top, tolerated) or value == NO_IMAGE:
-            self._restore(searched, "accepted")
-        self._leave_trials(searched)
-
-    def _leave_trials(self, searched: SearchedField) -> None:
-        search = self.search
-        del self._engine.kept["fallback"]
-        if search.degrees:
-            levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
-            CONSOLE.log(f"SH degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
-        self._after_degrees(searched)
-
-    # -------------------------------------------------------------------------------------------------- small things
-
-    def _measure_finite(self, searched: SearchedField) -> float:
-        """PSNR on the held-out views; without primitives that are not finite, if they spoil it."""
-        value = searched.measure()
-        dropped = searched.drop_nonfinite() if value == NO_IMAGE else 0
-        if not dropped:
-            return value
-        self._count_dropped(dropped)
-        self.search.accepted = searched.count
-        return searched.measure()
-
-    def _count_dropped(self, count: int) -> None:
-        self.search.dropped_nonfinite += count
-        if count:
-            warn(f"removed {count} primitives that were not finite")
-
-    def _choose_head(self, searched: SearchedField, primitives: int) -> bool:
-        chosen = heads.choose(searched, self.search, self._largest, primitives)
-        self._engine.enable_head(searched.state, self.search.head)
-        return chosen
-
-    def _keep(self, name: str, state: FieldState) -> None:
-        self._engine.keep(name, state, head=self.search.head)
-
-    def _restore(self, searched: SearchedField, name: str) -> None:
-        self._engine.go_back(name, searched.state, rates=False)
-        # Whatever is cached by the number of prunes is stale.
-        searched.state.pruning["num_prunes"] += 1
-        self.search.degree = searched.field.sh_degree
-
-    def _point(self, searched: SearchedField, psnr: float, phase: str, verdict: str) -> Point:
-        head, state = self.search.head, searched.state
-        return Point(
-            step=state.step,
-            phase=phase,
-            primitives=searched.count,
-            bytes=stored_bytes(searched.field if head else searched.bare, self.head_config if head else None),
-            psnr=psnr,
-            verdict=verdict,
-            since_cut=state.schedule_step - self.search.cut_at,
-        )
 
     def _write(self, searched: SearchedField) -> None:
         """Write curve, choice and cost of the search.

@@ -49,9 +49,9 @@ def may_pay(searched: SearchedField, largest: HeadConfig | None) -> bool:
     return largest is not None and head_for(count * searched.row, count, largest) is not None
 
 
-def choose(searched: SearchedField, search: SearchProgress, largest: HeadConfig | None, primitives: int) -> bool:
-    """Give the field the head that suits one of ``primitives``; returns whether there is one."""
-    state = searched.state
+def enable(searched: SearchedField, largest: HeadConfig | None, primitives: int) -> bool:
+    """Enable the head that suits a field of ``primitives``; returns whether there is one."""
+    state, search = searched.state, searched.search
     config = None if largest is None else head_for(primitives * searched.row, primitives, largest)
     if config is None or state.head is None:
         return False
@@ -59,13 +59,15 @@ def choose(searched: SearchedField, search: SearchProgress, largest: HeadConfig 
     if config != state.head.config:
         state.head.resize(config)
         narrow(state.field, state.optimizers, FEATURES, config.num_features)
+    searched.engine.enable_head(state, True)
     CONSOLE.log(f"a {config.size} head is enabled, with {config.num_features} features a primitive")
     searched.restart_rates(head=True)
     return True
 
 
-def remove(searched: SearchedField, search: SearchProgress) -> None:
+def remove(searched: SearchedField) -> None:
     """Remove the head and the features for good."""
+    search = searched.search
     searched.state.remove_head()
     search.head_dropped, search.head_size, search.num_features = True, "", 0
 

@@ -19,23 +19,34 @@ from sundae_ns.pruning.cutting import cut, drop_nonfinite
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering.contribution import contribution, weights_by_batch
 from sundae_ns.rendering.source import TrainingView
-from sundae_ns.storage import bytes_of
-from sundae_ns.training.budget.search import NO_IMAGE
+from sundae_ns.storage import bytes_of, stored_bytes
+from sundae_ns.training.budget.search import NO_IMAGE, Point, SearchProgress
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import measure_heldout
 from sundae_ns.training.schedulers import notify_pruned
+from sundae_ns.training.trials.engine import TrialEngine
+from sundae_ns.training.warning import warn
 
 MAX_VIEWS = 64
 """Training views, evenly chosen, for each score: a search scores the field at every cut."""
 
 
 class SearchedField:
-    """What a step of the search does to the field of a run."""
+    """What a step of the search does to the field of a run.
 
-    def __init__(self, run: TrainingRun, config: PruningConfig) -> None:
+    Args:
+        run: the training.
+        config: options of pruning.
+        search: state of the search.
+        engine: keeps the fields that the search may go back to.
+    """
+
+    def __init__(self, run: TrainingRun, config: PruningConfig, search: SearchProgress, engine: TrialEngine) -> None:
         self.run = run
         self.config = config
+        self.search = search
+        self.engine = engine
 
     @property
     def state(self) -> FieldState:
@@ -61,6 +72,12 @@ class SearchedField:
     def row(self) -> int:
         """Bytes of a primitive without features."""
         return bytes_of({name: value[:1] for name, value in self.bare.items()})
+
+    @property
+    def stored(self) -> int:
+        """Bytes of the field, with the head if it is enabled."""
+        head = self.state.head
+        return stored_bytes(self.field, head.config) if self.search.head and head else stored_bytes(self.bare, None)
 
     @property
     def steps_left(self) -> int:
@@ -107,17 +124,35 @@ class SearchedField:
         value = statistics.fmean(view.psnr for view in views)
         return value if math.isfinite(value) else NO_IMAGE
 
+    def measure_finite(self) -> float:
+        """:meth:`measure`; without primitives that are not finite, if they spoil it."""
+        value = self.measure()
+        if value > NO_IMAGE or not self.drop_nonfinite():
+            return value
+        self.search.accepted = self.count
+        return self.measure()
+
+    def evaluation(self, psnr: float, phase: str, verdict: str) -> Point:
+        """A point of the curve for the field as it is."""
+        state = self.state
+        return Point(
+            state.step, phase, self.count, self.stored, psnr, verdict, state.schedule_step - self.search.cut_at
+        )
+
     # ------------------------------------------------------------------------------------------------------- fields
 
     def drop_nonfinite(self) -> int:
         """Remove primitives with a NaN or infinite parameter; returns their number."""
-        return drop_nonfinite(self.field, self.state.optimizers, [self.state.pruning])
+        return self._count_dropped(drop_nonfinite(self.field, self.state.optimizers, [self.state.pruning]))
 
-    def cut_to(self, count: int) -> int:
+    def _count_dropped(self, count: int) -> int:
+        self.search.dropped_nonfinite += count
+        if count:
+            warn(f"removed {count} primitives that were not finite")
+        return count
+
+    def cut_to(self, count: int) -> None:
         """Keep ``count`` primitives by the configured rule, or all that are finite if there are fewer.
-
-        Returns:
-            Number of primitives removed because they were not finite.
 
         Raises:
             DataError: the field cannot be scored.
@@ -137,7 +172,18 @@ class SearchedField:
             step=state.schedule_step,
             count=lambda n: min(count, n),
         )
-        return decision.dropped_nonfinite
+        self._count_dropped(decision.dropped_nonfinite)
+
+    def keep(self, name: str) -> None:
+        """Keep a copy of the field, and of the head if it is enabled."""
+        self.engine.keep(name, self.state, head=self.search.head)
+
+    def go_back(self, name: str) -> None:
+        """Continue with a kept copy; rates and steps go on."""
+        self.engine.go_back(name, self.state, rates=False)
+        # Whatever is cached by the number of prunes is stale.
+        self.state.pruning["num_prunes"] += 1
+        self.search.degree = self.field.sh_degree
 
     def restart_rates(self, *, head: bool) -> None:
         """Restart the learning rates of the field, or those of the head."""

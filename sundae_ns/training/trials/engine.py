@@ -32,11 +32,11 @@ class Trial:
     held_out: list[int] = field(default_factory=list)
     """Indices of the training views that are held out."""
     averaged: float = 0
-    """Steps at the end over which weights are averaged; the mean is measured. 0 measures the weights of the last step."""
+    """Steps at its end over which weights are averaged; the mean is measured. 0 measures the last weights."""
     num_features: int | None = None
-    """Width of the features: 0 disables the head, a new width begins with a fresh head. None leaves the head as it is."""
+    """Width of the features: 0 disables the head, another width begins with a fresh one. None changes nothing."""
     counts: bool = True
-    """Whether its steps count at once. Otherwise they count when the trial has ended; see :attr:`FieldState.uncounted`."""
+    """Whether its steps count at once, or only when the trials have ended (:attr:`FieldState.uncounted`)."""
     began: int = 0
     """Step of the schedule at which it began; the engine sets it."""
 

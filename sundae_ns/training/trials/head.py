@@ -1,11 +1,11 @@
 """The decision how a field is finished (``head.mode auto``): plain, with a head, or with a head of more features.
 
-A head gains where views are many and agree; where they are few or differ, it fits their differences. So some training views
-are held out from shortly before the prune. From the pruned field, trials of one length follow in turn, each of a larger scene
-than the one before, until one does not pay. Its held-out views are rendered with the mean of the weights over its last steps,
-because the weights of a single step fit the last images best. The chosen field continues on all views; the steps of the others
-are the cost. Test views are never used. After a warm start the field has seen the held-out views before, and only the steps
-of the trials make it forget them.
+A head gains where views are many and agree; where they are few or differ, it fits their differences. So some training
+views are held out from shortly before the prune. From the pruned field, trials of one length follow in turn, each of a
+larger scene than the one before, until one does not pay. Its held-out views are rendered with the mean of the weights
+over its last steps, because the weights of a single step fit the last images best. The chosen field continues on all
+views; the steps of the others are the cost. Test views are never used. After a warm start the field has seen the
+held-out views before, and only the steps of the trials make it forget them.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ MORE_FEATURES = 29
 NAMES = {"plain": "no head", "head": "head", "features": f"head with {MORE_FEATURES} features"}
 """What the log calls them."""
 TRIAL_STEPS = 1200
-"""Length of a trial, if it is among the shares of the schedule below: shorter ones show too little of what a head gains."""
+"""Length of a trial, if it is between the shares below: shorter ones show too little of what a head gains."""
 LEAST_TRIAL, MOST_TRIAL = 0.04, 0.05
-"""Shortest and longest trial as shares of the schedule. All trials but those of the chosen candidate cost at most a tenth of it."""
+"""Shortest and longest trial as shares of the schedule. All but those of the chosen candidate cost at most a tenth."""
 RISE_SHARE = 5 / 12
-"""Share of a trial, at its beginning, over which the rate of the head may rise, so that the trial shows what it gains."""
+"""Share of a trial, at its beginning, over which the rate of the head may rise, so that it shows what it gains."""
 MEAN_SHARE = 0.25
 """Share of a trial, at its end, over which weights are averaged for the verdict."""
 HOLD_SHARE = 0.1
@@ -57,8 +57,8 @@ FEW_VIEWS = 12
 LEAST_GAIN = 0.1
 """Least PSNR that a candidate must gain over a smaller one, dB. Two runs of one seed differ by as much."""
 GAIN_PER_DOUBLING = 0.4
-"""PSNR that a candidate must gain for each doubling of the stored bytes, dB. Twice as many primitives gain about twice this at the
-end of a run, and a trial shows a part of a gain."""
+"""PSNR that a candidate must gain for each doubling of the stored bytes, dB. Twice as many primitives gain about twice
+this at the end of a run, and a trial shows a part of a gain."""
 _DISABLED = "so it stays disabled; train longer, or force it with --pipeline.model.head.mode residual"
 
 
@@ -70,13 +70,6 @@ class TrialPlan:
     """Held-out training views, by index."""
     length: int
     """Training steps of a trial."""
-    candidates: int
-    """Number of candidates."""
-
-    @property
-    def num_trials(self) -> int:
-        """Most trials that there may be."""
-        return self.candidates * len(self.folds)
 
     @property
     def views(self) -> list[int]:
@@ -84,20 +77,19 @@ class TrialPlan:
         return [index for fold in self.folds for index in fold]
 
 
-def plan_trials(indices: Sequence[int], steps: int, candidates: int = len(CANDIDATES)) -> TrialPlan:
+def plan_trials(indices: Sequence[int], steps: int) -> TrialPlan:
     """Plan the trials of a run.
 
     Args:
         indices: of the training views, at least two.
         steps: length of the schedule.
-        candidates: number of candidates.
     """
     few = len(indices) < FEW_VIEWS
     count = 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY))
     # Evenly over the capture, because neighbours in a path look alike.
     chosen = [indices[(2 * i + 1) * len(indices) // (2 * count)] for i in range(count)]
     length = LEAST_TRIAL * steps / 2 if few else max(LEAST_TRIAL * steps, min(TRIAL_STEPS, MOST_TRIAL * steps))
-    return TrialPlan([[index] for index in chosen] if few else [chosen], max(round(length), 1), candidates)
+    return TrialPlan([[index] for index in chosen] if few else [chosen], max(round(length), 1))
 
 
 @dataclass
@@ -111,7 +103,7 @@ class HeadTrialProgress:
     reason: str = ""
     """Why it was chosen without trials."""
     steps: int = 0
-    """Length of the schedule, noted when training starts: a resumed run may be longer or shorter, its trials may not."""
+    """Length of the schedule when training started: a resumed run may be longer or shorter, its trials may not."""
     folds: int = 1
     """Number of trials of a candidate."""
     bytes: list[int] = field(default_factory=list)
@@ -136,7 +128,7 @@ class HeadTrialProgress:
         return [HeldOutQuality(int(pixels), *figures) for trial in trials for pixels, *figures in trial]
 
     def best(self) -> str:
-        """The largest tried candidate that gains enough PSNR over the best smaller one for its bytes, and loses no SSIM."""
+        """The largest tried candidate that gains enough PSNR over the best smaller one, and loses no SSIM."""
         best = "plain"
         for candidate in self.tried[1:]:
             figures = (mean_quality(self.qualities(one)) for one in (best, candidate))
@@ -239,7 +231,7 @@ class HeadTrials(Extension):
             warn(f"training ended before the head could be tried, {_DISABLED}")
 
     def held_out(self, run: TrainingRun) -> list[int]:
-        """Indices of the views that the chosen field has not seen since before its trial; none if there were no trials."""
+        """Indices of the views that the chosen field has not seen since before its trial; none without trials."""
         return [] if self.progress.reason else self._planned(run).folds[-1]
 
     # ------------------------------------------------------------------------------------------------------- trials
@@ -251,13 +243,16 @@ class HeadTrials(Extension):
 
     def _planned(self, run: TrainingRun) -> TrialPlan:
         if self._plan is None:
-            self._plan = plan_trials(run.view_indices(), self.progress.steps, len(self._candidates))
+            self._plan = plan_trials(run.view_indices(), self.progress.steps)
         return self._plan
+
+    def _most_trials(self, plan: TrialPlan) -> int:
+        return len(self._candidates) * len(plan.folds)
 
     def _fits(self, run: TrainingRun) -> bool:
         """Whether the chosen candidate can train on for the length of a trial."""
         plan = self._planned(run)
-        return self._end_of(run) + run.state.offset > self.begins_at + (plan.num_trials + 1) * plan.length
+        return self._end_of(run) + run.state.offset > self.begins_at + (self._most_trials(plan) + 1) * plan.length
 
     def _end_of(self, run: TrainingRun) -> int:
         """Number of training steps of the run, whose first part this training may be; 0 if it does not train."""
@@ -267,7 +262,7 @@ class HeadTrials(Extension):
         """Begin the first trial."""
         plan, progress, state = self._planned(run), self.progress, run.state
         CONSOLE.log(
-            f"step {state.step}: is the head worth it? Up to {plan.num_trials} trials of {plan.length:,} steps; "
+            f"step {state.step}: is the head worth it? Up to {self._most_trials(plan)} trials of {plan.length:,} steps; "
             f"{len(plan.views)} of {len(run.view_indices())} training views are held out"
         )
         progress.phase, progress.folds = "trials", len(plan.folds)
@@ -304,43 +299,19 @@ class HeadTrials(Extension):
 
     def _decide(self, run: TrainingRun, trained: str) -> None:
         """Continue with the best candidate; ``trained`` is the one that the field is."""
-        progress = self.progress
-        decision, seen = progress.best(), all(progress.qualities(one) for one in progress.tried)
+        progress, decision = self.progress, self.progress.best()
+        figures = {one: self._figures(one) for one in progress.tried}
+        seen = all(one["views"] for one in figures.values())
         if seen:
-            self._report(run, decision)
+            text = "; ".join(
+                f"{NAMES[name]} {one['psnr']:.2f} dB, SSIM {one['ssim']:.4f}, {megabytes(one['bytes'])}"
+                for name, one in figures.items()
+            )
+            CONSOLE.log(f"step {run.state.step}: held-out training views: {text}. Continuing: {NAMES[decision]}")
+            run.log_scalars("Trials", {f"psnr_{name}": one["psnr"] for name, one in figures.items()})
         if decision != trained:
             self._engine.go_back(decision, run.state)
-        self._settle(run, decision, "" if seen else "masks leave no pixel of the held-out training views")
-
-    def _report(self, run: TrainingRun, decision: str) -> None:
-        """Log the figures of the candidates, and the decision."""
-        progress = self.progress
-        figures = {one: mean_quality(progress.qualities(one)) for one in progress.tried}
-        texts = [
-            f"{NAMES[one]} {decibels:.2f} dB, SSIM {ssim:.4f}, {megabytes(size)}"
-            for (one, (decibels, ssim)), size in zip(figures.items(), progress.bytes, strict=False)
-        ]
-        CONSOLE.log(
-            f"step {run.state.step}: held-out training views: {'; '.join(texts)}. Continuing: {NAMES[decision]}"
-        )
-        run.log_scalars("Trials", {f"psnr_{one}": decibels for one, (decibels, _) in figures.items()})
-
-    def _settle(self, run: TrainingRun, decision: str, reason: str) -> None:
-        """Take a decision, serve all training views from now on, and record it."""
-        progress = self.progress
-        if reason:
-            CONSOLE.log(f"the head is {'removed' if decision == 'plain' else 'enabled'}: {reason}")
-        progress.phase, progress.decision, progress.reason = "done", decision, reason
-        self._engine.end(run)
-        self._engine.enable_head(run.state, decision != "plain")
-        if decision == "plain":
-            run.state.remove_head()
-        record: dict[str, Any] = {"decision": decision, "reason": reason, "step": run.state.step}
-        if not reason:
-            plan = self._planned(run)
-            record |= {"held_out_views": plan.views, "steps_per_trial": plan.length}
-            record["arms"] = {one: self._figures(one) for one in progress.tried}
-        write_record(run, "trials.json", record)
+        self._settle(run, decision, "" if seen else "masks leave no pixel of the held-out training views", figures)
 
     def _figures(self, candidate: str) -> dict[str, Any]:
         """Figures of a candidate for the record."""
@@ -348,6 +319,22 @@ class HeadTrials(Extension):
         decibels, similarity = mean_quality(views)
         size = self.progress.bytes[CANDIDATES.index(candidate)]
         return {"psnr": decibels, "ssim": similarity, "bytes": size, "views": [view._asdict() for view in views]}
+
+    def _settle(self, run: TrainingRun, decision: str, reason: str, figures: Mapping[str, Any] | None = None) -> None:
+        """Take a decision, serve all training views from now on, and record it."""
+        progress, state = self.progress, run.state
+        if reason:
+            CONSOLE.log(f"the head is {'removed' if decision == 'plain' else 'enabled'}: {reason}")
+        progress.phase, progress.decision, progress.reason = "done", decision, reason
+        self._engine.end(run)
+        self._engine.enable_head(state, decision != "plain")
+        if decision == "plain":
+            state.remove_head()
+        record: dict[str, Any] = {"decision": decision, "reason": reason, "step": state.step}
+        if not reason:
+            plan = self._planned(run)
+            record |= {"held_out_views": plan.views, "steps_per_trial": plan.length, "arms": figures}
+        write_record(run, "trials.json", record)
 
 
 def _progress_of(saved: Mapping[str, Any]) -> HeadTrialProgress:

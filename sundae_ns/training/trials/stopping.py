@@ -1,9 +1,9 @@
 """The end of a training on few views, by held-out ones.
 
-With few views a field soon learns what its images do not share, and other views get worse while training goes on. So the
-views of the last trial (:mod:`sundae_ns.training.trials.head`) stay held out after the decision, and are measured again and
-again, by the loss: SSIM still rises where PSNR already falls. Once the loss grows, the field goes back to the decision, and
-trains on all views for as many steps as were best. Then training is paused. Test views are never used.
+With few views a field soon learns what its images do not share, and other views get worse while training goes on. So
+the views of the last trial (:mod:`sundae_ns.training.trials.head`) stay held out after the decision. They are measured
+again and again, by the loss: SSIM still rises where PSNR already falls. Once the loss grows, the field goes back to the
+decision, and trains on all views for as many steps as were best. Then training is paused. Test views are never used.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WINDOW_SHARE = 0.02
 LEAST_LOSS = 0.005
 """Growth of the loss over the best measurement that ends the watch, as a share."""
 WATCHED_SHARE = 0.5
-"""Longest watch, as a share of the steps after the decision; a field that has not lost by then trains on, on all views."""
+"""Longest watch, as a share of the steps after the decision; a field that has not lost by then trains on all views."""
 _START = "decision"
 """Name of the copy of the field to which the watch may return."""
 
@@ -158,8 +158,8 @@ class EarlyStopping(Extension):
         self._engine.keep(_START, state, head=state.head_enabled)
         self._watch(run)
         CONSOLE.log(
-            f"step {state.step}: {len(run.view_indices())} training views are few; {len(views)} stay held out, to see when "
-            "training stops helping"
+            f"step {state.step}: {len(run.view_indices())} training views are few; {len(views)} stay held out, to see "
+            "when training stops helping"
         )
 
     def _watch(self, run: TrainingRun) -> None:
@@ -177,8 +177,8 @@ class EarlyStopping(Extension):
         progress, length = self.progress, self.progress.best * self._window
         (_, *best), (_, *now) = progress.measured[progress.best - 1], progress.measured[-1]
         CONSOLE.log(
-            f"step {run.state.step}: the held-out views were best after {length:,} steps, {_text(best)}; now {_text(now)}. "
-            "Going back, to train as long on all views"
+            f"step {run.state.step}: the held-out views were best after {length:,} steps, {_text(best)}; "
+            f"now {_text(now)}. Going back, to train as long on all views"
         )
         self._engine.go_back(_START, run.state)
         self._engine.end(run)

@@ -23,7 +23,6 @@ SIZES = [100, 110, 120]
 def test_an_eighth_of_the_views_is_held_out_within_limits(views: int, held_out: int) -> None:
     trials = plan_trials(range(views), 30000)
     assert trials.length == 1200
-    assert trials.num_trials == 3
     (fold,) = trials.folds
     assert len(set(fold)) == held_out <= MOST_HELD_OUT
     # Even gaps: no stretch of the capture goes unjudged.
@@ -36,7 +35,6 @@ def test_an_eighth_of_the_views_is_held_out_within_limits(views: int, held_out: 
 @pytest.mark.parametrize("views", [6, 9, 11])
 def test_with_few_views_two_are_held_out_in_turn(views: int) -> None:
     trials = plan_trials([10 * i for i in range(views)], 30000)
-    assert trials.num_trials == 6
     assert trials.length == 600
     assert [len(fold) for fold in trials.folds] == [1, 1]
     assert len(set(trials.views)) == 2
@@ -48,18 +46,13 @@ def test_with_few_views_two_are_held_out_in_turn(views: int) -> None:
 def test_deciding_costs_at_most_a_tenth_of_the_steps(views: int, steps: int) -> None:
     trials = plan_trials(range(views), steps)
     # The trial of one candidate continues.
-    assert (trials.num_trials - 1) * trials.length <= 0.1 * steps
+    assert (len(CANDIDATES) * len(trials.folds) - 1) * trials.length <= 0.1 * steps
 
 
 @pytest.mark.parametrize(("steps", "length"), [(7000, 350), (18000, 900), (30000, 1200), (60000, 2400)])
 def test_short_runs_have_longer_trials_for_their_length(steps: int, length: int) -> None:
     """In a trial of 720 steps with a rise over 500 of them, a head on bonsai showed 0.08 of the 1.8 dB that it gains."""
     assert plan_trials(range(255), steps).length == length
-
-
-@pytest.mark.parametrize(("views", "most"), [(6, 4), (43, 2)])
-def test_a_head_of_most_features_leaves_two_candidates(views: int, most: int) -> None:
-    assert plan_trials(range(views), 30000, candidates=2).num_trials == most
 
 
 def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
