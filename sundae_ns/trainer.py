@@ -26,7 +26,7 @@ from torch import Tensor
 
 from sundae_ns import distributed
 from sundae_ns.datamanager import SundaeDatamanager, check_before_training, view_index
-from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, ConfigError, StorageError, SundaeError
+from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import View

@@ -114,9 +114,9 @@ class StepLosses:
     def emphasis(self, state: FieldState) -> float:
         """How many times as strong as in images a residual head's correction is in the loss at this step.
 
-        With each pass over the training images a head learns more of them by heart, which it corrects in other views too. So
-        its correction shrinks (as an estimate does by James and Stein, 1961), the more the more often images are seen. It
-        shrinks at 8, 16, 32 ... passes, because recorded steps hold the number.
+        With each pass over the training images a head learns more of them by heart, which it corrects in other views
+        too. So its correction shrinks (as an estimate does by James and Stein, 1961), the more the more often images
+        are seen. It shrinks at 8, 16, 32 ... passes, because recorded steps hold the number.
         """
         head = state.head
         if head is None or head.config.mode != "residual" or not (state.head_enabled and self.num_images):

@@ -32,11 +32,11 @@ class PruneReport:
     """Highest number of primitives at any step so far."""
     seconds: float
     """Wall-clock time of decision and surgery, synchronised."""
-    tau: float | None
+    tau: float | None = None
     """Threshold of the graph on squared distances, squared scene units; None without a graph."""
-    sigma: float | None
+    sigma: float | None = None
     """Width of the edge weights, scene units; None without a graph."""
-    isolated: int | None
+    isolated: int | None = None
     """Primitives without a neighbour within the threshold; None without a graph."""
 
     def summary(self) -> str:

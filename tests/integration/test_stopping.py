@@ -12,9 +12,10 @@ import pytest
 import torch
 from budget_runs import same, tidy
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from trial_runs import LENGTH, PRUNE_AT, STEPS, tiny_run, tiny_scene
 
-from sundae_ns.training import averaging
+from sundae_ns.training import averaging, progress
 from sundae_ns.training.heldout import HeldOutQuality
 from sundae_ns.training.trials import engine, stopping
 from sundae_ns.training.trials.head import HeadTrialProgress
@@ -207,6 +208,38 @@ def test_a_resumed_run_ends_at_the_same_step_bit_for_bit(make: Make, curve: Curv
     a, b = (torch.load(one.checkpoint_dir / last, map_location="cpu", weights_only=True) for one in (whole, resumed))
     for part in ("pipeline", "optimizers", "schedulers"):
         same(a[part], b[part])
+
+
+def test_a_run_resumed_while_training_is_paused_has_figures(
+    make: Make, curve: Curve, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    curve(lambda step: 20 - step)
+    stop = STEPS - 25
+    whole = make(name="whole", save_every=stop)
+    whole.train()
+    losses: list[float] = []
+    put_scalar = writer.put_scalar
+
+    def noted(name: str, scalar: Any, step: int) -> None:
+        losses.extend([float(scalar)] if name == "Train Loss" else [])
+        put_scalar(name, scalar, step)
+
+    monkeypatch.setattr(writer, "put_scalar", noted)
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
+    served, centres, _ = _watched(resumed)
+    capsys.readouterr()
+    resumed.train()
+    assert len(served) == 1, "one image is measured, and none is trained on"
+    assert all(torch.equal(centres[stop + 1], centre) for centre in centres.values())
+    assert len(losses) == 2
+    assert all(0 < loss < 1 for loss in losses)
+    assert "PSNR" in capsys.readouterr().out
+    last = f"step-{STEPS - 1:09d}.ckpt"
+    a, b = (torch.load(one.checkpoint_dir / last, map_location="cpu", weights_only=True) for one in (whole, resumed))
+    for part in ("pipeline", "optimizers", "schedulers"):
+        same(a[part], b[part])
+    assert torch.equal(a["random"]["torch"], b["random"]["torch"])
 
 
 def test_a_run_trains_again_after_the_end_of_its_schedule(make: Make, curve: Curve) -> None:

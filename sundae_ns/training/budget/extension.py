@@ -114,7 +114,7 @@ class BudgetSearch(Extension):
         """Evaluate or cut if it is due.
 
         Raises:
-            DataError: the budget is too small for one primitive, or the field cannot be scored. A checkpoint is saved first.
+            DataError: the budget is too small for one primitive, or the field cannot be scored. A checkpoint is saved.
         """
         search = self.search
         searched = self.searched(run)
@@ -184,8 +184,8 @@ class BudgetSearch(Extension):
         search.reference = searched.measure()
         if search.reference == NO_IMAGE:
             raise DataError(
-                "the warm-up field renders images that are not finite: the training has diverged, resume from an earlier "
-                "checkpoint"
+                "the warm-up field renders images that are not finite: the training has diverged, resume from an "
+                "earlier checkpoint"
             )
         search.target = search.reference - self.config.tolerated_drop
         CONSOLE.log(
@@ -218,7 +218,7 @@ class BudgetSearch(Extension):
         return searched.state.schedule_step >= self.config.stop and searched.steps_left == 0
 
     def _clock(self, searched: SearchedField) -> tuple[bool, int, bool]:
-        """Whether a head may be enabled after this phase, steps in which a cut must recover, whether another is too late."""
+        """Whether a head may follow this phase, steps in which a cut must recover, whether another is too late."""
         config, search, step = self.config, self.search, searched.state.schedule_step
         # Half of the time belongs to the head, if one may be enabled.
         head_to_come = search.phase == "field" and heads.may_pay(searched, self._largest)
@@ -331,9 +331,6 @@ class BudgetSearch(Extension):
             dropped_nonfinite=search.dropped_nonfinite,
             peak=state.pruning["peak"],
             seconds=search.seconds,
-            tau=None,
-            sigma=None,
-            isolated=None,
         )
         CONSOLE.log(report.summary())
         write_report(searched.run, report, before={}, after={})

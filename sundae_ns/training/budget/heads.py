@@ -1,4 +1,4 @@
-"""The head of a search: enabled if it is small beside the field, removed if it does not pay, reshaped for a checkpoint."""
+"""The head of a search: enabled if it is small beside the field, and removed if it does not pay."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WIDTHS = (1, 5, 13, 29)
 
 
 def head_for(stored: int, primitives: int, largest: HeadConfig) -> HeadConfig | None:
-    """The largest head, at most ``largest``, that is small beside ``stored`` bytes without features; None if none is."""
+    """The largest head, at most ``largest``, that is small beside ``stored`` bytes without features; else None."""
     narrower = [width for width in WIDTHS if width < largest.num_features]
     floats = HEAD_SHARE * stored / primitives / accounting.BYTES_PER_FLOAT
     widths = [width for width in (*narrower, largest.num_features) if width <= floats]

@@ -1,4 +1,4 @@
-"""Fewer SH coefficients: a lower degree for the whole field, by trials, and view-independent colours for some primitives."""
+"""Fewer SH coefficients: a lower degree for the field, by trials, and view-independent colours for some primitives."""
 
 from __future__ import annotations
 

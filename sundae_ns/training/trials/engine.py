@@ -136,11 +136,11 @@ class TrialEngine:
         Args:
             name: of the copy.
             state: the field in training.
-            rates: whether the learning rates go back too, and the steps since the copy do not count.
+            rates: whether learning rates and counted steps are those of the copy too.
         """
         state.restore(self.kept[name])
         steps = state.schedule_step - self.taken_back - self.kept[name]["counted"]
-        if rates and steps > 0:
+        if rates and steps:
             postpone(state.schedulers, steps)
             self.taken_back += steps
             self._count_steps(state)

@@ -262,8 +262,8 @@ class HeadTrials(Extension):
         """Begin the first trial."""
         plan, progress, state = self._planned(run), self.progress, run.state
         CONSOLE.log(
-            f"step {state.step}: is the head worth it? Up to {self._most_trials(plan)} trials of {plan.length:,} steps; "
-            f"{len(plan.views)} of {len(run.view_indices())} training views are held out"
+            f"step {state.step}: is the head worth it? Up to {self._most_trials(plan)} trials of {plan.length:,} "
+            f"steps; {len(plan.views)} of {len(run.view_indices())} training views are held out"
         )
         progress.phase, progress.folds = "trials", len(plan.folds)
         plain = {name: value for name, value in state.field.items() if name != FEATURES}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict
+from typing import Any
 
 import pytest
 from models import Training
@@ -163,3 +164,41 @@ def test_views_count_by_their_pixels() -> None:
     # A gain of 1 dB on few pixels does not outweigh a loss on many.
     plain, head = [[10.0, 20.0, 0.5], [990.0, 20.0, 0.5]], [[10.0, 21.0, 0.6], [990.0, 19.99, 0.6]]
     assert HeadTrialProgress(bytes=SIZES, measured=[plain, head]).best() == "plain"
+
+
+def earlier(phase: str, stopping: str) -> dict[str, dict[str, Any]]:
+    """States as versions before the engine saved them."""
+    numbers = {"phase": phase, "decision": "head" if phase == "done" else "", "reason": "", "steps": 1000, "trial": 1}
+    numbers |= {"folds": 1, "bytes": SIZES, "began": 40, "measured": [[[10.0, 20.0, 0.5]]], "undone": 7}
+    watch = {"phase": stopping, "began": 50, "ends": 90, "measured": [[0.1, 20.0, 0.5]]}
+    mean: dict[str, Any] = {"mean": {}, "count": 0}
+    return {
+        "trials": {"numbers": numbers, "start": None, "ends": {}, **mean},
+        "stopping": {"numbers": watch, "start": None, **mean},
+    }
+
+
+def load(model: SundaeModel, saved: dict[str, dict[str, Any]]) -> None:
+    for extension in model.extensions:
+        extension.load_state_dict(model.state, saved.get(extension.name, {}))
+
+
+@pytest.mark.parametrize(("stopping", "trains"), [("done", True), ("resting", False)])
+def test_a_decision_of_an_earlier_version_is_loaded(build: Build, stopping: str, trains: bool) -> None:
+    model = build(head={"mode": "auto"})
+    saved = earlier("done", stopping)
+    load(model, saved)
+    model.step = 100
+    assert model.state.head_enabled
+    assert model.state.uncounted == 7
+    assert all(extension.trains(model.state) for extension in model.extensions) == trains
+    model.step = 1000
+    assert all(extension.trains(model.state) for extension in model.extensions)
+
+
+@pytest.mark.parametrize(("phase", "stopping"), [("trials", "before"), ("done", "watching"), ("done", "repeating")])
+def test_trials_of_an_earlier_version_are_refused_in_one_line(build: Build, phase: str, stopping: str) -> None:
+    model, saved = build(head={"mode": "auto"}), earlier(phase, stopping)
+    with pytest.raises(CheckpointError, match="lacks a field") as raised:
+        load(model, saved)
+    assert "\n" not in str(raised.value)
