@@ -25,7 +25,8 @@ class FakeRun:
     """A run whose steps add 1 to every centre."""
 
     def __init__(self, state: Any) -> None:
-        self.state, self.held_out = state, []
+        self.state = state
+        self.held_out: list[int] = []
         self.source = SimpleNamespace(total=20)
 
     def hold_out(self, indices: Any) -> None:
@@ -99,7 +100,12 @@ def test_the_mean_of_the_last_weights_is_measured(
     run: FakeRun, monkeypatch: pytest.MonkeyPatch, averaged: int, shown: float, own: float
 ) -> None:
     seen: list[float] = []
-    monkeypatch.setattr(engine, "measure_heldout", lambda run: seen.append(height(run)) or [VIEW])
+
+    def measured(run: FakeRun) -> list[HeldOutQuality]:
+        seen.append(height(run))
+        return [VIEW]
+
+    monkeypatch.setattr(engine, "measure_heldout", measured)
     trials = TrialEngine()
     trials.start(run, Trial(5, averaged=averaged))  # type: ignore[arg-type]
     run.train(trials)

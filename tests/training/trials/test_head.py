@@ -168,7 +168,13 @@ def test_views_count_by_their_pixels() -> None:
 
 def earlier(phase: str, stopping: str) -> dict[str, dict[str, Any]]:
     """States as versions before the engine saved them."""
-    numbers = {"phase": phase, "decision": "head" if phase == "done" else "", "reason": "", "steps": 1000, "trial": 1}
+    numbers: dict[str, Any] = {
+        "phase": phase,
+        "decision": "head" if phase == "done" else "",
+        "reason": "",
+        "steps": 1000,
+        "trial": 1,
+    }
     numbers |= {"folds": 1, "bytes": SIZES, "began": 40, "measured": [[[10.0, 20.0, 0.5]]], "undone": 7}
     watch = {"phase": stopping, "began": 50, "ends": 90, "measured": [[0.1, 20.0, 0.5]]}
     mean: dict[str, Any] = {"mean": {}, "count": 0}
