@@ -48,10 +48,6 @@ class TrainingRun(Protocol):
         """Step at which training ends; None if no trainer says so."""
 
     @property
-    def num_steps(self) -> int | None:
-        """Number of steps of the run; None if no trainer says so."""
-
-    @property
     def schedule_length(self) -> int | None:
         """Number of steps for which the schedule is made: at least those of the run; None if no trainer says so."""
 

@@ -43,7 +43,7 @@ def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
     def fix(
         decibels: Callable[[int], float], similarity: Callable[[int], float] = lambda _: 0.5, held_out: int = 2
     ) -> None:
-        def measured(run: Any) -> list[HeldOutQuality]:
+        def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
             assert run.num_heldout == held_out
             return [HeldOutQuality(576, decibels(run.state.step), similarity(run.state.step))]
 

@@ -53,7 +53,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def fix(head: tuple[float, float] = NONE, features: tuple[float, float] = NONE) -> None:
         real = engine.measure_heldout
 
-        def measured(run: Any) -> list[HeldOutQuality]:
+        def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
             state, width = run.state, run.state.field["features"].shape[1]
             decibels, similarity = NONE
             if state.head_enabled:
@@ -202,7 +202,7 @@ def test_the_verdict_is_on_the_mean_of_the_weights(make: Make, judge: Any, monke
         act(run)
         after[run.state.step] = means()
 
-    def measured(run: Any) -> list[HeldOutQuality]:
+    def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
         if run.state.step <= DECIDED:  # later ones are of the watch
             judged[run.state.step] = means()
         return measure(run)
@@ -282,7 +282,7 @@ def test_a_run_that_is_too_short_for_trials_says_so(make: Make, capsys: pytest.C
 
 def test_masks_that_leave_no_pixel_leave_no_head(make: Make, judge: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     judge(head=(0.5, 0.01))
-    monkeypatch.setattr(engine, "measure_heldout", lambda run: [])
+    monkeypatch.setattr(engine, "measure_heldout", lambda run, **_: [])
     trainer = make()
     trainer.train()
     assert _record(trainer)["decision"] == "plain"

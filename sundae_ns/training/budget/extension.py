@@ -342,10 +342,10 @@ class BudgetSearch(Extension):
             StorageError: no space or no right to write.
         """
         run, search = searched.run, self.search
-        if run.num_steps is None:
+        if run.last_step is None:
             return
-        lost = search.steps_lost
-        cost = {"steps_lost": lost, "share_of_steps": lost / run.num_steps, "seconds": search.seconds}
+        share = search.steps_lost / (run.last_step + 1)
+        cost = {"steps_lost": search.steps_lost, "share_of_steps": share, "seconds": search.seconds}
         budget = dict([budget_of(self.config)])
         write_record(
             run, "budget.json", {"budget": budget, **asdict(search), "primitives": searched.count, "cost": cost}

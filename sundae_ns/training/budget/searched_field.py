@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -23,7 +23,6 @@ from sundae_ns.storage import bytes_of, stored_bytes
 from sundae_ns.training.budget.search import NO_IMAGE, Point, SearchProgress
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.heldout import measure_heldout
 from sundae_ns.training.schedulers import notify_pruned
 from sundae_ns.training.trials.engine import TrialEngine
 from sundae_ns.training.warning import warn
@@ -32,21 +31,15 @@ MAX_VIEWS = 64
 """Training views, evenly chosen, for each score: a search scores the field at every cut."""
 
 
+@dataclass(frozen=True)
 class SearchedField:
-    """What a step of the search does to the field of a run.
+    """What a step of the search does to the field of a run."""
 
-    Args:
-        run: the training.
-        config: options of pruning.
-        search: state of the search.
-        engine: keeps the fields that the search may go back to.
-    """
-
-    def __init__(self, run: TrainingRun, config: PruningConfig, search: SearchProgress, engine: TrialEngine) -> None:
-        self.run = run
-        self.config = config
-        self.search = search
-        self.engine = engine
+    run: TrainingRun
+    config: PruningConfig
+    search: SearchProgress
+    engine: TrialEngine
+    """Keeps the fields that the search may go back to."""
 
     @property
     def state(self) -> FieldState:
@@ -115,7 +108,7 @@ class SearchedField:
         Raises:
             DataError: masks leave no pixel.
         """
-        views = measure_heldout(self.run, with_ssim=False)
+        views = self.engine.measure(self.run, with_ssim=False)
         if not views:
             raise DataError(
                 "masks leave no pixel of the held-out views; mend the masks, or hold out other views with "

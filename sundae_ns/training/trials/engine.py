@@ -111,10 +111,10 @@ class TrialEngine:
             self._mean.count_in(weights_of(state))
         return left <= 0
 
-    def measure(self, run: TrainingRun) -> list[HeldOutQuality]:
+    def measure(self, run: TrainingRun, *, with_ssim: bool = True) -> list[HeldOutQuality]:
         """Quality of the held-out views with the mean of the weights, if there is one; the next mean begins anew."""
         with self._mean.shown(weights_of(run.state)):
-            views = measure_heldout(run)
+            views = measure_heldout(run, with_ssim=with_ssim)
         self._mean = RunningMean()
         return views
 

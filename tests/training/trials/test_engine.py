@@ -101,7 +101,7 @@ def test_the_mean_of_the_last_weights_is_measured(
 ) -> None:
     seen: list[float] = []
 
-    def measured(run: FakeRun) -> list[HeldOutQuality]:
+    def measured(run: FakeRun, **_: bool) -> list[HeldOutQuality]:
         seen.append(height(run))
         return [VIEW]
 
