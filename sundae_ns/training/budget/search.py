@@ -36,7 +36,7 @@ NO_IMAGE = 0.0
 
 _KINDS: dict[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "bool": (bool,)}
 
-Phase = Literal["before", "degrees", "field", "head", "done"]
+SearchPhase = Literal["before", "degrees", "field", "head", "done"]
 Verdict = Literal["accepted", "waiting", "rejected", "resting"]
 
 
@@ -62,7 +62,7 @@ class Point:
 class SearchProgress:
     """State of a search: plain numbers and strings for a checkpoint."""
 
-    phase: Phase = "before"
+    phase: SearchPhase = "before"
     reference: float = math.nan
     """PSNR of the warm-up field on the held-out views, dB."""
     target: float = math.nan
