@@ -261,7 +261,8 @@ class SundaeTrainer(Trainer):
         """Loss, its terms and metrics of the image of a step, without training on it."""
         state = self.model.state
         focal = state.trained_focal
-        with torch.random.fork_rng():
+        # The random state of the checkpoint is that of a run that was never stopped.
+        with torch.random.fork_rng([state.device] if state.device.type == "cuda" else []):
             _, terms, metrics = self.pipeline.get_train_loss_dict(step)
         state.trained_focal = focal
         return _detached((torch.stack(list(terms.values())).sum(), terms, metrics))
