@@ -65,11 +65,6 @@ class NerfstudioRun:
         return None if self._trainer is None else self._trainer.last_step
 
     @property
-    def num_steps(self) -> int | None:
-        """Number of steps of the run."""
-        return None if self._trainer is None else self._trainer.config.max_num_iterations
-
-    @property
     def schedule_length(self) -> int | None:
         """Number of steps for which the schedule is made."""
         return None if self._trainer is None else self._trainer.config.schedule_length or self._trainer.last_step + 1

@@ -322,7 +322,8 @@ class SundaeModel(SplatfactoModel):
         # Densification takes its statistics from whole images.
         parts = state.head_enabled and not state.densifying
         pixels = config.head.max_train_pixels if parts else 0
-        mirror = parts and not state.trying and config.head.mode != "features"
+        # Mirrored images help in the long run only.
+        mirror = parts and state.head_images > 0 and config.head.mode != "features"
         return StepResolution(step, int(2 ** max(rising, 0)), pixels, mirror)
 
     def get_training_callbacks(

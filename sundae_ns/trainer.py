@@ -6,11 +6,9 @@ Module path and class names are written into every run's ``config.yml``, so movi
 from __future__ import annotations
 
 import contextlib
-import math
 import sys
 import time
 from collections.abc import Iterable, Mapping
-from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -27,16 +25,16 @@ from torch import Tensor
 
 from sundae_ns import distributed
 from sundae_ns.datamanager import SundaeDatamanager, check_before_training
-from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, ConfigError, StorageError, SundaeError
+from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
-from sundae_ns.training import run_length
 from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
 from sundae_ns.training.recorded import RecordedStep
+from sundae_ns.training.run_length import set_schedule
 from sundae_ns.training.warning import warn
 
 
@@ -70,7 +68,7 @@ class SundaeTrainerConfig(TrainerConfig):
         table = Table(
             "part of training", "steps", title=f"{self.max_num_iterations:,}{scaled} steps", title_justify="left"
         )
-        for row in run_length.schedule_table(self):
+        for row in schedule_table(self):
             table.add_row(*row)
         CONSOLE.print(table)
 
@@ -88,38 +86,11 @@ class SundaeTrainerConfig(TrainerConfig):
             parser.data = parser.data.absolute()
 
     def make_schedule(self, words: Iterable[str]) -> None:
-        """Fit all options that count steps to the length of the run, or take those of the run that is resumed.
+        """Fit the options that count steps to the length of the run, or take those of the run that is resumed.
 
-        Args:
-            words: the command line; options in it keep their value.
-
-        Raises:
-            ConfigError: the length is no number of steps.
+        See :func:`sundae_ns.training.run_length.set_schedule`.
         """
-        from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
-
-        usual: Any = deepcopy(all_methods.get(str(self.method_name)))
-        given = run_length.given_options(words)
-        if self.load_dir is not None or self.load_checkpoint is not None:
-            run = run_length.resumed_config(self)
-            if isinstance(run, SundaeTrainerConfig) and usual is not None:
-                for line in run_length.take_options(self, run, usual, given):
-                    late = "; a prune that is done is not repeated" if ".pruning." in line else ""
-                    warn(line + late)
-                self.schedule_length = self.schedule_length or run.schedule_length or run.max_num_iterations
-                if "max_num_iterations" not in given and self.max_num_iterations == usual.max_num_iterations:
-                    self.max_num_iterations = run_length.steps_left(self)
-            # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
-            self.schedule_length = self.schedule_length or self.max_num_iterations
-            return
-        if self.schedule_length is None:
-            self.schedule_length = self.max_num_iterations
-        if self.schedule_length < 1:
-            raise ConfigError(
-                f"the length of the run is {self.schedule_length}; give --max-num-iterations 30000, or fewer"
-            )
-        if usual is not None:
-            run_length.fit_to_length(self, usual, given)
+        set_schedule(self, words)
 
     def set_timestamp(self) -> None:
         """Name the run, unless ``--timestamp`` did; runs that start in the same second get different names."""
@@ -170,8 +141,8 @@ class SundaeTrainer(Trainer):
         self.team.make_folder(self.base_dir)
         self._recorded: RecordedStep | None = None
         """Runs whole steps; None where they run kernel by kernel."""
-        self._result: Any = (torch.tensor(math.nan), {}, {})
-        """Loss, its terms and metrics of the last step."""
+        self._result: Any = None
+        """Loss, its terms and metrics of the last step that was trained."""
         self._trained: int | None = None
         """The last step that is trained."""
         self._stopped_by = 0
@@ -232,14 +203,28 @@ class SundaeTrainer(Trainer):
 
     def train_iteration(self, step: int) -> Any:
         """Train one step; several ranks agree on whether to stop after it."""
-        if not self.model.state.resting:
+        model = self.model
+        if all(extension.trains(model.state) for extension in model.extensions):
             self._result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
+        elif self._result is None:  # the run was resumed while training is paused
+            self._result = self._untrained(step)
         self._trained = step
         self._warn_if_long(step - self._start_step)
         self._stopped_by = self.team.agreed(self._interruption.number, step)
         if self._stopped_by:
             self.stop_training = True
         return self._result
+
+    @torch.no_grad()
+    def _untrained(self, step: int) -> Any:
+        """Loss, its terms and metrics of the image of a step, without training on it."""
+        state = self.model.state
+        focal = state.trained_focal
+        # The random state of the checkpoint is that of a run that was never stopped.
+        with torch.random.fork_rng([state.device] if state.device.type == "cuda" else []):
+            _, terms, metrics = self.pipeline.get_train_loss_dict(step)
+        state.trained_focal = focal
+        return _detached((torch.stack(list(terms.values())).sum(), terms, metrics))
 
     def _recordable(self) -> bool:
         """Whether options allow to record training steps."""

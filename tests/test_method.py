@@ -9,7 +9,9 @@ from typing import Any
 
 import pytest
 
-from sundae_ns.training import losses, stopping, trials
+from sundae_ns.training import losses
+from sundae_ns.training.trials import head as trials
+from sundae_ns.training.trials import stopping
 
 PAGE = Path(__file__).parents[1] / "docs" / "method.md"
 NAME = re.compile(r"`(sundae_ns(?:\.\w+)+)`")

@@ -1,6 +1,6 @@
 """Files: .ply, .spz, .sog and packed scenes; runs; atomic writes, sizes in bytes, similarity transforms. Floor 3."""
 
-from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module, megabytes
+from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module, megabytes, stored_bytes
 from sundae_ns.storage.atomic import replacing, write_text
 from sundae_ns.storage.ply import read_ply, write_ply
 from sundae_ns.storage.point_cloud import (
@@ -25,6 +25,7 @@ __all__ = [
     "read_point_cloud",
     "replacing",
     "similarity",
+    "stored_bytes",
     "write_ply",
     "write_sog",
     "write_spz",

@@ -6,7 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import chain
 
+import torch
 from torch import Tensor, nn
+
+from sundae_ns.compensation import CompensationHead, HeadConfig
 
 BYTES_PER_FLOAT = 4
 MEGABYTE = 1_000_000
@@ -20,6 +23,19 @@ def bytes_of(params: Mapping[str, Tensor]) -> int:
 def bytes_of_module(module: nn.Module) -> int:
     """Bytes of a module's parameters and buffers, each in its own dtype; a shared tensor counts once."""
     return sum(tensor.numel() * tensor.element_size() for tensor in chain(module.parameters(), module.buffers()))
+
+
+def bytes_of_head(head: HeadConfig | None) -> int:
+    """Bytes of a head, computed without allocating its weights; 0 for none."""
+    if head is None or head.mode == "off":
+        return 0
+    with torch.device("meta"):
+        return bytes_of_module(CompensationHead(head))
+
+
+def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
+    """Bytes of a field and its head. The one place where a decision of training counts bytes."""
+    return bytes_of(params) + bytes_of_head(head)
 
 
 def rows_within(params: Mapping[str, Tensor], limit: int, count_bytes: Callable[[Mapping[str, Tensor]], int]) -> int:

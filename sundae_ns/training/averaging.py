@@ -16,7 +16,7 @@ from torch import Tensor
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 
-EVERY = 10
+AVERAGED_EVERY = 10
 """Steps between two weights that count: neighbours differ by little."""
 
 NamedTensors = Mapping[str, Tensor]
@@ -77,7 +77,7 @@ class RunningMean:
 
 
 def weights_of(state: FieldState) -> dict[str, Tensor]:
-    """NamedTensors of the field and of the enabled head, by name; changes in place change the field."""
+    """Weights of the field and of the enabled head, by name; changes in place change the field."""
     weights = {name: value.data for name, value in state.field.items() if value.numel() > 0}
     if state.head_enabled and state.head is not None:
         weights |= {f"head.{name}": value.data for name, value in state.head.named_parameters()}
@@ -113,7 +113,7 @@ class Averaging(Extension):
         self._restored = 0
         """Returns to a snapshot that the field had made when the mean began."""
         self._replaced: dict[str, Tensor] = {}
-        """NamedTensors of the last step, which the mean has replaced: a longer training goes on from them."""
+        """Weights of the last step, which the mean has replaced: a longer training goes on from them."""
         self._alone = True
 
     def state_dict(self) -> dict[str, Any]:
@@ -149,7 +149,7 @@ class Averaging(Extension):
         if state.restored != self._restored:
             self._mean, self._restored = RunningMean(), state.restored
         weights = weights_of(state)
-        if state.step % EVERY == 0:
+        if state.step % AVERAGED_EVERY == 0:
             self._mean.count_in(weights)
         if state.step == last and self._mean.fits(weights):
             CONSOLE.log(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")

@@ -20,8 +20,7 @@ from sundae_ns.training.initial_field import Frame, PointOptions, Points, Start,
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import make_schedule
-from sundae_ns.training.stopping import Stopping
-from sundae_ns.training.trials import Trials
+from sundae_ns.training.trials import EarlyStopping, HeadTrials, TrialEngine
 
 
 class BuildOptions(GrowthOptions, PointOptions, Protocol):
@@ -122,9 +121,10 @@ def build(options: BuildOptions, *, num_images: int, points: Points | None, fram
     if pruning.mode == "auto":
         extensions.append(BudgetSearch(pruning, head, densification, state))
     elif options.head.mode == "auto":
-        begins_at = max(state.head_starts_at, pruning.settled_at, state.densify_until)
-        trials = Trials(int(begins_at), state)
-        extensions += [trials, Stopping(trials, options.ssim_lambda)]
+        begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
+        engine = TrialEngine(begins_at)
+        decision = HeadTrials(begins_at, state, engine)
+        extensions += [decision, EarlyStopping(decision, options.ssim_lambda, engine)]
     if options.average_share > 0:
         extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
     return Parts(gauss_params, networks, state, extensions, start)

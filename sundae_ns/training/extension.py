@@ -1,4 +1,4 @@
-"""The protocol between training and its extensions: densification, pruning, the budget search."""
+"""The protocol between training and its extensions: densification, pruning, trials, the budget search."""
 
 from __future__ import annotations
 
@@ -48,10 +48,6 @@ class TrainingRun(Protocol):
         """Step at which training ends; None if no trainer says so."""
 
     @property
-    def num_steps(self) -> int | None:
-        """Number of steps of the run; None if no trainer says so."""
-
-    @property
     def schedule_length(self) -> int | None:
         """Number of steps for which the schedule is made: at least those of the run; None if no trainer says so."""
 
@@ -97,6 +93,10 @@ class Extension:
 
     def before_training(self, run: TrainingRun) -> None:
         """Check options and warn, before the first step and after a checkpoint has been loaded."""
+
+    def trains(self, state: FieldState) -> bool:
+        """Whether this step trains; training is paused if one extension answers no."""
+        return True
 
     def before_backward(self, state: FieldState) -> None:
         """Prepare ``state.info`` of a training image for the backward pass."""

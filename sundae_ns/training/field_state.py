@@ -55,15 +55,11 @@ class FieldState:
     """Step of the schedule at which densification ends."""
     head_starts_at: float = math.inf
     """Step of the schedule after which the head is enabled."""
-    trying: bool = False
-    """Whether this is a trial, too short for what helps a residual head in the long run: mirrored images, and a correction that
-    shrinks."""
-    undone: int = 0
-    """Images trained on since the head could begin that do not count, because the field went back to before them."""
+    uncounted: float = 0
+    """Images trained on since the head was enabled that do not count: the field went back to before them. Infinite in
+    a trial whose field may be dropped."""
     images_per_step: int = 1
     """Number of images in the batch of a step."""
-    resting: bool = False
-    """Whether training steps change nothing, because more training would harm."""
     restored: int = 0
     """Number of times in this process that other weights took the place of the trained ones."""
     sh_degree_interval: int | None = None
@@ -104,6 +100,11 @@ class FieldState:
     def head_enabled(self) -> bool:
         """Whether images get the head's correction at this step."""
         return self.head is not None and self.schedule_step > self.head_starts_at
+
+    @property
+    def head_images(self) -> float:
+        """Number of images that the head was trained on, as far as they count; none before it is enabled."""
+        return (self.schedule_step - self.head_starts_at) * self.images_per_step - self.uncounted
 
     def remove_head(self) -> None:
         """Do without head and features from now on. Parameters stay the same objects, as optimizers need them."""
@@ -162,11 +163,14 @@ class FieldState:
         return saved
 
     def restore(self, saved: Mapping[str, Snapshot]) -> None:
-        """Restore a :meth:`snapshot`, with any number of primitives."""
+        """Restore a :meth:`snapshot`, with any number of primitives, and the width of its head."""
         self.restored += 1
         restore(self.field, self.optimizers, saved["field"])
         if _HEAD in saved:
             assert self.head is not None
+            width = self.field[FEATURES].shape[1]
+            if self.head.config.num_features != width:
+                self.head.resize(dataclasses.replace(self.head.config, num_features=width))
             restore_module(self.head.parameters(), self.optimizers["compensation"], saved[_HEAD])
 
     def running_states(self) -> dict[str, dict[str, Any]]:

@@ -118,15 +118,9 @@ class StepLosses:
         are seen. It shrinks at 8, 16, 32 ... passes, because recorded steps hold the number.
         """
         head = state.head
-        if (
-            head is None
-            or head.config.mode != "residual"
-            or state.trying
-            or not (state.head_enabled and self.num_images)
-        ):
+        if head is None or head.config.mode != "residual" or not (state.head_enabled and self.num_images):
             return 1.0
-        images = (state.schedule_step - state.head_starts_at) * state.images_per_step - state.undone
-        passes = images / self.num_images
+        passes = state.head_images / self.num_images
         if not FIRST_PASSES <= passes < math.inf:  # a budget search knows no step at which its head starts
             return 1.0
         return 1 + 2 ** math.floor(math.log2(passes)) / HALF_AFTER

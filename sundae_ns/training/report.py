@@ -32,11 +32,11 @@ class PruneReport:
     """Highest number of primitives at any step so far."""
     seconds: float
     """Wall-clock time of decision and surgery, synchronised."""
-    tau: float | None
+    tau: float | None = None
     """Threshold of the graph on squared distances, squared scene units; None without a graph."""
-    sigma: float | None
+    sigma: float | None = None
     """Width of the edge weights, scene units; None without a graph."""
-    isolated: int | None
+    isolated: int | None = None
     """Primitives without a neighbour within the threshold; None without a graph."""
 
     def summary(self) -> str:
@@ -54,7 +54,7 @@ def write_record(run: TrainingRun, name: str, record: Mapping[str, Any]) -> None
     """Write a record as JSON to the run's folder, if there is one; numbers that are not finite become null."""
     if run.folder is not None:
         run.folder.mkdir(parents=True, exist_ok=True)
-        write_text(run.folder / name, json.dumps(without_nan(record), indent=2) + "\n")
+        write_text(run.folder / name, json.dumps(without_nan(record), indent=2, allow_nan=False) + "\n")
 
 
 def write_report(

@@ -12,10 +12,13 @@ import pytest
 import torch
 from budget_runs import same, tidy
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import writer
 from trial_runs import LENGTH, PRUNE_AT, STEPS, tiny_run, tiny_scene
 
-from sundae_ns.training import averaging, stopping, trials
+from sundae_ns.training import averaging, progress
 from sundae_ns.training.heldout import HeldOutQuality
+from sundae_ns.training.trials import engine, stopping
+from sundae_ns.training.trials.head import HeadTrialProgress
 
 DECIDED = PRUNE_AT + 2 * LENGTH
 """Step of the decision, after trials of no head and of a head."""
@@ -34,17 +37,17 @@ def make(tmp_path: Path) -> Iterator[Make]:
 @pytest.fixture
 def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
     """Fixes PSNR and SSIM of the held-out views at a step; trials end without a head."""
-    monkeypatch.setattr(stopping, "EVERY", 1)
-    monkeypatch.setattr(trials.Progress, "best", lambda _: "plain")
+    monkeypatch.setattr(engine, "AVERAGED_EVERY", 1)
+    monkeypatch.setattr(HeadTrialProgress, "best", lambda _: "plain")
 
     def fix(
         decibels: Callable[[int], float], similarity: Callable[[int], float] = lambda _: 0.5, held_out: int = 2
     ) -> None:
-        def measured(run: Any) -> list[HeldOutQuality]:
+        def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
             assert run.num_heldout == held_out
             return [HeldOutQuality(576, decibels(run.state.step), similarity(run.state.step))]
 
-        monkeypatch.setattr(stopping, "measure_heldout", measured)
+        monkeypatch.setattr(engine, "measure_heldout", measured)
 
     return fix
 
@@ -69,7 +72,7 @@ def _watched(trainer: Trainer) -> tuple[list[int], dict[int, torch.Tensor], dict
     return views, centres, rates
 
 
-def test_the_field_goes_back_trains_as_long_as_was_best_and_rests(make: Make, curve: Curve) -> None:
+def test_the_field_goes_back_trains_as_long_as_was_best_and_pauses(make: Make, curve: Curve) -> None:
     best = DECIDED + 2 * WINDOW
     curve(lambda step: 20 - 0.08 * abs(step - best) / WINDOW)
     trainer = make()
@@ -117,9 +120,9 @@ def test_the_mean_of_the_last_window_stays(make: Make, curve: Curve) -> None:
     assert not torch.equal(centres[STEPS - 1], own[-1])
 
 
-def test_a_rest_in_the_last_steps_is_not_averaged(make: Make, curve: Curve, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The mean at the end of a run has counted weights before the rest began."""
-    monkeypatch.setattr(averaging, "EVERY", 1)
+def test_a_pause_in_the_last_steps_is_not_averaged(make: Make, curve: Curve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The mean at the end of a run has counted weights before the pause."""
+    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 1)
     curve(lambda step: 20 - 0.08 * abs(step - DECIDED - 10 * WINDOW) / WINDOW)
     trainer = make()
     _, centres, _ = _watched(trainer)
@@ -205,6 +208,38 @@ def test_a_resumed_run_ends_at_the_same_step_bit_for_bit(make: Make, curve: Curv
     a, b = (torch.load(one.checkpoint_dir / last, map_location="cpu", weights_only=True) for one in (whole, resumed))
     for part in ("pipeline", "optimizers", "schedulers"):
         same(a[part], b[part])
+
+
+def test_a_run_resumed_while_training_is_paused_has_figures(
+    make: Make, curve: Curve, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    curve(lambda step: 20 - step)
+    stop = STEPS - 25
+    whole = make(name="whole", save_every=stop)
+    whole.train()
+    losses: list[float] = []
+    put_scalar = writer.put_scalar
+
+    def noted(name: str, scalar: Any, step: int) -> None:
+        losses.extend([float(scalar)] if name == "Train Loss" else [])
+        put_scalar(name, scalar, step)
+
+    monkeypatch.setattr(writer, "put_scalar", noted)
+    monkeypatch.setattr(progress, "SECONDS_A_LINE", 0.0)
+    resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
+    served, centres, _ = _watched(resumed)
+    capsys.readouterr()
+    resumed.train()
+    assert len(served) == 1, "one image is measured, and none is trained on"
+    assert all(torch.equal(centres[stop + 1], centre) for centre in centres.values())
+    assert len(losses) == 2
+    assert all(0 < loss < 1 for loss in losses)
+    assert "PSNR" in capsys.readouterr().out
+    last = f"step-{STEPS - 1:09d}.ckpt"
+    a, b = (torch.load(one.checkpoint_dir / last, map_location="cpu", weights_only=True) for one in (whole, resumed))
+    for part in ("pipeline", "optimizers", "schedulers"):
+        same(a[part], b[part])
+    assert torch.equal(a["random"]["torch"], b["random"]["torch"])
 
 
 def test_a_run_trains_again_after_the_end_of_its_schedule(make: Make, curve: Curve) -> None:

@@ -21,11 +21,12 @@ from sundae_ns.callbacks import NerfstudioRun
 from sundae_ns.errors import CheckpointError
 from sundae_ns.scenes.measure import sizes
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.training import trials
 from sundae_ns.training.heldout import HeldOutQuality
+from sundae_ns.training.trials import engine
+from sundae_ns.training.trials import head as head_trials
 
 DECIDED = PRUNE_AT + 3 * LENGTH
-"""Step of the decision if all arms are tried."""
+"""Step of the decision if all candidates are tried."""
 NONE = (0.0, 0.0)
 Make = Callable[..., Trainer]
 
@@ -44,15 +45,15 @@ def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
 
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Fixes what the arms gain on every held-out view: PSNR in dB, SSIM. Bytes do not count: the field is tiny."""
-    monkeypatch.setattr(trials, "GAIN_PER_DOUBLING", 0.0)
-    monkeypatch.setattr(trials, "EVERY", 1)  # means, in trials of five steps
-    monkeypatch.setattr(trials, "MEAN_SHARE", 0.6)
+    """Fixes what the candidates gain on every held-out view: PSNR in dB, SSIM. Bytes do not count: the field is tiny."""
+    monkeypatch.setattr(head_trials, "GAIN_PER_DOUBLING", 0.0)
+    monkeypatch.setattr(engine, "AVERAGED_EVERY", 1)  # means, in trials of five steps
+    monkeypatch.setattr(head_trials, "MEAN_SHARE", 0.6)
 
     def fix(head: tuple[float, float] = NONE, features: tuple[float, float] = NONE) -> None:
-        real = trials.measure_heldout
+        real = engine.measure_heldout
 
-        def measured(run: Any) -> list[HeldOutQuality]:
+        def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
             state, width = run.state, run.state.field["features"].shape[1]
             decibels, similarity = NONE
             if state.head_enabled:
@@ -63,7 +64,7 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
                 HeldOutQuality(view.pixels, 20 + decibels + 1e-4 * view.psnr, 0.5 + similarity) for view in real(run)
             ]
 
-        monkeypatch.setattr(trials, "measure_heldout", measured)
+        monkeypatch.setattr(engine, "measure_heldout", measured)
 
     return fix
 
@@ -161,8 +162,8 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     # Each head's rate rises from the first step of its trial on, and is as high as it may be well before the end.
     for step in starts[1:]:
         for lowest, highest in zip(head_rates[step], head_rates[step + LENGTH // 2], strict=True):
-            assert lowest == pytest.approx(highest * 2 / (round(trials.RISE_SHARE * LENGTH) + 1), rel=0.05)
-    decided, place = PRUNE_AT + tried * LENGTH, trials.ARMS.index(chosen) + 1
+            assert lowest == pytest.approx(highest * 2 / (round(head_trials.RISE_SHARE * LENGTH) + 1), rel=0.05)
+    decided, place = PRUNE_AT + tried * LENGTH, head_trials.CANDIDATES.index(chosen) + 1
     end = seen[PRUNE_AT + place * LENGTH - 1][0]
     assert not torch.equal(end, seen[PRUNE_AT][0])
     # The field at the end of the chosen trial is one step away from the last that was seen of it.
@@ -171,7 +172,7 @@ def test_the_trials_start_alike_and_the_chosen_field_continues(
     record = _record(trainer)
     assert (record["decision"], record["step"], len(record["arms"])) == (chosen, decided, tried)
     # A head that was chosen has trained for one trial.
-    assert model.state.undone == (tried - 1) * LENGTH
+    assert model.state.uncounted == (tried - 1) * LENGTH
     width = {"plain": 0, "head": 5, "features": 29}[chosen]
     assert model.gauss_params["features"].shape[1] == width
     assert (model.head is None) == (chosen == "plain")
@@ -191,7 +192,7 @@ def test_the_verdict_is_on_the_mean_of_the_weights(make: Make, judge: Any, monke
     own: dict[int, torch.Tensor] = {}
     after: dict[int, torch.Tensor] = {}
     judged: dict[int, torch.Tensor] = {}
-    act, measure = trial.after_step, trials.measure_heldout
+    act, measure = trial.after_step, engine.measure_heldout
 
     def means() -> torch.Tensor:
         return model.gauss_params["means"].detach().clone()
@@ -201,12 +202,13 @@ def test_the_verdict_is_on_the_mean_of_the_weights(make: Make, judge: Any, monke
         act(run)
         after[run.state.step] = means()
 
-    def measured(run: Any) -> list[HeldOutQuality]:
-        judged[run.state.step] = means()
+    def measured(run: Any, **_: Any) -> list[HeldOutQuality]:
+        if run.state.step <= DECIDED:  # later ones are of the watch
+            judged[run.state.step] = means()
         return measure(run)
 
     trial.after_step = after_step
-    monkeypatch.setattr(trials, "measure_heldout", measured)
+    monkeypatch.setattr(engine, "measure_heldout", measured)
     trainer.train()
     assert list(judged) == [PRUNE_AT + i * LENGTH for i in (1, 2, 3)]
     for step, found in judged.items():
@@ -238,7 +240,7 @@ def test_a_resumed_run_takes_the_same_decision_bit_for_bit(
     same(a["optimizers"], b["optimizers"])
     same(a["schedulers"], b["schedulers"])
     models: list[Any] = [one.pipeline.model for one in (whole, resumed)]
-    assert models[0].state.undone == models[1].state.undone > 0
+    assert models[0].state.uncounted == models[1].state.uncounted > 0
     if stop < _record(whole)["step"]:  # before the decision
         assert _record(whole) == _record(resumed)
 
@@ -280,7 +282,7 @@ def test_a_run_that_is_too_short_for_trials_says_so(make: Make, capsys: pytest.C
 
 def test_masks_that_leave_no_pixel_leave_no_head(make: Make, judge: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     judge(head=(0.5, 0.01))
-    monkeypatch.setattr(trials, "measure_heldout", lambda run: [])
+    monkeypatch.setattr(engine, "measure_heldout", lambda run, **_: [])
     trainer = make()
     trainer.train()
     assert _record(trainer)["decision"] == "plain"
@@ -305,10 +307,10 @@ def test_a_checkpoint_that_lacks_the_field_to_return_to_is_refused(make: Make, j
     whole.train()
     path = whole.checkpoint_dir / f"step-{stop:09d}.ckpt"
     state = torch.load(path, map_location="cpu", weights_only=True)
-    state["pipeline"]["_model._extra_state"]["extensions"]["trials"]["ends"] = None
+    state["pipeline"]["_model._extra_state"]["extensions"]["trials"]["engine"]["kept"]["plain"] = None
     model: Any = make(name="other").pipeline.model
     inner = {name.removeprefix("_model."): value for name, value in state["pipeline"].items() if "_model." in name}
-    with pytest.raises(CheckpointError, match="lacks the fields"):
+    with pytest.raises(CheckpointError, match="lacks a field"):
         model.load_state_dict(inner)
 
 
@@ -322,7 +324,7 @@ def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, tria
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=3)
     model: Any = resumed.pipeline.model
     (trials_of_run,) = (extension for extension in model.extensions if extension.name == "trials")
-    assert trials_of_run.state_dict()["start"] is not None
+    assert "start" in trials_of_run.state_dict()["engine"]["kept"]
     resumed.pipeline.datamanager.place = (0, 2)
     attributes = TrainingCallbackAttributes(resumed.optimizers, resumed.grad_scaler, resumed.pipeline, resumed)
     trials_of_run.before_training(NerfstudioRun(model, attributes))
@@ -331,4 +333,4 @@ def test_several_gpus_train_the_head_without_trials(make: Make, judge: Any, tria
     assert model.state.head_enabled
     assert model.gauss_params["features"].shape[1] == width
     assert resumed.pipeline.datamanager.holdout_indices == []
-    assert trials_of_run.state_dict()["start"] is None
+    assert trials_of_run.state_dict()["engine"]["kept"] == {}

@@ -74,7 +74,7 @@ def searched_field(trainer: Trainer) -> SearchedField:
     """The field of a trainer under search."""
     model: Any = trainer.pipeline.model
     attributes = TrainingCallbackAttributes(trainer.optimizers, trainer.grad_scaler, trainer.pipeline, trainer)
-    return SearchedField(NerfstudioRun(model, attributes), model.config.pruning)
+    return search_of(model.extensions).searched(NerfstudioRun(model, attributes))
 
 
 class Run:

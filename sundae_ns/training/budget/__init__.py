@@ -5,6 +5,5 @@ primitives needs no search for their number, which then follows from it.
 """
 
 from sundae_ns.training.budget.extension import BudgetSearch
-from sundae_ns.training.budget.sizes import HEAD_SHARE, bytes_of, head_bytes, head_for
 
-__all__ = ["HEAD_SHARE", "BudgetSearch", "bytes_of", "head_bytes", "head_for"]
+__all__ = ["BudgetSearch"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from dataclasses import asdict
+from typing import Any
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -14,37 +15,23 @@ from torch import Tensor
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
 from sundae_ns.gaussians import from_points
-from sundae_ns.gaussians.snapshot import Snapshot
-from sundae_ns.storage import accounting, megabytes
-from sundae_ns.training.budget import heads, sizes
-from sundae_ns.training.budget.record import budget_of, write
-from sundae_ns.training.budget.search import NO_IMAGE, Point, Search
+from sundae_ns.storage import accounting, megabytes, stored_bytes
+from sundae_ns.training.budget import heads
+from sundae_ns.training.budget.search import NO_IMAGE, SearchProgress
 from sundae_ns.training.budget.searched_field import SearchedField
-from sundae_ns.training.budget.sh_degree import flatten, lower_degree
+from sundae_ns.training.budget.sh_degree import end_trial, flatten, start_trial, trained
 from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.report import PruneReport, write_report
+from sundae_ns.training.report import PruneReport, write_record, write_report
+from sundae_ns.training.trials.engine import TrialEngine
 from sundae_ns.training.warning import warn
 
 MAX_REJECTED = 5
 """Cuts that may be rejected, before and after the head is enabled."""
-TRIAL_EVALUATIONS = 3
-"""Length of the training at one SH degree, in evaluations."""
 FLAT_SHARE = 0.25
 """Share of the tolerated drop that view-independent colours may cost when they are introduced."""
-
-
-class _Clock(NamedTuple):
-    """Time left in a phase."""
-
-    head_to_come: bool
-    """Whether a head may be enabled after it."""
-    left: int
-    """Training steps in which a cut must recover."""
-    over: bool
-    """Whether it is too late for another cut."""
 
 
 class BudgetSearch(Extension):
@@ -63,29 +50,22 @@ class BudgetSearch(Extension):
         self, config: PruningConfig, head: HeadConfig, densification: Densification, state: FieldState
     ) -> None:
         self.config = config
-        self.search = Search()
-        heads.follow(state, self.search)
+        self.search = SearchProgress()
         self._largest = None if head.mode == "off" else head
         self._densification = densification
-        self._accepted: dict[str, Snapshot] | None = None
-        self._fallback: dict[str, Snapshot] | None = None
+        self._engine = TrialEngine()
+        self._engine.enable_head(state, False)
         self._flat: Tensor | None = None
 
-    @property
-    def head_config(self) -> HeadConfig | None:
-        """The chosen head, before that the largest one; None for none."""
-        return sizes.chosen_head(self.search, self._largest)
+    def searched(self, run: TrainingRun) -> SearchedField:
+        """The field of a run under this search."""
+        return SearchedField(run, self.config, self.search, self._engine)
 
     # ------------------------------------------------------------------------------------------------- checkpoints
 
     def state_dict(self) -> dict[str, Any]:
         """Numbers of the search and, while it goes on, copies of the fields that it may return to."""
-        return {
-            "numbers": self.search.state(),
-            "accepted": self._accepted,
-            "fallback": self._fallback,
-            "flat": self._flat,
-        }
+        return {"numbers": self.search.state(), "engine": self._engine.state_dict(), "flat": self._flat}
 
     def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Give field and head the shapes of a checkpoint.
@@ -103,11 +83,11 @@ class BudgetSearch(Extension):
         """
         search = _search_of(saved)
         needed = {"accepted": search.trying, "fallback": search.phase in ("degrees", "head")}
-        if any(due and not isinstance(saved.get(name), Mapping) for name, due in needed.items()):
-            raise CheckpointError("the checkpoint lacks the field that its search would return to; give another")
-        self.search = search
-        self._accepted, self._fallback, self._flat = saved.get("accepted"), saved.get("fallback"), saved.get("flat")
-        heads.follow(state, search)
+        engine = TrialEngine()
+        engine.load_state_dict(state, saved.get("engine", {}))
+        engine.require(*(name for name, due in needed.items() if due), trial=False)
+        self.search, self._engine, self._flat = search, engine, saved.get("flat")
+        engine.enable_head(state, search.head)
 
     # ---------------------------------------------------------------------------------------------------- training
 
@@ -119,7 +99,7 @@ class BudgetSearch(Extension):
         """
         # With its own generator, because the random state of a checkpoint has been restored by now.
         origin, generator = torch.zeros(1, 3), torch.Generator()
-        least = sizes.bytes_of(from_points(origin, origin, sh_degree=0, num_features=0, generator=generator), None)
+        least = stored_bytes(from_points(origin, origin, sh_degree=0, num_features=0, generator=generator), None)
         if self.config.max_bytes is not None and self.config.max_bytes < least:
             raise ConfigError(
                 f"pruning.max-bytes is {self.config.max_bytes:,}, and one primitive takes {least}; give more"
@@ -134,10 +114,10 @@ class BudgetSearch(Extension):
         """Evaluate or cut if it is due.
 
         Raises:
-            DataError: the budget is too small for one primitive, or the field cannot be scored. A checkpoint is saved first.
+            DataError: the budget is too small for one primitive, or the field cannot be scored. A checkpoint is saved.
         """
         search = self.search
-        searched = SearchedField(run, self.config)
+        searched = self.searched(run)
         if self._flat is not None:
             rest = searched.field["features_rest"]
             self._flat = self._flat.to(rest.device)
@@ -151,15 +131,16 @@ class BudgetSearch(Extension):
             run.save()
             raise
         search.seconds += time.perf_counter() - started
-        write(searched, search)
+        self._write(searched)
 
     def _act(self, searched: SearchedField) -> bool:
         """Begin, end a trial, or evaluate if it is due; returns whether anything was due."""
         phase = self.search.phase
         if phase == "before" and searched.state.schedule_step >= self.config.prune_at:
             self._begin(searched)
-        elif phase == "degrees" and (self._trained(searched) or self._time_is_up(searched)):
-            self._end_trial(searched)
+        elif phase == "degrees" and (trained(searched) or self._time_is_up(searched)):
+            if end_trial(searched):
+                self._after_degrees(searched)
         elif phase in ("field", "head") and self._evaluation_is_due(searched):
             self._evaluate(searched)
         else:
@@ -172,8 +153,8 @@ class BudgetSearch(Extension):
         if search.phase == "before":
             warn("training ended before the budget search began (pruning.prune-at)")
             return
-        searched, state = SearchedField(run, config), run.state
-        end = self._point(searched, searched.measure(), "final", "reached")
+        searched, state = self.searched(run), run.state
+        end = searched.evaluation(searched.measure(), "final", "reached")
         drop, stored, count = search.reference - end.psnr, end.bytes, searched.count
         option, limit = budget_of(config)
         cost = {"max_psnr_drop": drop, "max_bytes": stored, "max_primitives": count}[option]
@@ -189,13 +170,13 @@ class BudgetSearch(Extension):
             f"{megabytes(stored)}, SH degree {searched.field.sh_degree}, "
             f"{'with' if search.head else 'no'} head, {drop:+.3f} dB lost on {search.views} held-out views.{unfinished}"
         )
-        write(searched, search)
+        self._write(searched)
 
     # ---------------------------------------------------------------------------------------------------- the steps
 
     def _begin(self, searched: SearchedField) -> None:
         search, state = self.search, searched.state
-        self._count_dropped(searched.drop_nonfinite())
+        searched.drop_nonfinite()
         # Densification has ended, and its statistics would not match a field that is restored with more primitives.
         self._densification.initialize(state)
         search.began, search.before = state.schedule_step, searched.count
@@ -203,8 +184,8 @@ class BudgetSearch(Extension):
         search.reference = searched.measure()
         if search.reference == NO_IMAGE:
             raise DataError(
-                "the warm-up field renders images that are not finite: the training has diverged, resume from an earlier "
-                "checkpoint"
+                "the warm-up field renders images that are not finite: the training has diverged, resume from an "
+                "earlier checkpoint"
             )
         search.target = search.reference - self.config.tolerated_drop
         CONSOLE.log(
@@ -215,8 +196,8 @@ class BudgetSearch(Extension):
         search.degree = searched.field.sh_degree
         if search.degree > 0 and not self._time_is_up(searched):
             search.phase = "degrees"
-            self._fallback = searched.state.snapshot(head=search.head)
-            self._start_trial(searched, search.degree)
+            searched.keep("fallback")
+            start_trial(searched, search.degree)
         else:
             self._after_degrees(searched)
 
@@ -227,7 +208,7 @@ class BudgetSearch(Extension):
             return
         self.search.begin("field", searched.count)
         value = searched.measure()
-        if self._clock(searched).over:
+        if self._clock(searched)[2]:
             self._end_phase(searched, value)
         else:
             self._cut_or_rest(searched, value)
@@ -236,13 +217,14 @@ class BudgetSearch(Extension):
         """Whether the search must end at this step. A run that ends before ``stop`` may be trained on."""
         return searched.state.schedule_step >= self.config.stop and searched.steps_left == 0
 
-    def _clock(self, searched: SearchedField) -> _Clock:
+    def _clock(self, searched: SearchedField) -> tuple[bool, int, bool]:
+        """Whether a head may follow this phase, steps in which a cut must recover, whether another is too late."""
         config, search, step = self.config, self.search, searched.state.schedule_step
         # Half of the time belongs to the head, if one may be enabled.
         head_to_come = search.phase == "field" and heads.may_pay(searched, self._largest)
         deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
         left = deadline - step if head_to_come else searched.steps_left
-        return _Clock(head_to_come, left, self._is_over(searched, deadline, left))
+        return head_to_come, left, self._is_over(searched, deadline, left)
 
     def _is_over(self, searched: SearchedField, deadline: int, left: int) -> bool:
         """Whether too few steps are left to judge another cut."""
@@ -255,9 +237,9 @@ class BudgetSearch(Extension):
     def _evaluate(self, searched: SearchedField) -> None:
         search, config, state = self.search, self.config, searched.state
         head_to_come, left, over = self._clock(searched)
-        value = searched.measure() if search.trying else self._measure_finite(searched)
+        value = searched.measure() if search.trying else searched.measure_finite()
         verdict = search.judge(value, state.schedule_step, left, config.patience)
-        point = self._point(searched, value, search.phase, verdict)
+        point = searched.evaluation(value, search.phase, verdict)
         search.curve.append(point)
         CONSOLE.log(
             f"step {state.step}: {point.primitives:,} primitives, {value - search.target:+.3f} dB to the target, "
@@ -269,7 +251,7 @@ class BudgetSearch(Extension):
         if verdict == "waiting":
             return
         if verdict == "rejected":
-            self._restore(searched, self._accepted)
+            searched.go_back("accepted")
             value = search.before_cut
         # Do not wait for a head that does not help, or for a field while a head is to come.
         tired = {"field": 1 if head_to_come else math.inf, "head": math.inf if search.cuts else 3}[search.phase]
@@ -285,29 +267,28 @@ class BudgetSearch(Extension):
         count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
         if count is None or searched.steps_left < config.search_every:  # no evaluation would judge it
             return
-        self._accepted = searched.state.snapshot(head=search.head)
-        self._count_dropped(searched.cut_to(count))
+        searched.keep("accepted")
+        searched.cut_to(count)
         search.cut(value, count, searched.state.schedule_step)
 
     def _end_phase(self, searched: SearchedField, value: float) -> None:
         search, step = self.search, searched.state.schedule_step
         too_late = self._is_over(searched, self.config.stop, searched.steps_left)
         if search.phase == "field" and heads.may_pay(searched, self._largest) and not too_late:
-            self._fallback = searched.state.snapshot(head=search.head)
+            searched.keep("fallback")
             search.begin("head", search.accepted)
             search.head_at, search.lost_at_join = step, search.steps_lost
-            heads.enable(searched, search, self._largest, searched.count)
+            heads.enable(searched, self._largest, searched.count)
             return
         if search.phase == "head":
-            assert self._fallback is not None
-            without = len(self._fallback["field"]["means"]["value"]) * searched.row
-            if value == NO_IMAGE or sizes.bytes_of(searched.field, self.head_config) >= without:
+            without = len(self._engine.kept["fallback"]["field"]["means"]["value"]) * searched.row
+            if value == NO_IMAGE or searched.stored >= without:
                 search.steps_lost = search.lost_at_join + step - search.head_at
                 search.head = False
-                heads.follow(searched.state, search)
-                self._restore(searched, self._fallback)
+                self._engine.enable_head(searched.state, False)
+                searched.go_back("fallback")
         if not search.head and self._largest is not None:
-            heads.remove(searched, search)
+            heads.remove(searched)
         self._done(searched)
 
     def _fit(self, searched: SearchedField) -> None:
@@ -320,21 +301,21 @@ class BudgetSearch(Extension):
                 raise DataError(
                     f"pruning.max-bytes is {config.max_bytes:,}, and one primitive takes {row:,}; give more"
                 )
-        if not heads.enable(searched, search, self._largest, count) and self._largest is not None:
-            heads.remove(searched, search)
+        if not heads.enable(searched, self._largest, count) and self._largest is not None:
+            heads.remove(searched)
         if config.max_bytes is not None:
-            head = self.head_config if search.head else None
-            count = accounting.rows_within(searched.field, config.max_bytes, lambda rows: sizes.bytes_of(rows, head))
+            head = heads.chosen_head(search, self._largest) if search.head else None
+            count = accounting.rows_within(searched.field, config.max_bytes, lambda rows: stored_bytes(rows, head))
         if count < searched.count:
-            self._count_dropped(searched.cut_to(count))
+            searched.cut_to(count)
             search.cut_at = searched.state.schedule_step
         search.accepted = searched.count
-        search.curve.append(self._point(searched, searched.measure(), "field", "cut"))
+        search.curve.append(searched.evaluation(searched.measure(), "field", "cut"))
 
     def _done(self, searched: SearchedField) -> None:
         search, state = self.search, searched.state
         search.phase = "done"
-        self._accepted = self._fallback = None
+        self._engine.kept = {}
         value = searched.measure() if searched.field.sh_degree > 0 else NO_IMAGE
         if value > NO_IMAGE:
             least = value - FLAT_SHARE * self.config.tolerated_drop
@@ -350,95 +331,38 @@ class BudgetSearch(Extension):
             dropped_nonfinite=search.dropped_nonfinite,
             peak=state.pruning["peak"],
             seconds=search.seconds,
-            tau=None,
-            sigma=None,
-            isolated=None,
         )
         CONSOLE.log(report.summary())
         write_report(searched.run, report, before={}, after={})
 
-    # ------------------------------------------------------------------------------------------------- the SH degree
+    def _write(self, searched: SearchedField) -> None:
+        """Write curve, choice and cost of the search.
 
-    def _start_trial(self, searched: SearchedField, degree: int) -> None:
-        """Train on from the warm-up field at an SH degree."""
-        search = self.search
-        if degree < search.degree:
-            lower_degree(searched, degree)
-            search.degree = degree
-        search.cut_at = searched.state.schedule_step
-
-    def _trained(self, searched: SearchedField) -> bool:
-        """Whether a trial has been trained as long as all others."""
-        return searched.state.schedule_step - self.search.cut_at >= TRIAL_EVALUATIONS * self.config.search_every
-
-    def _end_trial(self, searched: SearchedField) -> None:
-        search, tolerated = self.search, self.config.tolerated_drop
-        if not self._trained(searched):
-            # The run ends during the trial. The warm-up's own degree needs no proof.
-            if search.degrees:
-                search.steps_lost += searched.state.schedule_step - search.cut_at
-                self._restore(searched, self._accepted)
-            self._leave_trials(searched)
+        Raises:
+            StorageError: no space or no right to write.
+        """
+        run, search = searched.run, self.search
+        if run.last_step is None:
             return
-        value = search.degrees[str(search.degree)] = self._measure_finite(searched)
-        top = max(int(name) for name in search.degrees)
-        if search.degree == search.lowest_degree(top, tolerated):
-            self._accepted = searched.state.snapshot(head=search.head) if value > NO_IMAGE else self._fallback
-        degree = search.next_degree(top, tolerated)
-        if len(search.degrees) > 1 or value == NO_IMAGE:  # this trial, or the one that it has replaced
-            search.steps_lost += searched.state.schedule_step - search.cut_at
-        if degree is not None:
-            self._restore(searched, self._fallback)
-            self._start_trial(searched, degree)
-            return
-        if search.degree != search.lowest_degree(top, tolerated) or value == NO_IMAGE:
-            self._restore(searched, self._accepted)
-        self._leave_trials(searched)
-
-    def _leave_trials(self, searched: SearchedField) -> None:
-        search = self.search
-        self._fallback = None
-        if search.degrees:
-            levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
-            CONSOLE.log(f"SH degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
-        self._after_degrees(searched)
-
-    # -------------------------------------------------------------------------------------------------- small things
-
-    def _measure_finite(self, searched: SearchedField) -> float:
-        """PSNR on the held-out views; without primitives that are not finite, if they spoil it."""
-        value = searched.measure()
-        dropped = searched.drop_nonfinite() if value == NO_IMAGE else 0
-        if not dropped:
-            return value
-        self._count_dropped(dropped)
-        self.search.accepted = searched.count
-        return searched.measure()
-
-    def _count_dropped(self, count: int) -> None:
-        self.search.dropped_nonfinite += count
-        if count:
-            warn(f"removed {count} primitives that were not finite")
-
-    def _restore(self, searched: SearchedField, saved: Mapping[str, Snapshot] | None) -> None:
-        searched.restore(saved)
-        self.search.degree = searched.field.sh_degree
-
-    def _point(self, searched: SearchedField, psnr: float, phase: str, verdict: str) -> Point:
-        head, state = self.search.head, searched.state
-        return Point(
-            step=state.step,
-            phase=phase,
-            primitives=searched.count,
-            bytes=sizes.bytes_of(searched.field if head else searched.bare, self.head_config if head else None),
-            psnr=psnr,
-            verdict=verdict,
-            since_cut=state.schedule_step - self.search.cut_at,
+        share = search.steps_lost / (run.last_step + 1)
+        cost = {"steps_lost": search.steps_lost, "share_of_steps": share, "seconds": search.seconds}
+        budget = dict([budget_of(self.config)])
+        write_record(
+            run, "budget.json", {"budget": budget, **asdict(search), "primitives": searched.count, "cost": cost}
         )
 
 
-def _search_of(saved: Mapping[str, Any]) -> Search:
+def budget_of(config: PruningConfig) -> tuple[str, float]:
+    """Name and value of the option that sets the budget."""
+    for name in ("max_bytes", "max_primitives"):
+        value = getattr(config, name)
+        if value is not None:
+            return name, value
+    return "max_psnr_drop", config.tolerated_drop
+
+
+def _search_of(saved: Mapping[str, Any]) -> SearchProgress:
     """The search of a checkpoint."""
     if not isinstance(saved.get("numbers"), Mapping):
         raise CheckpointError("the checkpoint is of a run without a budget search; load it with its own method")
-    return Search.from_state(saved["numbers"])
+    return SearchProgress.from_state(saved["numbers"])

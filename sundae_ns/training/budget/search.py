@@ -1,10 +1,10 @@
 """Decisions of a budget search: cut, let training recover, evaluate held-out views, accept or reject.
 
-Right after a cut the PSNR says little about where training ends. So a cut is judged after recovery: it is accepted as soon
-as the held-out views reach the target again. It may take all steps that are left, as long as it is predicted to recover.
-Recovery is close to a line over the logarithm of the steps since the cut; half of the predicted gain is counted. A cut that
-is not predicted to recover, or has not when time is up, is rejected, and the field before it is restored. Steps after an
-accepted cut are the fine-tuning itself; only those after a rejected cut are lost.
+Right after a cut the PSNR says little about where training ends. So a cut is judged after recovery: it is accepted as
+soon as the held-out views reach the target again. It may take all steps that are left, as long as it is predicted to
+recover. Recovery is close to a line over the logarithm of the steps since the cut; half of the predicted gain is
+counted. A cut that is not predicted to recover, or has not when time is up, is rejected, and the field before it is
+restored. Steps after an accepted cut are the fine-tuning itself; only those after a rejected cut are lost.
 
 A field with too many primitives may overfit the training views and fall below the target while it is trained on. If it
 stays below and gains no more, its own PSNR replaces the target.
@@ -36,7 +36,7 @@ NO_IMAGE = 0.0
 
 _KINDS: dict[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "bool": (bool,)}
 
-Phase = Literal["before", "degrees", "field", "head", "done"]
+SearchPhase = Literal["before", "degrees", "field", "head", "done"]
 Verdict = Literal["accepted", "waiting", "rejected", "resting"]
 
 
@@ -59,10 +59,10 @@ class Point:
 
 
 @dataclass
-class Search:
+class SearchProgress:
     """State of a search: plain numbers and strings for a checkpoint."""
 
-    phase: Phase = "before"
+    phase: SearchPhase = "before"
     reference: float = math.nan
     """PSNR of the warm-up field on the held-out views, dB."""
     target: float = math.nan
@@ -270,7 +270,7 @@ class Search:
         return asdict(self)
 
     @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> Search:
+    def from_state(cls, state: Mapping[str, Any]) -> SearchProgress:
         """Counterpart of :meth:`state`.
 
         Raises:

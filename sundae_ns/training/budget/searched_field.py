@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,30 +14,33 @@ from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES, finite_mask
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.sh_folding import mean_basis
-from sundae_ns.gaussians.snapshot import Snapshot
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering.contribution import contribution, weights_by_batch
 from sundae_ns.rendering.source import TrainingView
-from sundae_ns.training.budget.search import NO_IMAGE
-from sundae_ns.training.budget.sizes import bytes_of
+from sundae_ns.storage import bytes_of, stored_bytes
+from sundae_ns.training.budget.search import NO_IMAGE, Point, SearchProgress
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.heldout import measure_heldout
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedulers import notify_pruned
 from sundae_ns.training.schedules import prune_to
+from sundae_ns.training.trials.engine import TrialEngine
+from sundae_ns.training.warning import warn
 
 MAX_VIEWS = 64
 """Training views, evenly chosen, for each score: a search scores the field at every cut."""
 
 
+@dataclass(frozen=True)
 class SearchedField:
     """What a step of the search does to the field of a run."""
 
-    def __init__(self, run: TrainingRun, config: PruningConfig) -> None:
-        self.run = run
-        self.config = config
+    run: TrainingRun
+    config: PruningConfig
+    search: SearchProgress
+    engine: TrialEngine
+    """Keeps the fields that the search may go back to."""
 
     @property
     def state(self) -> FieldState:
@@ -66,7 +69,13 @@ class SearchedField:
     @property
     def row(self) -> int:
         """Bytes of a primitive without features."""
-        return bytes_of({name: value[:1] for name, value in self.bare.items()}, None)
+        return bytes_of({name: value[:1] for name, value in self.bare.items()})
+
+    @property
+    def stored(self) -> int:
+        """Bytes of the field, with the head if it is enabled."""
+        head = self.state.head
+        return stored_bytes(self.field, head.config) if self.search.head and head else stored_bytes(self.bare, None)
 
     @property
     def steps_left(self) -> int:
@@ -104,7 +113,7 @@ class SearchedField:
         Raises:
             DataError: masks leave no pixel.
         """
-        views = measure_heldout(self.run, with_ssim=False)
+        views = self.engine.measure(self.run, with_ssim=False)
         if not views:
             raise DataError(
                 "masks leave no pixel of the held-out views; mend the masks, or hold out other views with "
@@ -113,17 +122,35 @@ class SearchedField:
         value = statistics.fmean(view.psnr for view in views)
         return value if math.isfinite(value) else NO_IMAGE
 
+    def measure_finite(self) -> float:
+        """:meth:`measure`; without primitives that are not finite, if they spoil it."""
+        value = self.measure()
+        if value > NO_IMAGE or not self.drop_nonfinite():
+            return value
+        self.search.accepted = self.count
+        return self.measure()
+
+    def evaluation(self, psnr: float, phase: str, verdict: str) -> Point:
+        """A point of the curve for the field as it is."""
+        state = self.state
+        return Point(
+            state.step, phase, self.count, self.stored, psnr, verdict, state.schedule_step - self.search.cut_at
+        )
+
     # ------------------------------------------------------------------------------------------------------- fields
 
     def drop_nonfinite(self) -> int:
         """Remove primitives with a NaN or infinite parameter; returns their number, 0 if no primitive is finite."""
-        return self._pruner.drop_nonfinite() if finite_mask(self.field).any() else 0
+        return self._count_dropped(self._pruner.drop_nonfinite() if finite_mask(self.field).any() else 0)
 
-    def cut_to(self, count: int) -> int:
+    def _count_dropped(self, count: int) -> int:
+        self.search.dropped_nonfinite += count
+        if count:
+            warn(f"removed {count} primitives that were not finite")
+        return count
+
+    def cut_to(self, count: int) -> None:
         """Keep ``count`` primitives by the configured rule, or all that are finite if there are fewer.
-
-        Returns:
-            Number of primitives removed because they were not finite.
 
         Raises:
             DataError: the field cannot be scored.
@@ -131,14 +158,18 @@ class SearchedField:
         step = self.state.schedule_step
         rule = replace(self.config, seed=self.config.seed + step)
         report = prune_to(lambda n: min(count, n), rule, self._pruner, self.state.pruning, step, self.contribution)
-        return report.dropped_nonfinite
+        self._count_dropped(report.dropped_nonfinite)
 
-    def restore(self, saved: Mapping[str, Snapshot] | None) -> None:
-        """Return to a snapshot."""
-        assert saved is not None
-        self.state.restore(saved)
+    def keep(self, name: str) -> None:
+        """Keep a copy of the field, and of the head if it is enabled."""
+        self.engine.keep(name, self.state, head=self.search.head)
+
+    def go_back(self, name: str) -> None:
+        """Continue with a kept copy; rates and steps go on."""
+        self.engine.go_back(name, self.state, rates=False)
         # Whatever is cached by the number of prunes is stale.
         self.state.pruning["num_prunes"] += 1
+        self.search.degree = self.field.sh_degree
 
     def restart_rates(self, *, head: bool) -> None:
         """Restart the learning rates of the field, or those of the head."""

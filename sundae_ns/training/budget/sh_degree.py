@@ -1,4 +1,4 @@
-"""Fewer SH coefficients: a lower degree for the whole field, and view-independent colours for single primitives."""
+"""Fewer SH coefficients: a lower degree for the field, by trials, and view-independent colours for some primitives."""
 
 from __future__ import annotations
 
@@ -6,15 +6,64 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.gaussians.sh_folding import fold, view_dependence
 from sundae_ns.gaussians.snapshot import narrow
+from sundae_ns.training.budget.search import NO_IMAGE
 from sundae_ns.training.budget.searched_field import SearchedField
 
-TRIALS = 6
+TRIAL_EVALUATIONS = 3
+"""Length of the training at one SH degree, in evaluations."""
+BISECTIONS = 6
 """Steps of the bisection for the number of view-independent primitives."""
+
+
+def start_trial(searched: SearchedField, degree: int) -> None:
+    """Train on from the warm-up field at an SH degree."""
+    search = searched.search
+    if degree < search.degree:
+        lower_degree(searched, degree)
+        search.degree = degree
+    search.cut_at = searched.state.schedule_step
+
+
+def trained(searched: SearchedField) -> bool:
+    """Whether a trial has been trained as long as all others."""
+    return searched.state.schedule_step - searched.search.cut_at >= TRIAL_EVALUATIONS * searched.config.search_every
+
+
+def end_trial(searched: SearchedField) -> bool:
+    """Measure a trial, and start the next one; returns whether there is none, and the field has the chosen degree."""
+    search, tolerated = searched.search, searched.config.tolerated_drop
+    steps = searched.state.schedule_step - search.cut_at
+    if trained(searched):
+        value = search.degrees[str(search.degree)] = searched.measure_finite()
+        top = max(int(name) for name in search.degrees)
+        if search.degree == search.lowest_degree(top, tolerated):
+            if value > NO_IMAGE:
+                searched.keep("accepted")
+            else:
+                searched.engine.kept["accepted"] = searched.engine.kept["fallback"]
+        degree = search.next_degree(top, tolerated)
+        if len(search.degrees) > 1 or value == NO_IMAGE:  # this trial, or the one that it has replaced
+            search.steps_lost += steps
+        if degree is not None:
+            searched.go_back("fallback")
+            start_trial(searched, degree)
+            return False
+        if search.degree != search.lowest_degree(top, tolerated) or value == NO_IMAGE:
+            searched.go_back("accepted")
+    elif search.degrees:  # the run ends during the trial; the warm-up's own degree needs no proof
+        search.steps_lost += steps
+        searched.go_back("accepted")
+    del searched.engine.kept["fallback"]
+    if search.degrees:
+        levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
+        CONSOLE.log(f"SH degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
+    return True
 
 
 def lower_degree(searched: SearchedField, degree: int) -> None:
@@ -48,7 +97,7 @@ def flatten(searched: SearchedField, least: float) -> Tensor:
         return flat, torch.where(flat[:, None], folded, dc.data), rest.data * ~flat[:, None, None]
 
     low, high = 0, len(order)
-    for _ in range(TRIALS):
+    for _ in range(BISECTIONS):
         middle = (low + high + 1) // 2
         _, colors, coefficients = flattened(middle)
         with _values(dc, colors), _values(rest, coefficients):

@@ -12,7 +12,7 @@ from budget_runs import Make, Run, set_up, tidy
 from ray_tracing import write_still_life
 
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.training import budget
+from sundae_ns.training.budget import heads
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +39,6 @@ def done(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]
 def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Options of a head with 13 features; the search enables one of half a megabyte with 5, beside a field of kilobytes."""
     monkeypatch.setattr(
-        budget.sizes, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
+        heads, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
     )
     return {"head": HeadConfig(mode="residual", size="small", pixel_unshuffle=1, num_features=13)}

@@ -10,7 +10,8 @@ from budget_runs import PRUNE_AT, SAVE, STEPS, Make, Run, same, shown_alike_when
 
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.scenes.measure import sizes
-from sundae_ns.training import budget
+from sundae_ns.storage.accounting import bytes_of_head
+from sundae_ns.training.budget import heads
 from sundae_ns.training.budget.searched_field import SearchedField
 
 
@@ -78,7 +79,7 @@ def test_a_head_that_does_not_pay_is_removed(make: Make, small_head: dict[str, A
      (60_000, 56, ("tiny", 1)), (3_000, 236, None)],
 )  # fmt: skip
 def test_the_head_that_suits_a_field(primitives: int, row: int, expected: tuple[str, int] | None) -> None:
-    found = budget.head_for(primitives * row, primitives, HeadConfig())
+    found = heads.head_for(primitives * row, primitives, HeadConfig())
     assert (found and (found.size, found.num_features)) == expected
     if found is not None:
-        assert budget.head_bytes(found) <= budget.HEAD_SHARE * primitives * row
+        assert bytes_of_head(found) <= heads.HEAD_SHARE * primitives * row

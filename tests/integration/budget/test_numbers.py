@@ -13,9 +13,9 @@ from torch import Tensor
 
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import DataError
-from sundae_ns.training import budget
+from sundae_ns.storage import accounting
 from sundae_ns.training.budget import BudgetSearch
-from sundae_ns.training.budget.search import NO_IMAGE, Search
+from sundae_ns.training.budget.search import NO_IMAGE, SearchProgress
 from sundae_ns.training.budget.searched_field import SearchedField
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
@@ -28,7 +28,7 @@ def spoil(monkeypatch: pytest.MonkeyPatch, when: When, values: Callable[[FieldSt
     after_step, done = BudgetSearch.after_step, []
 
     def spoiled(self: BudgetSearch, run: TrainingRun) -> None:
-        if not done and when(self, SearchedField(run, self.config)):
+        if not done and when(self, self.searched(run)):
             values(run.state).data.fill_(torch.nan)
             done.append(run.state.step)
         after_step(self, run)
@@ -71,7 +71,7 @@ def test_a_head_that_renders_no_image_is_not_kept_for_its_bytes(
         return extension.search.cuts > 0 and about_to_evaluate(extension, searched, "head", trying=False)
 
     spoil(monkeypatch, when, weights_of_head)
-    monkeypatch.setattr(budget.sizes, "head_bytes", lambda _: 0)
+    monkeypatch.setattr(accounting, "bytes_of_head", lambda _: 0)
     trainer = make(model_options=small_head, max_psnr_drop=3.0)
     trainer.train()
     found = Run(trainer).found
@@ -80,16 +80,16 @@ def test_a_head_that_renders_no_image_is_not_kept_for_its_bytes(
 
 
 def test_the_warm_up_field_stays_if_no_trial_renders_an_image(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    restore, restored = SearchedField.restore, []
+    go_back, restored = SearchedField.go_back, []
     trainer = make(model_options={"head": HeadConfig(mode="off")})
     search = search_of(trainer.pipeline.model.extensions).search
 
-    def noted(searched: SearchedField, saved: Any) -> None:
+    def noted(searched: SearchedField, name: str) -> None:
         trained = searched.field["means"].detach().clone()
-        restore(searched, saved)
+        go_back(searched, name)
         restored.append((searched.state.schedule_step, torch.equal(searched.field["means"], trained)))
 
-    monkeypatch.setattr(SearchedField, "restore", noted)
+    monkeypatch.setattr(SearchedField, "go_back", noted)
     monkeypatch.setattr(SearchedField, "measure", lambda _: 20.0 if search.phase == "before" else NO_IMAGE)
     trainer.train()
     found = Run(trainer).found
@@ -108,7 +108,9 @@ def test_primitives_that_are_not_finite_are_removed_at_the_next_evaluation(
 
     spoil(monkeypatch, when, lambda state: state.field["features_dc"][:3])
     # Nothing is cut at once: the verdict of the next evaluation is "resting".
-    monkeypatch.setattr(Search, "next_count", lambda self, *_: 100 if self.looks > 1 and self.accepted == 197 else None)
+    monkeypatch.setattr(
+        SearchProgress, "next_count", lambda self, *_: 100 if self.looks > 1 and self.accepted == 197 else None
+    )
     trainer = make(max_psnr_drop=3.0)
     trainer.train()
     found = Run(trainer).found
@@ -126,9 +128,9 @@ def test_primitives_that_are_not_finite_are_removed_before_the_contribution(
 ) -> None:
     cut_to, contribution, asked = SearchedField.cut_to, SearchedField.contribution, []
 
-    def spoiled(searched: SearchedField, count: int) -> int:
+    def spoiled(searched: SearchedField, count: int) -> None:
         searched.field["opacities"].data[:2] = torch.nan
-        return cut_to(searched, count)
+        cut_to(searched, count)
 
     def noted(searched: SearchedField, count: int | None = None) -> Tensor:
         asked.append((searched.count, count))

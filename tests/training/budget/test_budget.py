@@ -12,12 +12,12 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.training.budget import BudgetSearch
-from sundae_ns.training.budget.search import Search
+from sundae_ns.training.budget.search import SearchProgress
 from sundae_ns.training.densification import ChainStrategy, Densification
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.pruning_config import PruningConfig
 
-FIELD = {"field": {"means": torch.zeros(2, 3)}}
+FIELD = {"counted": 0, "field": {"means": torch.zeros(2, 3)}}
 
 
 def a_state() -> FieldState:
@@ -32,7 +32,7 @@ def a_search(state: FieldState) -> BudgetSearch:
 
 
 def numbers(phase: str, *, trying: bool = False, **changes: Any) -> dict[str, Any]:
-    search = Search(reference=30.1, target=30.0)
+    search = SearchProgress(reference=30.1, target=30.0)
     search.begin(phase, 1000)  # type: ignore[arg-type]
     if trying:
         search.cut(30.2, 500, step=3)
@@ -45,10 +45,10 @@ def numbers(phase: str, *, trying: bool = False, **changes: Any) -> dict[str, An
         ({}, "without a budget search"),
         ({"numbers": 3}, "without a budget search"),
         ({"numbers": {}}, "damaged budget search"),
-        ({"numbers": numbers("field", trying=True)}, "lacks the field"),
-        ({"numbers": numbers("field", trying=True), "accepted": [1]}, "lacks the field"),
-        ({"numbers": numbers("degrees"), "accepted": FIELD}, "lacks the field"),
-        ({"numbers": numbers("head"), "fallback": 3}, "lacks the field"),
+        ({"numbers": numbers("field", trying=True)}, "lacks a field"),
+        ({"numbers": numbers("field", trying=True), "engine": {"kept": {"accepted": [1]}}}, "lacks a field"),
+        ({"numbers": numbers("degrees"), "engine": {"kept": {"accepted": FIELD}}}, "lacks a field"),
+        ({"numbers": numbers("head"), "engine": {"kept": {"fallback": 3}}}, "lacks a field"),
     ],
 )
 def test_a_state_that_cannot_be_resumed_is_refused_and_changes_nothing(saved: Any, reason: str) -> None:
@@ -65,7 +65,11 @@ def test_a_state_that_cannot_be_resumed_is_refused_and_changes_nothing(saved: An
 def test_a_state_goes_from_one_search_to_the_next(phase: str) -> None:
     state = a_state()
     first, second = a_search(state), a_search(state)
-    saved = {"numbers": numbers(phase, trying=True), "accepted": FIELD, "fallback": FIELD, "flat": None}
+    saved = {
+        "numbers": numbers(phase, trying=True),
+        "engine": {"kept": {"accepted": FIELD, "fallback": FIELD}},
+        "flat": None,
+    }
     first.load_state_dict(state, saved)
     assert first.search.phase == phase
     assert first.search.trying
@@ -94,7 +98,6 @@ def test_a_checkpoint_gives_field_and_head_their_shapes() -> None:
 def test_once_the_search_has_decided_against_a_head_there_is_none() -> None:
     state = a_state()
     extension = a_search(state)
-    assert extension.head_config == HeadConfig(size="tiny")
     extension.prepare_loading(state, {"numbers": numbers("done", head_dropped=True, num_features=0)})
     assert state.head is None
     assert state.field["features"].shape == (2, 0)

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from sundae_ns.errors import CheckpointError
-from sundae_ns.training.budget.search import DEEPEST, NO_IMAGE, SHALLOWEST, Point, Search
+from sundae_ns.training.budget.search import DEEPEST, NO_IMAGE, SHALLOWEST, Point, SearchProgress
 
 
-def search(accepted: int = 1000, **options: Any) -> Search:
-    made = Search(reference=30.1, target=30.0, **options)
+def search(accepted: int = 1000, **options: Any) -> SearchProgress:
+    made = SearchProgress(reference=30.1, target=30.0, **options)
     made.begin("field", accepted)
     return made
 
@@ -23,7 +23,7 @@ END = 200
 """Steps of training, a look each."""
 
 
-def play(found: Search, recovered: Callable[[int], float], *, patience: int = 4, least: int = 5) -> list[int]:
+def play(found: SearchProgress, recovered: Callable[[int], float], *, patience: int = 4, least: int = 5) -> list[int]:
     """Search on a field whose PSNR is a function of its count once it has recovered, half the way a look; cuts made."""
     psnr, count, before, cuts = recovered(found.accepted), found.accepted, found.accepted, []
     for step in range(1, END + 1):
@@ -47,7 +47,7 @@ def play(found: Search, recovered: Callable[[int], float], *, patience: int = 4,
     return cuts
 
 
-def verdicts(found: Search, *values: float, left: int = 100, patience: int = 4) -> list[str]:
+def verdicts(found: SearchProgress, *values: float, left: int = 100, patience: int = 4) -> list[str]:
     """Of looks at a cut, every 10 steps, with so many steps left after the last of them."""
     steps = range(found.cut_at + 10, found.cut_at + 10 * len(values) + 1, 10)
     return [found.judge(psnr, step, left + steps[-1] - step, patience) for psnr, step in zip(values, steps)]
@@ -79,7 +79,7 @@ def test_a_field_that_needs_nothing_is_cut_to_the_least() -> None:
     assert found.next_count(40.0, 17, 3) is None
 
 
-def cut_in_half() -> Search:
+def cut_in_half() -> SearchProgress:
     found = search()
     found.cut(30.1, 500, step=100)
     return found
@@ -126,7 +126,7 @@ def test_what_is_foreseen_lies_on_a_line_over_the_logarithm_of_the_steps() -> No
     assert falling.predicted(20, 0.5) == pytest.approx(27.0), "a loss is counted whole"
 
 
-def rest(found: Search, *values: float) -> Search:
+def rest(found: SearchProgress, *values: float) -> SearchProgress:
     for psnr in values:
         assert found.judge(psnr, 10, 100, patience=3) == "resting"
     return found
@@ -176,7 +176,7 @@ def test_a_picture_that_is_not_a_number_is_no_success() -> None:
     assert (found.accepted, found.failed) == (1000, 500)
     assert found.slope == 0, "it says nothing of what a halving costs"
     assert found.next_count(30.1, 1, 3) == int(1000 * 0.5**0.5)
-    assert Search.from_state(found.state()).state()["trail"] == [[10, NO_IMAGE]]
+    assert SearchProgress.from_state(found.state()).state()["trail"] == [[10, NO_IMAGE]]
 
 
 def test_a_field_no_images_error_is_trained_and_neither_cut_nor_taken_for_all_there_is() -> None:
@@ -185,7 +185,7 @@ def test_a_field_no_images_error_is_trained_and_neither_cut_nor_taken_for_all_th
 
 
 def test_no_band_goes_where_all_of_them_have_made_no_picture() -> None:
-    found = Search(reference=30.0, degrees={"3": NO_IMAGE})
+    found = SearchProgress(reference=30.0, degrees={"3": NO_IMAGE})
     assert (found.next_degree(3, 0.1), found.lowest_degree(3, 0.1)) == (None, 3)
 
 
@@ -239,7 +239,7 @@ def test_how_deep_to_cut_follows_from_what_the_last_cut_cost() -> None:
     ],
 )
 def test_degrees_are_bisected(values: dict[int, float], order: list[int], lowest: int) -> None:
-    found, top, tried = Search(), max(values), []
+    found, top, tried = SearchProgress(), max(values), []
     while (degree := found.next_degree(top, 0.1)) is not None:
         tried.append(degree)
         found.degrees[str(degree)] = values[degree]
@@ -253,7 +253,7 @@ def test_state_goes_through_a_checkpoint() -> None:
     found.judge(29.0, 110, 50, patience=4)
     found.lowered, found.best = 29.0, 29.1
     found.curve.append(Point(1, "field", 10, 100, 30.0, "waiting", 5))
-    assert Search.from_state(found.state()) == found
+    assert SearchProgress.from_state(found.state()) == found
     assert json.loads(json.dumps(found.state()))["curve"][0]["primitives"] == 10
 
 
@@ -262,7 +262,7 @@ def test_a_state_that_lacks_an_entry_is_refused(name: str) -> None:
     state = search().state()
     del state[name]
     with pytest.raises(CheckpointError, match="other entries"):
-        Search.from_state(state)
+        SearchProgress.from_state(state)
 
 
 @pytest.mark.parametrize(
@@ -286,21 +286,21 @@ def test_a_state_that_lacks_an_entry_is_refused(name: str) -> None:
 )
 def test_a_foreign_state_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(CheckpointError, match="damaged budget search"):
-        Search.from_state({**search().state(), **change})
+        SearchProgress.from_state({**search().state(), **change})
 
 
 def test_states_at_the_ends_of_what_can_be_are_taken() -> None:
     for change in ({"degree": 4}, {"degree": -1}, {"num_features": 1024}, {"num_features": -1}):
-        Search.from_state({**search().state(), **change})
+        SearchProgress.from_state({**search().state(), **change})
 
 
 @pytest.mark.parametrize("phase", ["before", "degrees", "field", "head", "done"])
 def test_a_search_is_under_way_between_its_first_and_its_last_phase(phase: Any) -> None:
-    assert Search(phase=phase).searching == (phase not in ("before", "done"))
+    assert SearchProgress(phase=phase).searching == (phase not in ("before", "done"))
 
 
 def test_a_new_phase_counts_anew_and_remembers_the_cost_of_a_halving() -> None:
-    found = Search(
+    found = SearchProgress(
         reference=30.1, target=30.0, rejected=2, failed=7, cuts=3, looks=5, stuck=4, lowered=29.0, best=30.0, slope=0.2
     )
     found.begin("head", 400)
