@@ -34,7 +34,7 @@ from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
 from sundae_ns.training.recorded import RecordedStep
-from sundae_ns.training.run_length import set_schedule
+from sundae_ns.training.run_length import schedule_table, set_schedule
 from sundae_ns.training.warning import warn
 
 

@@ -23,8 +23,8 @@ def test_a_prune_merges_colours(build: Build, training_of: TrainingOf, datamanag
         model.gauss_params["features_dc"].mul_(4)
     assert model.state.field.encoding == "logits"
     harmonics = Field({name: value.detach().clone() for name, value in model.state.field.as_harmonics().items()})
-    weights = model.contribution(datamanager, 0.5)
-    expected = decide(harmonics, model.config.pruning, lambda: weights, count=model.num_points // 2).values
+    count = model.num_points // 2
+    expected = decide(harmonics, model.config.pruning, count, model.contribution(datamanager, count)).values
     assert expected is not None
     training.act("pruning", 3)
     assert torch.equal(model.means, expected["means"])
