@@ -30,7 +30,6 @@ DATASET_FRAME = "sundae_dataset_frame"
 NO_IMAGES = "sundae_no_images"
 """Key of a dataset's metadata and of a batch: cameras without images, which are grey."""
 
-
 LEAST_FOCAL, MOST_FOCAL = 0.01, 1000.0
 """Shortest and longest focal length in widths of the image: views of 178 and of 0.06 degrees."""
 FARTHEST = 10_000

@@ -115,10 +115,7 @@ class StepRecordings:
 
     @torch.no_grad()
     def overflow(self, capacity: Capacity | None) -> Tensor | None:
-        """1 if the lists of tiles were too short, so that the step must change nothing, else 0; float ``[]``.
-
-        None without a limit.
-        """
+        """1 if lists of tiles were too short, so the step must change nothing; else 0, float ``[]``. None if unlimited."""
         if capacity is None or capacity.pairs is None:
             return None
         assert self._most is not None
