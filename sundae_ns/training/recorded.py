@@ -130,12 +130,7 @@ class RecordedStep:
         return _Held.of(state, trained, settings.head, growing=growing)
 
     def _step(
-        self,
-        state: FieldState,
-        held: _Held,
-        inputs: StepInputs,
-        settings: RenderSettings,
-        capacity: Capacity | None,
+        self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None
     ) -> StepResult:
         """One step on the buffers; all of its work is recorded."""
         tensors, head, view = self._buffers.tensors, settings.head, inputs.view

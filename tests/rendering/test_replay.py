@@ -106,7 +106,7 @@ def test_what_a_recording_has_fixed_makes_another_one(
     with torch.no_grad():
         model.gauss_params["means"] = torch.nn.Parameter(model.gauss_params["means"].clone())
     assert show() == 7
-    assert len(model._replay._frames._graphs) == 1
+    assert len(model._replay._frames) == 1
     model.step = 0  # fewer bands of the harmonics take part
     assert show() == 8
     model.config.rasterize_mode = "antialiased"
@@ -212,7 +212,7 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(
 def eager(model: SundaeModel, camera: Cameras) -> dict[str, Tensor]:
     model._replay = FrameReplay()
     outputs = model.get_outputs_for_camera(camera)
-    assert len(model._replay._frames._graphs) == 0
+    assert len(model._replay._frames) == 0
     return {name: outputs[name] for name in replay.REPLAYED}
 
 
@@ -234,7 +234,7 @@ def test_what_is_played_back_is_what_would_be_rendered(
     for _ in range(RECORD_AT):
         model.get_outputs_for_camera(views[0])
     shown = [model.get_outputs_for_camera(view) for view in views]
-    assert len(replayed._frames._graphs) == 1
+    assert len(replayed._frames) == 1
     assert replayed._can_record
     # The head is a part of the frame's recording, and has none of its own, unless a single frame has run it often enough.
     if model.head is not None and model.head.config.phases < RECORD_AT:
@@ -256,7 +256,7 @@ def test_what_is_trained_meanwhile_is_seen(build: Build, perturb: Perturb, camer
         for value in model.head.parameters():  # type: ignore[union-attr]
             value += 0.02
     after = model.get_outputs_for_camera(camera())["rgb"]
-    assert len(model._replay._frames._graphs) == 1
+    assert len(model._replay._frames) == 1
     assert not torch.equal(after, before)
     torch.testing.assert_close(after, eager(model, camera())["rgb"], rtol=0, atol=2e-3)
     with torch.no_grad():  # a prune
