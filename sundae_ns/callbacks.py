@@ -24,7 +24,6 @@ class ModelInTraining(Protocol):
     state: FieldState
     source: FieldSource
     extensions: list[Extension]
-    step: int
 
     @property
     def shown_background(self) -> Tensor:
@@ -147,7 +146,7 @@ class NerfstudioRun:
             extension.before_training(self)
 
     def _begin_step(self, step: int) -> None:
-        self.model.step = step
+        self.state.step = step
 
     def _end_step(self, step: int) -> None:
         self.act(self.model.extensions)

@@ -38,8 +38,7 @@ class Timetable:
     """
 
     def __init__(self, cameras: Capture, order: Callable[[int], int], device: torch.device | str) -> None:
-        self.ranks = dist.get_world_size()
-        self._cameras, self._order, self._device = cameras, order, device
+        self.ranks, self._cameras, self._order, self._device = dist.get_world_size(), cameras, order, device
         self._table: _Table | None = None
 
     def views(self, step: int) -> list[int]:

@@ -12,9 +12,7 @@ from pytorch_msssim import ssim as _windowed_ssim
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-
-SSIM_WINDOW = 11
-"""Side of SSIM's window in pixels; smaller images have no SSIM."""
+from sundae_ns.gpu.fused_loss import SSIM_WINDOW
 
 
 def check_pair(pred: Tensor, target: Tensor) -> None:

@@ -19,7 +19,7 @@ from torch import Tensor
 from sundae_ns.errors import DataError, SundaeError
 from sundae_ns.gpu.nvrtc import Kernel, Launch
 
-WINDOW = 11
+SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
 
 SIGMA = 1.5
@@ -188,10 +188,10 @@ class Launches(NamedTuple):
 
 def definitions() -> tuple[str, ...]:
     """Compiler options of :data:`SOURCE`."""
-    window = [math.exp(-((k - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(WINDOW)]
+    window = [math.exp(-((k - SSIM_WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(SSIM_WINDOW)]
     weights = ",".join(f"{w / sum(window):.9e}f" for w in window)
-    sizes = (f"-D{name}={globals()[name]}" for name in ("WINDOW", "TILE_WIDTH", "TILE_HEIGHT", "THREADS"))
-    return (*sizes, f"-DWEIGHTS={weights}")
+    sizes = (f"-D{name}={globals()[name]}" for name in ("TILE_WIDTH", "TILE_HEIGHT", "THREADS"))
+    return (*sizes, f"-DWINDOW={SSIM_WINDOW}", f"-DWEIGHTS={weights}")
 
 
 @functools.cache
@@ -217,7 +217,7 @@ def fused_loss(
     L1 is the mean over all values. SSIM is pytorch_msssim's, over windows inside the image, with a data range of 1.
 
     Args:
-        image: float32 on a CUDA device ``[H, W, 3]``, both sides at least :data:`WINDOW`.
+        image: float32 on a CUDA device ``[H, W, 3]``, both sides at least :data:`SSIM_WINDOW`.
         target: target image, as ``image``; gets no gradient.
         weight: weight of 1 - SSIM, in [0, 1].
         base: base colours to compare with the target, as ``image``, or None.
@@ -233,10 +233,10 @@ def fused_loss(
     """
     for each in (image,) if base is None else (image, base):
         same_kind = each.shape == target.shape and each.dtype == target.dtype == torch.float32
-        if not same_kind or each.shape[2:] != (3,) or min(each.shape[:2]) < WINDOW:
+        if not same_kind or each.shape[2:] != (3,) or min(each.shape[:2]) < SSIM_WINDOW:
             raise DataError(
                 f"the fused loss cannot compare {each.dtype} {list(each.shape)} with {target.dtype} "
-                f"{list(target.shape)}; pass float32 [H, W, 3] of one size, at least {WINDOW} px per side"
+                f"{list(target.shape)}; pass float32 [H, W, 3] of one size, at least {SSIM_WINDOW} px per side"
             )
     launches = loss_kernels(image.device) if launches is None else launches
     weights = (1 - weight if l1_weight is None else l1_weight, weight)
@@ -257,7 +257,7 @@ class _Loss(torch.autograd.Function):
         image, target = image.contiguous(), target.contiguous()
         base = None if base is None else base.contiguous()
         height, width, channels = image.shape
-        windows = (height - WINDOW + 1) * (width - WINDOW + 1) * channels
+        windows = (height - SSIM_WINDOW + 1) * (width - SSIM_WINDOW + 1) * channels
         derivatives = image.new_empty(3 * windows) if any(ctx.needs_input_grad) else None
         losses = image.new_empty(_threads(image) // THREADS)
         base_losses = None if base is None else torch.empty_like(losses)

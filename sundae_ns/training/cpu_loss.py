@@ -15,16 +15,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sundae_ns.gpu.fused_loss import SIGMA, WINDOW
+from sundae_ns.gpu.fused_loss import SIGMA, SSIM_WINDOW
 from sundae_ns.rasterization.cpu.lanes import WIDTH, broadcast, fma, load, select, store, zeros
 from sundae_ns.rasterization.cpu.parallel import as_array, compiled, inlined, parallel_for
 
 _COLORS = 3
-_REACH = _COLORS * (WINDOW - 1)  # numbers from the first pixel of a window to its last
+_REACH = _COLORS * (SSIM_WINDOW - 1)  # numbers from the first pixel of a window to its last
 _C1, _C2 = 0.01**2, 0.03**2
 _MIN_PER_THREAD = 16  # rows
 
-_gaussian = [math.exp(-((k - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(WINDOW)]
+_gaussian = [math.exp(-((k - SSIM_WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(SSIM_WINDOW)]
 _WEIGHTS = np.array([value / sum(_gaussian) for value in _gaussian], np.float32)
 
 
@@ -42,7 +42,7 @@ class _Loss(torch.autograd.Function):
         ctx: Any, image: Tensor, base: Tensor | None, target: Tensor, weights: tuple[float, float]
     ) -> tuple[Tensor, Tensor | None]:
         height, width, _ = image.shape
-        windows_high, windows_wide = height - WINDOW + 1, _COLORS * (width - WINDOW + 1)
+        windows_high, windows_wide = height - SSIM_WINDOW + 1, _COLORS * (width - SSIM_WINDOW + 1)
         arrays = [as_array(value) for value in (image, image if base is None else base, target)]
         derivatives = np.empty((3, windows_high, _whole_lanes(windows_wide)), np.float32)
         sums = np.empty((height, 3))
@@ -82,7 +82,7 @@ def _whole_lanes(count: int) -> int:
 def _filtered(weights: Any, values: Any, place: int, step: int) -> Any:
     """Weighted sum of lanes of ``values`` at ``place``, ``place + step``, ..."""
     total = zeros(values)
-    for k in range(WINDOW):
+    for k in range(SSIM_WINDOW):
         total = fma(broadcast(weights, k), load(values, place + k * step), total)
     return total
 
@@ -96,7 +96,7 @@ def _compare(
     It writes the derivatives of a window's SSIM with respect to its means of x, x x and x y.
     """
     height, length = image.shape[0], _COLORS * image.shape[1]
-    windows_high, windows_wide, stride = height - WINDOW + 1, length - _REACH, derivatives.shape[2]
+    windows_high, windows_wide, stride = height - SSIM_WINDOW + 1, length - _REACH, derivatives.shape[2]
     # Lanes beyond the last window read beyond the row.
     room = stride + _REACH
     partial, similarity = np.zeros(5 * room, np.float32), np.empty(stride, np.float32)
@@ -113,7 +113,7 @@ def _compare(
         for block in range(0, length, WIDTH):
             place = min(block, length - WIDTH)  # the last lanes overlap with those before
             x = y = xx = yy = xy = zeros(weights)
-            for k in range(WINDOW):
+            for k in range(SSIM_WINDOW):
                 weight, at = broadcast(weights, k), (row + k) * length + place
                 a, b = load(image, at), load(target, at)
                 weighted_a, weighted_b = weight * a, weight * b
@@ -170,13 +170,13 @@ def _compare_backward(
 ) -> None:
     """Write the gradients of both images. A pixel is in the windows that begin up to a reach above and left of it."""
     height, length = image.shape[0], _COLORS * image.shape[1]
-    windows_high, windows_wide, stride = height - WINDOW + 1, length - _REACH, derivatives.shape[2]
+    windows_high, windows_wide, stride = height - SSIM_WINDOW + 1, length - _REACH, derivatives.shape[2]
     # Zeros on both sides, where no window begins.
     room = _REACH + _whole_lanes(length) + WIDTH
     partial = np.zeros(3 * room, np.float32)
     l1_slope, ssim_slope, base_slope = broadcast(slopes, 0), broadcast(slopes, 1), broadcast(slopes, 2)
     for row in range(begin, end):
-        first, last = max(row - WINDOW + 1, 0), min(row, windows_high - 1)
+        first, last = max(row - SSIM_WINDOW + 1, 0), min(row, windows_high - 1)
         for kind in range(3):
             for place in range(0, windows_wide, WIDTH):
                 total = zeros(weights)

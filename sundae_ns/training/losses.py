@@ -14,7 +14,7 @@ from pytorch_msssim import SSIM
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
-from sundae_ns.gpu.fused_loss import WINDOW, fused_loss, loss_kernels
+from sundae_ns.gpu.fused_loss import SSIM_WINDOW, fused_loss, loss_kernels
 from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
 
@@ -154,7 +154,7 @@ def image_losses(
     if not squares:
         return _losses(image, base, target, ssim, weight, 1 - weight)
     root = ((image - target).square().mean() + LEAST_SQUARE).sqrt()
-    if weight == 0 or min(target.shape[:2]) < WINDOW:
+    if weight == 0 or min(target.shape[:2]) < SSIM_WINDOW:
         return root, None if base is None else (base - target).abs().mean()
     rest, of_base = _losses(image, base, target, ssim, weight, 0.0)
     return (1 - weight) * root + rest, of_base
@@ -165,7 +165,7 @@ def _losses(
 ) -> tuple[Tensor, Tensor | None]:
     """``l1_weight L1 + weight (1 - SSIM)`` of an image, and the L1 loss of its base colours."""
     single = all(one.dtype == torch.float32 for one in (image, target, base) if one is not None)
-    large = min(target.shape[:2]) >= WINDOW
+    large = min(target.shape[:2]) >= SSIM_WINDOW
     if weight > 0 and large and single and image.is_cuda and _kernel_runs(image.device):
         return fused_loss(image, target, weight, base, l1_weight=l1_weight)
     if weight > 0 and large and single and image.device.type == "cpu" and numba_problem() is None:

@@ -61,11 +61,6 @@ class _Held:
         addresses = tuple(own[name].data_ptr() for _, _, own in states for name in (*MOMENTS, "step"))
         return cls(trained, growing, groups, tensors, (addresses, None if head is None else head.addresses()))
 
-    @property
-    def rates(self) -> list[float]:
-        """Learning rates of the groups."""
-        return [float(group["lr"]) for _, _, group in self.groups]
-
     def unchanged(self, state: FieldState, settings: RenderSettings, *, growing: bool) -> bool:
         """Whether the state still consists of these tensors."""
         with_head = self.groups[-1][0] == HEAD
@@ -111,10 +106,12 @@ class RecordedStep:
             held = self._held = self._hold(state, settings, growing=growing)
         self._recordings.keep_for(self._losses.emphasis(state))
         # Pinned: copying from other memory would wait until the GPU has finished the last step.
-        rates = torch.tensor(held.rates, pin_memory=state.device.type == "cuda").to(state.device, non_blocking=True)
+        rates = torch.tensor(
+            [float(group["lr"]) for _, _, group in held.groups], pin_memory=state.device.type == "cuda"
+        )
         result = self._recordings.run(
             partial(self._step, state, held),
-            replace(inputs, rates=rates),
+            replace(inputs, rates=rates.to(state.device, non_blocking=True)),
             settings,
             kind=_kind(state, inputs, settings),
             addresses=held.addresses,
@@ -133,12 +130,7 @@ class RecordedStep:
         return _Held.of(state, trained, settings.head, growing=growing)
 
     def _step(
-        self,
-        state: FieldState,
-        held: _Held,
-        inputs: StepInputs,
-        settings: RenderSettings,
-        capacity: Capacity | None,
+        self, state: FieldState, held: _Held, inputs: StepInputs, settings: RenderSettings, capacity: Capacity | None
     ) -> StepResult:
         """One step on the buffers; all of its work is recorded."""
         tensors, head, view = self._buffers.tensors, settings.head, inputs.view

@@ -81,13 +81,7 @@ class StepRecordings:
             self._constants = constants
 
     def run(
-        self,
-        work: StepWork,
-        inputs: StepInputs,
-        settings: RenderSettings,
-        *,
-        kind: Hashable,
-        addresses: Hashable = None,
+        self, work: StepWork, inputs: StepInputs, settings: RenderSettings, kind: Hashable, addresses: Hashable = None
     ) -> StepResult:
         """Run a step, by a recording where there is one.
 
@@ -115,11 +109,8 @@ class StepRecordings:
 
     @torch.no_grad()
     def overflow(self, capacity: Capacity | None) -> Tensor | None:
-        """1 if the lists of tiles were too short, so that the step must change nothing, else 0; float ``[]``.
-
-        None without a limit.
-        """
-        if capacity is None or capacity.pairs is None:
+        """1 if the lists of tiles were too short, so the step must change nothing; else 0, float ``[]``."""
+        if capacity is None or capacity.pairs is None:  # lists of any length
             return None
         assert self._most is not None
         assert self._most_on_host is not None
