@@ -9,6 +9,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -26,20 +27,22 @@ from torch import Tensor
 
 from sundae_ns import distributed
 from sundae_ns.datamanager import SundaeDatamanager, check_before_training, view_index
-from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError
+from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, ConfigError, StorageError, SundaeError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import View
 from sundae_ns.rendering.render import RenderSettings
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
+from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.runs.folder import find_config
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
 from sundae_ns.training.recordable import StepInputs, StepResult
 from sundae_ns.training.recorded import RecordedStep
-from sundae_ns.training.run_length import schedule_table, set_schedule
+from sundae_ns.training.run_length import fit_to_length, given_options, schedule_table, take_options
 from sundae_ns.training.step import training_view
 from sundae_ns.training.warning import warn
 
@@ -92,11 +95,67 @@ class SundaeTrainerConfig(TrainerConfig):
             parser.data = parser.data.absolute()
 
     def make_schedule(self, words: Iterable[str]) -> None:
-        """Fit the options that count steps to the length of the run, or take those of the run that is resumed.
+        """Fit all options that count steps to the length of the run, or take those of the run that is resumed.
 
-        See :func:`sundae_ns.training.run_length.set_schedule`.
+        Args:
+            words: the command line; options in it keep their value.
+
+        Raises:
+            ConfigError: the length is no number of steps.
         """
-        set_schedule(self, words)
+        from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
+
+        usual: Any = deepcopy(all_methods.get(str(self.method_name)))
+        given = given_options(words)
+        if self.load_dir is not None or self.load_checkpoint is not None:
+            run = self._resumed_run()
+            if run is not None and usual is not None:
+                for line in take_options(self, run, usual, given):
+                    late = "; a prune that is done is not repeated" if ".pruning." in line else ""
+                    warn(line + late)
+                self.schedule_length = self.schedule_length or run.schedule_length or run.max_num_iterations
+                if "max_num_iterations" not in given and self.max_num_iterations == usual.max_num_iterations:
+                    self.max_num_iterations = self._steps_left()
+            # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
+            self.schedule_length = self.schedule_length or self.max_num_iterations
+            return
+        if self.schedule_length is None:
+            self.schedule_length = self.max_num_iterations
+        if self.schedule_length < 1:
+            raise ConfigError(
+                f"the length of the run is {self.schedule_length}; give --max-num-iterations 30000, or fewer"
+            )
+        if usual is not None:
+            fit_to_length(self, usual, given)
+
+    def _steps_left(self) -> int:
+        """Steps from the checkpoint to resume to the end of the schedule.
+
+        Raises:
+            ConfigError: there are none.
+        """
+        place = self.load_dir or self.load_checkpoint
+        assert self.schedule_length is not None
+        assert place is not None
+        step = checkpoint.newest_step(place) if self.load_step is None else self.load_step
+        left = self.schedule_length if step is None else self.schedule_length - step - 1
+        if left < 1:
+            raise ConfigError(
+                f"the run has trained all of its {self.schedule_length:,} steps; give the number of further ones with "
+                "--max-num-iterations"
+            )
+        return left
+
+    def _resumed_run(self) -> SundaeTrainerConfig | None:
+        """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
+        place = self.load_dir or self.load_checkpoint
+        path = None if place is None else find_config(place)
+        try:
+            run = None if path is None else load_config(path)
+        except CheckpointError as error:
+            warn(f"{error}; the run is resumed with the options of this command")
+            return None
+        return run if isinstance(run, SundaeTrainerConfig) else None
 
     def set_timestamp(self) -> None:
         """Name the run, unless ``--timestamp`` did; runs that start in the same second get different names."""

@@ -16,10 +16,10 @@ from torch import Tensor
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 
-AVERAGED_EVERY = 10
+EVERY = 10
 """Steps between two weights that count: neighbours differ by little."""
 
-NamedWeights = Mapping[str, Tensor]
+Weights = Mapping[str, Tensor]
 """Tensors by name."""
 
 
@@ -31,7 +31,7 @@ class RunningMean:
         count: number of weights in it.
     """
 
-    def __init__(self, values: NamedWeights | None = None, count: int = 0) -> None:
+    def __init__(self, values: Weights | None = None, count: int = 0) -> None:
         self.values, self.count = dict(values or {}), count
 
     @classmethod
@@ -45,7 +45,7 @@ class RunningMean:
         return {"mean": self.values, "count": self.count}
 
     @torch.no_grad()
-    def count_in(self, weights: NamedWeights) -> None:
+    def count_in(self, weights: Weights) -> None:
         """Count weights in; those of other shapes begin a new mean."""
         if not self.fits(weights):
             self.values, self.count = {name: value.clone() for name, value in weights.items()}, 0
@@ -55,14 +55,14 @@ class RunningMean:
         torch._foreach_lerp_([self.values[name] for name in weights], list(weights.values()), 1 / self.count)
 
     @torch.no_grad()
-    def replace(self, weights: NamedWeights) -> dict[str, Tensor]:
+    def replace(self, weights: Weights) -> dict[str, Tensor]:
         """Put the mean in the place of weights; returns their copies."""
         copies = {name: value.clone() for name, value in weights.items()}
         put(self.values, weights)
         return copies
 
     @contextmanager
-    def shown(self, weights: NamedWeights) -> Iterator[None]:
+    def shown(self, weights: Weights) -> Iterator[None]:
         """Put the mean, if there is one that fits, in the place of weights for the length of a block."""
         own = self.replace(weights) if self.fits(weights) else None
         try:
@@ -71,13 +71,13 @@ class RunningMean:
             if own is not None:
                 put(own, weights)
 
-    def fits(self, weights: NamedWeights) -> bool:
+    def fits(self, weights: Weights) -> bool:
         """Whether there is a mean, and of weights of these names and shapes."""
         return self.count > 0 and same_shapes(self.values, weights)
 
 
 def weights_of(state: FieldState) -> dict[str, Tensor]:
-    """NamedWeights of the field and of the enabled head, by name; changes in place change the field."""
+    """Weights of the field and of the enabled head, by name; changes in place change the field."""
     weights = {name: value.data for name, value in state.field.items() if value.numel() > 0}
     if state.head_enabled and state.head is not None:
         weights |= {f"head.{name}": value.data for name, value in state.head.named_parameters()}
@@ -85,13 +85,13 @@ def weights_of(state: FieldState) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def put(values: NamedWeights, weights: NamedWeights) -> None:
+def put(values: Weights, weights: Weights) -> None:
     """Copy values into the weights of the same names."""
     for name, value in weights.items():
         value.copy_(values[name])
 
 
-def same_shapes(some: NamedWeights, others: NamedWeights) -> bool:
+def same_shapes(some: Weights, others: Weights) -> bool:
     """Whether names and shapes are the same."""
     return some.keys() == others.keys() and all(value.shape == others[name].shape for name, value in some.items())
 
@@ -113,7 +113,7 @@ class Averaging(Extension):
         self._restored = 0
         """Returns to a snapshot that the field had made when the mean began."""
         self._replaced: dict[str, Tensor] = {}
-        """NamedWeights of the last step, which the mean has replaced: a longer training goes on from them."""
+        """Weights of the last step, which the mean has replaced: a longer training goes on from them."""
         self._alone = True
 
     def state_dict(self) -> dict[str, Any]:
@@ -149,7 +149,7 @@ class Averaging(Extension):
         if state.restored != self._restored:
             self._mean, self._restored = RunningMean(), state.restored
         weights = weights_of(state)
-        if state.step % AVERAGED_EVERY == 0:
+        if state.step % EVERY == 0:
             self._mean.count_in(weights)
         if state.step == last and self._mean.fits(weights):
             CONSOLE.log(f"step {state.step}: the weights are the mean of {self._mean.count} of the last steps")

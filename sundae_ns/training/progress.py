@@ -8,9 +8,9 @@ from typing import Any
 
 from nerfstudio.utils.writer import EVENT_STORAGE, GLOBAL_BUFFER, EventName, LocalWriter
 
-TRAIN_METRICS = "Train Metrics Dict"
+METRICS = "Train Metrics Dict"
 """Event of nerfstudio's trainer with the metrics of a training image."""
-SECONDS_A_LINE = 10.0
+EVERY = 10.0
 """Seconds between two lines."""
 
 LONG = 1800.0
@@ -24,7 +24,7 @@ class ProgressWriter(LocalWriter):
         super().__init__(config, banner_messages)
         for line in banner_messages or []:
             print(line, flush=True)
-        self._printed_at = -SECONDS_A_LINE
+        self._printed_at = -EVERY
         self._metrics: Any = None
 
     def write_stats_log(self, step: int) -> None:
@@ -35,10 +35,10 @@ class ProgressWriter(LocalWriter):
         """
         events = {event["name"]: event for event in EVENT_STORAGE}
         # nerfstudio measures every few steps only, and ten steps after a prune may take a minute on a CPU.
-        if TRAIN_METRICS in events:
-            self._metrics = events[TRAIN_METRICS]["event"]
+        if METRICS in events:
+            self._metrics = events[METRICS]["event"]
         trained = events.get(EventName.ITER_TRAIN_TIME.value)
-        if trained is not None and self._metrics is not None and time.monotonic() - self._printed_at >= SECONDS_A_LINE:
+        if trained is not None and self._metrics is not None and time.monotonic() - self._printed_at >= EVERY:
             self._printed_at = time.monotonic()
             done, seconds = trained["step"] + 1, float(trained["event"])
             print(progress_line(done, GLOBAL_BUFFER["max_iter"], seconds, self._metrics), flush=True)

@@ -1,7 +1,7 @@
 """The schedule of a run: all options that count steps, and how they follow the length of the run.
 
-A method's options are written for the method's own length, 30,000 steps for ``sundae``. :func:`fit_to_length` scales
-those that nobody set by hand to another length; nothing else in the package knows a factor.
+A method's options are written for the method's own length, 30,000 steps for ``sundae``. :func:`fit_to_length` scales those
+that nobody set by hand to another length; nothing else in the package knows a factor.
 """
 
 from __future__ import annotations
@@ -10,14 +10,9 @@ import dataclasses
 import re
 from collections.abc import Collection, Iterable, Sequence
 from copy import deepcopy
-from pathlib import Path
 from typing import Any
 
-from sundae_ns.errors import CheckpointError, ConfigError
-from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.runs.config_file import load_config
-from sundae_ns.storage.runs.folder import find_config
-from sundae_ns.training.warning import warn
+from sundae_ns.errors import ConfigError
 
 SCHEDULE = {
     "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval refine_every",
@@ -37,69 +32,6 @@ _SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle"
 """Options of the model that the shapes in a checkpoint depend on."""
 _RESETS = "pipeline.model.reset_alpha_every"
 _REFINE = "pipeline.model.refine_every"
-
-
-def set_schedule(config: Any, words: Iterable[str]) -> None:
-    """Fit all options that count steps to the length of the run, or take those of the run that is resumed.
-
-    Args:
-        config: ``SundaeTrainerConfig``; its schedule changes.
-        words: the command line; options in it keep their value.
-
-    Raises:
-        ConfigError: the length is no number of steps.
-    """
-    from nerfstudio.configs.method_configs import all_methods  # imports the entry points, so not at the top
-
-    usual: Any = deepcopy(all_methods.get(str(config.method_name)))
-    given, place = given_options(words), config.load_dir or config.load_checkpoint
-    if place is not None:
-        run = _resumed_run(config, place)
-        if run is not None and usual is not None:
-            for line in take_options(config, run, usual, given):
-                late = "; a prune that is done is not repeated" if ".pruning." in line else ""
-                warn(line + late)
-            config.schedule_length = config.schedule_length or run.schedule_length or run.max_num_iterations
-            if "max_num_iterations" not in given and config.max_num_iterations == usual.max_num_iterations:
-                config.max_num_iterations = _steps_left(config, place)
-        # Without its configuration, nothing says how long the run was meant to be: options stay as they are.
-        config.schedule_length = config.schedule_length or config.max_num_iterations
-        return
-    if config.schedule_length is None:
-        config.schedule_length = config.max_num_iterations
-    if config.schedule_length < 1:
-        raise ConfigError(
-            f"the length of the run is {config.schedule_length}; give --max-num-iterations 30000, or fewer"
-        )
-    if usual is not None:
-        fit_to_length(config, usual, given)
-
-
-def _steps_left(config: Any, place: Path) -> int:
-    """Steps from the checkpoint to resume to the end of the schedule.
-
-    Raises:
-        ConfigError: there are none.
-    """
-    step = checkpoint.newest_step(place) if config.load_step is None else config.load_step
-    left: int = config.schedule_length if step is None else config.schedule_length - step - 1
-    if left < 1:
-        raise ConfigError(
-            f"the run has trained all of its {config.schedule_length:,} steps; give the number of further ones with "
-            "--max-num-iterations"
-        )
-    return left
-
-
-def _resumed_run(config: Any, place: Path) -> Any:
-    """The configuration of the run that is resumed; None if it is not beside its checkpoints."""
-    path = find_config(place)
-    try:
-        run = None if path is None else load_config(path)
-    except CheckpointError as error:
-        warn(f"{error}; the run is resumed with the options of this command")
-        return None
-    return run if isinstance(run, type(config)) else None
 
 
 def given_options(words: Iterable[str]) -> frozenset[str]:

@@ -15,7 +15,7 @@ from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR, LRScheduler
 
-DecayShape = Literal["exponential", "cosine"]
+Shape = Literal["exponential", "cosine"]
 
 SPARSE = 15_000
 """In a pruned field of fewer primitives centres move faster: on surfaces, they are the root of the quotient farther apart."""
@@ -38,7 +38,7 @@ class Decay:
         restart: float | None,
         hold_until_prune: bool,
         warmup_steps: int,
-        shape: DecayShape = "exponential",
+        shape: Shape = "exponential",
     ) -> None:
         self.final = final
         self.max_steps = max_steps
@@ -82,7 +82,7 @@ class PruneAwareDecayConfig(SchedulerConfig):
     """Whether the rate stays constant until pruning has ended and the head is enabled; the decay starts there."""
     warmup_steps: int = 0
     """Steps over which the rate rises after the prune."""
-    shape: DecayShape = "exponential"
+    shape: Shape = "exponential"
     """Decay by an exponential, or along half a cosine."""
 
 

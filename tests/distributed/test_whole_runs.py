@@ -120,7 +120,7 @@ def check_training(shards: Shards, folder: Path) -> None:
         return replace(self, weights)
 
     ShardedField._exchange, RunningMean.replace = noted, noted_mean  # type: ignore[method-assign]
-    averaging.AVERAGED_EVERY = 1
+    averaging.EVERY = 1
     config = configured(folder, "train")
     config.schedule_length = STEPS  # as ns-train sets it
     trainer = train(config, shards.rank, RANKS)

@@ -15,7 +15,7 @@ from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
 from trial_runs import LENGTH, PRUNE_AT, STEPS, tiny_run, tiny_scene
 
-from sundae_ns.training import averaging, progress
+from sundae_ns.training import averaging
 from sundae_ns.training.heldout import HeldOutQuality
 from sundae_ns.training.trials import engine, stopping
 from sundae_ns.training.trials.head import HeadTrialProgress
@@ -37,7 +37,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
 @pytest.fixture
 def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
     """Fixes PSNR and SSIM of the held-out views at a step; trials end without a head."""
-    monkeypatch.setattr(engine, "AVERAGED_EVERY", 1)
+    monkeypatch.setattr(engine, "EVERY", 1)
     monkeypatch.setattr(HeadTrialProgress, "best", lambda _: "plain")
 
     def fix(
@@ -122,7 +122,7 @@ def test_the_mean_of_the_last_window_stays(make: Make, curve: Curve) -> None:
 
 def test_a_pause_in_the_last_steps_is_not_averaged(make: Make, curve: Curve, monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean at the end of a run has counted weights before the pause."""
-    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 1)
+    monkeypatch.setattr(averaging, "EVERY", 1)
     curve(lambda step: 20 - 0.08 * abs(step - DECIDED - 10 * WINDOW) / WINDOW)
     trainer = make()
     _, centres, _ = _watched(trainer)
@@ -225,7 +225,6 @@ def test_a_run_resumed_while_training_is_paused_has_figures(
         put_scalar(name, scalar, step)
 
     monkeypatch.setattr(writer, "put_scalar", noted)
-    monkeypatch.setattr(progress, "SECONDS_A_LINE", 0.0)
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
     served, centres, _ = _watched(resumed)
     capsys.readouterr()

@@ -36,13 +36,13 @@ def train(state: Any, mean: Averaging, steps: range, *, seen: list[torch.Tensor]
         torch.manual_seed(step)
         for value in state.field.values():
             value.data += torch.randn_like(value)
-        if seen is not None and step >= 90 and step % averaging.AVERAGED_EVERY == 0:
+        if seen is not None and step >= 90 and step % averaging.EVERY == 0:
             seen.append(state.field["means"].detach().clone())
         mean.after_step(run_of(state))
 
 
 def test_the_last_weights_become_the_mean(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
+    monkeypatch.setattr(averaging, "EVERY", 3)
     seen: list[torch.Tensor] = []
     train(state, Averaging(0.09, settled_at=0), range(LAST + 1), seen=seen)
     assert len(seen) == 4
@@ -51,7 +51,7 @@ def test_the_last_weights_become_the_mean(state: Any, monkeypatch: pytest.Monkey
 
 def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that stops in its last part and is resumed for a longer one ends with weights of the end alone."""
-    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
+    monkeypatch.setattr(averaging, "EVERY", 3)
     first, longer = Averaging(0.3, settled_at=0), Averaging(0.09, settled_at=0)
     train(state, first, range(90))
     assert first.state_dict()["count"] > 0
@@ -63,7 +63,7 @@ def test_a_mean_that_an_interruption_has_cut_short_is_dropped(state: Any, monkey
 
 def test_no_mean_of_fields_that_differ(state: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a prune, or a return to an earlier field, only the weights since then count."""
-    monkeypatch.setattr(averaging, "AVERAGED_EVERY", 3)
+    monkeypatch.setattr(averaging, "EVERY", 3)
     for change in ("prune", "return"):
         seen: list[torch.Tensor] = []
         mean = Averaging(0.3, settled_at=0)

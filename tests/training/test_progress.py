@@ -10,7 +10,7 @@ from nerfstudio.utils import writer
 
 from sundae_ns.cli.process import percent_of
 from sundae_ns.training import progress
-from sundae_ns.training.progress import TRAIN_METRICS, ProgressWriter, duration, long_on_cpu
+from sundae_ns.training.progress import METRICS, ProgressWriter, duration, long_on_cpu
 
 
 def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
@@ -20,7 +20,7 @@ def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, caps
         # A resumed run writes its configuration first.
         {"name": "config", "event": {}, "step": 0},
         {"name": "Train Iter (time)", "event": 0.25, "step": 159},
-        {"name": TRAIN_METRICS, "event": {"psnr": 21.456, "gaussian_count": 12345}},
+        {"name": METRICS, "event": {"psnr": 21.456, "gaussian_count": 12345}},
     ]
     monkeypatch.setattr(progress, "EVENT_STORAGE", events)
     made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10), ["Viewer at: somewhere"])
@@ -33,14 +33,14 @@ def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, caps
 
 
 def test_a_slow_step_without_metrics_shows_the_last_ones(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    monkeypatch.setattr(progress, "SECONDS_A_LINE", 0.0)
+    monkeypatch.setattr(progress, "EVERY", 0.0)
     monkeypatch.setattr(progress, "GLOBAL_BUFFER", {"max_iter": 4})
     events: list[dict[str, Any]] = [{"name": "Train Iter (time)", "event": 2.0, "step": 0}]
     monkeypatch.setattr(progress, "EVENT_STORAGE", events)
     made = ProgressWriter(SimpleNamespace(stats_to_track=(), max_log_size=10))
     made.write_stats_log(0)
     assert capsys.readouterr().out == "", "nothing is measured yet"
-    events.append({"name": TRAIN_METRICS, "event": {"psnr": 20.0, "gaussian_count": 7}})
+    events.append({"name": METRICS, "event": {"psnr": 20.0, "gaussian_count": 7}})
     events[0]["step"] = 1
     made.write_stats_log(1)
     del events[1]

@@ -16,7 +16,7 @@ import torch
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.gaussians.surgery import replace_parameter
-from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, put, weights_of
+from sundae_ns.training.averaging import EVERY, RunningMean, put, weights_of
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, measure_heldout
@@ -107,7 +107,7 @@ class TrialEngine:
         trial, state = self.trial, run.state
         assert trial is not None
         left = trial.began + trial.length - state.schedule_step
-        if left < trial.averaged and state.step % AVERAGED_EVERY == 0:
+        if left < trial.averaged and state.step % EVERY == 0:
             self._mean.count_in(weights_of(state))
         return left <= 0
 

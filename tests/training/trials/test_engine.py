@@ -44,7 +44,7 @@ class FakeRun:
 
 @pytest.fixture
 def run(build: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> FakeRun:
-    monkeypatch.setattr(engine, "AVERAGED_EVERY", 1)
+    monkeypatch.setattr(engine, "EVERY", 1)
     state = build(n=20).state
     state.head_starts_at = math.inf
     state.field["means"].data.zero_()
