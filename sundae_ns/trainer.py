@@ -37,6 +37,7 @@ from sundae_ns.storage.runs import checkpoint, folder
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.folder import find_config
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.figures import detached, figures_without_training
 from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
@@ -182,18 +183,6 @@ class SundaeTrainerConfig(TrainerConfig):
         write_text(path, yaml.dump(self))
 
 
-def _detached(result: tuple[Tensor, Mapping[str, Any], Mapping[str, Any]]) -> tuple[Any, ...]:
-    """Loss, its terms, and metrics without their graph.
-
-    nerfstudio holds them until the next step. Trials that resize the head in between need the graph to be gone.
-    """
-    loss, *figures = result
-    values = [
-        {name: one.detach() if isinstance(one, Tensor) else one for name, one in part.items()} for part in figures
-    ]
-    return loss.detach(), *values
-
-
 def recorded_outputs(
     model: SundaeModel,
     camera: Cameras,
@@ -305,26 +294,15 @@ class SundaeTrainer(Trainer):
         """Train one step; several ranks agree on whether to stop after it."""
         model = self.model
         if all(extension.trains(model.state) for extension in model.extensions):
-            self._result = self._recorded_iteration(step) or _detached(super().train_iteration(step))
+            self._result = self._recorded_iteration(step) or detached(super().train_iteration(step))
         elif self._result is None:  # the run was resumed while training is paused
-            self._result = self._untrained(step)
+            self._result = figures_without_training(self.pipeline, model.state, step)
         self._trained = step
         self._foretell(step - self._start_step)
         self._stopped_by = self.team.agreed(self._interruption.number, step)
         if self._stopped_by:
             self.stop_training = True
         return self._result
-
-    @torch.no_grad()
-    def _untrained(self, step: int) -> Any:
-        """Loss, its terms and metrics of the image of a step, without training on it."""
-        state = self.model.state
-        focal = state.trained_focal
-        # The random state of the checkpoint is that of a run that was never stopped.
-        with torch.random.fork_rng([state.device] if state.device.type == "cuda" else []):
-            _, terms, metrics = self.pipeline.get_train_loss_dict(step)
-        state.trained_focal = focal
-        return _detached((torch.stack(list(terms.values())).sum(), terms, metrics))
 
     def _recordable(self) -> bool:
         """Whether options allow to record training steps."""
