@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple, cast
 
@@ -20,17 +19,13 @@ from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.cuda_graphs import GraphCache, is_recording, record, warm_up
+from sundae_ns.gpu.nvrtc import Argument
 
 _log = logging.getLogger(__name__)
 
 
 class Weights:
-    """A network's convolution weights in the dtype of the arithmetic, channels last.
-
-    Args:
-        net: the network.
-        dtype: dtype of the arithmetic.
-    """
+    """A network's convolution weights in the dtype of the arithmetic, channels last."""
 
     def __init__(self, net: UNet, dtype: torch.dtype) -> None:
         first, *others = (conv.weight.detach() for conv in convolutions(net))
@@ -49,16 +44,17 @@ class Weights:
         torch._foreach_copy_(self.cast[1:], others)
 
 
-@dataclass
-class Tape:
+class Tape(NamedTuple):
     """Values that the backward pass needs: inputs of the convolutions, and results before their bias and activation."""
 
-    inputs: list[Tensor] = field(default_factory=list)
+    inputs: list[Tensor]
     """Inputs of all 3 x 3 convolutions, in order; every second one holds the activations of the convolution before."""
-    coarse: list[Tensor] = field(default_factory=list)
+    coarse: list[Tensor]
     """Inputs of the upsamplings, from the coarsest level on."""
-    last: Tensor | None = None
-    """Input of the last kernel."""
+    last: Tensor
+    """Input of the last kernel: the result of the last 3 x 3 convolution, without bias and activation.
+
+    ``[1, width, h, w]`` channels last."""
 
 
 def padded_channels(channels: int, fold: int) -> int:
@@ -68,49 +64,28 @@ def padded_channels(channels: int, fold: int) -> int:
 
 
 def fold(splatted: Tensor, alpha: Tensor, size: int, residual: bool, folded: Tensor, launches: Launches) -> None:
-    """Write splatted values to the network's input, with blocks of ``size`` pixels per side folded into channels.
+    """Write splatted values to the network's input ``folded``, ``size`` x ``size`` pixels in the channels of one.
 
-    Args:
-        splatted: colours and features, float32; pixels may have a stride, rows must be adjacent ``[H, W, 3 + F]``.
-        alpha: accumulation, with the same layout ``[H, W, 1]``.
-        size: side of the blocks, pixels.
-        residual: whether the network sees colours and accumulation beside the features.
-        folded: output, ``[1, C, h, w]`` channels last.
-        launches: the kernels.
+    Splatted values ``[H, W, 3 + F]`` and accumulation ``[H, W, 1]`` are float32; their pixels may have a stride, their
+    rows must be adjacent. Only a residual network sees colours and accumulation.
     """
     height, width = splatted.shape[:2]
     rows, columns = folded.shape[-2:]
     padded = folded.shape[1] // size**2
-    launches["fold"](
-        rows * columns * padded,
-        [
-            *(splatted, pixel_stride(splatted), alpha, pixel_stride(alpha)),
-            *(4 if residual else 0, splatted.shape[2] - 3, padded),
-            *(height, width, rows, columns, folded),
-        ],
-    )
+    images: list[Argument] = [splatted, pixel_stride(splatted), alpha, pixel_stride(alpha)]
+    sizes = [4 if residual else 0, splatted.shape[2] - 3, padded, height, width, rows, columns]
+    launches["fold"](rows * columns * padded, [*images, *sizes, folded])
 
 
 def network(net: UNet, weights: Weights, folded: Tensor, launches: Launches) -> Tape:
-    """Run the network from its folded input to the input of the last kernel.
-
-    Args:
-        net: the network, for its biases.
-        weights: weights of the network.
-        folded: ``[1, C, h, w]`` channels last.
-        launches: the kernels.
-
-    Returns:
-        The tape; ``last`` is the result of the last 3 x 3 convolution, without bias and activation,
-        ``[1, width, h, w]`` channels last.
-    """
+    """Run the network from its folded input ``[1, C, h, w]``, channels last, to the input of the last kernel."""
     levels = len(net.encoder)
-    tape = Tape()
+    inputs, coarse = [], []
     convs = iter(zip(weights.cast, convolutions(net), strict=True))
 
     def convolved(x: Tensor) -> tuple[Tensor, Tensor]:
         weight, conv = next(convs)
-        tape.inputs.append(x)
+        inputs.append(x)
         return F.conv2d(x, weight, padding=1).contiguous(memory_format=torch.channels_last), bias_of(conv)
 
     def double(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -132,39 +107,25 @@ def network(net: UNet, weights: Weights, folded: Tensor, launches: Launches) -> 
         raw, bias = double(x)
     for skip in reversed(skips):
         _, channels, rows, columns = raw.shape
-        tape.coarse.append(raw)
+        coarse.append(raw)
         threads = 4 * raw.numel() // PACK
         launches["upsample"](threads, [raw, bias, channels, rows, columns, skip, skip.shape[1]])
         raw, bias = double(skip)
-    tape.last = raw
-    return tape
+    return Tape(inputs, coarse, raw)
 
 
 def unfold(net: UNet, raw: Tensor, base: Tensor, alpha: Tensor, launches: Launches) -> Tensor:
-    """The image from the result of the last 3 x 3 convolution.
+    """The image ``[H, W, 3]`` from the last 3 x 3 convolution's result ``[1, width, h, w]``.
 
-    Args:
-        net: the network, for its last layers.
-        raw: ``[1, width, h, w]`` channels last.
-        base: image to correct, float32; any tensor of its size if the network is not residual ``[H, W, 3]``.
-        alpha: accumulation, float32 ``[H, W, 1]``.
-        launches: the kernels.
-
-    Returns:
-        ``[H, W, 3]`` float32.
+    A residual network corrects ``base`` ``[H, W, 3]`` in proportion to accumulation ``[H, W, 1]``; of another network
+    only the size of ``base`` matters. All but ``raw`` are float32.
     """
     height, width = base.shape[:2]
     rows, columns = raw.shape[-2:]
     base = base.contiguous()
     out = torch.empty_like(base)
-    launches["unfold"](
-        rows * columns,
-        [
-            *(raw, *last_layers(net), rows, columns),
-            *(base, alpha, pixel_stride(alpha)),
-            *(height, width, out),
-        ],
-    )
+    arguments = [raw, *last_layers(net), rows, columns, base, alpha, pixel_stride(alpha), height, width, out]
+    launches["unfold"](rows * columns, arguments)
     return out
 
 
@@ -221,11 +182,8 @@ class _Recording(NamedTuple):
 class FusedInference:
     """Compensated images of a network without gradients, with its current weights.
 
-    A plain object that refers to the network, so that graphs and weights stay out of checkpoints.
-
-    Args:
-        net: the network; its parameters must stay the same tensors while on one device.
-        residual: whether the output corrects an image or is one.
+    A plain object that refers to the network, so that graphs and weights stay out of checkpoints. The network's
+    parameters must stay the same tensors while on one device. A residual network corrects an image.
     """
 
     def __init__(self, net: UNet, residual: bool) -> None:
@@ -271,9 +229,7 @@ class FusedInference:
 
     def _run(self, folded: Tensor, launches: Launches) -> Tensor:
         # Casting half a million weights costs nothing, and follows the network's training.
-        raw = network(self.net, Weights(self.net, folded.dtype), folded, launches).last
-        assert raw is not None
-        return raw
+        return network(self.net, Weights(self.net, folded.dtype), folded, launches).last
 
     def _record(self, folded: Tensor, launches: Launches) -> _Recording:
         with warm_up(folded.device):

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -27,7 +26,7 @@ from sundae_ns.compensation.fused import (
     pixel_stride,
     unfold,
 )
-from sundae_ns.compensation.kernels import BACKWARD, FORWARD, PACK, Launches, compiled, definitions
+from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, is_recording, record, warm_up
@@ -41,18 +40,13 @@ _log = logging.getLogger(__name__)
 def network_backward(
     net: UNet, weights: Weights, tape: Tape, gradient: Tensor, launches: Launches
 ) -> tuple[Tensor, list[Tensor]]:
-    """Gradients of :func:`sundae_ns.compensation.fused.network`.
+    """Gradients of :func:`sundae_ns.compensation.fused.network`, with the weights and the tape of the forward pass.
 
     Args:
-        net: the network.
-        weights: weights of the forward pass.
-        tape: tape of the forward pass.
-        gradient: gradient of the result of the last 3 x 3 convolution with its bias, ``[1, width, h, w]``
-            channels last.
-        launches: the kernels.
+        gradient: gradient of the last 3 x 3 convolution's result with its bias ``[1, width, h, w]``, channels last.
 
     Returns:
-        The gradients of the folded input ``[1, C, h, w]`` channels last, and of weight and bias of each 3 x 3
+        The gradients of the folded input ``[1, C, h, w]``, channels last, and of weight and bias of each 3 x 3
         convolution in turn, float32.
     """
     levels = len(net.encoder)
@@ -112,18 +106,10 @@ def network_backward(
 def unfold_backward(
     net: UNet, raw: Tensor, gradient: Tensor, alpha: Tensor, grad_raw: Tensor, launches: Launches
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of :func:`sundae_ns.compensation.fused.unfold`.
+    """Gradients of :func:`sundae_ns.compensation.fused.unfold`, from that of the image ``[H, W, 3]``.
 
-    Args:
-        net: the network, for its last layers.
-        raw: input of the last kernel in the forward pass ``[1, width, h, w]`` channels last.
-        gradient: gradient of the image, float32 ``[H, W, 3]``.
-        alpha: accumulation, float32 ``[H, W, 1]``.
-        grad_raw: output, the gradient of ``raw``, with its layout.
-        launches: the kernels.
-
-    Returns:
-        The gradients of accumulation ``[H, W, 1]``, and of weight and bias of the 1 x 1 convolution, float32.
+    It writes the gradient of ``raw`` to ``grad_raw``, and returns those of accumulation ``[H, W, 1]``, and of weight and
+    bias of the 1 x 1 convolution, float32.
     """
     height, width = gradient.shape[:2]
     rows, columns = raw.shape[-2:]
@@ -131,32 +117,30 @@ def unfold_backward(
     gradient = gradient.contiguous()
     values, grad_values = raw.new_empty(rows, columns, raw.shape[1]), raw.new_empty(rows, columns, outputs)
     grad_alpha = torch.zeros_like(alpha, memory_format=torch.contiguous_format)
-    launches["unfold_backward"](
-        rows * columns,
-        [
-            *(raw, *last_layers(net), rows, columns),
-            *(gradient, alpha, pixel_stride(alpha), height, width),
-            *(grad_raw, values, grad_values, grad_alpha),
-        ],
-    )
+    inputs = [raw, *last_layers(net), rows, columns, gradient, alpha, pixel_stride(alpha), height, width]
+    launches["unfold_backward"](rows * columns, [*inputs, grad_raw, values, grad_values, grad_alpha])
     # Sum row by row: as one product it would be a single sum over all pixels, which a GPU cannot parallelise.
     grad_weight = torch.bmm(grad_values.transpose(1, 2), values).sum(dim=0, dtype=torch.float32)
     grad_bias = grad_values.sum(dim=(0, 1), dtype=torch.float32)
     return grad_alpha, grad_weight.reshape(net.out.weight.shape), grad_bias
 
 
-@dataclass
-class _Pass:
-    """Buffers of one image size and the graphs that use them; the graphs are None if nothing is recorded."""
+class _Graphs(NamedTuple):
+    """Both directions as CUDA graphs, and the gradients that the second one writes."""
+
+    forward: torch.cuda.CUDAGraph
+    backward: torch.cuda.CUDAGraph
+    grad_folded: Tensor
+    grad_parameters: list[Tensor]
+
+
+class _Pass(NamedTuple):
+    """Buffers of one image size, and the graphs that use them if they are recorded."""
 
     weights: Weights
-    folded: Tensor
     tape: Tape
     grad_raw: Tensor
-    grad_folded: Tensor | None = None
-    grad_parameters: list[Tensor] | None = None
-    forward: torch.cuda.CUDAGraph | None = None
-    backward: torch.cuda.CUDAGraph | None = None
+    graphs: _Graphs | None = None
 
 
 class FusedTraining:
@@ -165,18 +149,12 @@ class FusedTraining:
     A plain object that refers to the network, so that graphs stay out of checkpoints. Call ``backward()`` on a
     correction before computing the next one: passes of one size share their buffers. The gradient of a parameter lies
     in such a buffer until the next pass, which copies it first; a result of ``torch.autograd.grad`` is overwritten by
-    then.
-
-    Args:
-        net: the network; its parameters must stay the same tensors while on one device.
-        residual: whether the output corrects an image or is one.
-        launches: kernels to use instead of those compiled for the device.
+    then. The network's parameters must stay the same tensors while on one device. A residual network corrects an image.
     """
 
-    def __init__(self, net: UNet, residual: bool, launches: Launches | None = None) -> None:
+    def __init__(self, net: UNet, residual: bool) -> None:
         self.net = net
         self.residual = residual
-        self.launches = launches
         self._parameters = tuple(_parameters(net))
         self._recorded: dict[tuple[object, ...], _Pass] = {}
         self._can_record = True
@@ -197,9 +175,7 @@ class FusedTraining:
         Raises:
             BackendError: the kernels cannot be compiled or loaded.
         """
-        launches = self.launches
-        if launches is None:
-            launches = compiled(splatted.device, dtype, definitions(self.net, self.residual), FORWARD + BACKWARD)
+        launches = compiled(splatted.device, dtype, definitions(self.net, self.residual))
         return cast("Tensor", _Correction.apply(splatted, alpha, self, dtype, launches, *self._parameters))
 
     def forward(
@@ -212,26 +188,25 @@ class FusedTraining:
         # Work that is being recorded as part of something larger contains no graph of its own.
         inside = is_recording()
         current = None if inside else self._recorded.get(key)
+        folded = folded_input(net, height, width, splatted, dtype) if current is None else current.tape.inputs[0]
+        can_record = splatted.is_cuda and self._can_record and not inside and len(self._recorded) < MAX_GRAPHS
+        if current is None and can_record:
+            try:
+                current = self._recorded[key] = self._record(folded.zero_(), launches)
+            except BackendError as error:
+                _log.warning("the head's training is not recorded and runs kernel by kernel: %s", error)
+                self._can_record = False
+        fold(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
         if current is None:
-            folded = folded_input(net, height, width, splatted, dtype)
-            if splatted.is_cuda and self._can_record and not inside and len(self._recorded) < MAX_GRAPHS:
-                try:
-                    current = self._recorded[key] = self._record(folded.zero_(), launches)
-                except BackendError as error:
-                    _log.warning("the head's training is not recorded and runs kernel by kernel: %s", error)
-                    self._can_record = False
-            if current is None:
-                current = _Pass(Weights(net, dtype), folded, Tape(), Tensor())
-        fold(splatted, alpha, net.pixel_unshuffle, self.residual, current.folded, launches)
-        if current.forward is not None:
-            self._release_gradients(current)
-            current.forward.replay()
-        else:
-            current.tape = network(net, current.weights, current.folded, launches)
-            current.grad_raw = torch.empty_like(_last(current.tape))
+            weights = Weights(net, dtype)
+            tape = network(net, weights, folded, launches)
+            current = _Pass(weights, tape, torch.empty_like(tape.last))
+        elif current.graphs is not None:
+            self._release_gradients(current.graphs)
+            current.graphs.forward.replay()
         self._passes += 1
         no_base = splatted.new_zeros(height, width, 3)
-        return unfold(net, _last(current.tape), no_base, alpha, launches), current, self._passes
+        return unfold(net, current.tape.last, no_base, alpha, launches), current, self._passes
 
     def backward(
         self, current: _Pass, number: int, gradient: Tensor, splatted_channels: int, alpha: Tensor, launches: Launches
@@ -239,40 +214,28 @@ class FusedTraining:
         """Gradients of splatted values ``[H, W, 3 + F]``, accumulation ``[H, W, 1]`` and the parameters."""
         if number != self._passes:
             raise SundaeError("the head has computed another image since: call backward() before the next forward pass")
-        net = self.net
-        grad_alpha, *grad_last = unfold_backward(net, _last(current.tape), gradient, alpha, current.grad_raw, launches)
-        if current.backward is not None:
-            assert current.grad_folded is not None
-            assert current.grad_parameters is not None
-            self._release_gradients(current)  # an earlier backward pass of the same image may have left gradients there
-            current.backward.replay()
-            # Detached tensors without other references: autograd adopts them as gradients without a copy.
-            grad_folded, grad_parameters = (
-                current.grad_folded,
-                [gradient.detach() for gradient in current.grad_parameters],
-            )
+        net, (weights, tape, grad_raw, graphs) = self.net, current
+        grad_alpha, *grad_last = unfold_backward(net, tape.last, gradient, alpha, grad_raw, launches)
+        if graphs is None:
+            grad_folded, grad_parameters = network_backward(net, weights, tape, grad_raw, launches)
         else:
-            grad_folded, grad_parameters = network_backward(
-                net, current.weights, current.tape, current.grad_raw, launches
-            )
+            self._release_gradients(graphs)  # an earlier backward pass of the same image may have left gradients there
+            graphs.backward.replay()
+            # Detached tensors without other references: autograd adopts them as gradients without a copy.
+            grad_folded, grad_parameters = graphs.grad_folded, [value.detach() for value in graphs.grad_parameters]
         height, width = gradient.shape[:2]
         # Channels that the network does not see have no gradient.
         new = torch.empty if self.residual else torch.zeros
         grad_splatted = new(height, width, splatted_channels, dtype=torch.float32, device=gradient.device)
         rows, columns = grad_folded.shape[-2:]
         padded = grad_folded.shape[1] // net.pixel_unshuffle**2
-        launches["fold_backward"](
-            rows * columns * padded,
-            [
-                *(grad_folded, 4 if self.residual else 0, splatted_channels - 3, padded),
-                *(height, width, rows, columns, grad_splatted, grad_alpha),
-            ],
-        )
+        sizes = [4 if self.residual else 0, splatted_channels - 3, padded, height, width, rows, columns]
+        launches["fold_backward"](rows * columns * padded, [grad_folded, *sizes, grad_splatted, grad_alpha])
         return grad_splatted, grad_alpha, [*grad_parameters, *grad_last]
 
-    def _release_gradients(self, current: _Pass) -> None:
+    def _release_gradients(self, graphs: _Graphs) -> None:
         """Copy gradients of parameters that still lie in the buffers, before a pass overwrites them."""
-        for parameter, gradient in zip(self._parameters, current.grad_parameters or (), strict=False):
+        for parameter, gradient in zip(self._parameters, graphs.grad_parameters):
             if parameter.grad is not None and parameter.grad.data_ptr() == gradient.data_ptr():
                 parameter.grad = parameter.grad.clone()
 
@@ -280,7 +243,7 @@ class FusedTraining:
         weights = Weights(self.net, folded.dtype)
         with warm_up(folded.device):
             tape = network(self.net, weights, folded, launches)
-            network_backward(self.net, weights, tape, torch.zeros_like(_last(tape)), launches)
+            network_backward(self.net, weights, tape, torch.zeros_like(tape.last), launches)
             del tape
 
         def forward_pass() -> Tape:
@@ -288,13 +251,13 @@ class FusedTraining:
             return network(self.net, weights, folded, launches)
 
         forward, tape = record(forward_pass, folded.device)
-        grad_raw = torch.empty_like(_last(tape))
+        grad_raw = torch.empty_like(tape.last)
         backward, (grad_folded, grad_parameters) = record(
             lambda: network_backward(self.net, weights, tape, grad_raw, launches),
             folded.device,
             share_memory_with=forward,
         )
-        return _Pass(weights, folded, tape, grad_raw, grad_folded, grad_parameters, forward, backward)
+        return _Pass(weights, tape, grad_raw, _Graphs(forward, backward, grad_folded, grad_parameters))
 
 
 class _Correction(torch.autograd.Function):
@@ -328,8 +291,3 @@ def _parameters(net: UNet) -> Iterator[Tensor]:
         assert conv.bias is not None
         yield conv.weight
         yield conv.bias
-
-
-def _last(tape: Tape) -> Tensor:
-    assert tape.last is not None
-    return tape.last

@@ -16,16 +16,15 @@ import torch
 from torch import nn
 
 from sundae_ns.compensation.unet import SLOPE, UNet
-from sundae_ns.gpu.nvrtc import Kernel, Launch
+from sundae_ns.gpu.nvrtc import Launch, load_kernels
 
 PACK = 8
 """Channels that a thread moves at once, 16 bytes; images are padded to a multiple, which tensor cores need too."""
 
-FORWARD = ("fold", "activate", "pool", "upsample", "unfold")
-"""Kernels of :data:`SOURCE` for the forward pass."""
+_FORWARD = ("fold", "activate", "pool", "upsample", "unfold")
 
-BACKWARD = (*(f"{name}_backward" for name in FORWARD), "sum_pixels")
-"""Kernels of :data:`SOURCE` for the backward pass."""
+KERNELS = (*_FORWARD, *(f"{name}_backward" for name in _FORWARD), "sum_pixels")
+"""Names of the kernels of :data:`SOURCE`."""
 
 _CONVERSIONS = {
     torch.float16: r"""
@@ -44,6 +43,15 @@ SOURCE = r"""
 struct __align__(PACK * sizeof(T)) Pack { T v[PACK]; };
 
 // All images are channels last: [height, width, channels]. A thread has one pack of channels of one pixel.
+
+// The place of a thread: a pixel of an image of HIGH x WIDE pixels, and its first channel of the pack.
+#define PLACE(HIGH, WIDE) \
+    const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x; \
+    const int packs = channels / PACK; \
+    if (i >= (long long)(HIGH) * (WIDE) * packs) return; \
+    const int c = (int)(i % packs) * PACK; \
+    const long long place = i / packs; \
+    const int column = (int)(place % (WIDE)), row = (int)(place / (WIDE));
 
 __device__ __forceinline__ float leaky(float x) { return x > 0.0f ? x : SLOPE * x; }
 
@@ -86,16 +94,11 @@ extern "C" __global__ void activate(T* x, const float* __restrict__ bias, int ch
 // Adds the bias and activates; writes the result into the last channels of a wider image, and the mean of 2 x 2 pixels.
 extern "C" __global__ void pool(const T* __restrict__ x, const float* __restrict__ bias, int channels, int rows,
                                 int columns, T* __restrict__ wide, int wide_channels, T* __restrict__ pooled) {
-    const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
-    const int packs = channels / PACK;
-    if (i >= (long long)(rows / 2) * (columns / 2) * packs) return;
-    const int c = (int)(i % packs) * PACK;
-    const long long coarse = i / packs;
-    const int column = (int)(coarse % (columns / 2)) * 2, row = (int)(coarse / (columns / 2)) * 2;
+    PLACE(rows / 2, columns / 2)
     float sum[PACK] = {};
     for (int dy = 0; dy < 2; ++dy)
         for (int dx = 0; dx < 2; ++dx) {
-            const long long pixel = (long long)(row + dy) * columns + column + dx;
+            const long long pixel = (long long)(2 * row + dy) * columns + 2 * column + dx;
             Pack pack = *(const Pack*)(x + pixel * channels + c);
 #pragma unroll
             for (int k = 0; k < PACK; ++k) {
@@ -114,12 +117,7 @@ extern "C" __global__ void pool(const T* __restrict__ x, const float* __restrict
 // wider image. A fine pixel's centre is a quarter of a coarse pixel from the centre of its coarse pixel.
 extern "C" __global__ void upsample(const T* __restrict__ x, const float* __restrict__ bias, int channels, int rows,
                                     int columns, T* __restrict__ wide, int wide_channels) {
-    const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
-    const int packs = channels / PACK;
-    if (i >= 4LL * rows * columns * packs) return;
-    const int c = (int)(i % packs) * PACK;
-    const long long fine = i / packs;
-    const int column = (int)(fine % (2 * columns)), row = (int)(fine / (2 * columns));
+    PLACE(2 * rows, 2 * columns)
     const int near_y = row / 2, far_y = near_y + (row % 2 ? 1 : -1);
     const int near_x = column / 2, far_x = near_x + (column % 2 ? 1 : -1);
     const int ys[2] = {near_y, far_y < 0 ? 0 : far_y >= rows ? rows - 1 : far_y};
@@ -135,7 +133,7 @@ extern "C" __global__ void upsample(const T* __restrict__ x, const float* __rest
     Pack pack;
 #pragma unroll
     for (int k = 0; k < PACK; ++k) pack.v[k] = store(sum[k]);
-    *(Pack*)(wide + fine * wide_channels + c) = pack;
+    *(Pack*)(wide + place * wide_channels + c) = pack;
 }
 
 // Adds the bias, activates, applies the final 1 x 1 convolution, unfolds blocks, crops, and adds the correction.
@@ -271,13 +269,8 @@ extern "C" __global__ void sum_pixels(const T* __restrict__ x, int channels, int
 extern "C" __global__ void pool_backward(const T* __restrict__ grad_wide, const T* __restrict__ wide, int wide_channels,
                                          const T* __restrict__ grad_pooled, int channels, int rows, int columns,
                                          T* __restrict__ grad_x) {
-    const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
-    const int packs = channels / PACK;
-    if (i >= (long long)rows * columns * packs) return;
-    const int c = (int)(i % packs) * PACK;
-    const long long pixel = i / packs;
-    const int column = (int)(pixel % columns), row = (int)(pixel / columns);
-    const long long at = pixel * wide_channels + (wide_channels - channels) + c;
+    PLACE(rows, columns)
+    const long long at = place * wide_channels + (wide_channels - channels) + c;
     const Pack direct = *(const Pack*)(grad_wide + at), activations = *(const Pack*)(wide + at);
     const long long coarse = (long long)(row / 2) * (columns / 2) + column / 2;
     const Pack mean = *(const Pack*)(grad_pooled + coarse * channels + c);
@@ -292,12 +285,7 @@ extern "C" __global__ void pool_backward(const T* __restrict__ grad_wide, const 
 extern "C" __global__ void upsample_backward(const T* __restrict__ grad_wide, int wide_channels,
                                              const T* __restrict__ x, const float* __restrict__ bias, int channels,
                                              int rows, int columns, T* __restrict__ grad_x) {
-    const long long i = blockIdx.x * (long long)blockDim.x + threadIdx.x;
-    const int packs = channels / PACK;
-    if (i >= (long long)rows * columns * packs) return;
-    const int c = (int)(i % packs) * PACK;
-    const long long pixel = i / packs;
-    const int column = (int)(pixel % columns), row = (int)(pixel / columns);
+    PLACE(rows, columns)
     float sum[PACK] = {};
     for (int a = -1; a < 3; ++a)
         for (int b = -1; b < 3; ++b) {
@@ -346,6 +334,7 @@ Launches = Mapping[str, Launch]
 """Launch functions by kernel name."""
 
 
+@functools.cache
 def program(dtype: torch.dtype) -> str:
     """The source for images of a dtype; :func:`definitions` gives its macros."""
     return _CONVERSIONS[dtype] + SOURCE
@@ -364,19 +353,15 @@ def definitions(net: UNet, residual: bool) -> tuple[str, ...]:
     )
 
 
-@functools.cache
-def compiled(
-    device: torch.device, dtype: torch.dtype, options: tuple[str, ...], names: tuple[str, ...] = FORWARD
-) -> Launches:
+def compiled(device: torch.device, dtype: torch.dtype, options: tuple[str, ...]) -> Launches:
     """The kernels for a device, compiled on the first call.
 
     Args:
         device: CUDA device.
         dtype: dtype of images between the convolutions, float16 or bfloat16.
         options: see :func:`definitions`.
-        names: kernels to compile.
 
     Raises:
         BackendError: the kernels cannot be compiled or loaded.
     """
-    return {name: Kernel(program(dtype), name, device, options) for name in names}
+    return load_kernels(program(dtype), KERNELS, options, device)

@@ -19,9 +19,9 @@ from sundae_ns.rasterization.sharded import (
     Route,
     exchange,
     gather_cameras,
-    give_back,
     may_be_seen,
     plan_exchange,
+    swap,
 )
 from sundae_ns.rendering.source import (
     NEAR_PLANE,
@@ -126,7 +126,7 @@ class ShardedField:
         """Return the values to the ranks that hold the primitives, and add them view by view. Collective."""
         route = primitives.route
         assert route is not None
-        returned = give_back(values[:, None], route)[:, 0]
+        returned = swap(values[:, None], route.received, route.sent)[:, 0]
         by_view = zip(route.ids.split(route.sent), returned.split(route.sent))
         for ids, added in list(by_view)[: batch.num_views]:
             total[ids] += added

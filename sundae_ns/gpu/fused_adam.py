@@ -6,7 +6,6 @@ most of the GPU waits; here a block has 1,024.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from sundae_ns.gpu.nvrtc import Kernel, Launch
+from sundae_ns.gpu.nvrtc import load_kernels
 
 THREADS = 256
 PER_THREAD = 4
@@ -56,9 +55,8 @@ extern "C" __global__ void adam(int n, float* __restrict__ value, const float* _
 """
 
 
-def definitions() -> tuple[str, ...]:
-    """Compiler options of :data:`SOURCE`."""
-    return (f"-DPER_THREAD={PER_THREAD}",)
+OPTIONS = (f"-DPER_THREAD={PER_THREAD}",)
+"""Compiler options of :data:`SOURCE`."""
 
 
 class Update(NamedTuple):
@@ -109,15 +107,7 @@ def adam_step(groups: Sequence[tuple[Mapping[str, Any], Sequence[Update]]], rate
 
 
 @torch.no_grad()
-def adam(
-    update: Update,
-    rate: Tensor,
-    skip: Tensor | None,
-    *,
-    betas: tuple[float, float],
-    eps: float,
-    launch: Launch | None = None,
-) -> None:
+def adam(update: Update, rate: Tensor, skip: Tensor | None, *, betas: tuple[float, float], eps: float) -> None:
     """Update a parameter in place (Kingma & Ba 2015), as ``torch.optim.Adam`` does without weight decay.
 
     Args:
@@ -126,17 +116,11 @@ def adam(
         skip: not 0 to change nothing ``[]``; None for 0.
         betas: decay rates of both means.
         eps: added to the root of the mean of squares.
-        launch: kernel to use instead of the one compiled for the device.
 
     Raises:
         BackendError: the kernel cannot be compiled or loaded.
     """
-    launch = _compiled(update.value.device) if launch is None else launch
+    launch = load_kernels(SOURCE, ("adam",), OPTIONS, update.value.device, THREADS)["adam"]
     logs = [math.log(beta) if beta > 0 else -math.inf for beta in betas]
     count = update.value.numel()
     launch(-(-count // PER_THREAD), [count, *update, rate, skip, *betas, *logs, eps])
-
-
-@functools.cache
-def _compiled(device: torch.device) -> Kernel:
-    return Kernel(SOURCE, "adam", device, definitions(), THREADS)

@@ -9,15 +9,14 @@ The source is plain C++ except for the thread indices, so the tests compile the 
 
 from __future__ import annotations
 
-import functools
 import math
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError, SundaeError
-from sundae_ns.gpu.nvrtc import Kernel, Launch
+from sundae_ns.gpu.nvrtc import Launch, load_kernels
 
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
@@ -179,29 +178,26 @@ extern "C" __global__ void compare_backward(int height, int width, const float* 
 """
 
 
-class Launches(NamedTuple):
-    """The two kernels on one device."""
+_window = [math.exp(-((k - SSIM_WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(SSIM_WINDOW)]
+_WEIGHTS = ",".join(f"{weight / sum(_window):.9e}f" for weight in _window)
 
-    compare: Launch
-    compare_backward: Launch
-
-
-def definitions() -> tuple[str, ...]:
-    """Compiler options of :data:`SOURCE`."""
-    window = [math.exp(-((k - SSIM_WINDOW // 2) ** 2) / (2 * SIGMA**2)) for k in range(SSIM_WINDOW)]
-    weights = ",".join(f"{w / sum(window):.9e}f" for w in window)
-    sizes = (f"-D{name}={globals()[name]}" for name in ("TILE_WIDTH", "TILE_HEIGHT", "THREADS"))
-    return (*sizes, f"-DWINDOW={SSIM_WINDOW}", f"-DWEIGHTS={weights}")
+OPTIONS = (
+    f"-DWINDOW={SSIM_WINDOW}",
+    f"-DTILE_WIDTH={TILE_WIDTH}",
+    f"-DTILE_HEIGHT={TILE_HEIGHT}",
+    f"-DTHREADS={THREADS}",
+    f"-DWEIGHTS={_WEIGHTS}",
+)
+"""Compiler options of :data:`SOURCE`."""
 
 
-@functools.cache
-def loss_kernels(device: torch.device) -> Launches:
+def loss_kernels(device: torch.device) -> dict[str, Launch]:
     """The kernels for a CUDA device, compiled on the first call.
 
     Raises:
         BackendError: the kernels cannot be compiled or loaded.
     """
-    return Launches(*(Kernel(SOURCE, name, device, definitions(), THREADS) for name in Launches._fields))
+    return load_kernels(SOURCE, ("compare", "compare_backward"), OPTIONS, device, THREADS)
 
 
 def fused_loss(
@@ -209,7 +205,6 @@ def fused_loss(
     target: Tensor,
     weight: float,
     base: Tensor | None = None,
-    launches: Launches | None = None,
     l1_weight: float | None = None,
 ) -> tuple[Tensor, Tensor | None]:
     """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, and L1 of its base colours; differentiable scalars.
@@ -221,7 +216,6 @@ def fused_loss(
         target: target image, as ``image``; gets no gradient.
         weight: weight of 1 - SSIM, in [0, 1].
         base: base colours to compare with the target, as ``image``, or None.
-        launches: kernels to use instead of those compiled for the device.
         l1_weight: weight of L1; None for ``1 - weight``.
 
     Returns:
@@ -238,9 +232,8 @@ def fused_loss(
                 f"the fused loss cannot compare {each.dtype} {list(each.shape)} with {target.dtype} "
                 f"{list(target.shape)}; pass float32 [H, W, 3] of one size, at least {SSIM_WINDOW} px per side"
             )
-    launches = loss_kernels(image.device) if launches is None else launches
     weights = (1 - weight if l1_weight is None else l1_weight, weight)
-    return cast("tuple[Tensor, Tensor | None]", _Loss.apply(image, base, target.detach(), weights, launches))
+    return cast("tuple[Tensor, Tensor | None]", _Loss.apply(image, base, target.detach(), weights))
 
 
 def _threads(image: Tensor) -> int:
@@ -252,7 +245,7 @@ def _threads(image: Tensor) -> int:
 class _Loss(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, image: Tensor, base: Tensor | None, target: Tensor, weights: tuple[float, float], launches: Launches
+        ctx: Any, image: Tensor, base: Tensor | None, target: Tensor, weights: tuple[float, float]
     ) -> tuple[Tensor, Tensor | None]:
         image, target = image.contiguous(), target.contiguous()
         base = None if base is None else base.contiguous()
@@ -263,9 +256,9 @@ class _Loss(torch.autograd.Function):
         base_losses = None if base is None else torch.empty_like(losses)
         scales = (weights[0] / image.numel(), weights[1] / windows, 1 / image.numel())
         arguments = [height, width, image, base, target, *scales, derivatives, losses, base_losses]
-        launches.compare(_threads(image), arguments)
+        loss_kernels(image.device)["compare"](_threads(image), arguments)
         ctx.save_for_backward(image, base, target, derivatives)
-        ctx.launches, ctx.scales = launches, scales
+        ctx.scales = scales
         return losses.sum(), None if base_losses is None else base_losses.sum()
 
     @staticmethod
@@ -280,5 +273,5 @@ class _Loss(torch.autograd.Function):
         grad_image, grad_base = torch.empty_like(image), None if base is None else torch.empty_like(base)
         height, width, _ = image.shape
         arguments = [height, width, image, base, target, *ctx.scales, derivatives, grad_loss, grad_base_loss]
-        ctx.launches.compare_backward(_threads(image), [*arguments, grad_image, grad_base])
-        return grad_image, grad_base, None, None, None
+        loss_kernels(image.device)["compare_backward"](_threads(image), [*arguments, grad_image, grad_base])
+        return grad_image, grad_base, None, None

@@ -102,6 +102,18 @@ class Kernel:
 
 
 @functools.cache
+def load_kernels(
+    source: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device, block: int = 128
+) -> dict[str, Launch]:
+    """Kernels of one source by name, compiled on the first call; arguments are those of :class:`Kernel`.
+
+    Raises:
+        BackendError: the kernels cannot be compiled or loaded.
+    """
+    return {name: Kernel(source, name, device, options, block) for name in names}
+
+
+@functools.cache
 def _module(source: str, options: tuple[str, ...], device: torch.device) -> c_void_p:
     """A compiled source, loaded once for all of its kernels: compiling takes up to a second."""
     major, minor = torch.cuda.get_device_capability(device)

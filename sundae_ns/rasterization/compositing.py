@@ -40,24 +40,6 @@ _SMALL_BATCH = 2**15  # ... except in batches so small that the cost per call ou
 _FAINTEST = -20.0  # lower bound of exponents, far below log(1 / 255): exp() is ten times slower on denormals
 
 
-def composite(
-    means2d: Tensor,  # [1, N, 2]
-    conics: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, C]
-    lists: TileLists,
-    width: int,
-    height: int,
-    absgrad: bool,
-) -> tuple[Tensor, Tensor]:
-    """Blend to an image ``[H, W, C]`` and its alpha ``[H, W, 1]``; once differentiable in the four tensors.
-
-    With ``absgrad`` the backward pass sets ``means2d.absgrad`` ``[1, N, 2]``: the absolute gradient of each pixel with
-    respect to the centre, summed over the pixels (Ye et al., "AbsGS", 2024).
-    """
-    return _Composite.apply(means2d, conics, opacities, colors, lists, width, height, absgrad)
-
-
 @dataclass(frozen=True)
 class _Batch:
     """One segment of the lists of several tiles."""
@@ -70,15 +52,7 @@ class _Batch:
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        means2d: Tensor,
-        conics: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        lists: TileLists,
-        width: int,
-        height: int,
-        absgrad: bool,
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, lists: TileLists, absgrad: bool
     ) -> tuple[Tensor, Tensor]:
         basis = _pixel_basis(means2d)
         exponents = _exponents(_offsets(means2d, lists), conics, opacities, lists)
@@ -100,7 +74,7 @@ class _Composite(torch.autograd.Function):
                 tiles, transmittance = tiles[unfinished], behind[unfinished]
         ctx.save_for_backward(means2d, conics, opacities, colors)
         ctx.lists, ctx.batches, ctx.absgrad = lists, batches, absgrad
-        image = _from_tiles(blended, lists, width, height)
+        image = _from_tiles(blended, lists)
         return image[..., :-1].contiguous(), image[..., -1:].contiguous()
 
     @staticmethod
@@ -143,12 +117,21 @@ class _Composite(torch.autograd.Function):
             means2d.absgrad = _sum_by_owner(absolute[:-1], lists, means2d)[None]
         grad_colors = grad_channels[:-1, :-1] if needs_colors else None
         if not needs_geometry:
-            return None, None, None, grad_colors, None, None, None, None
+            return None, None, None, grad_colors, None, None
         shape = _shape_gradients(moments[:-1], offsets, conics[lists.gaussian_ids])
         summed = _sum_by_owner(shape, lists, means2d)
         # Opacities below 1/255 are in no list, so the clamp changes no gradient.
         grad_opacities = summed[:, 5] / opacities.clamp(min=0.5 * MIN_ALPHA)
-        return summed[None, :, :2], summed[:, 2:5], grad_opacities, grad_colors, None, None, None, None
+        return summed[None, :, :2], summed[:, 2:5], grad_opacities, grad_colors, None, None
+
+
+composite = _Composite.apply
+"""Blend to an image ``[H, W, C]`` and its alpha ``[H, W, 1]``; once differentiable.
+
+It takes centres ``[1, N, 2]`` in pixels, conics ``[N, 3]``, opacities ``[N]``, colours ``[N, C]``, the tile
+lists, and ``absgrad``. With it the backward pass sets ``absgrad`` ``[1, N, 2]`` of the centres: the absolute gradient
+of each pixel with respect to the centre, summed over the pixels (Ye et al., "AbsGS", 2024).
+"""
 
 
 def _groups(lists: TileLists) -> Iterator[Tensor]:
@@ -266,15 +249,14 @@ def _sum_by_owner(values: Tensor, lists: TileLists, means2d: Tensor) -> Tensor:
     return values.new_zeros(means2d.shape[1], values.shape[1]).index_add_(0, lists.gaussian_ids, values)
 
 
-def _from_tiles(tiles: Tensor, lists: TileLists, width: int, height: int) -> Tensor:
+def _from_tiles(tiles: Tensor, lists: TileLists) -> Tensor:
     """Assemble tiles ``[tiles, P, D]`` to an image ``[H, W, D]``."""
     grid = tiles.reshape(lists.rows, lists.columns, TILE, TILE, -1).transpose(1, 2)
-    return grid.reshape(lists.rows * TILE, lists.columns * TILE, -1)[:height, :width]
+    return grid.reshape(lists.rows * TILE, lists.columns * TILE, -1)[: lists.height, : lists.width]
 
 
 def _to_tiles(image: Tensor, lists: TileLists) -> Tensor:
     """Cut an image ``[H, W, D]`` into tiles ``[tiles, P, D]``, zero outside the image."""
-    height, width, depth = image.shape
-    padded = pad(image, (0, 0, 0, lists.columns * TILE - width, 0, lists.rows * TILE - height))
-    grid = padded.reshape(lists.rows, TILE, lists.columns, TILE, depth).transpose(1, 2)
-    return grid.reshape(-1, _PIXELS, depth)
+    right, bottom = lists.columns * TILE - lists.width, lists.rows * TILE - lists.height
+    grid = pad(image, (0, 0, 0, right, 0, bottom)).reshape(lists.rows, TILE, lists.columns, TILE, -1).transpose(1, 2)
+    return grid.reshape(-1, _PIXELS, image.shape[2])

@@ -8,14 +8,13 @@ already multiplied with the gradient of the pixel, so a thread keeps one number 
 
 from __future__ import annotations
 
-import functools
-from typing import Any, NamedTuple, cast
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import SundaeError
-from sundae_ns.gpu.nvrtc import Argument, Kernel, Launch
+from sundae_ns.gpu.nvrtc import Argument, load_kernels
 from sundae_ns.rasterization.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
 from sundae_ns.rasterization.gsplat_tiles import BOX, ROUNDING, TILE, TileLists
 from sundae_ns.rasterization.tiles import MIN_ALPHA
@@ -271,26 +270,13 @@ extern "C" __global__ void blend_backward(LISTS, FIELD, const float* __restrict_
 )
 
 
-class Launches(NamedTuple):
-    """Both kernels on one device, for one number of channels."""
-
-    blend: Launch
-    blend_backward: Launch
-
-
-def definitions(channels: int, *, absgrad: bool, lanes: int = LANES) -> tuple[str, ...]:
-    """Compiler options of :data:`SOURCE`.
-
-    Args:
-        channels: number of channels to blend.
-        absgrad: whether absolute gradients of the centres are summed too.
-        lanes: threads of a warp.
-    """
+def definitions(channels: int, *, absgrad: bool) -> tuple[str, ...]:
+    """Compiler options of :data:`SOURCE` for a number of channels, with or without absolute gradients of the centres."""
     values = channels + (8 if absgrad else 6)
     numbers = {
         "TILE": TILE,
         "THREADS": THREADS,
-        "LANES": lanes,
+        "LANES": LANES,
         "CHANNELS": channels,
         "PADDED": -(-channels // 4) * 4,
         "VALUES": values,
@@ -309,54 +295,12 @@ def definitions(channels: int, *, absgrad: bool, lanes: int = LANES) -> tuple[st
     )
 
 
-def blend(
-    means2d: Tensor,
-    conics: Tensor,
-    colors: Tensor,
-    opacities: Tensor,
-    lists: TileLists,
-    width: int,
-    height: int,
-    *,
-    absgrad: bool = False,
-) -> tuple[Tensor, Tensor]:
-    """Blend to an image ``[1, H, W, C]`` and its alpha ``[1, H, W, 1]``; once differentiable in the first four.
-
-    Args:
-        means2d: centres in pixels ``[1, N, 2]``; all float32 on a CUDA device. With ``absgrad`` the backward pass sets
-            ``means2d.absgrad`` ``[1, N, 2]``, the absolute gradients of the pixels, summed (AbsGS).
-        conics: inverse covariances on the screen, upper triangle ``[1, N, 3]``.
-        colors: values to blend ``[1, N, C]``.
-        opacities: ``[1, N]``.
-        lists: of the image's tiles; those of further tiles are ignored.
-        width: image width in pixels.
-        height: image height in pixels.
-        absgrad: see ``means2d``.
-
-    Raises:
-        BackendError: the kernels cannot be compiled or loaded.
-    """
-    launches = _compiled(means2d.device, colors.shape[-1], absgrad)
-    return cast(
-        "tuple[Tensor, Tensor]",
-        _Blended.apply(means2d, conics, colors, opacities, lists, width, height, absgrad, launches),
-    )
-
-
-class _Blended(torch.autograd.Function):
+class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any,
-        means2d: Tensor,
-        conics: Tensor,
-        colors: Tensor,
-        opacities: Tensor,
-        lists: TileLists,
-        width: int,
-        height: int,
-        absgrad: bool,
-        launches: Launches,
+        ctx: Any, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, lists: TileLists, absgrad: bool
     ) -> tuple[Tensor, Tensor]:
+        width, height = lists.width, lists.height
         field = [value.contiguous() for value in (means2d, conics, colors, opacities)]
         image = colors.new_empty(1, height, width, colors.shape[-1])
         alphas = colors.new_empty(1, height, width, 1)
@@ -364,30 +308,34 @@ class _Blended(torch.autograd.Function):
         stops = torch.empty(height, width, dtype=torch.int32, device=colors.device)
         tiles = -(-width // TILE) * -(-height // TILE)
         ctx.place = [width, height, tiles, lists.starts.numel(), len(lists.primitives), lists.starts, lists.primitives]
-        launches.blend(tiles * THREADS, [*ctx.place, *field, image, alphas, lefts, stops])
+        options = definitions(colors.shape[-1], absgrad=absgrad)
+        ctx.kernels = load_kernels(SOURCE, ("blend", "blend_backward"), options, colors.device, THREADS)
+        ctx.kernels["blend"](tiles * THREADS, [*ctx.place, *field, image, alphas, lefts, stops])
         ctx.save_for_backward(means2d, *field, lefts, stops)
-        ctx.absgrad, ctx.launches = absgrad, launches
+        ctx.absgrad = absgrad
         return image, alphas
 
     @staticmethod
-    def backward(ctx: Any, grad_image: Tensor, grad_alphas: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(  # type: ignore[override]
+        ctx: Any, grad_image: Tensor, grad_alphas: Tensor
+    ) -> tuple[Tensor | None, ...]:
         if torch.is_grad_enabled():  # create_graph=True: the kernel would be missing from that graph
             raise SundaeError("this blending has no second derivative; use the reference rasteriser")
-        centers, means2d, conics, colors, opacities, lefts, stops = ctx.saved_tensors
-        grad_means, grad_conics, grad_colors, grad_opacities = (
-            torch.zeros_like(value) for value in (means2d, conics, colors, opacities)
-        )
-        absolute = torch.zeros_like(means2d) if ctx.absgrad else None
-        arguments: list[Argument] = [*ctx.place, means2d, conics, colors, opacities, lefts, stops]
-        arguments += [grad_image.contiguous(), grad_alphas.contiguous()]
-        grads = [grad_means, grad_conics, grad_colors, grad_opacities, absolute]
-        ctx.launches.blend_backward(ctx.place[2] * THREADS, [*arguments, *grads])
+        centers, *saved = ctx.saved_tensors
+        grads = [torch.zeros_like(value) for value in saved[:4]]
+        absolute = torch.zeros_like(saved[0]) if ctx.absgrad else None
+        arguments: list[Argument] = [*ctx.place, *saved, grad_image.contiguous(), grad_alphas.contiguous()]
+        ctx.kernels["blend_backward"](ctx.place[2] * THREADS, [*arguments, *grads, absolute])
         if ctx.absgrad:
             centers.absgrad = absolute
-        return grad_means, grad_conics, grad_colors, grad_opacities, None, None, None, None, None
+        return *grads, None, None
 
 
-@functools.cache
-def _compiled(device: torch.device, channels: int, absgrad: bool) -> Launches:
-    options = definitions(channels, absgrad=absgrad)
-    return Launches(*(Kernel(SOURCE, name, device, options, THREADS) for name in Launches._fields))
+blend = _Blend.apply
+"""Blend splats to an image ``[1, H, W, C]`` and its alpha ``[1, H, W, 1]``; once differentiable.
+
+It takes centres ``[1, N, 2]`` in pixels, conics ``[1, N, 3]``, colours ``[1, N, C]`` and opacities ``[1, N]``, all float32
+on a CUDA device, the tile lists, and ``absgrad``. Lists of tiles outside the image are ignored. With ``absgrad`` the
+backward pass sets ``absgrad`` ``[1, N, 2]`` of the centres: the absolute gradients of the pixels, summed (AbsGS). It
+raises BackendError if the kernels cannot be compiled or loaded.
+"""

@@ -7,14 +7,13 @@ parameters. The formulas are those of :mod:`sundae_ns.rasterization.harmonics`.
 
 from __future__ import annotations
 
-import functools
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from sundae_ns.errors import SundaeError
-from sundae_ns.gpu.nvrtc import Argument, Kernel, Launch
+from sundae_ns.gpu.nvrtc import Argument, Launch, load_kernels
 
 PER_BLOCK = 128
 """Primitives of a block of threads, which reads and writes their coefficients as one piece."""
@@ -153,55 +152,36 @@ extern "C" __global__ void harmonic_colors_backward(
 MOST_REST = 72
 """Numbers of a primitive's coefficients beyond the first, of SH degree 4."""
 
-
-class Launches(NamedTuple):
-    """Both kernels on one device."""
-
-    harmonic_colors: Launch
-    harmonic_colors_backward: Launch
+OPTIONS = (f"-DPER_BLOCK={PER_BLOCK}", f"-DMOST_REST={MOST_REST}")
+"""Compiler options of :data:`SOURCE`."""
 
 
-def definitions() -> tuple[str, ...]:
-    """Compiler options of :data:`SOURCE`."""
-    return f"-DPER_BLOCK={PER_BLOCK}", f"-DMOST_REST={MOST_REST}"
+def harmonic_colors(degree: int, means: Tensor, center: Tensor, features_dc: Tensor, features_rest: Tensor) -> Tensor:
+    """See :func:`sundae_ns.rasterization.harmonic_colors`; differentiable once, but not in ``center``.
 
-
-def harmonic_colors(
-    degree: int,
-    means: Tensor,
-    center: Tensor,
-    features_dc: Tensor,
-    features_rest: Tensor,
-    launches: Launches | None = None,
-) -> Tensor:
-    """Harmonics plus 0.5, at least 0: colours ``[N, 3]``, differentiable once with respect to all but ``center``.
-
-    Args:
-        degree: 0 to 4.
-        means: centres, world units; float32 on a CUDA device ``[N, 3]``.
-        center: camera centre ``[3]``, or one for each primitive ``[N, 3]``.
-        features_dc: first coefficients ``[N, 3]``.
-        features_rest: the others ``[N, K - 1, 3]``.
-        launches: kernels to use instead of those compiled for the device.
+    All tensors are float32 on a CUDA device.
 
     Raises:
         BackendError: the kernels cannot be compiled or loaded.
     """
-    launches = _compiled(means.device) if launches is None else launches
-    return cast("Tensor", _Colors.apply(degree, means, center, features_dc, features_rest, launches))
+    return cast("Tensor", _Colors.apply(degree, means, center, features_dc, features_rest))
+
+
+def _kernels(device: torch.device) -> dict[str, Launch]:
+    return load_kernels(SOURCE, ("harmonic_colors", "harmonic_colors_backward"), OPTIONS, device, PER_BLOCK)
 
 
 class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, degree: int, means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, launches: Launches
+        ctx: Any, degree: int, means: Tensor, center: Tensor, dc: Tensor, rest: Tensor
     ) -> Tensor:
         means, center, dc, rest = (value.contiguous() for value in (means, center, dc, rest))
         colors = torch.empty_like(means)
         place: list[Argument] = [len(means), degree, means, center, int(center.ndim > 1)]
-        launches.harmonic_colors(colors.numel(), [*place, dc, rest, rest.shape[1], colors])
+        _kernels(means.device)["harmonic_colors"](colors.numel(), [*place, dc, rest, rest.shape[1], colors])
         ctx.save_for_backward(means, center, dc, rest, colors)
-        ctx.degree, ctx.launches = degree, launches
+        ctx.degree = degree
         return colors
 
     @staticmethod
@@ -213,10 +193,5 @@ class _Colors(torch.autograd.Function):
         place: list[Argument] = [len(means), ctx.degree, means, center, int(center.ndim > 1)]
         threads = -(-len(means) // PER_BLOCK) * PER_BLOCK
         arguments: list[Argument] = [*place, rest, rest.shape[1], colors, gradient.contiguous(), *grads]
-        ctx.launches.harmonic_colors_backward(threads, arguments)
-        return None, grads[0], None, grads[1], grads[2], None
-
-
-@functools.cache
-def _compiled(device: torch.device) -> Launches:
-    return Launches(*(Kernel(SOURCE, name, device, definitions(), PER_BLOCK) for name in Launches._fields))
+        _kernels(means.device)["harmonic_colors_backward"](threads, arguments)
+        return None, grads[0], None, grads[1], grads[2]

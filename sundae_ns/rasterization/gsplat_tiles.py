@@ -9,13 +9,12 @@ primitives are blended, and in which order, stays the same to the bit.
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
-from sundae_ns.gpu.nvrtc import Kernel
+from sundae_ns.gpu.nvrtc import load_kernels
 
 TILE = 16
 """Side of gsplat's tiles, pixels."""
@@ -192,6 +191,10 @@ class Capacity:
 class TileLists:
     """Lists of tiles in row-major order, each front to back, as gsplat's ``rasterize_to_pixels`` reads them."""
 
+    width: int
+    """Width of the image, pixels."""
+    height: int
+    """Height of the image, pixels."""
     starts: Tensor
     """Start of each tile's list, int32 ``[1, rows, columns]``."""
     primitives: Tensor
@@ -232,14 +235,14 @@ def tile_lists(
     device = means2d.device
     columns, rows = -(-width // TILE), -(-height // TILE)
     dtype = torch.int16 if columns * (rows + 1) <= torch.iinfo(torch.int16).max else torch.int32
-    count, fill = _compiled(device, dtype)
+    kernels = load_kernels(SOURCE, ("count_tiles", "list_tiles"), definitions(dtype), device)
     n = len(means2d)
     lanes = lanes_per_primitive(n)
     order = depths.argsort(stable=True)
     axes = 1 if radii.ndim == 1 else 2
     geometry = (n, lanes, order, means2d, conics, opacities, radii, axes, width, height, columns, rows)
     counts = torch.empty(n * lanes, dtype=torch.int32, device=device)
-    count(n * lanes, [*geometry, counts])
+    kernels["count_tiles"](n * lanes, [*geometry, counts])
     ends = counts.cumsum(0)
     capacity.needed.append(ends[-1])
     if capacity.pairs is None:
@@ -250,25 +253,19 @@ def tile_lists(
         pairs, below = capacity.pairs, 1
         tiles = torch.full((pairs,), columns * rows, dtype=dtype, device=device)
         primitives = torch.zeros(pairs, dtype=torch.int32, device=device)
-    fill(n * lanes, [*geometry, counts, ends, pairs, tiles, primitives])
+    kernels["list_tiles"](n * lanes, [*geometry, counts, ends, pairs, tiles, primitives])
     tiles, by_tile = torch.sort(tiles, stable=True)  # stable, so each list stays in order of depth
     numbers = torch.arange(columns * (rows + below), dtype=dtype, device=device)
     starts = torch.searchsorted(tiles, numbers, out_int32=True)
     shape = (1, rows + below, columns)
     # Gradients would walk through the unused pairs, so their tiles are marked.
     drawn = (numbers < columns * rows).view(shape) if below else None
-    return TileLists(starts.view(shape), primitives.index_select(0, by_tile), drawn)
+    return TileLists(width, height, starts.view(shape), primitives.index_select(0, by_tile), drawn)
 
 
 def lanes_per_primitive(n: int) -> int:
     """Threads that share the rows of tiles of a primitive: few primitives may each be as large as the image."""
     return 32 if n < 2**17 else 8
-
-
-@functools.cache
-def _compiled(device: torch.device, dtype: torch.dtype) -> tuple[Kernel, Kernel]:
-    options = definitions(dtype)
-    return Kernel(SOURCE, "count_tiles", device, options), Kernel(SOURCE, "list_tiles", device, options)
 
 
 def definitions(dtype: torch.dtype) -> tuple[str, ...]:

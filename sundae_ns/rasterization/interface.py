@@ -55,7 +55,8 @@ def rasterize(
         DataError: A tensor has the wrong shape, dtype or device, or the image is empty.
     """
     n = means.shape[0]
-    _check_size(width, height)
+    if width < 1 or height < 1:
+        raise DataError(f"an image of {width}x{height} pixels is empty; width and height must be at least 1")
     _check_shape("means", means, (n, 3))
     _check_shape("quats", quats, (n, 4))
     _check_shape("scales", scales, (n, 3))
@@ -163,18 +164,13 @@ def blending_weights(
     """
     if pixels is not None:
         _check_shape("pixels", pixels, (height, width))
+    means, quats, scales, opacities, viewmat, K = (
+        value.detach() for value in (means, quats, scales, opacities, viewmat, K)
+    )
     with torch.enable_grad():
         ones = torch.ones_like(means[:, :1], requires_grad=True)
         image = rasterize(
-            means.detach(),
-            quats.detach(),
-            scales.detach(),
-            opacities.detach(),
-            ones,
-            viewmat.detach(),
-            K.detach(),
-            width,
-            height,
+            *(means, quats, scales, opacities, ones, viewmat, K, width, height),
             near_plane=near_plane,
             far_plane=far_plane,
             antialiased=antialiased,
@@ -182,11 +178,6 @@ def blending_weights(
         ).colors
         (weights,) = torch.autograd.grad(image.sum() if pixels is None else (image[..., 0] * pixels).sum(), ones)
     return weights[:, 0]
-
-
-def _check_size(width: int, height: int) -> None:
-    if width < 1 or height < 1:
-        raise DataError(f"an image of {width}x{height} pixels is empty; width and height must be at least 1")
 
 
 def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.rasterization.types import Inputs
 
 BLUR = 0.3
 """Variance in square pixels added to each footprint."""
@@ -38,32 +39,23 @@ def camera_center(viewmat: Tensor) -> Tensor:
     return -viewmat[:3, :3].T @ viewmat[:3, 3]
 
 
-def project(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    viewmat: Tensor,  # [4, 4]
-    K: Tensor,  # [3, 3]
-    width: int,
-    height: int,
-    near_plane: float,
-    far_plane: float,
-) -> Projection:
-    """Project primitives into a pinhole view; arguments as in :func:`sundae_ns.rasterization.rasterize`."""
-    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
-    camera = means @ rotation.T + translation
+def project(inputs: Inputs) -> Projection:
+    """Project primitives into a pinhole view."""
+    rotation, translation = inputs.viewmat[:3, :3], inputs.viewmat[:3, 3]
+    camera = inputs.means @ rotation.T + translation
     z = camera[:, 2]
-    in_range = (z >= near_plane) & (z <= far_plane) & (z > 0)
+    in_range = (z >= inputs.near_plane) & (z <= inputs.far_plane) & (z > 0)
     # Replace culled centres first: where() alone would still pass NaN from 1 / z to the gradients.
     camera = torch.where(in_range[:, None], camera, camera.new_tensor([0.0, 0.0, 1.0]))
     x, y, z = camera.unbind(-1)
 
+    K, width, height = inputs.K, inputs.width, inputs.height
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=-1)
 
     # A 3x3 root of the covariance maps the unit sphere to the primitive; the root's two screen rows map it to the
     # footprint.
-    root = (rotation @ rotation_matrices(quats)) * scales[:, None, :]
+    root = (rotation @ rotation_matrices(inputs.quats)) * inputs.scales[:, None, :]
     slope_x = _limit_slope(x / z, fx, cx, width)
     slope_y = _limit_slope(y / z, fy, cy, height)
     row_x = (fx / z)[:, None] * (root[:, 0] - slope_x[:, None] * root[:, 2])

@@ -29,36 +29,37 @@ class ReferenceBackend:
 
     def rasterize(self, inputs: Inputs) -> Rasterization:
         """Render one view."""
-        width, height = inputs.width, inputs.height
+        projection = self._project(inputs)
         opacities, colors = inputs.opacities, inputs.colors
-        projection = self._project(
-            *(inputs.means, inputs.quats, inputs.scales, inputs.viewmat, inputs.K, width, height),
-            *(inputs.near_plane, inputs.far_plane),
-        )
         if inputs.antialiased:
             opacities = opacities * projection.compensations
         if inputs.render_depth:
             colors = torch.cat([colors, projection.depths[:, None]], dim=-1)
         means2d = projection.means2d[None]
-        lists = self._build_lists(projection, opacities, width, height)
-        image, alpha = self._composite(
-            means2d, projection.conics, opacities, colors, lists, width, height, inputs.absgrad
-        )
-        depth = None
-        if inputs.render_depth:
-            image, depth = image[..., :-1], image[..., -1:] / alpha.clamp(min=_SMALLEST_ALPHA)
-        radii = projection.radii
-        return Rasterization(
-            colors=image,
-            depth=depth,
-            alpha=alpha,
-            radii=radii,
-            info=strategy_info(means2d, _per_axis(radii)[None], width, height),
-        )
+        lists = self._build_lists(projection, opacities, inputs.width, inputs.height)
+        image, alpha = self._composite(means2d, projection.conics, opacities, colors, lists, inputs.absgrad)
+        return finished(image, alpha, means2d, _per_axis(projection.radii)[None], inputs)
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
         """Sum of harmonics ``[N, 3]`` for directions ``[N, 3]`` (not zero) and coefficients ``[N, K, 3]``."""
         return evaluate_harmonics(degree, directions, coeffs)
+
+
+def finished(image: Tensor, alpha: Tensor, means2d: Tensor, radii: Tensor, inputs: Inputs) -> Rasterization:
+    """The result of a backend.
+
+    Args:
+        image: Blended channels ``[H, W, C]``; the last is camera z if depth was requested.
+        alpha: Accumulated opacity ``[H, W, 1]``.
+        means2d: Centres ``[1, N, 2]``.
+        radii: ``[1, N]``, or one per axis ``[1, N, 2]``.
+        inputs: What was rendered.
+    """
+    depth = None
+    if inputs.render_depth:
+        image, depth = image[..., :-1], image[..., -1:] / alpha.clamp(min=_SMALLEST_ALPHA)
+    info = strategy_info(means2d, radii, inputs.width, inputs.height)
+    return Rasterization(colors=image, depth=depth, alpha=alpha, radii=largest_axis(radii[0]), info=info)
 
 
 def _per_axis(radii: Tensor) -> Tensor:

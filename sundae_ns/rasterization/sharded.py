@@ -215,17 +215,3 @@ def exchange(rows: Tensor, route: Route) -> Tensor:
         ``[M, D]``, in order of the source rank, and within each in the order of its shard.
     """
     return _Exchange.apply(rows, route)  # type: ignore[no-untyped-call]
-
-
-@torch.no_grad()
-def give_back(values: Tensor, route: Route) -> Tensor:
-    """Send values of received rows back to their owners. Collective.
-
-    Args:
-        values: in the order of the result of :func:`exchange` ``[M, D]``.
-        route: route of that exchange.
-
-    Returns:
-        ``[S, D]`` in the order of ``route.ids``, undivided.
-    """
-    return swap(values, route.received, route.sent)

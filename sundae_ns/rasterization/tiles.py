@@ -29,6 +29,8 @@ ROUNDING = 1e-3  # slack on exponents, so that rounding never drops a primitive 
 class TileLists:
     """Pairs of a tile and a primitive, sorted by tile (row-major), then by depth, then by index."""
 
+    width: int  # of the image, pixels
+    height: int
     columns: int
     rows: int
     gaussian_ids: Tensor  # [L], int64
@@ -71,7 +73,7 @@ def build_tile_lists(projection: Projection, opacities: Tensor, width: int, heig
     tile_ids, order = torch.sort(cells.index_select(0, touches), stable=True)
     gaussian_ids = ids.index_select(0, owner.index_select(0, touches.index_select(0, order)))
     lengths = torch.bincount(tile_ids, minlength=columns * rows)
-    return TileLists(columns, rows, gaussian_ids, tile_ids, lengths.cumsum(0) - lengths, lengths)
+    return TileLists(width, height, columns, rows, gaussian_ids, tile_ids, lengths.cumsum(0) - lengths, lengths)
 
 
 def tile_centres(tile_ids: Tensor, columns: int) -> Tensor:

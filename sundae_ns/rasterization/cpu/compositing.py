@@ -45,49 +45,17 @@ _MOMENTS = 8  # sums per primitive and tile after the channels: six moments, two
 _MIN_PER_THREAD_TO_SUM = 5_000  # primitives
 
 
-def composite(
-    means2d: Tensor,  # [1, N, 2]
-    conics: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, C]
-    lists: Lists,
-    width: int,
-    height: int,
-    absgrad: bool,
-) -> tuple[Tensor, Tensor]:
-    """As :func:`sundae_ns.rasterization.compositing.composite`; the geometry is read from the lists."""
-    return _Composite.apply(means2d, conics, opacities, colors, lists, width, height, absgrad)
-
-
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        means2d: Tensor,
-        conics: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        lists: Lists,
-        width: int,
-        height: int,
-        absgrad: bool,
+        ctx: Any, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, lists: Lists, absgrad: bool
     ) -> tuple[Tensor, Tensor]:
-        image = np.zeros((height, width, colors.shape[1]), lists.table.dtype)
-        alpha = np.zeros((height, width, 1), lists.table.dtype)
-        tiles = lists.columns * lists.rows
-        transmittances = np.empty((tiles, _PIXELS), lists.table.dtype)
-        last = np.empty((tiles, _PIXELS), np.int32)
-        parallel_for(
-            _blend,
-            len(lists.longest_first),
-            *lists.for_blending(),
-            as_array(colors),
-            image,
-            alpha,
-            transmittances,
-            last,
-            min_per_thread=_MIN_PER_THREAD,
-        )
+        dtype, tiles = lists.table.dtype, lists.columns * lists.rows
+        image = np.zeros((lists.height, lists.width, colors.shape[1]), dtype)
+        alpha = np.zeros((lists.height, lists.width, 1), dtype)
+        transmittances, last = np.empty((tiles, _PIXELS), dtype), np.empty((tiles, _PIXELS), np.int32)
+        arguments = (lists.for_blending(), as_array(colors), image, alpha, transmittances, last)
+        parallel_for(_blend, len(lists.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
         ctx.save_for_backward(means2d, conics, opacities, colors)
         ctx.lists, ctx.transmittances, ctx.last, ctx.absgrad = lists, transmittances, last, absgrad
         return torch.from_numpy(image), torch.from_numpy(alpha)
@@ -101,40 +69,23 @@ class _Composite(torch.autograd.Function):
         absgrad = ctx.absgrad and needs_geometry
         padded = -(-colors.shape[1] // _CHANNEL_GROUP) * _CHANNEL_GROUP
         parts = np.empty((len(lists.slots), padded + _MOMENTS), lists.table.dtype)
-        parallel_for(
-            _blend_backward,
-            len(lists.longest_first),
-            *lists.for_blending(),
-            as_array(colors),
-            lists.slots,
-            ctx.transmittances,
-            ctx.last,
-            as_array(grad_image),
-            as_array(grad_alpha),
-            needs_geometry,
-            needs_colors,
-            absgrad,
-            parts,
-            min_per_thread=_MIN_PER_THREAD,
-        )
-        outputs = [np.zeros(value.shape, lists.table.dtype) for value in ctx.saved_tensors]
+        blended = (as_array(colors), lists.slots, ctx.transmittances, ctx.last)
+        gradients, needs = (as_array(grad_image), as_array(grad_alpha)), (needs_geometry, needs_colors, absgrad)
+        arguments = (lists.for_blending(), blended, gradients, needs, parts)
+        parallel_for(_blend_backward, len(lists.longest_first), *arguments, min_per_thread=_MIN_PER_THREAD)
+        outputs = tuple(np.zeros(value.shape, lists.table.dtype) for value in ctx.saved_tensors)
         absolute_grads = np.zeros(means2d.shape if absgrad else (0, 0, 0), lists.table.dtype)
-        parallel_for(
-            _sum_slots,
-            len(lists.ids),
-            lists.ids,
-            lists.first_slots,
-            lists.table,
-            parts,
-            *outputs,
-            absolute_grads,
-            min_per_thread=_MIN_PER_THREAD_TO_SUM,
-        )
+        summed = (lists.ids, lists.first_slots, lists.table, parts, outputs, absolute_grads)
+        parallel_for(_sum_slots, len(lists.ids), *summed, min_per_thread=_MIN_PER_THREAD_TO_SUM)
         if ctx.absgrad:
             means2d.absgrad = torch.from_numpy(absolute_grads) if absgrad else torch.zeros_like(means2d)
         wanted = (needs_geometry, needs_geometry, needs_geometry, needs_colors)
         grads = (torch.from_numpy(output) if want else None for output, want in zip(outputs, wanted))
-        return *grads, None, None, None, None
+        return *grads, None, None
+
+
+composite = _Composite.apply
+"""As :data:`sundae_ns.rasterization.compositing.composite`; the geometry is read from the lists."""
 
 
 @inlined
@@ -154,21 +105,9 @@ def _pixel_centres(like: Any) -> Any:
 
 @compiled
 def _blend(
-    begin: int,
-    end: int,
-    columns: int,
-    tiles: Any,
-    starts: Any,
-    ranks: Any,
-    spans: Any,
-    ids: Any,
-    table: Any,
-    colors: Any,
-    image: Any,
-    alpha_image: Any,
-    transmittances: Any,
-    last: Any,
+    begin: int, end: int, lists: Any, colors: Any, image: Any, alpha_image: Any, transmittances: Any, last: Any
 ) -> None:
+    columns, tiles, starts, ranks, spans, ids, table = lists
     number = table.dtype.type
     height, width, channels = image.shape
     across, down = _pixel_centres(table)
@@ -232,28 +171,12 @@ def _any_unfinished(through: Any) -> bool:
 
 
 @compiled
-def _blend_backward(
-    begin: int,
-    end: int,
-    columns: int,
-    tiles: Any,
-    starts: Any,
-    ranks: Any,
-    spans: Any,
-    ids: Any,
-    table: Any,
-    colors: Any,
-    slots: Any,
-    transmittances: Any,
-    last: Any,
-    grad_image: Any,
-    grad_alpha: Any,
-    needs_geometry: bool,
-    needs_colors: bool,
-    absgrad: bool,
-    parts: Any,
-) -> None:
+def _blend_backward(begin: int, end: int, lists: Any, blended: Any, gradients: Any, needs: Any, parts: Any) -> None:
     """Write for each slot the gradients of channels, the moments of dL/de, and the absolute gradient of the centre."""
+    columns, tiles, starts, ranks, spans, ids, table = lists
+    colors, slots, transmittances, last = blended
+    grad_image, grad_alpha = gradients
+    needs_geometry, needs_colors, absgrad = needs
     number = table.dtype.type
     height, width, channels = grad_image.shape
     padded = parts.shape[1] - _MOMENTS
@@ -348,19 +271,10 @@ def _sum_channels(weights: Any, grads: Any, first: int, beyond: int, channel: in
 
 @compiled
 def _sum_slots(
-    begin: int,
-    end: int,
-    ids: Any,
-    first_slots: Any,
-    table: Any,
-    parts: Any,
-    grad_means2d: Any,
-    grad_conics: Any,
-    grad_opacities: Any,
-    grad_colors: Any,
-    absolute_grads: Any,
+    begin: int, end: int, ids: Any, first_slots: Any, table: Any, parts: Any, outputs: Any, absolute_grads: Any
 ) -> None:
     """Sum the slots of each primitive in float64, and convert moments to gradients."""
+    grad_means2d, grad_conics, grad_opacities, grad_colors = outputs
     channels, width = parts.shape[1] - _MOMENTS, parts.shape[1]
     sums = np.empty(width)
     for rank in range(begin, end):

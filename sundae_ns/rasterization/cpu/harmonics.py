@@ -15,15 +15,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sundae_ns.rasterization.cpu.parallel import as_array, compiled, parallel_for
+from sundae_ns.rasterization.harmonics import write_basis
 
 _MIN_PER_THREAD = 5_000  # primitives
 _SHORTEST = 1e-12  # lower bound of a direction's divisor, as in torch's normalize()
 _TERMS = 25  # of degree 4
 
-
-def evaluate_harmonics(degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
-    """As :func:`sundae_ns.rasterization.harmonics.evaluate_harmonics`, once differentiable."""
-    return _Harmonics.apply(degree, directions, coeffs)
+_write_basis = compiled(write_basis)
 
 
 class _Harmonics(torch.autograd.Function):
@@ -41,9 +39,13 @@ class _Harmonics(torch.autograd.Function):
     def backward(ctx: Any, grad_colors: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
         outputs = [torch.empty_like(value, memory_format=torch.contiguous_format) for value in inputs]
-        arrays = [as_array(value) for value in (*inputs, grad_colors, *outputs)]
-        parallel_for(_evaluate_backward, len(inputs[0]), ctx.degree, *arrays, min_per_thread=_MIN_PER_THREAD)
+        arguments = (*map(as_array, (*inputs, grad_colors)), tuple(map(as_array, outputs)))
+        parallel_for(_evaluate_backward, len(inputs[0]), ctx.degree, *arguments, min_per_thread=_MIN_PER_THREAD)
         return None, *(output if wanted else None for output, wanted in zip(outputs, ctx.needs_input_grad[1:]))
+
+
+evaluate_harmonics = _Harmonics.apply
+""":func:`sundae_ns.rasterization.harmonics.evaluate_harmonics`, once differentiable."""
 
 
 @compiled
@@ -63,15 +65,9 @@ def _evaluate(begin: int, end: int, degree: int, directions: Any, coeffs: Any, c
 
 @compiled
 def _evaluate_backward(
-    begin: int,
-    end: int,
-    degree: int,
-    directions: Any,
-    coeffs: Any,
-    grad_colors: Any,
-    grad_directions: Any,
-    grad_coeffs: Any,
+    begin: int, end: int, degree: int, directions: Any, coeffs: Any, grad_colors: Any, outputs: Any
 ) -> None:
+    grad_directions, grad_coeffs = outputs
     basis, gains = np.empty(_TERMS), np.empty(_TERMS)
     terms = (degree + 1) ** 2
     for i in range(begin, end):
@@ -101,34 +97,6 @@ def _unit(directions: Any, i: int) -> tuple[float, float, float, float]:
     x, y, z = float(directions[i, 0]), float(directions[i, 1]), float(directions[i, 2])
     length = max(sqrt(x * x + y * y + z * z), _SHORTEST)
     return x / length, y / length, z / length, length
-
-
-@compiled
-def _write_basis(degree: int, x: float, y: float, z: float, out: Any) -> None:
-    """Write the harmonics of a unit vector."""
-    out[0] = 0.5 / sqrt(pi)
-    if degree >= 1:
-        c = sqrt(3 / (4 * pi))
-        out[1], out[2], out[3] = -c * y, c * z, -c * x
-    xx, yy, zz = x * x, y * y, z * z
-    xy, cos2 = x * y, xx - yy
-    if degree >= 2:
-        c1, c0 = sqrt(15 / (4 * pi)), sqrt(5 / (16 * pi))
-        out[4], out[5], out[6], out[7] = c1 * xy, -c1 * y * z, c0 * (3 * zz - 1), -c1 * x * z
-        out[8] = 0.5 * c1 * cos2
-    cos3, sin3 = x * (xx - 3 * yy), y * (3 * xx - yy)
-    if degree >= 3:
-        c3, c2, c1, c0 = sqrt(35 / (32 * pi)), sqrt(105 / (16 * pi)), sqrt(21 / (32 * pi)), sqrt(7 / (16 * pi))
-        inner = 5 * zz - 1
-        out[9], out[10], out[11] = -c3 * sin3, 2 * c2 * xy * z, -c1 * y * inner
-        out[12], out[13], out[14], out[15] = c0 * z * (5 * zz - 3), -c1 * x * inner, c2 * z * cos2, -c3 * cos3
-    if degree >= 4:
-        c4, c3 = sqrt(315 / (256 * pi)), sqrt(315 / (32 * pi))
-        c2, c1, c0 = sqrt(45 / (64 * pi)), sqrt(45 / (32 * pi)), sqrt(9 / (256 * pi))
-        inner2, inner1 = 7 * zz - 1, z * (7 * zz - 3)
-        out[16], out[17], out[18], out[19] = 4 * c4 * xy * cos2, -c3 * z * sin3, 2 * c2 * xy * inner2, -c1 * y * inner1
-        out[20], out[21] = c0 * (zz * (35 * zz - 30) + 3), -c1 * x * inner1
-        out[22], out[23], out[24] = c2 * cos2 * inner2, -c3 * z * cos3, c4 * (x * cos3 - y * sin3)
 
 
 @compiled

@@ -17,34 +17,27 @@ from torch.autograd.function import once_differentiable
 from sundae_ns.rasterization.cpu.parallel import as_array, compiled, parallel_for
 from sundae_ns.rasterization.projection import BLUR, FOV_MARGIN, MAX_RADIUS, Projection
 from sundae_ns.rasterization.projection import project as project_with_autograd
+from sundae_ns.rasterization.types import Inputs
 
 _MIN_PER_THREAD = 2_500  # primitives: below 0.1 ms of work, waking a thread costs more than it saves
 _SHORTEST = 1e-12  # lower bound of a quaternion's divisor, as in torch's normalize()
 
 
-def project(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    viewmat: Tensor,  # [4, 4]
-    K: Tensor,  # [3, 3]
-    width: int,
-    height: int,
-    near_plane: float,
-    far_plane: float,
-) -> Projection:
+def project(inputs: Inputs) -> Projection:
     """As :func:`sundae_ns.rasterization.projection.project`, once differentiable.
 
     If a camera requires gradients, that function runs instead, because the loops here have none for cameras.
     """
-    if torch.is_grad_enabled() and (viewmat.requires_grad or K.requires_grad):
-        return project_with_autograd(means, quats, scales, viewmat, K, width, height, near_plane, far_plane)
-    lens = as_array(K)[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float64)
-    size = np.array([width, height], dtype=np.float64)
+    if torch.is_grad_enabled() and (inputs.viewmat.requires_grad or inputs.K.requires_grad):
+        return project_with_autograd(inputs)
+    means = inputs.means
+    view = as_array(inputs.viewmat.double())
+    lens = as_array(inputs.K)[[0, 1, 0, 1], [0, 1, 2, 2]].astype(np.float64)
+    size = np.array([inputs.width, inputs.height], dtype=np.float64)
     # Round the planes to the tensors' dtype, as torch does when it compares a tensor with a number.
-    planes = np.array([near_plane, far_plane], np.float32 if means.dtype == torch.float32 else np.float64)
-    planes = planes.astype(np.float64)
-    outputs = _Project.apply(means, quats, scales, viewmat, (lens, size, planes))
+    planes = np.array([inputs.near_plane, inputs.far_plane], np.float32 if means.dtype == torch.float32 else np.float64)
+    camera = (view, lens, size, planes.astype(np.float64))
+    outputs = _Project.apply(means, inputs.quats, inputs.scales, camera)
     means2d, conics, depths, compensations, covars2d, radii = outputs
     return Projection(means2d, covars2d, conics, depths, compensations, radii)
 
@@ -52,18 +45,17 @@ def project(
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, camera: tuple[Any, Any, Any]
+        ctx: Any, means: Tensor, quats: Tensor, scales: Tensor, camera: tuple[Any, Any, Any, Any]
     ) -> tuple[Tensor, ...]:
         n = means.shape[0]
         means2d, conics, covars2d = means.new_empty(n, 2), means.new_empty(n, 3), means.new_empty(n, 3)
         depths, compensations = means.new_empty(n), means.new_empty(n)
         radii = torch.empty(n, dtype=torch.int32)
         outputs = (means2d, conics, depths, compensations, covars2d, radii)
-        view = as_array(viewmat.double())
-        inputs = [as_array(value) for value in (means, quats, scales)]
-        parallel_for(_project, n, *inputs, view, *camera, *map(as_array, outputs), min_per_thread=_MIN_PER_THREAD)
+        arguments = (*map(as_array, (means, quats, scales)), camera, tuple(map(as_array, outputs)))
+        parallel_for(_project, n, *arguments, min_per_thread=_MIN_PER_THREAD)
         ctx.save_for_backward(means, quats, scales)
-        ctx.view, ctx.camera = view, camera
+        ctx.camera = camera
         ctx.mark_non_differentiable(covars2d, radii)
         return outputs
 
@@ -72,10 +64,10 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         inputs = ctx.saved_tensors
         outputs = [torch.empty_like(value, memory_format=torch.contiguous_format) for value in inputs]
-        arrays = [as_array(value) for value in (*inputs, *grads[:4])]
-        arguments = (*arrays, ctx.view, *ctx.camera, *map(as_array, outputs))
+        grads_in, grads_out = tuple(map(as_array, grads[:4])), tuple(map(as_array, outputs))
+        arguments = (*map(as_array, inputs), grads_in, ctx.camera, grads_out)
         parallel_for(_project_backward, inputs[0].shape[0], *arguments, min_per_thread=_MIN_PER_THREAD)
-        return outputs[0], outputs[1], outputs[2], None, None
+        return *outputs, None
 
 
 @compiled
@@ -104,56 +96,60 @@ def _slope_limits(lens: Any, size: Any) -> tuple[float, float, float, float]:
 
 
 @compiled
-def _project(
-    begin: int,
-    end: int,
-    means: Any,
-    quats: Any,
-    scales: Any,
-    view: Any,
-    lens: Any,
-    size: Any,
-    planes: Any,
-    means2d: Any,
-    conics: Any,
-    depths: Any,
-    compensations: Any,
-    covars2d: Any,
-    radii: Any,
-) -> None:
-    rotation, root, row_x, row_y = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3)
+def _to_camera(view: Any, means: Any, i: int) -> tuple[float, float, float]:
+    """Camera coordinates of a centre; z is rounded to the dtype of the centres, in which it is compared."""
+    x = view[0, 0] * means[i, 0] + view[0, 1] * means[i, 1] + view[0, 2] * means[i, 2] + view[0, 3]
+    y = view[1, 0] * means[i, 0] + view[1, 1] * means[i, 1] + view[1, 2] * means[i, 2] + view[1, 3]
+    z = view[2, 0] * means[i, 0] + view[2, 1] * means[i, 1] + view[2, 2] * means[i, 2] + view[2, 3]
+    return x, y, float(means.dtype.type(z))
+
+
+@compiled
+def _to_view(view: Any, rotation: Any, out: Any) -> None:
+    """Write a primitive's axes in camera coordinates ``[3, 3]``."""
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = view[r, 0] * rotation[0, c] + view[r, 1] * rotation[1, c] + view[r, 2] * rotation[2, c]
+
+
+@compiled
+def _footprint(row_x: Any, row_y: Any, normal: Any) -> tuple[float, float, float, float, float]:
+    """Covariance xx, xy, yy before the blur from the rows of its root, and its determinants before and after the blur.
+
+    ``normal`` receives the cross product of the rows.
+    """
+    xx = row_x[0] * row_x[0] + row_x[1] * row_x[1] + row_x[2] * row_x[2]
+    xy = row_x[0] * row_y[0] + row_x[1] * row_y[1] + row_x[2] * row_y[2]
+    yy = row_y[0] * row_y[0] + row_y[1] * row_y[1] + row_y[2] * row_y[2]
+    normal[0] = row_x[1] * row_y[2] - row_x[2] * row_y[1]
+    normal[1] = row_x[2] * row_y[0] - row_x[0] * row_y[2]
+    normal[2] = row_x[0] * row_y[1] - row_x[1] * row_y[0]
+    sharp_det = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+    return xx, xy, yy, sharp_det, sharp_det + BLUR * (xx + yy) + BLUR * BLUR
+
+
+@compiled
+def _project(begin: int, end: int, means: Any, quats: Any, scales: Any, camera: Any, outputs: Any) -> None:
+    view, lens, size, planes = camera
+    means2d, conics, depths, compensations, covars2d, radii = outputs
+    rotation, root, row_x, row_y, normal = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     min_x, max_x, min_y, max_y = _slope_limits(lens, size)
     for i in range(begin, end):
-        x = view[0, 0] * means[i, 0] + view[0, 1] * means[i, 1] + view[0, 2] * means[i, 2] + view[0, 3]
-        y = view[1, 0] * means[i, 0] + view[1, 1] * means[i, 1] + view[1, 2] * means[i, 2] + view[1, 3]
-        z = view[2, 0] * means[i, 0] + view[2, 1] * means[i, 1] + view[2, 2] * means[i, 2] + view[2, 3]
-        depths[i] = z
-        z = float(depths[i])
+        x, y, z = _to_camera(view, means, i)
         if not (z >= planes[0] and z <= planes[1] and z > 0):
             means2d[i], conics[i], covars2d[i] = 0, 0, 0
             depths[i], compensations[i], radii[i] = 0, 0, 0
             continue
         centre_x, centre_y = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
         _rotation(quats, i, rotation)
-        for r in range(3):
-            for c in range(3):
-                root[r, c] = (
-                    view[r, 0] * rotation[0, c] + view[r, 1] * rotation[1, c] + view[r, 2] * rotation[2, c]
-                ) * scales[i, c]
+        _to_view(view, rotation, root)
         slope_x, slope_y = min(max(x / z, min_x), max_x), min(max(y / z, min_y), max_y)
         for c in range(3):
-            row_x[c] = lens[0] / z * (root[0, c] - slope_x * root[2, c])
-            row_y[c] = lens[1] / z * (root[1, c] - slope_y * root[2, c])
-        xx = row_x[0] * row_x[0] + row_x[1] * row_x[1] + row_x[2] * row_x[2]
-        xy = row_x[0] * row_y[0] + row_x[1] * row_y[1] + row_x[2] * row_y[2]
-        yy = row_y[0] * row_y[0] + row_y[1] * row_y[1] + row_y[2] * row_y[2]
-        across = row_x[1] * row_y[2] - row_x[2] * row_y[1]
-        down = row_x[2] * row_y[0] - row_x[0] * row_y[2]
-        along = row_x[0] * row_y[1] - row_x[1] * row_y[0]
-        sharp_det = across * across + down * down + along * along
-        det = sharp_det + BLUR * (xx + yy) + BLUR * BLUR
+            across, down, along = root[0, c] * scales[i, c], root[1, c] * scales[i, c], root[2, c] * scales[i, c]
+            row_x[c], row_y[c] = lens[0] / z * (across - slope_x * along), lens[1] / z * (down - slope_y * along)
+        xx, xy, yy, sharp_det, det = _footprint(row_x, row_y, normal)
         xx, yy = xx + BLUR, yy + BLUR
-        means2d[i, 0], means2d[i, 1] = centre_x, centre_y
+        means2d[i, 0], means2d[i, 1], depths[i] = centre_x, centre_y, z
         covars2d[i, 0], covars2d[i, 1], covars2d[i, 2] = xx, xy, yy
         conics[i, 0], conics[i, 1], conics[i, 2] = yy / det, -xy / det, xx / det
         compensations[i] = sqrt(sharp_det / det)
@@ -167,23 +163,11 @@ def _project(
 
 @compiled
 def _project_backward(
-    begin: int,
-    end: int,
-    means: Any,
-    quats: Any,
-    scales: Any,
-    grad_means2d: Any,
-    grad_conics: Any,
-    grad_depths: Any,
-    grad_compensations: Any,
-    view: Any,
-    lens: Any,
-    size: Any,
-    planes: Any,
-    grad_means: Any,
-    grad_quats: Any,
-    grad_scales: Any,
+    begin: int, end: int, means: Any, quats: Any, scales: Any, gradients: Any, camera: Any, outputs: Any
 ) -> None:
+    view, lens, size, planes = camera
+    grad_means2d, grad_conics, grad_depths, grad_compensations = gradients
+    grad_means, grad_quats, grad_scales = outputs
     rotation, root, row_x, row_y = np.empty((4, 4)), np.empty((3, 3)), np.empty(3), np.empty(3)
     normal, sharp_x, sharp_y = np.empty(3), np.empty(3), np.empty(3)
     grad_row_x, grad_row_y, grad_root, grad_rotation = np.empty(3), np.empty(3), np.empty((3, 3)), np.empty((3, 3))
@@ -191,10 +175,7 @@ def _project_backward(
     for i in range(begin, end):
         u, v, depth, blur = grad_means2d[i, 0], grad_means2d[i, 1], grad_depths[i], grad_compensations[i]
         a, b, c = float(grad_conics[i, 0]), float(grad_conics[i, 1]), float(grad_conics[i, 2])
-        x = view[0, 0] * means[i, 0] + view[0, 1] * means[i, 1] + view[0, 2] * means[i, 2] + view[0, 3]
-        y = view[1, 0] * means[i, 0] + view[1, 1] * means[i, 1] + view[1, 2] * means[i, 2] + view[1, 3]
-        z = view[2, 0] * means[i, 0] + view[2, 1] * means[i, 1] + view[2, 2] * means[i, 2] + view[2, 3]
-        z = float(means.dtype.type(z))
+        x, y, z = _to_camera(view, means, i)
         culled = not (z >= planes[0] and z <= planes[1] and z > 0)
         no_gradient = u == 0 and v == 0 and depth == 0 and blur == 0 and a == 0 and b == 0 and c == 0
         if culled or no_gradient:
@@ -203,23 +184,14 @@ def _project_backward(
 
         # Recompute the forward pass ...
         length = _rotation(quats, i, rotation)
-        for r in range(3):
-            for k in range(3):
-                root[r, k] = view[r, 0] * rotation[0, k] + view[r, 1] * rotation[1, k] + view[r, 2] * rotation[2, k]
+        _to_view(view, rotation, root)
         slope_x, slope_y = min(max(x / z, min_x), max_x), min(max(y / z, min_y), max_y)
         zoom_x, zoom_y = lens[0] / z, lens[1] / z
         for k in range(3):
             sharp_x[k] = (root[0, k] - slope_x * root[2, k]) * scales[i, k]
             sharp_y[k] = (root[1, k] - slope_y * root[2, k]) * scales[i, k]
             row_x[k], row_y[k] = zoom_x * sharp_x[k], zoom_y * sharp_y[k]
-        xx = row_x[0] * row_x[0] + row_x[1] * row_x[1] + row_x[2] * row_x[2]
-        xy = row_x[0] * row_y[0] + row_x[1] * row_y[1] + row_x[2] * row_y[2]
-        yy = row_y[0] * row_y[0] + row_y[1] * row_y[1] + row_y[2] * row_y[2]
-        normal[0] = row_x[1] * row_y[2] - row_x[2] * row_y[1]
-        normal[1] = row_x[2] * row_y[0] - row_x[0] * row_y[2]
-        normal[2] = row_x[0] * row_y[1] - row_x[1] * row_y[0]
-        sharp_det = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
-        det = sharp_det + BLUR * (xx + yy) + BLUR * BLUR
+        xx, xy, yy, sharp_det, det = _footprint(row_x, row_y, normal)
 
         # ... and differentiate: from conic and compensation to the covariance and its determinants,
         grad_det = -(a * (yy + BLUR) - b * xy + c * (xx + BLUR)) / (det * det)

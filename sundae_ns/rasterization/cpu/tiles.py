@@ -34,6 +34,8 @@ _DIGIT_BITS = 11  # bits per pass of the radix sort
 class Lists:
     """V visible primitives in T tiles, row by row; L slots."""
 
+    width: int  # of the image, pixels
+    height: int
     columns: int
     rows: int
     ids: Any  # [V], int32: primitive of each rank
@@ -46,7 +48,7 @@ class Lists:
     longest_first: Any  # [B], int32: tiles with a list, the longest first
 
     def for_blending(self) -> tuple[Any, ...]:
-        """Arguments that both loops over the tiles share."""
+        """What both loops over the tiles read."""
         return self.columns, self.longest_first, self.starts, self.ranks, self.spans, self.ids, self.table
 
 
@@ -61,19 +63,18 @@ def build_lists(projection: Projection, opacities: Tensor, width: int, height: i
     count = len(ids)
     table, boxes = np.empty((count, 9), depths.dtype), np.empty((count, 4), np.int32)
     first_intervals, first_slots = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
-    inputs = [as_array(value) for value in (projection.means2d, projection.covars2d, projection.conics)]
-    measured = (ids, *inputs, radii, opacity, columns, rows, table, boxes, first_intervals)
+    splats = (*map(as_array, (projection.means2d, projection.covars2d, projection.conics)), radii, opacity)
+    measured = (ids, splats, (columns, rows), table, boxes, first_intervals)
     parallel_for(_measure, count, *measured, min_per_thread=_MIN_PER_THREAD)
     np.cumsum(first_intervals, out=first_intervals)
     intervals = np.empty((first_intervals[-1], 2), np.int32)
-    parallel_for(
-        _find_intervals, count, table, boxes, first_intervals, intervals, first_slots, min_per_thread=_MIN_PER_THREAD
-    )
+    found = (table, boxes, first_intervals, intervals, first_slots)
+    parallel_for(_find_intervals, count, *found, min_per_thread=_MIN_PER_THREAD)
     np.cumsum(first_slots, out=first_slots)
     starts, ranks, slots, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
     lengths = np.diff(starts)
     longest_first = np.argsort(-lengths, kind="stable").astype(np.int32)[: np.count_nonzero(lengths)]
-    return Lists(columns, rows, ids, table, first_slots, starts, ranks, slots, spans, longest_first)
+    return Lists(width, height, columns, rows, ids, table, first_slots, starts, ranks, slots, spans, longest_first)
 
 
 @compiled
@@ -107,22 +108,9 @@ def _visible_by_depth(keys: Any, radii: Any, opacities: Any) -> Any:
 
 
 @compiled
-def _measure(
-    begin: int,
-    end: int,
-    ids: Any,
-    means2d: Any,
-    covars2d: Any,
-    conics: Any,
-    radii: Any,
-    opacities: Any,
-    columns: int,
-    rows: int,
-    table: Any,
-    boxes: Any,
-    counts: Any,
-) -> None:
+def _measure(begin: int, end: int, ids: Any, splats: Any, grid: Any, table: Any, boxes: Any, counts: Any) -> None:
     """Write a rank's row of the table and its rectangle of tiles, and at rank + 1 the number of columns of tiles."""
+    means2d, covars2d, conics, radii, opacities = splats
     number = table.dtype.type
     per_bin = BIN // TILE
     for rank in range(begin, end):
@@ -135,9 +123,8 @@ def _measure(
             half = number(sqrt(number(2) * reach * covars2d[i, 2 * axis]))
             low = max(np.floor((centre - radius) / BIN) * per_bin, np.floor((centre - half) / TILE))
             high = min(np.ceil((centre + radius) / BIN) * per_bin, np.ceil((centre + half) / TILE))
-            limit = columns if axis == 0 else rows
-            boxes[rank, axis] = np.int32(min(max(low, 0), limit))
-            boxes[rank, 2 + axis] = np.int32(min(max(high, 0), limit))
+            boxes[rank, axis] = np.int32(min(max(low, 0), grid[axis]))
+            boxes[rank, 2 + axis] = np.int32(min(max(high, 0), grid[axis]))
             table[rank, HALF_WIDTH + axis] = half
         table[rank, U], table[rank, V] = means2d[i, 0], means2d[i, 1]
         table[rank, HALF_XX] = number(0.5) * conics[i, 0]
