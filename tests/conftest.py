@@ -19,6 +19,7 @@ import pytest
 import torch
 from filelock import FileLock
 
+from sundae_ns.errors import BackendError
 from sundae_ns.gpu import nvrtc
 from sundae_ns.gpu.nvrtc import Argument, Launch
 
@@ -158,10 +159,10 @@ def compile_for_cpu(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., c
 
 
 @pytest.fixture(scope="session")
-def compile_kernels(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKernels:
-    """Compile a CUDA source for the CPU, and return launch functions for the named kernels."""
+def load_on_cpu(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKernels:
+    """As ``nvrtc.load_kernels``, but for the CPU."""
 
-    def compile_them(source: str, names: Sequence[str], options: Sequence[str] = ()) -> dict[str, Launch]:
+    def compile_them(source: str, names: Sequence[str], options: Sequence[str], *_: object) -> dict[str, Launch]:
         loaded = compile_for_cpu(source, options)
 
         def launch_of(name: str) -> Launch:
@@ -177,3 +178,13 @@ def compile_kernels(compile_for_cpu: Callable[..., ctypes.CDLL]) -> CompileKerne
         return {name: launch_of(name) for name in names}
 
     return compile_them
+
+
+@pytest.fixture(scope="session")
+def compile_for_gpu() -> Callable[..., bytes]:
+    """As ``nvrtc.compile_cubin``; skip where the compiler is missing."""
+    try:
+        nvrtc._library("nvrtc")
+    except BackendError as error:
+        pytest.skip(f"no NVRTC here: {error}")
+    return nvrtc.compile_cubin

@@ -124,7 +124,7 @@ def unfold(net: UNet, raw: Tensor, base: Tensor, alpha: Tensor, launches: Launch
     rows, columns = raw.shape[-2:]
     base = base.contiguous()
     out = torch.empty_like(base)
-    arguments = [raw, *last_layers(net), rows, columns, base, alpha, pixel_stride(alpha), height, width, out]
+    arguments: list[Argument] = [raw, *last_layers(net), rows, columns, base, alpha, pixel_stride(alpha), height, width, out]
     launches["unfold"](rows * columns, arguments)
     return out
 

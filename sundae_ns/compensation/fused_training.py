@@ -30,6 +30,7 @@ from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, is_recording, record, warm_up
+from sundae_ns.gpu.nvrtc import Argument
 
 MOST_WORKERS = 2**17
 """Threads that sum a gradient over the pixels; fewer leave the GPU idle, and more wait for each other to add."""
@@ -117,7 +118,7 @@ def unfold_backward(
     gradient = gradient.contiguous()
     values, grad_values = raw.new_empty(rows, columns, raw.shape[1]), raw.new_empty(rows, columns, outputs)
     grad_alpha = torch.zeros_like(alpha, memory_format=torch.contiguous_format)
-    inputs = [raw, *last_layers(net), rows, columns, gradient, alpha, pixel_stride(alpha), height, width]
+    inputs: list[Argument] = [raw, *last_layers(net), rows, columns, gradient, alpha, pixel_stride(alpha), height, width]
     launches["unfold_backward"](rows * columns, [*inputs, grad_raw, values, grad_values, grad_alpha])
     # Sum row by row: as one product it would be a single sum over all pixels, which a GPU cannot parallelise.
     grad_weight = torch.bmm(grad_values.transpose(1, 2), values).sum(dim=0, dtype=torch.float32)

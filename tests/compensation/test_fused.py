@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import cast
 
 import pytest
@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 from sundae_ns.compensation import CompensationHead, HeadConfig, fused, fused_training, kernels
-from sundae_ns.compensation.fused_training import FusedTraining, _Pass, network_backward
+from sundae_ns.compensation.fused_training import FusedTraining, _Graphs, _Pass, network_backward
 from sundae_ns.errors import BackendError, SundaeError
-from sundae_ns.gpu import nvrtc
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, RECORD_AT
 
 FLOAT_IMAGES = """
@@ -24,16 +23,24 @@ inline float load(T v) { return v; }
 inline T store(float v) { return v; }
 """
 
-Compile = Callable[[CompensationHead], kernels.Launches]
+
+@pytest.fixture(autouse=True, scope="module")
+def on_cpu(load_on_cpu: Callable[..., kernels.Launches]) -> Iterator[None]:
+    """Float32 images, which only these tests use, are those of the CPU."""
+    on_gpu = kernels.load_kernels
+
+    def load(source: str, names: tuple[str, ...], options: tuple[str, ...], device: torch.device) -> kernels.Launches:
+        return (load_on_cpu if device.type == "cpu" else on_gpu)(source, names, options, device)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels, "load_kernels", load)
+        patch.setitem(kernels._CONVERSIONS, torch.float32, FLOAT_IMAGES)
+        yield
 
 
-@pytest.fixture(scope="module")
-def compiled(compile_kernels: Callable[..., kernels.Launches]) -> Compile:
-    def compile_for(head: CompensationHead) -> kernels.Launches:
-        options = kernels.definitions(head.net, head.config.mode == "residual")
-        return compile_kernels(FLOAT_IMAGES + kernels.SOURCE, kernels.FORWARD + kernels.BACKWARD, options)
-
-    return compile_for
+def compiled(head: CompensationHead) -> kernels.Launches:
+    options = kernels.definitions(head.net, head.config.mode == "residual")
+    return kernels.compiled(torch.device("cpu"), torch.float32, options)
 
 
 def make(**options: object) -> CompensationHead:
@@ -54,47 +61,46 @@ def splatted(height: int, width: int, num_features: int, *, seed: int = 0) -> tu
 
 
 @torch.no_grad()
-def by_kernels(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor], compiled: Compile) -> Tensor:
+def by_kernels(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     base, seen, alpha = images
     launches = compiled(head)
     folded = fused.folded_input(head.net, *base.shape[:2], base, torch.float32).fill_(torch.nan)
     fused.fold(seen, alpha, head.config.pixel_unshuffle, head.config.mode == "residual", folded, launches)
     last = fused.network(head.net, fused.Weights(head.net, torch.float32), folded, launches).last
-    assert last is not None
     return fused.unfold(head.net, last, base, alpha, launches)
 
 
 @pytest.mark.parametrize("mode", ["residual", "features"])
 @pytest.mark.parametrize("pixel_unshuffle", [1, 2, 3, 4])
 @torch.no_grad()
-def test_same_image(compiled: Compile, mode: str, pixel_unshuffle: int) -> None:
+def test_same_image(mode: str, pixel_unshuffle: int) -> None:
     head = make(mode=mode, pixel_unshuffle=pixel_unshuffle)
     images = splatted(37, 50, 5)
-    torch.testing.assert_close(by_kernels(head, images, compiled), head(*images), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
 
 
 @given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
 @torch.no_grad()
-def test_same_image_at_any_size(compiled: Compile, height: int, width: int, num_features: int, seed: int) -> None:
+def test_same_image_at_any_size(height: int, width: int, num_features: int, seed: int) -> None:
     head = make(num_features=num_features)
     images = splatted(height, width, num_features, seed=seed)
-    torch.testing.assert_close(by_kernels(head, images, compiled), head(*images), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
 
 
 @torch.no_grad()
-def test_sizes_of_the_network(compiled: Compile) -> None:
+def test_sizes_of_the_network() -> None:
     for size in ("compact", "wide", "small"):
         head = make(size=size, num_features=13)
         images = splatted(20, 33, 13)
-        torch.testing.assert_close(by_kernels(head, images, compiled), head(*images), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(by_kernels(head, images), head(*images), rtol=1e-4, atol=1e-5)
 
 
 @torch.no_grad()
-def test_overflowing_pixels_are_not_corrected(compiled: Compile) -> None:
+def test_overflowing_pixels_are_not_corrected() -> None:
     head = make()
     base, seen, alpha = splatted(16, 16, 5)
     seen[3, 4] = torch.inf
-    out = by_kernels(head, (base, seen, alpha), compiled)
+    out = by_kernels(head, (base, seen, alpha))
     assert torch.isfinite(out).all()
     assert torch.equal(out[3, 4], base[3, 4])
 
@@ -132,9 +138,9 @@ def assert_same(found: Gradients, expected: Gradients) -> None:
 
 @pytest.mark.parametrize("mode", ["residual", "features"])
 @pytest.mark.parametrize("pixel_unshuffle", [1, 2, 4])
-def test_same_gradients(compiled: Compile, mode: str, pixel_unshuffle: int) -> None:
+def test_same_gradients(mode: str, pixel_unshuffle: int) -> None:
     head = make(mode=mode, pixel_unshuffle=pixel_unshuffle)
-    training = FusedTraining(head.net, mode == "residual", compiled(head))
+    training = FusedTraining(head.net, mode == "residual")
     for size in ((37, 50), (16, 16)):
         images, grad_out = splatted(*size, 5), torch.randn(*size, 3)
         assert_same(
@@ -143,18 +149,18 @@ def test_same_gradients(compiled: Compile, mode: str, pixel_unshuffle: int) -> N
         )
 
 
-def test_sums_over_pixels_by_few_threads(compiled: Compile, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sums_over_pixels_by_few_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fused_training, "MOST_WORKERS", 37)
     head, images, grad_out = make(), splatted(37, 50, 5), torch.randn(37, 50, 3)
-    training = FusedTraining(head.net, True, compiled(head))
+    training = FusedTraining(head.net, True)
     assert_same(kernel_gradients(head, images, grad_out, training), layer_gradients(head, images, grad_out))
 
 
 @given(height=st.integers(1, 40), width=st.integers(1, 40), num_features=st.integers(1, 14), seed=st.integers(0, 99))
-def test_same_gradients_at_any_size(compiled: Compile, height: int, width: int, num_features: int, seed: int) -> None:
+def test_same_gradients_at_any_size(height: int, width: int, num_features: int, seed: int) -> None:
     head = make(num_features=num_features)
     images, grad_out = splatted(height, width, num_features, seed=seed), torch.randn(height, width, 3)
-    training = FusedTraining(head.net, True, compiled(head))
+    training = FusedTraining(head.net, True)
     both = zip(
         kernel_gradients(head, images, grad_out, training),
         layer_gradients(head, images, grad_out),
@@ -172,13 +178,12 @@ class FakeGraph:
         self.replay = replay
 
 
-def as_recorded(head: CompensationHead, height: int, width: int, launches: kernels.Launches) -> _Pass:
+def as_recorded(head: CompensationHead, height: int, width: int) -> _Pass:
     """A pass whose results lie in the same buffers each time, as those of a recording do."""
-    net = head.net
+    net, launches = head.net, compiled(head)
     weights = fused.Weights(net, torch.float32)
     folded = fused.folded_input(net, height, width, torch.empty(0), torch.float32).zero_()
     tape = fused.network(net, weights, folded, launches)
-    assert tape.last is not None
     grad_raw = torch.zeros_like(tape.last)
     grad_folded, grad_parameters = network_backward(net, weights, tape, grad_raw, launches)
 
@@ -189,7 +194,7 @@ def as_recorded(head: CompensationHead, height: int, width: int, launches: kerne
         again = fused.network(net, weights, folded, launches)
         for old, new in zip([*tape.inputs, *tape.coarse, tape.last], [*again.inputs, *again.coarse, again.last]):
             if old is not folded:
-                old.copy_(new)  # type: ignore[union-attr, arg-type]
+                old.copy_(new)
 
     def backward() -> None:
         found, gradients = network_backward(net, weights, tape, grad_raw, launches)
@@ -198,13 +203,13 @@ def as_recorded(head: CompensationHead, height: int, width: int, launches: kerne
             old.copy_(new)
 
     graphs = [cast("torch.cuda.CUDAGraph", FakeGraph(run)) for run in (forward, backward)]
-    return _Pass(weights, folded, tape, grad_raw, grad_folded, grad_parameters, *graphs)
+    return _Pass(weights, tape, grad_raw, _Graphs(*graphs, grad_folded, grad_parameters))
 
 
-def test_gradients_of_replayed_passes_are_not_copied_and_add_up(compiled: Compile) -> None:
+def test_gradients_of_replayed_passes_are_not_copied_and_add_up() -> None:
     head = make()
-    training = FusedTraining(head.net, True, compiled(head))
-    made = as_recorded(head, 37, 50, compiled(head))
+    training = FusedTraining(head.net, True)
+    made = as_recorded(head, 37, 50)
     training._recorded[37, 50, torch.float32, head.net.out.weight.data_ptr()] = made
     images, grad_out = [splatted(37, 50, 5, seed=seed) for seed in range(3)], torch.randn(37, 50, 3)
     expected = [layer_gradients(head, seen, grad_out)[3:] for seen in images]
@@ -221,15 +226,15 @@ def test_gradients_of_replayed_passes_are_not_copied_and_add_up(compiled: Compil
     twice = [p.grad.clone() for p in head.parameters() if p.grad is not None]
     assert_same(twice, layer_gradients(head, images[0], grad_out + other)[3:])
     assert_same(kernel_gradients(head, images[2], grad_out, training)[3:], expected[2])
-    assert made.grad_parameters is not None
-    for parameter, gradient in zip(training._parameters, made.grad_parameters):
+    assert made.graphs is not None
+    for parameter, gradient in zip(training._parameters, made.graphs.grad_parameters):
         assert parameter.grad is not None
         assert parameter.grad.data_ptr() == gradient.data_ptr()
 
 
-def test_gradients_of_an_earlier_image_are_refused(compiled: Compile) -> None:
+def test_gradients_of_an_earlier_image_are_refused() -> None:
     head = make()
-    training = FusedTraining(head.net, True, compiled(head))
+    training = FusedTraining(head.net, True)
     images = [splatted(16, 16, 5, seed=seed) for seed in range(2)]
     outs = [training(p[1].clone().requires_grad_(), p[2], torch.float32) for p in images]
     with pytest.raises(SundaeError, match=r"before the next forward pass$"):
@@ -239,7 +244,7 @@ def test_gradients_of_an_earlier_image_are_refused(compiled: Compile) -> None:
 
 @torch.no_grad()
 def test_a_head_that_cannot_be_recorded_runs_kernel_by_kernel(
-    compiled: Compile, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def refuse(*_: object) -> None:
         raise BackendError("no recordings today")
@@ -247,19 +252,17 @@ def test_a_head_that_cannot_be_recorded_runs_kernel_by_kernel(
     head = make()
     images = splatted(16, 16, 5)
     expected = head(*images)
-    launches = compiled(head)
-    monkeypatch.setattr(fused, "compiled", lambda *_: launches)
     monkeypatch.setattr(head._inference, "_record", refuse)
     for _ in range(RECORD_AT + 2):
         torch.testing.assert_close(head._inference(*images, torch.float32), expected, rtol=1e-4, atol=1e-5)
     assert caplog.text.count("kernel by kernel: no recordings today") == 1
 
 
-def test_late_gradients_of_replayed_passes_are_refused(compiled: Compile) -> None:
+def test_late_gradients_of_replayed_passes_are_refused() -> None:
     """Two images of one size share their buffers."""
     head = make()
-    training = FusedTraining(head.net, True, compiled(head))
-    recorded = as_recorded(head, 16, 16, compiled(head))
+    training = FusedTraining(head.net, True)
+    recorded = as_recorded(head, 16, 16)
     training._recorded[16, 16, torch.float32, head.net.out.weight.data_ptr()] = recorded
     images = [splatted(16, 16, 5, seed=seed) for seed in range(2)]
     outs = [training(seen[1].clone().requires_grad_(), seen[2], torch.float32) for seen in images]
@@ -268,19 +271,15 @@ def test_late_gradients_of_replayed_passes_are_refused(compiled: Compile) -> Non
     outs[1].sum().backward()
 
 
-def test_kernels_compile_for_gpus_that_have_the_types() -> None:
-    try:
-        nvrtc._library("nvrtc")
-    except BackendError as error:
-        pytest.skip(f"no NVRTC here: {error}")
+def test_kernels_compile_for_gpus_that_have_the_types(compile_for_gpu: Callable[..., bytes]) -> None:
     for architecture, dtype, head in (
         ("sm_75", torch.float16, make(pixel_unshuffle=4)),
         ("sm_80", torch.bfloat16, make(size="large", mode="features")),
         ("sm_90", torch.float16, make()),
     ):
         options = kernels.definitions(head.net, head.config.mode == "residual")
-        code = nvrtc.compile_cubin(kernels.program(dtype), architecture, options)
-        assert all(name.encode() in code for name in kernels.FORWARD + kernels.BACKWARD)
+        code = compile_for_gpu(kernels.program(dtype), architecture, options)
+        assert all(name.encode() in code for name in kernels.KERNELS)
 
 
 @pytest.mark.gpu

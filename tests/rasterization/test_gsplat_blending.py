@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import BackendError, SundaeError
-from sundae_ns.gpu import nvrtc
+from sundae_ns.errors import SundaeError
 from sundae_ns.rasterization import gsplat_blending
 from sundae_ns.rasterization.compositing import composite
 from sundae_ns.rasterization.gsplat_blending import blend
@@ -22,13 +21,9 @@ NAMES = ("means2d", "conics", "colors", "opacities")
 
 
 @pytest.fixture(autouse=True)
-def on_cpu(compile_kernels: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
-    def compiled(_: torch.device, channels: int, absgrad: bool) -> gsplat_blending.Launches:
-        options = gsplat_blending.definitions(channels, absgrad=absgrad, lanes=1)
-        names = gsplat_blending.Launches._fields
-        return gsplat_blending.Launches(**compile_kernels(gsplat_blending.SOURCE, names, options))
-
-    monkeypatch.setattr(gsplat_blending, "_compiled", compiled)
+def on_cpu(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gsplat_blending, "load_kernels", load_on_cpu)
+    monkeypatch.setattr(gsplat_blending, "LANES", 1)
 
 
 def field(n: int, channels: int, width: int, height: int, *, opacity: float = 1.0) -> dict[str, Tensor]:
@@ -57,7 +52,7 @@ def whole_lists(primitives: dict[str, Tensor], width: int, height: int, spare: i
     order = primitives["depths"].argsort(stable=True).int()
     starts = torch.arange(columns * (rows + (spare > 0)), dtype=torch.int32).clamp(max=columns * rows) * len(order)
     pairs = torch.cat([order.repeat(columns * rows), torch.zeros(spare, dtype=torch.int32)])
-    return TileLists(starts.view(1, -1, columns), pairs)
+    return TileLists(width, height, starts.view(1, -1, columns), pairs)
 
 
 def expected(
@@ -74,9 +69,7 @@ def expected(
     )
     opacities = leaves["opacities"][0]
     lists = build_tile_lists(projection, opacities.detach(), width, height)
-    return composite(
-        leaves["means2d"], leaves["conics"][0], opacities, leaves["colors"][0], lists, width, height, absgrad
-    )
+    return composite(leaves["means2d"], leaves["conics"][0], opacities, leaves["colors"][0], lists, absgrad)
 
 
 def leaves_of(primitives: dict[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
@@ -100,7 +93,7 @@ def test_image_and_gradients_match_the_reference(
     primitives = field(n, channels, width, height, opacity=opacity)
     ours, exact = leaves_of(primitives, torch.float32), leaves_of(primitives, torch.float64)
     lists = whole_lists(primitives, width, height, spare=7 if absgrad else 0)
-    image, alpha = blend(**ours, lists=lists, width=width, height=height, absgrad=absgrad)
+    image, alpha = blend(*ours.values(), lists, absgrad)
     other_image, other_alpha = expected(primitives, exact, width, height, absgrad)
     assert image.shape == (1, height, width, channels)
     torch.testing.assert_close(image[0].double(), other_image, rtol=0, atol=2e-5)
@@ -122,7 +115,7 @@ def test_gradients_flow_into_some_inputs_only() -> None:
     ours = {name: primitives[name].float() for name in NAMES}
     ours["colors"].requires_grad_()
     lists = whole_lists(primitives, 20, 20, spare=0)
-    image, _ = blend(**ours, lists=lists, width=20, height=20)
+    image, _ = blend(*ours.values(), lists, False)
     (gradient,) = torch.autograd.grad(image.sum(), ours["colors"])
     assert (gradient >= 0).all()
     assert gradient.sum() > 0
@@ -130,8 +123,8 @@ def test_gradients_flow_into_some_inputs_only() -> None:
 
 def test_an_empty_list_leaves_the_background() -> None:
     ours = leaves_of(field(5, 3, 20, 20), torch.float32)
-    lists = TileLists(torch.zeros(1, 2, 2, dtype=torch.int32), torch.zeros(0, dtype=torch.int32))
-    image, alpha = blend(**ours, lists=lists, width=20, height=20)
+    lists = TileLists(20, 20, torch.zeros(1, 2, 2, dtype=torch.int32), torch.zeros(0, dtype=torch.int32))
+    image, alpha = blend(*ours.values(), lists, False)
     assert not image.any()
     assert not alpha.any()
     (image.sum() + alpha.sum()).backward()
@@ -141,17 +134,13 @@ def test_an_empty_list_leaves_the_background() -> None:
 def test_second_derivatives_are_refused() -> None:
     primitives = field(5, 3, 20, 20)
     ours = leaves_of(primitives, torch.float32)
-    image, _ = blend(**ours, lists=whole_lists(primitives, 20, 20, spare=0), width=20, height=20)
+    image, _ = blend(*ours.values(), whole_lists(primitives, 20, 20, spare=0), False)
     with pytest.raises(SundaeError, match="second derivative"):
         torch.autograd.grad(image.sum(), ours["means2d"], create_graph=True)
 
 
-def test_kernels_compile_for_gpus() -> None:
-    try:
-        for architecture, channels, absgrad in (("sm_75", 3, True), ("sm_90", 16, False), ("sm_90", 32, False)):
-            options = gsplat_blending.definitions(channels, absgrad=absgrad)
-            nvrtc.compile_cubin(gsplat_blending.SOURCE, architecture, options)
-    except BackendError as error:
-        if "libnvrtc" not in str(error) and "without CUDA" not in str(error):
-            raise
-        pytest.skip(f"no NVRTC here: {error}")
+def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gsplat_blending, "LANES", 32)
+    for architecture, channels, absgrad in (("sm_75", 3, True), ("sm_90", 16, False), ("sm_90", 32, False)):
+        options = gsplat_blending.definitions(channels, absgrad=absgrad)
+        compile_for_gpu(gsplat_blending.SOURCE, architecture, options)

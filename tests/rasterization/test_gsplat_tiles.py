@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from sundae_ns.errors import BackendError, SundaeError
-from sundae_ns.gpu import nvrtc
+from sundae_ns.errors import SundaeError
 from sundae_ns.rasterization import (
     GsplatBackend,
     RecordableGsplat,
@@ -29,15 +28,9 @@ Field = dict[str, Tensor]
 
 
 @pytest.fixture(autouse=True)
-def on_cpu(compile_kernels: Callable[..., dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
-    def compiled(_: torch.device, dtype: torch.dtype) -> tuple[Any, ...]:
-        names = ("count_tiles", "list_tiles")
-        return tuple(compile_kernels(gsplat_tiles.SOURCE, names, gsplat_tiles.definitions(dtype)).values())
-
-    monkeypatch.setattr(gsplat_tiles, "_compiled", compiled)
-    source, options = gsplat_colors.SOURCE, gsplat_colors.definitions()
-    launches = gsplat_colors.Launches(**compile_kernels(source, gsplat_colors.Launches._fields, options))
-    monkeypatch.setattr(gsplat_colors, "_compiled", lambda _: launches)
+def on_cpu(load_on_cpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gsplat_tiles, "load_kernels", load_on_cpu)
+    monkeypatch.setattr(gsplat_colors, "load_kernels", load_on_cpu)
     monkeypatch.setattr(gsplat_backend, "_check_kernels_take", lambda _: None)
 
 
@@ -191,7 +184,10 @@ def test_more_tiles_than_16_bits_count() -> None:
 
 
 def colors_inputs() -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Centres, a camera's centre, and coefficients of degree 4; some colours are negative, and one centre is the camera's."""
+    """Centres, a camera's centre, and coefficients of degree 4.
+
+    Some colours are negative, and one centre is the camera's.
+    """
     means, center = torch.randn(300, 3) * 3, torch.tensor([0.5, -1.0, 2.0])
     means[7] = center
     return means, center, torch.randn(300, 3) * 2, torch.randn(300, 24, 3)
@@ -228,15 +224,10 @@ def test_second_derivatives_of_colors_are_refused() -> None:
         torch.autograd.grad(found.sum(), means, create_graph=True)
 
 
-def test_kernels_compile_for_gpus() -> None:
-    try:
-        for dtype in (torch.int16, torch.int32):
-            nvrtc.compile_cubin(gsplat_tiles.SOURCE, "sm_75", gsplat_tiles.definitions(dtype))
-        nvrtc.compile_cubin(gsplat_colors.SOURCE, "sm_90", gsplat_colors.definitions())
-    except BackendError as error:
-        if "libnvrtc" not in str(error) and "without CUDA" not in str(error):
-            raise
-        pytest.skip(f"no NVRTC here: {error}")
+def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes]) -> None:
+    for dtype in (torch.int16, torch.int32):
+        compile_for_gpu(gsplat_tiles.SOURCE, "sm_75", gsplat_tiles.definitions(dtype))
+    compile_for_gpu(gsplat_colors.SOURCE, "sm_90", gsplat_colors.OPTIONS)
 
 
 def test_harmonics_that_are_not_recorded_are_gsplats(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from splat_inputs import geometry
 
 from sundae_ns.rasterization.cpu.lanes import (
     WIDTH,
@@ -94,7 +95,7 @@ def test_every_blended_pixel_is_listed_and_few_others(dtype: torch.dtype) -> Non
     scales = 10 ** (2 * torch.rand(n, 3, generator=generator) - 2.5)
     camera = torch.eye(4), torch.tensor([[80.0, 0, 35], [0, 80, 25], [0, 0, 1]])
     values = (means, torch.randn(n, 4, generator=generator), scales, *camera)
-    projection = project(*(value.to(dtype) for value in values), width, height, 0.01, 1e10)
+    projection = project(geometry(*(value.to(dtype) for value in values), width, height))
     # The faint opacity ends footprints inside gsplat's three-sigma bins, so the bins do not matter here.
     lists = build_lists(projection, torch.full((n,), 0.2, dtype=dtype), width, height)
     table = lists.table.astype(np.float64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from splat_inputs import geometry
 from torch import Tensor
 
 from sundae_ns.gaussians.rotations import rotation_matrices
@@ -62,7 +63,7 @@ def test_projection_matches_gsplat(antialiased: bool) -> None:
     inputs = [value.requires_grad_() for value in _primitives()]
     means, quats, scales = inputs
     viewmat, K = _camera()
-    ours = project(means, quats, scales, viewmat, K, WIDTH, HEIGHT, 0.01, 1e10)
+    ours = project(geometry(means, quats, scales, viewmat, K, WIDTH, HEIGHT))
     covars, _ = gsplat_torch._quat_scale_to_covar_preci(quats, scales, True, False)
     radii, means2d, depths, conics, compensations = gsplat_torch._fully_fused_projection(
         means, covars, viewmat[None], K[None], WIDTH, HEIGHT, calc_compensations=antialiased

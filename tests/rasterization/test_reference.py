@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from splat_inputs import geometry
 from torch import Tensor
 
 from sundae_ns.rasterization import Rasterization, blending_weights, rasterize, select_backend, spherical_harmonics
@@ -53,7 +54,7 @@ def _oracle(
     """Blend pixel by pixel in a Python loop; also the weights, and z blended like a colour."""
     width, height = view["width"], view["height"]
     splats = project(
-        scene["means"], scene["quats"], scene["scales"], view["viewmat"], view["K"], width, height, 0.01, 1e10
+        geometry(scene["means"], scene["quats"], scene["scales"], view["viewmat"], view["K"], width, height)
     )
     opacities = scene["opacities"] * (splats.compensations if antialiased else 1.0)
     order = sorted(range(len(opacities)), key=lambda i: (splats.depths[i].item(), i))

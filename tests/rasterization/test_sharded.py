@@ -6,12 +6,13 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from splat_inputs import geometry
 from torch import Tensor
 
 from sundae_ns.rasterization.projection import project
 from sundae_ns.rasterization.sharded import UNMOVED, Slack, frustum_bounds, may_be_seen
 
-NEAR, FAR = 0.01, 1e10
+NEAR = 0.01
 
 
 def scattered(seed: int, n: int = 4000) -> tuple[Tensor, Tensor, Tensor]:
@@ -32,7 +33,7 @@ def test_all_rendered_primitives_may_be_seen(
 ) -> None:
     means, quats, scales = scattered(seed)
     K = torch.tensor([[focal, 0.0, cx], [0.0, 1.5 * focal, height / 2], [0.0, 0.0, 1.0]])
-    drawn = project(means, quats, scales, torch.eye(4), K, width, height, NEAR, FAR).radii > 0
+    drawn = project(geometry(means, quats, scales, torch.eye(4), K, width, height)).radii > 0
     away = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
     bounds = torch.stack([frustum_bounds(pose, K, width, height, NEAR) for pose in (away, torch.eye(4))])
     unseen, seen = may_be_seen(means, scales.log(), bounds)
@@ -67,7 +68,7 @@ def test_primitives_rendered_after_a_move_may_be_seen_before_it(
     else:
         moved = means + means_slack * (2 * torch.rand(means.shape, generator=generator) - 1)
         grown = scales.log() + scales_slack * (2 * torch.rand(scales.shape, generator=generator) - 1)
-    drawn = project(moved, quats, grown.exp(), pose, K, 64, 48, NEAR, FAR).radii > 0
+    drawn = project(geometry(moved, quats, grown.exp(), pose, K, 64, 48)).radii > 0
     assert not (drawn & ~seen).any()
 
 
@@ -82,7 +83,7 @@ def test_slack_adds_few_primitives() -> None:
 def test_nan_depth_is_not_seen() -> None:
     means = torch.tensor([[0.0, 0.0, 2.0], [torch.nan, 0.0, 2.0], [0.0, 0.0, torch.nan], [0.0, 0.0, 0.0]])
     scales = torch.full((4, 3), 0.1)
-    drawn = project(means, torch.ones(4, 4), scales, torch.eye(4), torch.eye(3), 10, 10, NEAR, FAR).radii > 0
+    drawn = project(geometry(means, torch.ones(4, 4), scales, torch.eye(4), torch.eye(3), 10, 10)).radii > 0
     (seen,) = may_be_seen(means, scales.log(), frustum_bounds(torch.eye(4), torch.eye(3), 10, 10, NEAR)[None])
     assert drawn.tolist()[0]
     assert not (drawn & ~seen).any()
