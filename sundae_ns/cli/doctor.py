@@ -146,7 +146,7 @@ def own_kernels() -> Finding:
         nvrtc.Kernel(traversal.SOURCE, traversal.KERNEL, device, options, traversal.BLOCK)
         fused_loss.loss_kernels(device)
         net = CompensationHead(HeadConfig()).net
-        kernels.compiled(device, torch.bfloat16, kernels.definitions(net, True))
+        kernels.head_kernels(device, torch.bfloat16, kernels.head_options(net, True))
     except BackendError as error:
         cause, fix = str(error).rsplit(": ", 1)
         detail = f"{cause}: neighbours are searched on the CPU; head and SSIM run layer by layer"

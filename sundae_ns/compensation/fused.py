@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
+from sundae_ns.compensation.kernels import PACK, Launches, head_kernels, head_options
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.cuda_graphs import GraphCache, is_recording, record, warm_up
@@ -63,7 +63,7 @@ def padded_channels(channels: int, fold: int) -> int:
     return -(-channels // per_pack) * per_pack
 
 
-def fold(splatted: Tensor, alpha: Tensor, size: int, residual: bool, folded: Tensor, launches: Launches) -> None:
+def fold_pixels(splatted: Tensor, alpha: Tensor, size: int, residual: bool, folded: Tensor, launches: Launches) -> None:
     """Write splatted values to the network's input ``folded``, ``size`` x ``size`` pixels in the channels of one.
 
     Splatted values ``[H, W, 3 + F]`` and accumulation ``[H, W, 1]`` are float32; their pixels may have a stride, their
@@ -114,7 +114,7 @@ def network(net: UNet, weights: Weights, folded: Tensor, launches: Launches) -> 
     return Tape(inputs, coarse, raw)
 
 
-def unfold(net: UNet, raw: Tensor, base: Tensor, alpha: Tensor, launches: Launches) -> Tensor:
+def unfold_pixels(net: UNet, raw: Tensor, base: Tensor, alpha: Tensor, launches: Launches) -> Tensor:
     """The image ``[H, W, 3]`` from the last 3 x 3 convolution's result ``[1, width, h, w]``.
 
     A residual network corrects ``base`` ``[H, W, 3]`` in proportion to accumulation ``[H, W, 1]``; of another network
@@ -124,8 +124,9 @@ def unfold(net: UNet, raw: Tensor, base: Tensor, alpha: Tensor, launches: Launch
     rows, columns = raw.shape[-2:]
     base = base.contiguous()
     out = torch.empty_like(base)
-    arguments: list[Argument] = [raw, *last_layers(net), rows, columns, base, alpha, pixel_stride(alpha), height, width, out]
-    launches["unfold"](rows * columns, arguments)
+    layers: list[Argument] = [raw, *last_layers(net), rows, columns]
+    images: list[Argument] = [base, alpha, pixel_stride(alpha), height, width, out]
+    launches["unfold"](rows * columns, [*layers, *images])
     return out
 
 
@@ -193,21 +194,16 @@ class FusedInference:
         self._can_record = True
 
     def __call__(self, base: Tensor, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
-        """Compensate one image.
+        """Compensate one image; see :meth:`sundae_ns.compensation.CompensationHead.forward`.
 
-        Args:
-            base: float32, on CUDA ``[H, W, 3]``.
-            splatted: float32, on CUDA; pixels may have a stride, rows must be adjacent ``[H, W, 3 + F]``.
-            alpha: with the same layout ``[H, W, 1]``.
-            dtype: dtype of the arithmetic, float16 or bfloat16.
-        Returns:
-            ``[H, W, 3]`` float32, see :meth:`sundae_ns.compensation.CompensationHead.forward`.
+        All images are float32 on CUDA. Pixels of ``splatted`` and ``alpha`` may have a stride, rows must be adjacent.
+        ``dtype`` is that of the arithmetic, float16 or bfloat16.
 
         Raises:
             BackendError: the kernels cannot be compiled or loaded.
         """
         net = self.net
-        launches = compiled(base.device, dtype, definitions(net, self.residual))
+        launches = head_kernels(base.device, dtype, head_options(net, self.residual))
         height, width = base.shape[:2]
         key = (height, width, dtype, net.out.weight.data_ptr())
         new_input = partial(folded_input, net, height, width, base, dtype)
@@ -219,13 +215,13 @@ class FusedInference:
                 _log.warning("the head is not recorded and runs kernel by kernel: %s", error)
                 self._can_record = False
         folded = new_input() if recorded is None else recorded.folded
-        fold(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
+        fold_pixels(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
         if recorded is None:
             raw = self._run(folded, launches)
         else:
             recorded.graph.replay()
             raw = recorded.raw
-        return unfold(net, raw, base, alpha, launches)
+        return unfold_pixels(net, raw, base, alpha, launches)
 
     def _run(self, folded: Tensor, launches: Launches) -> Tensor:
         # Casting half a million weights costs nothing, and follows the network's training.

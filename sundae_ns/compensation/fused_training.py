@@ -18,15 +18,15 @@ from sundae_ns.compensation.fused import (
     Weights,
     bias_of,
     convolutions,
-    fold,
+    fold_pixels,
     folded_input,
     image_like,
     last_layers,
     network,
     pixel_stride,
-    unfold,
+    unfold_pixels,
 )
-from sundae_ns.compensation.kernels import PACK, Launches, compiled, definitions
+from sundae_ns.compensation.kernels import PACK, Launches, head_kernels, head_options
 from sundae_ns.compensation.unet import UNet
 from sundae_ns.errors import BackendError, SundaeError
 from sundae_ns.gpu.cuda_graphs import MAX_GRAPHS, is_recording, record, warm_up
@@ -107,10 +107,10 @@ def network_backward(
 def unfold_backward(
     net: UNet, raw: Tensor, gradient: Tensor, alpha: Tensor, grad_raw: Tensor, launches: Launches
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of :func:`sundae_ns.compensation.fused.unfold`, from that of the image ``[H, W, 3]``.
+    """Gradients of :func:`sundae_ns.compensation.fused.unfold_pixels`, from that of the image ``[H, W, 3]``.
 
-    It writes the gradient of ``raw`` to ``grad_raw``, and returns those of accumulation ``[H, W, 1]``, and of weight and
-    bias of the 1 x 1 convolution, float32.
+    It writes the gradient of ``raw`` to ``grad_raw``. It returns those of accumulation ``[H, W, 1]``, and of weight
+    and bias of the 1 x 1 convolution, float32.
     """
     height, width = gradient.shape[:2]
     rows, columns = raw.shape[-2:]
@@ -118,8 +118,9 @@ def unfold_backward(
     gradient = gradient.contiguous()
     values, grad_values = raw.new_empty(rows, columns, raw.shape[1]), raw.new_empty(rows, columns, outputs)
     grad_alpha = torch.zeros_like(alpha, memory_format=torch.contiguous_format)
-    inputs: list[Argument] = [raw, *last_layers(net), rows, columns, gradient, alpha, pixel_stride(alpha), height, width]
-    launches["unfold_backward"](rows * columns, [*inputs, grad_raw, values, grad_values, grad_alpha])
+    layers: list[Argument] = [raw, *last_layers(net), rows, columns]
+    images: list[Argument] = [gradient, alpha, pixel_stride(alpha), height, width]
+    launches["unfold_backward"](rows * columns, [*layers, *images, grad_raw, values, grad_values, grad_alpha])
     # Sum row by row: as one product it would be a single sum over all pixels, which a GPU cannot parallelise.
     grad_weight = torch.bmm(grad_values.transpose(1, 2), values).sum(dim=0, dtype=torch.float32)
     grad_bias = grad_values.sum(dim=(0, 1), dtype=torch.float32)
@@ -138,6 +139,7 @@ class _Graphs(NamedTuple):
 class _Pass(NamedTuple):
     """Buffers of one image size, and the graphs that use them if they are recorded."""
 
+    launches: Launches
     weights: Weights
     tape: Tape
     grad_raw: Tensor
@@ -163,27 +165,20 @@ class FusedTraining:
         """Number of forward passes; it identifies a pass, since recorded passes of one size share their buffers."""
 
     def __call__(self, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> Tensor:
-        """One correction times accumulation, or one image if the network makes it by itself.
+        """One correction times accumulation, or one image if the network makes it by itself: ``[H, W, 3]`` float32.
 
-        Args:
-            splatted: colours and features, float32 ``[H, W, 3 + F]``.
-            alpha: accumulation, float32 ``[H, W, 1]``.
-            dtype: dtype of the arithmetic, float16 or bfloat16.
-
-        Returns:
-            ``[H, W, 3]`` float32.
+        Colours and features ``[H, W, 3 + F]`` and accumulation ``[H, W, 1]`` are float32. ``dtype`` is that of the
+        arithmetic, float16 or bfloat16.
 
         Raises:
             BackendError: the kernels cannot be compiled or loaded.
         """
-        launches = compiled(splatted.device, dtype, definitions(self.net, self.residual))
-        return cast("Tensor", _Correction.apply(splatted, alpha, self, dtype, launches, *self._parameters))
+        return cast("Tensor", _Correction.apply(splatted, alpha, self, dtype, *self._parameters))
 
-    def forward(
-        self, splatted: Tensor, alpha: Tensor, dtype: torch.dtype, launches: Launches
-    ) -> tuple[Tensor, _Pass, int]:
+    def forward(self, splatted: Tensor, alpha: Tensor, dtype: torch.dtype) -> tuple[Tensor, _Pass, int]:
         """The correction, the pass that computed it, and the number of the pass."""
         net = self.net
+        launches = head_kernels(splatted.device, dtype, head_options(net, self.residual))
         height, width = splatted.shape[:2]
         key = (height, width, dtype, net.out.weight.data_ptr())
         # Work that is being recorded as part of something larger contains no graph of its own.
@@ -197,25 +192,25 @@ class FusedTraining:
             except BackendError as error:
                 _log.warning("the head's training is not recorded and runs kernel by kernel: %s", error)
                 self._can_record = False
-        fold(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
+        fold_pixels(splatted, alpha, net.pixel_unshuffle, self.residual, folded, launches)
         if current is None:
             weights = Weights(net, dtype)
             tape = network(net, weights, folded, launches)
-            current = _Pass(weights, tape, torch.empty_like(tape.last))
+            current = _Pass(launches, weights, tape, torch.empty_like(tape.last))
         elif current.graphs is not None:
             self._release_gradients(current.graphs)
             current.graphs.forward.replay()
         self._passes += 1
         no_base = splatted.new_zeros(height, width, 3)
-        return unfold(net, current.tape.last, no_base, alpha, launches), current, self._passes
+        return unfold_pixels(net, current.tape.last, no_base, alpha, launches), current, self._passes
 
     def backward(
-        self, current: _Pass, number: int, gradient: Tensor, splatted_channels: int, alpha: Tensor, launches: Launches
+        self, current: _Pass, number: int, gradient: Tensor, splatted_channels: int, alpha: Tensor
     ) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Gradients of splatted values ``[H, W, 3 + F]``, accumulation ``[H, W, 1]`` and the parameters."""
         if number != self._passes:
             raise SundaeError("the head has computed another image since: call backward() before the next forward pass")
-        net, (weights, tape, grad_raw, graphs) = self.net, current
+        net, (launches, weights, tape, grad_raw, graphs) = self.net, current
         grad_alpha, *grad_last = unfold_backward(net, tape.last, gradient, alpha, grad_raw, launches)
         if graphs is None:
             grad_folded, grad_parameters = network_backward(net, weights, tape, grad_raw, launches)
@@ -258,22 +253,16 @@ class FusedTraining:
             folded.device,
             share_memory_with=forward,
         )
-        return _Pass(weights, tape, grad_raw, _Graphs(forward, backward, grad_folded, grad_parameters))
+        return _Pass(launches, weights, tape, grad_raw, _Graphs(forward, backward, grad_folded, grad_parameters))
 
 
 class _Correction(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any,
-        splatted: Tensor,
-        alpha: Tensor,
-        training: FusedTraining,
-        dtype: torch.dtype,
-        launches: Launches,
-        *parameters: Tensor,
+        ctx: Any, splatted: Tensor, alpha: Tensor, training: FusedTraining, dtype: torch.dtype, *parameters: Tensor
     ) -> Tensor:
-        out, ctx.current, ctx.number = training.forward(splatted, alpha, dtype, launches)
-        ctx.training, ctx.launches, ctx.channels = training, launches, splatted.shape[2]
+        out, ctx.current, ctx.number = training.forward(splatted, alpha, dtype)
+        ctx.training, ctx.channels = training, splatted.shape[2]
         ctx.save_for_backward(alpha)
         return out
 
@@ -281,9 +270,9 @@ class _Correction(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         (alpha,) = ctx.saved_tensors
         grad_splatted, grad_alpha, grad_parameters = ctx.training.backward(
-            ctx.current, ctx.number, gradient, ctx.channels, alpha, ctx.launches
+            ctx.current, ctx.number, gradient, ctx.channels, alpha
         )
-        return grad_splatted, grad_alpha, None, None, None, *grad_parameters
+        return grad_splatted, grad_alpha, None, None, *grad_parameters
 
 
 def _parameters(net: UNet) -> Iterator[Tensor]:

@@ -190,7 +190,8 @@ class CompensationHead(nn.Module):
         residual = self.config.mode == "residual"
         image = torch.cat([splatted[..., :3], alpha, splatted[..., 3:]], dim=-1) if residual else splatted[..., 3:]
         # [H, W, C] is the channels-last layout of [1, C, H, W]: no copy.
-        out = self._layers(image.permute(2, 0, 1)[None], dtype)[0].permute(1, 2, 0)
+        with torch.autocast(image.device.type, dtype=dtype, enabled=dtype != torch.float32):
+            out = self.net(image.permute(2, 0, 1)[None].to(dtype))[0].permute(1, 2, 0)
         if out.dtype == torch.float16:
             # Activations beyond 65504 become infinite, and NaN in the next layer: do not correct such pixels.
             out = out.nan_to_num(0.0, 0.0, 0.0)
@@ -208,7 +209,3 @@ class CompensationHead(nn.Module):
             return self._inference(base, splatted, alpha, dtype)
         out = self._training(splatted, alpha, dtype)
         return base + out if self.config.mode == "residual" else out
-
-    def _layers(self, image: Tensor, dtype: torch.dtype) -> Tensor:
-        with torch.autocast(image.device.type, dtype=dtype, enabled=dtype != torch.float32):
-            return self.net(image.to(dtype))

@@ -335,12 +335,12 @@ Launches = Mapping[str, Launch]
 
 
 @functools.cache
-def program(dtype: torch.dtype) -> str:
-    """The source for images of a dtype; :func:`definitions` gives its macros."""
+def head_source(dtype: torch.dtype) -> str:
+    """The source for images of a dtype; :func:`head_options` gives its macros."""
     return _CONVERSIONS[dtype] + SOURCE
 
 
-def definitions(net: UNet, residual: bool) -> tuple[str, ...]:
+def head_options(net: UNet, residual: bool) -> tuple[str, ...]:
     """Compiler options for a network: its fold, its widths, and whether it corrects an image."""
     widths = [layer.out_channels for layer in net.modules() if isinstance(layer, nn.Conv2d)]
     return (
@@ -353,15 +353,15 @@ def definitions(net: UNet, residual: bool) -> tuple[str, ...]:
     )
 
 
-def compiled(device: torch.device, dtype: torch.dtype, options: tuple[str, ...]) -> Launches:
+def head_kernels(device: torch.device, dtype: torch.dtype, options: tuple[str, ...]) -> Launches:
     """The kernels for a device, compiled on the first call.
 
     Args:
         device: CUDA device.
         dtype: dtype of images between the convolutions, float16 or bfloat16.
-        options: see :func:`definitions`.
+        options: see :func:`head_options`.
 
     Raises:
         BackendError: the kernels cannot be compiled or loaded.
     """
-    return load_kernels(program(dtype), KERNELS, options, device)
+    return load_kernels(head_source(dtype), KERNELS, options, device)

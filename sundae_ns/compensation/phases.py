@@ -1,8 +1,8 @@
 """Averaging the head over shifted images, so that its output depends less on the position of the pixel grid.
 
 A U-Net that folds and pools pixels is not equivariant to a shift by one pixel, which shows as flicker when the camera
-moves. The mean over shifted images, each shifted back, depends less on their position. A residual head trains on mirrored
-images too, so half of four runs see the image in a mirror: what the head gets wrong differs there.
+moves. The mean over shifted images, each shifted back, depends less on their position. A residual head also trains on
+mirrored images, so half of four runs see the image in a mirror: the head's errors differ there.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 
 from sundae_ns.compensation import training_window
-from sundae_ns.rasterization.sharded import Cameras, Plan, Route, Slack, camera_row, cameras_of
+from sundae_ns.rasterization.sharded import Cameras, Plan, Route, Slack, camera_row, cameras_of_rows
 from sundae_ns.rendering.source import NEAR_PLANE, StepResolution
 from sundae_ns.rendering.views import View, view_of
 
@@ -48,7 +48,7 @@ class Timetable:
     def cameras(self, at: StepResolution) -> Cameras:
         """The cameras of all ranks at a step, by rank; one launch, no collective."""
         table = self._table_of(at.downscale)
-        return cameras_of(torch.stack([self._row(table, index, at) for index in self.views(at.step)]))
+        return cameras_of_rows(torch.stack([self._row(table, index, at) for index in self.views(at.step)]))
 
     def _row(self, table: _Table, index: int, at: StepResolution) -> Tensor:
         view = table.on_host[index]

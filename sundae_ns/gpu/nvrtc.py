@@ -54,21 +54,15 @@ def compile_cubin(source: str, architecture: str, options: Sequence[str] = ()) -
 
 
 class Kernel:
-    """A kernel on one device, callable with tensors and numbers."""
+    """The ``extern "C"`` kernel ``name`` of a CUDA C++ source on one device, callable with tensors and numbers.
+
+    ``options`` are further compiler options, ``block`` is the number of threads per block.
+
+    Raises:
+        BackendError: the kernel cannot be compiled or loaded.
+    """
 
     def __init__(self, source: str, name: str, device: torch.device, options: Sequence[str] = (), block: int = 128):
-        """Compile and load.
-
-        Args:
-            source: CUDA C++.
-            name: name of the ``extern "C"`` kernel.
-            device: CUDA device.
-            options: further compiler options.
-            block: threads per block.
-
-        Raises:
-            BackendError: the kernel cannot be compiled or loaded.
-        """
         self._driver = _library("cuda")
         self._device = device
         self._block = block

@@ -1,9 +1,9 @@
 """Gaussian splatting of one view: one interface, three backends.
 
 :func:`rasterize`, :func:`spherical_harmonics`, :func:`harmonic_colors` and :func:`blending_weights` are the whole
-interface; each takes a :class:`Backend` from :func:`select_backend`. ``gsplat`` runs the CUDA kernels of the gsplat package.
-``reference`` is differentiable pure torch with the same thresholds, on any device, in float32 or float64. ``cpu`` computes
-the same as the reference in loops compiled by numba, several times as fast.
+interface; each takes a :class:`Backend` from :func:`select_backend`. ``gsplat`` runs the CUDA kernels of the gsplat
+package. ``reference`` is differentiable pure torch with the same thresholds, on any device, in float32 or float64.
+``cpu`` computes the same as the reference in loops compiled by numba, several times as fast.
 """
 
 from sundae_ns.rasterization.gsplat_backend import GsplatBackend, RecordableGsplat

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,21 +12,11 @@ from sundae_ns.errors import BackendError
 from sundae_ns.rasterization.constants import constant
 from sundae_ns.rasterization.gsplat_blending import blend
 from sundae_ns.rasterization.gsplat_colors import harmonic_colors
-from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, TileLists, tile_lists
+from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, GsplatLists, Splats, tile_lists
 from sundae_ns.rasterization.reference import ReferenceBackend, finished
 from sundae_ns.rasterization.types import Inputs, Rasterization
 
 _CHANNELS_PER_PASS = 32
-
-
-class Splats(NamedTuple):
-    """Primitives on the screen of one image, as gsplat projects them."""
-
-    radii: Tensor  # [1, N]; [1, N, 2] from gsplat 1.5 on
-    means2d: Tensor  # [1, N, 2]
-    depths: Tensor  # [1, N]
-    conics: Tensor  # [1, N, 3]
-    opacities: Tensor  # [1, N], those to blend
 
 
 class GsplatBackend:
@@ -56,15 +45,15 @@ class GsplatBackend:
         image = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
         return finished(image, alpha, splats.means2d, splats.radii, inputs)
 
-    def _lists(self, splats: Splats, width: int, height: int) -> TileLists:
+    def _lists(self, splats: Splats, width: int, height: int) -> GsplatLists:
         """gsplat's own lists: every tile that a primitive's bounding square touches."""
         from gsplat import isect_offset_encode, isect_tiles
 
         columns, rows = -(-width // TILE), -(-height // TILE)
         _, pairs, primitives = isect_tiles(splats.means2d, splats.radii, splats.depths, TILE, columns, rows)
-        return TileLists(width, height, isect_offset_encode(pairs, 1, columns, rows), primitives)
+        return GsplatLists(width, height, isect_offset_encode(pairs, 1, columns, rows), primitives)
 
-    def _blend(self, splats: Splats, colors: Tensor, lists: TileLists, absgrad: bool) -> tuple[Tensor, Tensor]:
+    def _blend(self, splats: Splats, colors: Tensor, lists: GsplatLists, absgrad: bool) -> tuple[Tensor, Tensor]:
         """Image ``[1, H, W, C]`` and alpha ``[1, H, W, 1]`` of colours ``[1, N, C]``."""
         from gsplat import rasterize_to_pixels
 
@@ -101,11 +90,10 @@ class RecordableGsplat(GsplatBackend):
     def __init__(self, capacity: Capacity) -> None:
         self._capacity = capacity
 
-    def _lists(self, splats: Splats, width: int, height: int) -> TileLists:
-        radii, means2d, depths, conics, opacities = (value[0] for value in splats)
-        return tile_lists(means2d, conics, opacities, depths, radii, width, height, capacity=self._capacity)
+    def _lists(self, splats: Splats, width: int, height: int) -> GsplatLists:
+        return tile_lists(splats, width, height, capacity=self._capacity)
 
-    def _blend(self, splats: Splats, colors: Tensor, lists: TileLists, absgrad: bool) -> tuple[Tensor, Tensor]:
+    def _blend(self, splats: Splats, colors: Tensor, lists: GsplatLists, absgrad: bool) -> tuple[Tensor, Tensor]:
         values = (splats.means2d, splats.conics, colors, splats.opacities)
         if torch.is_grad_enabled() and any(value.requires_grad for value in values):
             return blend(*values, lists, absgrad)

@@ -1,9 +1,9 @@
 """Front-to-back blending of gsplat's tile lists, and its gradients: one kernel each way, for training.
 
-The arithmetic and thresholds are gsplat's. Its backward pass sums each value of a primitive over the pixels of a warp by
-five exchanges, and adds the sums one by one. Here the lanes of a warp halve the values while they exchange them: 32 values
-take 31 exchanges in place of 160, and all are added at once. The gradient of alpha needs only the sum of what lies behind,
-already multiplied with the gradient of the pixel, so a thread keeps one number for it in place of one for each channel.
+The arithmetic and thresholds are gsplat's. Its backward pass sums each value of a primitive over the pixels of a warp
+by five exchanges, and adds the sums one by one. Here the lanes of a warp halve the values while they exchange them: 32
+values take 31 exchanges in place of 160, and all are added at once. The gradient of alpha needs the sum over all later
+primitives only as a product with the pixel's gradient. So a thread keeps one number for it, not one for each channel.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 from sundae_ns.errors import SundaeError
 from sundae_ns.gpu.nvrtc import Argument, load_kernels
 from sundae_ns.rasterization.compositing import MAX_ALPHA, MIN_TRANSMITTANCE
-from sundae_ns.rasterization.gsplat_tiles import BOX, ROUNDING, TILE, TileLists
+from sundae_ns.rasterization.gsplat_tiles import BOX, ROUNDING, TILE, GsplatLists
 from sundae_ns.rasterization.tiles import MIN_ALPHA
 
 THREADS = TILE * TILE
@@ -50,7 +50,8 @@ struct Batch {
 #define FIELD const float* __restrict__ means, const float* __restrict__ conics, const float* __restrict__ colors, \
     const float* __restrict__ opacities
 
-__device__ __forceinline__ void read(Batch& batch, const int* __restrict__ list, int count, int tile, int width, FIELD) {
+__device__ __forceinline__ void read(Batch& batch, const int* __restrict__ list, int count, int tile, int width,
+                                     FIELD) {
     const int columns = (width + TILE - 1) / TILE;
     for (int k = threadIdx.x; k < count; k += blockDim.x) {
         const long long i = list[k];
@@ -61,7 +62,8 @@ __device__ __forceinline__ void read(Batch& batch, const int* __restrict__ list,
 #pragma unroll
         for (int warp = 0; warp < THREADS / (WIDE * HIGH); ++warp) {
             const float x = left + warp % ACROSS * WIDE, y = up + warp / ACROSS * HIGH;
-            if (!misses_box(s.a, s.b, s.c, down, across, reach, x, x + WIDE - 1, y, y + HIGH - 1)) s.warps |= 1u << warp;
+            if (!misses_box(s.a, s.b, s.c, down, across, reach, x, x + WIDE - 1, y, y + HIGH - 1))
+                s.warps |= 1u << warp;
         }
         batch.shapes[k] = s;
 #pragma unroll
@@ -270,8 +272,8 @@ extern "C" __global__ void blend_backward(LISTS, FIELD, const float* __restrict_
 )
 
 
-def definitions(channels: int, *, absgrad: bool) -> tuple[str, ...]:
-    """Compiler options of :data:`SOURCE` for a number of channels, with or without absolute gradients of the centres."""
+def blending_options(channels: int, *, absgrad: bool) -> tuple[str, ...]:
+    """Compiler options of :data:`SOURCE`; with ``absgrad`` it also sums absolute gradients of the centres."""
     values = channels + (8 if absgrad else 6)
     numbers = {
         "TILE": TILE,
@@ -298,7 +300,7 @@ def definitions(channels: int, *, absgrad: bool) -> tuple[str, ...]:
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, lists: TileLists, absgrad: bool
+        ctx: Any, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, lists: GsplatLists, absgrad: bool
     ) -> tuple[Tensor, Tensor]:
         width, height = lists.width, lists.height
         field = [value.contiguous() for value in (means2d, conics, colors, opacities)]
@@ -308,7 +310,7 @@ class _Blend(torch.autograd.Function):
         stops = torch.empty(height, width, dtype=torch.int32, device=colors.device)
         tiles = -(-width // TILE) * -(-height // TILE)
         ctx.place = [width, height, tiles, lists.starts.numel(), len(lists.primitives), lists.starts, lists.primitives]
-        options = definitions(colors.shape[-1], absgrad=absgrad)
+        options = blending_options(colors.shape[-1], absgrad=absgrad)
         ctx.kernels = load_kernels(SOURCE, ("blend", "blend_backward"), options, colors.device, THREADS)
         ctx.kernels["blend"](tiles * THREADS, [*ctx.place, *field, image, alphas, lefts, stops])
         ctx.save_for_backward(means2d, *field, lefts, stops)
@@ -334,8 +336,9 @@ class _Blend(torch.autograd.Function):
 blend = _Blend.apply
 """Blend splats to an image ``[1, H, W, C]`` and its alpha ``[1, H, W, 1]``; once differentiable.
 
-It takes centres ``[1, N, 2]`` in pixels, conics ``[1, N, 3]``, colours ``[1, N, C]`` and opacities ``[1, N]``, all float32
-on a CUDA device, the tile lists, and ``absgrad``. Lists of tiles outside the image are ignored. With ``absgrad`` the
-backward pass sets ``absgrad`` ``[1, N, 2]`` of the centres: the absolute gradients of the pixels, summed (AbsGS). It
-raises BackendError if the kernels cannot be compiled or loaded.
+It takes centres ``[1, N, 2]`` in pixels, conics ``[1, N, 3]``, colours ``[1, N, C]`` and opacities ``[1, N]``, all
+float32 on a CUDA device, the tile lists, and ``absgrad``. Lists of tiles outside the image are ignored. With
+``absgrad`` the backward pass sets ``absgrad`` ``[1, N, 2]`` of the centres: the absolute gradients of the pixels,
+summed (AbsGS).
+It raises BackendError if the kernels cannot be compiled or loaded.
 """

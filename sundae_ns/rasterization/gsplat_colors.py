@@ -1,8 +1,8 @@
 """Colours of primitives as seen from a place, and their gradients: one kernel each way, on torch's current stream.
 
-gsplat 1.4 launches its own harmonics on CUDA's default stream. A CUDA graph records another stream, so recorded work would
-lack the colours. These kernels also take the coefficients where the field holds them, without a copy that joins both
-parameters. The formulas are those of :mod:`sundae_ns.rasterization.harmonics`.
+gsplat 1.4 launches its own harmonics on CUDA's default stream. A CUDA graph records another stream, so recorded work
+would lack the colours. These kernels also read the coefficients where the field holds them, without a copy that joins
+both parameters. The formulas are those of :mod:`sundae_ns.rasterization.harmonics`.
 """
 
 from __future__ import annotations

@@ -10,6 +10,7 @@ primitives are blended, and in which order, stays the same to the bit.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -29,10 +30,10 @@ __device__ __forceinline__ float within(float value, float low, float high) {
     return value < low ? low : value > high ? high : value;
 }
 
-// Whether a primitive's exponent, a dx^2 + 2 b dx dy + c dy^2, exceeds its reach in all pixels of a box around their centres,
-// relative to its own. The exponent is least at dy = slope_down dx in a column, and at dx = slope_across dy in a row. If the
-// primitive's centre is outside the box, the least exponent lies on an edge that faces the centre. NaN returns false, which
-// leaves the decision to the blending.
+// Whether a primitive's exponent, a dx^2 + 2 b dx dy + c dy^2, exceeds its reach in all pixels of a box. The box goes
+// around the pixels' centres, relative to the primitive's. The exponent is least at dy = slope_down dx in a column, and
+// at dx = slope_across dy in a row. If the primitive's centre is outside the box, the least exponent lies on an edge
+// that faces the centre. NaN returns false, which leaves the decision to the blending.
 __device__ __forceinline__ bool misses_box(float a, float b, float c, float slope_down, float slope_across, float reach,
                                            float left, float right, float up, float down) {
     const float near_x = nearest(left, right), near_y = nearest(up, down);
@@ -177,6 +178,21 @@ extern "C" __global__ void list_tiles(FIELD, const int* __restrict__ counts, con
 )
 
 
+class Splats(NamedTuple):
+    """Primitives on the screen of one image, as gsplat projects them; float32, contiguous."""
+
+    radii: Tensor
+    """int32 ``[1, N]``; one per axis ``[1, N, 2]`` from gsplat 1.5 on; 0 where a primitive is culled."""
+    means2d: Tensor
+    """Centres in pixels ``[1, N, 2]``."""
+    depths: Tensor
+    """Camera z ``[1, N]``."""
+    conics: Tensor
+    """Inverse covariances, upper triangle ``[1, N, 3]``."""
+    opacities: Tensor
+    """Opacities to blend ``[1, N]``."""
+
+
 @dataclass
 class Capacity:
     """Number of tile/primitive pairs to allocate, so that nothing waits for the GPU to count them."""
@@ -188,7 +204,7 @@ class Capacity:
 
 
 @dataclass(frozen=True)
-class TileLists:
+class GsplatLists:
     """Lists of tiles in row-major order, each front to back, as gsplat's ``rasterize_to_pixels`` reads them."""
 
     width: int
@@ -204,26 +220,11 @@ class TileLists:
 
 
 @torch.no_grad()
-def tile_lists(
-    means2d: Tensor,
-    conics: Tensor,
-    opacities: Tensor,
-    depths: Tensor,
-    radii: Tensor,
-    width: int,
-    height: int,
-    *,
-    capacity: Capacity,
-) -> TileLists:
+def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -> GsplatLists:
     """Tile lists of one view.
 
     Args:
-        means2d: centres in pixels ``[N, 2]``; all float32 on a CUDA device, contiguous, as returned by gsplat's
-            projection.
-        conics: inverse covariances on the screen, upper triangle ``[N, 3]``.
-        opacities: opacities to blend ``[N]``.
-        depths: camera z ``[N]``.
-        radii: int32 ``[N]``, or one per axis ``[N, 2]``; 0 where a primitive is culled.
+        splats: what to list, on a CUDA device.
         width: image width in pixels.
         height: image height in pixels.
         capacity: number of pairs to allocate; the number needed is appended to it. Without a limit this waits once for
@@ -232,15 +233,15 @@ def tile_lists(
     Raises:
         BackendError: the kernels cannot be compiled or loaded.
     """
+    radii, means2d, depths, conics, opacities = splats
     device = means2d.device
     columns, rows = -(-width // TILE), -(-height // TILE)
     dtype = torch.int16 if columns * (rows + 1) <= torch.iinfo(torch.int16).max else torch.int32
-    kernels = load_kernels(SOURCE, ("count_tiles", "list_tiles"), definitions(dtype), device)
-    n = len(means2d)
+    kernels = load_kernels(SOURCE, ("count_tiles", "list_tiles"), listing_options(dtype), device)
+    n = means2d.shape[1]
     lanes = lanes_per_primitive(n)
-    order = depths.argsort(stable=True)
-    axes = 1 if radii.ndim == 1 else 2
-    geometry = (n, lanes, order, means2d, conics, opacities, radii, axes, width, height, columns, rows)
+    order = depths[0].argsort(stable=True)
+    geometry = (n, lanes, order, means2d, conics, opacities, radii, radii.ndim - 1, width, height, columns, rows)
     counts = torch.empty(n * lanes, dtype=torch.int32, device=device)
     kernels["count_tiles"](n * lanes, [*geometry, counts])
     ends = counts.cumsum(0)
@@ -260,7 +261,7 @@ def tile_lists(
     shape = (1, rows + below, columns)
     # Gradients would walk through the unused pairs, so their tiles are marked.
     drawn = (numbers < columns * rows).view(shape) if below else None
-    return TileLists(width, height, starts.view(shape), primitives.index_select(0, by_tile), drawn)
+    return GsplatLists(width, height, starts.view(shape), primitives.index_select(0, by_tile), drawn)
 
 
 def lanes_per_primitive(n: int) -> int:
@@ -268,7 +269,7 @@ def lanes_per_primitive(n: int) -> int:
     return 32 if n < 2**17 else 8
 
 
-def definitions(dtype: torch.dtype) -> tuple[str, ...]:
+def listing_options(dtype: torch.dtype) -> tuple[str, ...]:
     """Compiler options of :data:`SOURCE` for tile numbers of a dtype, int16 or int32."""
     number = "short" if dtype == torch.int16 else "int"
     return (f"-DTILE={TILE}", f"-DROUNDING={ROUNDING}f", f"-DTileId={number}")

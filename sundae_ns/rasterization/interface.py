@@ -6,10 +6,9 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError
+from sundae_ns.gaussians.parameters import MAX_SH_DEGREE
 from sundae_ns.rasterization.constants import constant
 from sundae_ns.rasterization.types import Backend, ColorBackend, Inputs, Rasterization
-
-MAX_SH_DEGREE = 4
 
 
 def rasterize(

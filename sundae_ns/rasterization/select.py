@@ -27,20 +27,20 @@ def select_backend(name: BackendName, device: torch.device | str) -> Backend:
         ConfigError: The name is unknown.
     """
     device = torch.device(device)
-    if name == "auto":
-        if _gsplat_problem_on(device) is None:
+    if name in ("auto", "gsplat"):
+        problem = _gsplat_problem_on(device)
+        if problem is None:
             return GsplatBackend()
-        return ReferenceBackend() if _cpu_problem_on(device) else _cpu_backend()
-    if name == "reference":
-        return ReferenceBackend()
-    if name == "gsplat":
-        if problem := _gsplat_problem_on(device):
+        if name == "gsplat":
             raise BackendError(f"gsplat cannot rasterize: {problem}; or use the backend 'reference'")
-        return GsplatBackend()
-    if name == "cpu":
-        if problem := _cpu_problem_on(device):
+    if name in ("auto", "cpu"):
+        problem = _cpu_problem_on(device)
+        if problem is None:
+            return _cpu_backend()
+        if name == "cpu":
             raise BackendError(f"the cpu backend cannot rasterize: {problem}; or use the backend 'reference'")
-        return _cpu_backend()
+    if name in ("auto", "reference"):
+        return ReferenceBackend()
     raise ConfigError(f"unknown rasterizer {name!r}; use auto, gsplat, cpu or reference")
 
 

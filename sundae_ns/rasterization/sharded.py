@@ -76,7 +76,7 @@ def camera_row(viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: 
     return torch.cat([camera_center(viewmat), frustum_bounds(viewmat, K, width, height, near_plane).flatten()])
 
 
-def cameras_of(rows: Tensor) -> Cameras:
+def cameras_of_rows(rows: Tensor) -> Cameras:
     """Cameras from rows of :func:`camera_row` ``[R, 33]``."""
     return Cameras(rows[:, :3], rows[:, 3:].view(-1, 5, 6))
 
@@ -87,7 +87,7 @@ def gather_cameras(viewmat: Tensor, K: Tensor, width: int, height: int, near_pla
     own = camera_row(viewmat, K, width, height, near_plane)
     rows = own.new_empty(dist.get_world_size() * len(own))
     dist.all_gather_into_tensor(rows, own)
-    return cameras_of(rows.view(-1, len(own)))
+    return cameras_of_rows(rows.view(-1, len(own)))
 
 
 @torch.no_grad()
@@ -168,15 +168,10 @@ def plan_exchange(seen: Tensor) -> Plan:
 
 
 def swap(rows: Tensor, sent: list[int], received: list[int]) -> Tensor:
-    """Send a block of rows to each rank and receive one from each. Collective.
+    """Send ``sent`` rows to each rank and receive ``received`` rows from each. Collective.
 
-    Args:
-        rows: the blocks in order of their destination rank ``[sum(sent), ...]``.
-        sent: number of rows for each rank.
-        received: number of rows from each rank.
-
-    Returns:
-        ``[sum(received), ...]``, in order of the source rank.
+    ``rows`` ``[sum(sent), ...]`` are in order of the destination rank, the result ``[sum(received), ...]`` in order of
+    the source rank.
     """
     incoming = rows.new_empty(sum(received), *rows.shape[1:])
     dist.all_to_all_single(incoming, rows.contiguous(), received, sent)
@@ -207,11 +202,7 @@ def exchange(rows: Tensor, route: Route) -> Tensor:
     Gradients come back divided by the number of ranks, so that they are those of the mean of all ranks' losses. The
     values of ``route.ask`` come back with them; it must be set on all ranks or on none.
 
-    Args:
-        rows: rows in the order of ``route.ids`` ``[S, D]``.
-        route: route of a :class:`Plan`.
-
-    Returns:
-        ``[M, D]``, in order of the source rank, and within each in the order of its shard.
+    ``rows`` ``[S, D]`` are in the order of ``route.ids``. The result ``[M, D]`` is in order of the source rank, and
+    within each in the order of its shard.
     """
     return _Exchange.apply(rows, route)  # type: ignore[no-untyped-call]

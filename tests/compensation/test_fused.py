@@ -39,8 +39,8 @@ def on_cpu(load_on_cpu: Callable[..., kernels.Launches]) -> Iterator[None]:
 
 
 def compiled(head: CompensationHead) -> kernels.Launches:
-    options = kernels.definitions(head.net, head.config.mode == "residual")
-    return kernels.compiled(torch.device("cpu"), torch.float32, options)
+    options = kernels.head_options(head.net, head.config.mode == "residual")
+    return kernels.head_kernels(torch.device("cpu"), torch.float32, options)
 
 
 def make(**options: object) -> CompensationHead:
@@ -65,9 +65,9 @@ def by_kernels(head: CompensationHead, images: tuple[Tensor, Tensor, Tensor]) ->
     base, seen, alpha = images
     launches = compiled(head)
     folded = fused.folded_input(head.net, *base.shape[:2], base, torch.float32).fill_(torch.nan)
-    fused.fold(seen, alpha, head.config.pixel_unshuffle, head.config.mode == "residual", folded, launches)
+    fused.fold_pixels(seen, alpha, head.config.pixel_unshuffle, head.config.mode == "residual", folded, launches)
     last = fused.network(head.net, fused.Weights(head.net, torch.float32), folded, launches).last
-    return fused.unfold(head.net, last, base, alpha, launches)
+    return fused.unfold_pixels(head.net, last, base, alpha, launches)
 
 
 @pytest.mark.parametrize("mode", ["residual", "features"])
@@ -203,7 +203,7 @@ def as_recorded(head: CompensationHead, height: int, width: int) -> _Pass:
             old.copy_(new)
 
     graphs = [cast("torch.cuda.CUDAGraph", FakeGraph(run)) for run in (forward, backward)]
-    return _Pass(weights, tape, grad_raw, _Graphs(*graphs, grad_folded, grad_parameters))
+    return _Pass(launches, weights, tape, grad_raw, _Graphs(*graphs, grad_folded, grad_parameters))
 
 
 def test_gradients_of_replayed_passes_are_not_copied_and_add_up() -> None:
@@ -277,8 +277,8 @@ def test_kernels_compile_for_gpus_that_have_the_types(compile_for_gpu: Callable[
         ("sm_80", torch.bfloat16, make(size="large", mode="features")),
         ("sm_90", torch.float16, make()),
     ):
-        options = kernels.definitions(head.net, head.config.mode == "residual")
-        code = compile_for_gpu(kernels.program(dtype), architecture, options)
+        options = kernels.head_options(head.net, head.config.mode == "residual")
+        code = compile_for_gpu(kernels.head_source(dtype), architecture, options)
         assert all(name.encode() in code for name in kernels.KERNELS)
 
 
@@ -326,7 +326,7 @@ def test_without_kernels_the_layers_run(monkeypatch: pytest.MonkeyPatch, caplog:
     head = make().cuda().eval()
     images = tuple(image.cuda() for image in splatted(16, 16, 5))
     expected = head(*images)
-    monkeypatch.setattr(fused, "compiled", refuse)
+    monkeypatch.setattr(fused, "head_kernels", refuse)
     with caplog.at_level(logging.WARNING):
         found, again = head(*images), head(*images)
     assert caplog.text.count("layer by layer") == 1

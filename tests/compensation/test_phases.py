@@ -14,7 +14,8 @@ Images = tuple[Tensor, Tensor, Tensor]
 
 
 def head(phases: int = 4, **options: object) -> CompensationHead:
-    made = CompensationHead(HeadConfig(**{"size": "tiny", "num_features": 5, "phases": phases, **options}))  # type: ignore[arg-type]
+    config = {"size": "tiny", "num_features": 5, "phases": phases, **options}
+    made = CompensationHead(HeadConfig(**config))  # type: ignore[arg-type]
     for parameter in made.parameters():
         nn.init.normal_(parameter, std=0.1 if parameter.ndim == 1 else parameter[0].numel() ** -0.5)
     return made

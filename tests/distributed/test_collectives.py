@@ -31,7 +31,7 @@ from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rasterization import rasterize, select_backend
-from sundae_ns.rasterization.sharded import Cameras, camera_row, cameras_of, may_be_seen
+from sundae_ns.rasterization.sharded import Cameras, camera_row, cameras_of_rows, may_be_seen
 from sundae_ns.rendering import ColorSettings, Primitives, StepResolution, TrainingView, View
 from sundae_ns.rendering.source import colors_from
 from sundae_ns.training.densification import CappedStrategy
@@ -206,7 +206,7 @@ class Views:
 
     def cameras(self, at: StepResolution) -> Cameras:
         views = [self.of(at, rank) for rank in range(RANKS)]
-        return cameras_of(torch.stack([camera_row(v.viewmat, v.K, v.width, v.height, 0.01) for v in views]))
+        return cameras_of_rows(torch.stack([camera_row(v.viewmat, v.K, v.width, v.height, 0.01) for v in views]))
 
 
 def check_planning_ahead(shards: Shards) -> None:
@@ -529,7 +529,7 @@ def check_batches(shards: Shards) -> None:
 
 
 def _frustum(view: View) -> Tensor:
-    return cameras_of(camera_row(view.viewmat, view.K, view.width, view.height, 0.01)[None]).bounds
+    return cameras_of_rows(camera_row(view.viewmat, view.K, view.width, view.height, 0.01)[None]).bounds
 
 
 def check_taking_a_shard(shards: Shards) -> None:

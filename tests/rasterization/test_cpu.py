@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 import torch
+from hard_scenes import CASES, NEAR, Scene
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -24,7 +25,6 @@ from sundae_ns.errors import BackendError
 from sundae_ns.rasterization import Rasterization, blending_weights, rasterize, select_backend
 
 CPU, REFERENCE = select_backend("cpu", "cpu"), select_backend("reference", "cpu")
-Scene = dict[str, Tensor]
 
 
 def make_scene(n: int, channels: int = 3, seed: int = 0) -> Scene:
@@ -210,72 +210,12 @@ def test_absgrad_of_repeated_backward_passes() -> None:
 
 # ------------------------------------------------------------------------------------------------------------ float32
 
-NEAR = 2.0**-6
-
-
-def hard(name: str) -> tuple[Scene, int]:
-    """The scenes of ``test_steady.py``, and the image size."""
-    scene = make_scene(10_000 if "on one pixel" in name else 300)
-    if name == "scales of 1e-8":
-        scene["scales"][:150] = math.log(1e-8)
-    elif name == "scales of 1e3":
-        scene["scales"][:150] = math.log(1e3)
-    elif name == "needles":
-        scene["scales"][:150] = torch.log(torch.tensor([1e3, 1e-8, 1e-8]))
-    elif name == "logits of 30":
-        scene["opacities"][:150] = 30.0
-    elif name == "logits of -30":
-        scene["opacities"][:150] = -30.0
-    elif name == "near plane":
-        near = torch.tensor(NEAR)
-        steps = [
-            near,
-            near.nextafter(torch.tensor(1.0)),
-            near.nextafter(torch.tensor(0.0)),
-            0 * near,
-            -near,
-            -100 * near,
-        ]
-        for i, z in enumerate(steps):
-            scene["means"][10 * i : 10 * i + 10, 2] = z
-            scene["means"][10 * i : 10 * i + 5, :2] = 0.0
-    elif name == "behind":
-        scene["means"][:, 2] -= 10.0
-    elif name == "zero quaternions":
-        scene["quats"][:150] = 0.0
-    elif name == "one pixel":
-        return scene, 1
-    elif "on one pixel" in name:
-        scene["means"][:, :2] *= 1e-3
-        scene["scales"] -= 1.0
-        scene["opacities"][:] = 30.0 if "opaque" in name else scene["opacities"] / 2
-        return scene, 16
-    else:
-        assert name == "ordinary"
-    return scene, 48
-
-
-# Bounds on the errors of values and of the worst gradient against the oracle in float64.
-HARD = {
-    "ordinary": (5e-6, 2e-5),
-    "scales of 1e-8": (5e-6, 2e-5),
-    "scales of 1e3": (5e-6, 2e-5),
-    "needles": (5e-5, 1e-3),
-    "logits of 30": (5e-6, 2e-5),
-    "logits of -30": (5e-6, 2e-5),
-    "near plane": (5e-6, 2e-5),
-    "behind": (0.0, 0.0),
-    "zero quaternions": (5e-6, 2e-5),
-    "one pixel": (5e-6, 1e-4),
-    "10,000 on one pixel": (5e-6, 2e-5),
-    "10,000 opaque on one pixel": (5e-6, 2e-5),
-}
-
 
 @pytest.mark.parametrize("antialiased", [False, True], ids=["plain", "antialiased"])
-@pytest.mark.parametrize("name", HARD)
+@pytest.mark.parametrize("name", CASES)
 def test_hard_scenes(name: str, antialiased: bool) -> None:
-    scene, size = hard(name)
+    make, size, *bounds = CASES[name]
+    scene = make()
     view = make_view(size, size, torch.float64)
     view["viewmat"] = torch.eye(4)  # so that primitives lie on the near plane in both precisions
     options = {"antialiased": antialiased, "near_plane": NEAR}
@@ -283,7 +223,7 @@ def test_hard_scenes(name: str, antialiased: bool) -> None:
     double = render(scene, view, torch.float64, CPU, **options)
     assert torch.equal(double["radii"], exact["radii"])
     compare(double, exact, 1e-9, 1e-7)  # measured: 2.2e-12 and 1.9e-10, of needles; else 3.3e-15 and 2.9e-13
-    compare(render(scene, view, torch.float32, CPU, **options), exact, *HARD[name])
+    compare(render(scene, view, torch.float32, CPU, **options), exact, *bounds)
 
 
 def test_scales_that_vanish_and_centres_far_away_are_finite() -> None:

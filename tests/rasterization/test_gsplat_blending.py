@@ -13,7 +13,7 @@ from sundae_ns.errors import SundaeError
 from sundae_ns.rasterization import gsplat_blending
 from sundae_ns.rasterization.compositing import composite
 from sundae_ns.rasterization.gsplat_blending import blend
-from sundae_ns.rasterization.gsplat_tiles import TILE, TileLists
+from sundae_ns.rasterization.gsplat_tiles import TILE, GsplatLists
 from sundae_ns.rasterization.projection import Projection
 from sundae_ns.rasterization.tiles import build_tile_lists
 
@@ -46,13 +46,13 @@ def field(n: int, channels: int, width: int, height: int, *, opacity: float = 1.
     }
 
 
-def whole_lists(primitives: dict[str, Tensor], width: int, height: int, spare: int) -> TileLists:
+def whole_lists(primitives: dict[str, Tensor], width: int, height: int, spare: int) -> GsplatLists:
     """Every primitive in every tile, by depth, and a tile below the image with ``spare`` pairs."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     order = primitives["depths"].argsort(stable=True).int()
     starts = torch.arange(columns * (rows + (spare > 0)), dtype=torch.int32).clamp(max=columns * rows) * len(order)
     pairs = torch.cat([order.repeat(columns * rows), torch.zeros(spare, dtype=torch.int32)])
-    return TileLists(width, height, starts.view(1, -1, columns), pairs)
+    return GsplatLists(width, height, starts.view(1, -1, columns), pairs)
 
 
 def expected(
@@ -123,7 +123,7 @@ def test_gradients_flow_into_some_inputs_only() -> None:
 
 def test_an_empty_list_leaves_the_background() -> None:
     ours = leaves_of(field(5, 3, 20, 20), torch.float32)
-    lists = TileLists(20, 20, torch.zeros(1, 2, 2, dtype=torch.int32), torch.zeros(0, dtype=torch.int32))
+    lists = GsplatLists(20, 20, torch.zeros(1, 2, 2, dtype=torch.int32), torch.zeros(0, dtype=torch.int32))
     image, alpha = blend(*ours.values(), lists, False)
     assert not image.any()
     assert not alpha.any()
@@ -142,5 +142,5 @@ def test_second_derivatives_are_refused() -> None:
 def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gsplat_blending, "LANES", 32)
     for architecture, channels, absgrad in (("sm_75", 3, True), ("sm_90", 16, False), ("sm_90", 32, False)):
-        options = gsplat_blending.definitions(channels, absgrad=absgrad)
+        options = gsplat_blending.blending_options(channels, absgrad=absgrad)
         compile_for_gpu(gsplat_blending.SOURCE, architecture, options)

@@ -22,7 +22,7 @@ from sundae_ns.rasterization import (
     harmonic_colors,
     select_backend,
 )
-from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, tile_lists
+from sundae_ns.rasterization.gsplat_tiles import TILE, Capacity, Splats, tile_lists
 
 Field = dict[str, Tensor]
 
@@ -84,7 +84,8 @@ def most_alpha(primitives: Field, column: int, row: int, width: int, height: int
 
 
 def by_tile(primitives: Field, width: int, height: int, capacity: Capacity | None = None) -> list[Tensor]:
-    lists = tile_lists(**primitives, width=width, height=height, capacity=capacity or Capacity())
+    splats = Splats(**{name: value[None] for name, value in primitives.items()})
+    lists = tile_lists(splats, width, height, capacity=capacity or Capacity())
     ends = [*lists.starts.flatten()[1:].tolist(), len(lists.primitives)]
     starts = lists.starts.flatten().tolist()
     return [lists.primitives[start:end].long() for start, end in zip(starts, ends, strict=True)]
@@ -226,7 +227,7 @@ def test_second_derivatives_of_colors_are_refused() -> None:
 
 def test_kernels_compile_for_gpus(compile_for_gpu: Callable[..., bytes]) -> None:
     for dtype in (torch.int16, torch.int32):
-        compile_for_gpu(gsplat_tiles.SOURCE, "sm_75", gsplat_tiles.definitions(dtype))
+        compile_for_gpu(gsplat_tiles.SOURCE, "sm_75", gsplat_tiles.listing_options(dtype))
     compile_for_gpu(gsplat_colors.SOURCE, "sm_90", gsplat_colors.OPTIONS)
 
 

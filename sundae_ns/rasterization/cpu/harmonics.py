@@ -1,7 +1,7 @@
 """Spherical harmonics and their derivatives, one compiled loop each.
 
-The polynomials are those of :mod:`sundae_ns.rasterization.harmonics`. Loops read and write the tensors' dtype and compute
-in float64.
+The polynomials are those of :mod:`sundae_ns.rasterization.harmonics`. Loops read and write the tensors' dtype, and
+compute in float64.
 """
 
 from __future__ import annotations

@@ -34,20 +34,16 @@ _SOURCES = "".join(path.read_text() for path in _FILES)
 _ready: set[tuple[Any, ...]] = set()  # loops already called, with the dtypes of their arguments
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As :func:`compiled`, but inlined into the calling loop, which keeps lanes in registers."""
+    return compiled(function, forceinline=True)
+
+
+def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """Compile at the first call with new types; later processes load the machine code from disk.
 
     numba caches it beside the module or in the user's cache folder, and recompiles when a file of this package changes.
     """
-    return _compile(function)
-
-
-def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As :func:`compiled`, but inlined into the calling loop, which keeps lanes in registers."""
-    return _compile(function, forceinline=True)
-
-
-def _compile(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     # x / 0 gives inf or NaN, as in torch: raising would cost a branch.
     options |= {"nogil": True, "error_model": "numpy"}
     # Constants of other modules are compiled in: a hash of them in the name selects the cache file.
