@@ -1,7 +1,7 @@
 """Images of another scale than those the head was trained on.
 
 A screen-space network learns one size of a pixel in the scene. On an image of half or twice the focal length it may do
-harm, so such images are compensated at the trained scale, and the correction is resized.
+harm. Such images are compensated at the trained scale, and the correction is resized.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ FADE = (4.0, 2.0)
 a thumbnail must not cost a full-size image, nor the head appear abruptly during a zoom."""
 
 MAX_PIXELS = 2**24
-"""The head also fades out for images with more pixels than this at the trained scale, such as a wide view, and is off
-at twice as many. 33 million pixels take two gigabytes."""
+"""The head also fades out for images with more pixels than this at the trained scale, such as a wide view. It is off
+at twice as many: 33 million pixels take two gigabytes."""
 
 MARGIN = 1.25
 """The pixel limit does not apply at scales up to this factor, whatever the size of the image."""

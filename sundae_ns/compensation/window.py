@@ -1,5 +1,8 @@
-"""What the head sees of a training image: a random window of a large one, so that the cost of a step does not grow with
-the image size, and in half of the steps its mirror image, so that it does not learn the training views by heart."""
+"""The window of a training image on which the head trains.
+
+Windows of large images are random, so the cost of a step does not grow with the image size. Half of the steps see the
+mirror image, against overfitting to the training views.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ class Window(NamedTuple):
 
 
 def training_window(width: int, height: int, max_pixels: int, seed: int, *, mirror: bool = False) -> Window | None:
-    """A random window with the image's aspect ratio, or None to train on the whole image as it is.
+    """A random window with the image's aspect ratio, or None to train on the whole image, not mirrored.
 
     Positions are drawn from beyond the edges too and moved back inside, because uniform ones would rarely include the
     pixels next to the edges.

@@ -1,7 +1,7 @@
 """``(1 - weight) L1 + weight (1 - SSIM)`` of an image, L1 of its base colours, and gradients: one GPU kernel each.
 
 Built from convolutions, SSIM reads and writes the image dozens of times. Here a block of threads keeps a tile of both
-images in shared memory, filters it there by rows and columns, and writes only three derivatives, which the backward
+images in shared memory, and filters it there by rows and columns. It writes only three derivatives, which the backward
 pass filters once more.
 
 The source is plain C++ except for the thread indices, so the tests compile the same source for the CPU.

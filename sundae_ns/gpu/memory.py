@@ -12,7 +12,7 @@ from sundae_ns.errors import out_of_memory
 
 @contextmanager
 def naming_full_memory(num_primitives: Callable[[], int]) -> Iterator[None]:
-    """Turn CUDA's error inside the block into one that names the number of primitives and what to try.
+    """Turn CUDA's error inside the block into one that names the number of primitives and a remedy.
 
     Args:
         num_primitives: counts the primitives, called on an error only.

@@ -79,7 +79,7 @@ class GsplatBackend:
 
 
 class RecordableGsplat(GsplatBackend):
-    """gsplat with what CUDA graphs need: nothing waits for the GPU, and all work is on torch's current stream.
+    """gsplat that CUDA graphs can record: nothing waits for the GPU, and all work is on torch's current stream.
 
     Tiles get our own lists, shorter than gsplat's. Colours, and blending with gradients, have kernels of our own.
 

@@ -336,8 +336,8 @@ class _Blend(torch.autograd.Function):
 blend = _Blend.apply
 """Blend splats to an image ``[1, H, W, C]`` and its alpha ``[1, H, W, 1]``; once differentiable.
 
-It takes centres ``[1, N, 2]`` in pixels, conics ``[1, N, 3]``, colours ``[1, N, C]`` and opacities ``[1, N]``, all
-float32 on a CUDA device, the tile lists, and ``absgrad``. Lists of tiles outside the image are ignored. With
+It takes centres ``[1, N, 2]`` in pixels, conics ``[1, N, 3]``, colours ``[1, N, C]``, opacities ``[1, N]``, the tile
+lists, and ``absgrad``. Tensors are float32 on a CUDA device. Lists of tiles outside the image are ignored. With
 ``absgrad`` the backward pass sets ``absgrad`` ``[1, N, 2]`` of the centres: the absolute gradients of the pixels,
 summed (AbsGS).
 It raises BackendError if the kernels cannot be compiled or loaded.

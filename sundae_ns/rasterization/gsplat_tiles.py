@@ -224,7 +224,7 @@ def tile_lists(splats: Splats, width: int, height: int, *, capacity: Capacity) -
     """Tile lists of one view.
 
     Args:
-        splats: what to list, on a CUDA device.
+        splats: the primitives, on a CUDA device.
         width: image width in pixels.
         height: image height in pixels.
         capacity: number of pairs to allocate; the number needed is appended to it. Without a limit this waits once for

@@ -149,7 +149,7 @@ def blending_weights(
 ) -> Tensor:
     """Contribution of each primitive to one view: its alpha times transmittance, summed over the pixels.
 
-    Blending is linear in the colours, so this is exactly the gradient of the summed image with respect to a one-channel
+    Blending is linear in the colours. So this is exactly the gradient of the summed image with respect to a one-channel
     colour, and no backend needs code for it. Arguments are those of :func:`rasterize`, and:
 
     Args:

@@ -1,8 +1,7 @@
 """EWA projection of 3D Gaussians to the screen, in plain autograd torch.
 
-Zwicker et al., "EWA Splatting", 2002, with the conventions of 3DGS: the perspective map is linearised at the centre,
-with its slope clamped to the image plus 0.15 of its size on each side, and every footprint is blurred by 0.3 square
-pixels.
+Zwicker et al., "EWA Splatting", 2002, with the conventions of 3DGS. The perspective map is linearised at the centre.
+Its slope is clamped to the image plus 0.15 of its size on each side. Every footprint is blurred by 0.3 square pixels.
 """
 
 from __future__ import annotations

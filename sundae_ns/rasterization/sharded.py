@@ -44,9 +44,9 @@ UNMOVED = Slack(0.0, 0.0)
 def frustum_bounds(viewmat: Tensor, K: Tensor, width: int, height: int, near_plane: float) -> Tensor:
     """Five linear forms of ``(x, y, z, 1, s)``, s the largest scale; a primitive with one above 0 is culled ``[5, 6]``.
 
-    A backend culls a primitive whose distance from the image exceeds its radius, at most three standard deviations of
-    the footprint, whose variance is at most its trace. A row of the perspective map's Jacobian has the length
-    ``f / z * sqrt(1 + k^2)`` for a slope k, which is clamped to the image and a margin, so the trace is at most
+    A backend culls a primitive whose distance from the image exceeds its radius. The radius is at most three standard
+    deviations of the footprint, whose variance is at most its trace. A row of the perspective map's Jacobian has the
+    length ``f / z * sqrt(1 + k^2)`` for a slope k, which is clamped to the image and a margin. So the trace is at most
     ``(s / z)^2 C^2`` with one C per camera, plus the blur. Multiplied by z, this is linear. The fifth form is the near
     plane. The sixth column is the largest change of a form if x, y and z each change by up to 1.
 

@@ -1,7 +1,7 @@
 """Depth-ordered lists of the primitives that can touch each tile of the image.
 
 gsplat 1.4 bins primitives into 16-pixel tiles by their three-sigma square and blends them in every pixel of those
-tiles, so its images depend on that grid. The lists here use a finer grid and leave out only primitives that cannot
+tiles. So its images depend on that grid. The lists here use a finer grid and leave out only primitives that cannot
 reach an alpha of 1/255 in a tile: the image is that of the 16-pixel grid, with fewer evaluations. (gsplat 1.5 fits the
 bins to the opacity instead, which also keeps the rim of opaque primitives from 3 to 3.33 sigma.)
 """

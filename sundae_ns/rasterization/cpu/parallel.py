@@ -1,8 +1,8 @@
 """Compiled loops, and the threads that run them.
 
-Loops are compiled without the interpreter's lock and run on ordinary threads. Numba's own thread pools do not serve:
-with the OpenMP pool a forked process dies (data loaders fork), with the built-in pool two concurrent callers die (a
-viewer is one), and ``parallel=True`` takes several times as long to compile.
+Loops are compiled without the interpreter's lock and run on ordinary threads. Numba's own thread pools do not serve.
+With the OpenMP pool a forked process dies, and data loaders fork. With the built-in pool two concurrent callers die,
+and a viewer is one. ``parallel=True`` takes several times as long to compile.
 
 A loop writes only the elements of its own range, so results do not depend on the number of threads.
 """

@@ -1,8 +1,8 @@
 """Depth-ordered lists of the primitives of each tile, by the rule of :mod:`sundae_ns.rasterization.tiles`.
 
 Primitives are sorted by depth once and are then identified by their rank. A rank owns consecutive slots, one per tile
-that it can touch; the list of a tile is a list of slots. The backward pass writes its sums per tile into the slots, so
-the sum over the tiles of a primitive reads adjacent memory in a fixed order.
+that it can touch; the list of a tile is a list of slots. The backward pass writes its sums per tile into the slots. The
+sum over the tiles of a primitive then reads adjacent memory in a fixed order.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Lists:
     longest_first: Any  # [B], int32: tiles with a list, the longest first
 
     def for_blending(self) -> tuple[Any, ...]:
-        """What both loops over the tiles read."""
+        """The arrays that both loops over the tiles read."""
         return self.columns, self.longest_first, self.starts, self.ranks, self.spans, self.ids, self.table
 
 
