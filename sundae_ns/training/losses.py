@@ -7,7 +7,6 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
 
 import torch
 from pytorch_msssim import SSIM
@@ -17,6 +16,7 @@ from sundae_ns.errors import BackendError
 from sundae_ns.gpu.fused_loss import SSIM_WINDOW, fused_loss, loss_kernels
 from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.options import ModelOptions
 
 CHAIN_PRIOR = 0.01
 """Weights of opacities and scales in the loss of a chain (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
@@ -30,16 +30,6 @@ LEAST_SQUARE = 1e-8
 """Added to the mean square, so that its root has a gradient for equal images."""
 
 _log = logging.getLogger(__name__)
-
-
-class LossOptions(Protocol):
-    """Options of a model that its losses depend on."""
-
-    ssim_lambda: float
-    base_loss_weight: float
-    warmup: Literal["densify", "mcmc"]
-    loss_after_prune: Literal["l1", "rms"]
-    prior_after_prune: float
 
 
 @dataclass(frozen=True)
@@ -62,7 +52,7 @@ class StepLosses:
     """Number of training images; 0 if it is not known."""
 
     @classmethod
-    def of(cls, options: LossOptions, ssim: SSIM, num_images: int) -> StepLosses:
+    def of(cls, options: ModelOptions, ssim: SSIM, num_images: int) -> StepLosses:
         """The losses of a model.
 
         Args:

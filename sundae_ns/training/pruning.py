@@ -36,11 +36,6 @@ class ScheduledPruning(Extension):
         self.pruner: Callable[..., FieldPruner] = FieldPruner
         """Makes the pruner of field, optimizers and running states; several ranks have their own."""
 
-    @property
-    def _searching(self) -> bool:
-        """Whether a budget search prunes in place of the schedule."""
-        return self.schedule.config.mode == "auto"
-
     def before_training(self, run: TrainingRun) -> None:
         """Warn if training ends before the prune or the head."""
         if run.last_step is not None:
@@ -74,7 +69,7 @@ class ScheduledPruning(Extension):
             raise
         settled = state.schedule_step >= config.settled_at
         pruned = settled or (config.ends_growth_at is not None and state.pruning["num_prunes"] > 0)
-        if pruned and not self._searching:
+        if pruned and config.mode != "auto":
             with_head = settled and state.schedule_step >= state.head_starts_at
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
@@ -90,7 +85,7 @@ class ScheduledPruning(Extension):
     def finish(self, run: TrainingRun) -> None:
         """Report the peak, and warn if nothing was pruned; a budget search reports by itself."""
         report_peak(run)
-        if not self._searching:
+        if self.schedule.config.mode != "auto":
             _warn_if_too_short(run, self.schedule.config, run.state.step)
 
 

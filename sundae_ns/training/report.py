@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -73,15 +72,12 @@ def write_report(
     scalars = {"before": report.before, "after": report.after, "seconds": report.seconds, "peak": report.peak}
     run.log_scalars("Prune", scalars)
     if run.folder is not None:
-        _append(run.folder / "prune.json", report, before, after)
-
-
-def _append(path: Path, report: PruneReport, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-    # A run that was killed between a prune and the next save repeats that prune.
-    reports = prunes_before(path, report.step)
-    reports.append({**asdict(report), "warm_up": dict(before), "pruned": dict(after)})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps(reports, indent=2))
+        path = run.folder / "prune.json"
+        # A run that was killed between a prune and the next save repeats that prune.
+        reports = prunes_before(path, report.step)
+        reports.append({**asdict(report), "warm_up": dict(before), "pruned": dict(after)})
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, json.dumps(reports, indent=2))
 
 
 def report_peak(run: TrainingRun) -> None:

@@ -128,7 +128,7 @@ def test_what_is_foreseen_lies_on_a_line_over_the_logarithm_of_the_steps() -> No
 
 def rest(found: SearchProgress, *values: float) -> SearchProgress:
     for psnr in values:
-        assert found.judge(psnr, 10, 100, patience=3) == "resting"
+        assert found.judge(psnr, 10, 100, patience=3) == "no cut"
     return found
 
 
@@ -221,7 +221,7 @@ def test_how_deep_to_cut_follows_from_what_the_last_cut_cost() -> None:
     assert found.next_count(30.3, 1, 3) == int(500 * 0.5**0.5)
     assert found.next_count(30.05, 1, 3) is None
     assert search().next_count(29.99, 1, 3) is None, "a field below the target is trained, not cut"
-    assert found.judge(30.05, 2, 50, patience=4) == "resting"
+    assert found.judge(30.05, 2, 50, patience=4) == "no cut"
     found.cut(30.3, 353, step=3)
     assert found.judge(30.3, 4, 50, patience=4) == "accepted"
     assert found.slope == pytest.approx(0.3), "a lucky cut does not make the next one cheap"
