@@ -54,22 +54,22 @@ class RunningMean:
         self.count += 1
         torch._foreach_lerp_([self.values[name] for name in weights], list(weights.values()), 1 / self.count)
 
-    @torch.no_grad()
     def replace(self, weights: NamedTensors) -> dict[str, Tensor]:
-        """Put the mean in the place of weights; returns their copies."""
+        """Put the mean, if one fits, in the place of weights; returns their copies, which are empty without a mean."""
+        if not self.fits(weights):
+            return {}
         copies = {name: value.clone() for name, value in weights.items()}
         put(self.values, weights)
         return copies
 
     @contextmanager
     def shown(self, weights: NamedTensors) -> Iterator[None]:
-        """Put the mean, if there is one that fits, in the place of weights for the length of a block."""
-        own = self.replace(weights) if self.fits(weights) else None
+        """Put the mean, if one fits, in the place of weights for the length of a block."""
+        own = self.replace(weights)
         try:
             yield
         finally:
-            if own is not None:
-                put(own, weights)
+            put(own, weights)
 
     def fits(self, weights: NamedTensors) -> bool:
         """Whether there is a mean, and of weights of these names and shapes."""
@@ -87,8 +87,8 @@ def weights_of(state: FieldState) -> dict[str, Tensor]:
 @torch.no_grad()
 def put(values: NamedTensors, weights: NamedTensors) -> None:
     """Copy values into the weights of the same names."""
-    for name, value in weights.items():
-        value.copy_(values[name])
+    for name, value in values.items():
+        weights[name].copy_(value)
 
 
 def same_shapes(some: NamedTensors, others: NamedTensors) -> bool:
@@ -121,9 +121,7 @@ class Averaging(Extension):
 
         Several ranks save neither, because each has those of its own shard: resumed, they go on from the mean.
         """
-        if not self._alone:
-            return {}
-        return {**self._mean.state_dict(), "replaced": self._replaced}
+        return {**self._mean.state_dict(), "replaced": self._replaced} if self._alone else {}
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
 
-from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.compensation import CompensationHead
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.training.averaging import Averaging
@@ -20,20 +19,6 @@ from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.schedules import make_schedule
 from sundae_ns.training.trials import EarlyStopping, HeadTrials, TrialEngine
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What a model is made of."""
-
-    gauss_params: torch.nn.ParameterDict
-    networks: torch.nn.ModuleDict
-    state: FieldState
-    """On these parameters and networks."""
-    extensions: list[Extension]
-    """Densification, scheduled pruning, and the optional ones: budget search or trials and stopping, averaging."""
-    start: Start
-    """To announce when training starts."""
 
 
 def check(options: ModelOptions) -> None:
@@ -60,7 +45,9 @@ def check(options: ModelOptions) -> None:
         raise ConfigError("sundae has no bilateral grid: the head would learn against it; use splatfacto for it")
 
 
-def build(options: ModelOptions, *, num_images: int, points: Points | None, frame: Frame | None) -> Parts:
+def build(
+    options: ModelOptions, *, num_images: int, points: Points | None, frame: Frame | None
+) -> tuple[FieldState, list[Extension], Start]:
     """Build the parts on the CPU.
 
     Args:
@@ -68,6 +55,10 @@ def build(options: ModelOptions, *, num_images: int, points: Points | None, fram
         num_images: number of training images.
         points: sparse points of the capture, if it has any.
         frame: transform from the capture's coordinates to the model's, if known.
+
+    Returns:
+        State of field and head; extensions in their order (densification, scheduled pruning, and the optional ones:
+        budget search or trials and stopping, averaging); what to announce when training starts.
 
     Raises:
         ConfigError: an option cannot work.
@@ -99,4 +90,4 @@ def build(options: ModelOptions, *, num_images: int, points: Points | None, fram
         extensions += [decision, EarlyStopping(decision, options.ssim_lambda, engine)]
     if options.average_share > 0:
         extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
-    return Parts(gauss_params, networks, state, extensions, start)
+    return state, extensions, start

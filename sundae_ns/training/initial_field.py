@@ -28,7 +28,7 @@ Frame = tuple[Tensor, float]
 
 @dataclass(frozen=True)
 class Start:
-    """Warnings, or an error, to report when training starts. A checkpoint that is loaded first makes them irrelevant."""
+    """Warnings or an error to report when training starts. A checkpoint that is loaded first makes them irrelevant."""
 
     warnings: tuple[str, ...] = ()
     failure: CheckpointError | None = None

@@ -71,8 +71,8 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
         return None
     return (
         f"this training runs on a CPU and takes at least {duration(seconds * left)} more ({1000 * seconds:.0f} ms a "
-        "step). sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images are "
-        "faster: end the command with nerfstudio-data --downscale-factor 4"
+        "step). sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images "
+        "are faster: end the command with nerfstudio-data --downscale-factor 4"
     )
 
 

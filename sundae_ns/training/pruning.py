@@ -91,10 +91,9 @@ class ScheduledPruning(Extension):
 
 def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:
     """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
-    state = run.state
+    state, target, pruned = run.state, pruning.target_primitives, run.state.pruning["num_prunes"]
     # A warm start is pruned at once.
     first = pruning.first_prune if state.offset == 0 else None
-    target, pruned = pruning.target_primitives, state.pruning["num_prunes"]
     begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
     # A head whose start is not known yet is decided upon elsewhere.
     scheduled = state.head is not None and math.isfinite(state.head_starts_at)

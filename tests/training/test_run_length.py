@@ -24,7 +24,7 @@ OURS = sorted(name for name in all_methods if name.startswith("sundae"))
 
 
 def fitted(method: str, length: int, *words: str, **model: Any) -> Any:
-    """A configuration of ``length`` steps; ``words`` are options that keep their value, ``model`` changes the model's."""
+    """A configuration of ``length`` steps; ``words`` are options that keep their value, ``model`` are new values."""
     config = deepcopy(all_methods[method])
     config.max_num_iterations = config.schedule_length = length
     for name, value in model.items():

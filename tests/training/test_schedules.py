@@ -18,12 +18,7 @@ from sundae_ns.graphs import build_graph
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.report import PruneReport
-from sundae_ns.training.schedules import (
-    ContinuousPruning,
-    OneShotPruning,
-    PruningSchedule,
-    make_schedule,
-)
+from sundae_ns.training.schedules import PruningSchedule, make_schedule
 
 Field = tuple[dict[str, Parameter], dict[str, Optimizer]]
 
@@ -319,13 +314,6 @@ def test_a_field_above_the_cap_is_pruned_when_continuous_pruning_has_ended() -> 
 def test_continuous_prunes_a_step_once() -> None:
     policy = make_schedule(PruningConfig(mode="continuous", start=0, stop=10, every=1))
     assert [policy.due({**policy.initialize_state(), "pruned_at": 5}, step, 100) for step in (5, 6)] == [False, True]
-
-
-@pytest.mark.parametrize(
-    ("mode", "kind"), [("one-shot", OneShotPruning), ("continuous", ContinuousPruning), ("off", PruningSchedule)]
-)
-def test_mode_names_the_policy(mode: Any, kind: type[PruningSchedule]) -> None:
-    assert type(make_schedule(PruningConfig(mode=mode))) is kind
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import torch
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.gaussians.surgery import replace_parameter
-from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, put, weights_of
+from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, measure_heldout
@@ -120,9 +120,7 @@ class TrialEngine:
 
     def take_mean(self, state: FieldState) -> None:
         """Continue with the mean of the weights, if there is one."""
-        weights = weights_of(state)
-        if self._mean.fits(weights):
-            put(self._mean.values, weights)
+        self._mean.replace(weights_of(state))
         self._mean = RunningMean()
         state.restored += 1  # another mean must not contain the weights before it
 

@@ -173,12 +173,15 @@ class EarlyStopping(Extension):
         run.log_scalars("Stopping", {"psnr": decibels, "ssim": similarity})
 
     def _go_back(self, run: TrainingRun) -> None:
-        """Return to the field of the decision, and train on all views for as long as was best."""
+        """Return to the field of the decision, and train on all views for as many steps as were best."""
         progress, length = self.progress, self.progress.best * self._window
-        (_, *best), (_, *now) = progress.measured[progress.best - 1], progress.measured[-1]
+        best, now = (
+            f"{decibels:.2f} dB, SSIM {similarity:.4f}"
+            for _, decibels, similarity in (progress.measured[progress.best - 1], progress.measured[-1])
+        )
         CONSOLE.log(
-            f"step {run.state.step}: the held-out views were best after {length:,} steps, {_text(best)}; "
-            f"now {_text(now)}. Going back, to train as long on all views"
+            f"step {run.state.step}: the held-out views were best after {length:,} steps, {best}; now {now}. "
+            "Going back, to train as long on all views"
         )
         self._engine.go_back(_START, run.state)
         self._engine.end(run)
@@ -203,9 +206,3 @@ class EarlyStopping(Extension):
             "steps_on_all_views": length,
         }
         write_record(run, "stopping.json", record)
-
-
-def _text(figures: list[float]) -> str:
-    """PSNR and SSIM for the log."""
-    decibels, similarity = figures
-    return f"{decibels:.2f} dB, SSIM {similarity:.4f}"
