@@ -17,8 +17,10 @@ from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.initial_field import Frame, Points, Start, initial_field
 from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.pruning import ScheduledPruning
-from sundae_ns.training.schedules import make_schedule
-from sundae_ns.training.trials import EarlyStopping, HeadTrials, TrialEngine
+from sundae_ns.training.schedules import PruningSchedule
+from sundae_ns.training.trials.engine import TrialEngine
+from sundae_ns.training.trials.head import HeadTrials
+from sundae_ns.training.trials.stopping import EarlyStopping
 
 
 def check(options: ModelOptions) -> None:
@@ -77,7 +79,7 @@ def build(
         head_starts_at=pruning.settled_at if head.start_at is None else head.start_at,
         sh_degree_interval=None if warm else options.sh_degree_interval,
     )
-    densification, schedule = Densification(strategy), make_schedule(pruning)
+    densification, schedule = Densification(strategy), PruningSchedule(pruning)
     densification.initialize(state)
     state.pruning = schedule.initialize_state()
     extensions: list[Extension] = [densification, ScheduledPruning(schedule, evaluate=options.evaluate_prune)]

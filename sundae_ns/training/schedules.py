@@ -41,7 +41,7 @@ class PruningSchedule:
     """
 
     config: PruningConfig
-    """Options; not changed."""
+    """Valid options; not changed."""
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
         """Whether a field of ``n`` primitives is to be pruned after this step.
@@ -105,16 +105,6 @@ class PruningSchedule:
             pruner.add(lacking, LEAST_OPACITY)
             state["peak"] = max(state["peak"], pruner.total)
         return report
-
-
-def make_schedule(config: PruningConfig) -> PruningSchedule:
-    """Schedule of the configured mode.
-
-    Raises:
-        ConfigError: an option cannot work.
-    """
-    config.validate()
-    return PruningSchedule(config)
 
 
 def prune_to(

@@ -18,7 +18,7 @@ from sundae_ns.training.run_length import (
     step_options,
     take_options,
 )
-from sundae_ns.training.schedules import make_schedule
+from sundae_ns.training.schedules import PruningSchedule
 
 OURS = sorted(name for name in all_methods if name.startswith("sundae"))
 
@@ -118,7 +118,7 @@ def test_a_chain_keeps_its_number_of_rounds() -> None:
 @pytest.mark.parametrize("length", [300, 1500, 7000, 50000])
 def test_continuous_pruning_keeps_its_number_of_prunes(length: int) -> None:
     def prunes(config: Any) -> int:
-        schedule = make_schedule(config.pipeline.model.pruning)
+        schedule = PruningSchedule(config.pipeline.model.pruning)
         state = schedule.initialize_state()
         return sum(schedule.due(state, step, 1000) for step in range(config.max_num_iterations))
 

@@ -63,8 +63,6 @@ class BudgetSearch(Extension):
         """The field of a run under this search."""
         return SearchedField(run, self.config, self.search, self._engine, self._largest)
 
-    # ------------------------------------------------------------------------------------------------- checkpoints
-
     def state_dict(self) -> dict[str, Any]:
         """Numbers of the search and, while it goes on, copies of the fields that it may return to."""
         return {"numbers": asdict(self.search), "engine": self._engine.state_dict(), "flat": self._flat}
@@ -89,8 +87,6 @@ class BudgetSearch(Extension):
         engine.require(*(name for name, due in needed.items() if due), trial=False)
         self.search, self._engine, self._flat = search, engine, saved.get("flat")
         engine.enable_head(state, search.head)
-
-    # ---------------------------------------------------------------------------------------------------- training
 
     def before_training(self, run: TrainingRun) -> None:
         """Check that views are held out, and that the budget suffices for one primitive.
@@ -171,8 +167,6 @@ class BudgetSearch(Extension):
         )
         self._write(searched)
 
-    # -------------------------------------------------------------------------------------------------- SH degrees
-
     def _begin(self, searched: SearchedField) -> None:
         search, state = self.search, searched.state
         searched.drop_nonfinite()
@@ -244,8 +238,6 @@ class BudgetSearch(Extension):
             self._end_phase(searched, value)
         else:
             self._cut_or_wait(searched, value)
-
-    # -------------------------------------------------------------------------------------------------------- cuts
 
     def _time_is_up(self, searched: SearchedField) -> bool:
         """Whether the search must end at this step. A run that ends before ``stop`` may be trained on."""

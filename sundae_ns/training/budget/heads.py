@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.compensation.head import SIZES
@@ -35,22 +36,15 @@ def head_for(primitives: int, row: int, largest: HeadConfig) -> HeadConfig | Non
     return None
 
 
-def chosen_head(search: SearchProgress, largest: HeadConfig | None) -> HeadConfig | None:
-    """The head that a search has chosen; before its choice the largest, and None for none."""
-    if largest is None or search.head_dropped:
-        return None
-    if not search.head_size:
-        return largest
-    return replace(largest, size=search.head_size, num_features=search.num_features)  # type: ignore[arg-type]
-
-
 def reshape(state: FieldState, search: SearchProgress, largest: HeadConfig | None) -> None:
     """Give field and head the shapes that a search has left in a checkpoint; values are loaded afterwards."""
-    chosen = chosen_head(search, largest)
     if search.degree >= 0:
         rest = state.field["features_rest"]
         rest.data = rest.data[:, : (search.degree + 1) ** 2 - 1]
-    if chosen is None:
+    if largest is None or search.head_dropped:
         state.remove_head()
-    elif state.head is not None and state.head.config != chosen:
+        return
+    size: Any = search.head_size
+    chosen = replace(largest, size=size, num_features=search.num_features) if size else largest
+    if state.head is not None and state.head.config != chosen:
         state.reshape_head(chosen)

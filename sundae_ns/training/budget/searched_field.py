@@ -87,8 +87,6 @@ class SearchedField:
         state, age = self.state, self.state.schedule_step - self.search.cut_at
         return Point(state.step, phase, self.count, self.stored, psnr, verdict, age)
 
-    # ------------------------------------------------------------------------------------------------------- views
-
     def _views(self) -> list[TrainingView]:
         views = self.run.training_views()
         return views[:: -(-len(views) // MAX_VIEWS)]
@@ -133,8 +131,6 @@ class SearchedField:
             return value
         self.search.accepted = self.count
         return self.measure()
-
-    # ------------------------------------------------------------------------------------------------------- fields
 
     def drop_nonfinite(self) -> int:
         """Remove primitives with a NaN or infinite parameter; returns their number, 0 if no primitive is finite."""
@@ -211,8 +207,6 @@ class SearchedField:
         schedulers = self.state.schedulers
         restarted = {name: value for name, value in schedulers.items() if (name == "compensation") == head}
         notify_pruned(restarted, self.state.step, self.count)
-
-    # --------------------------------------------------------------------------------------------------------- head
 
     def head_for(self, primitives: int) -> HeadConfig | None:
         """The head that is small beside ``primitives`` of this field; None for none."""

@@ -58,8 +58,6 @@ class TrialEngine:
         self._head_starts_at = head_starts_at
         self._mean = RunningMean()
 
-    # ------------------------------------------------------------------------------------------------- checkpoints
-
     def state_dict(self) -> dict[str, Any]:
         """Plain values and tensors for a checkpoint."""
         trial = None if self.trial is None else asdict(self.trial)
@@ -81,8 +79,6 @@ class TrialEngine:
         """
         if (trial and self.trial is None) or not all(isinstance(self.kept.get(name), Mapping) for name in names):
             raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
-
-    # ----------------------------------------------------------------------------------------------------- trials
 
     def start(self, run: TrainingRun, trial: Trial) -> None:
         """Start a trial from the field as it is."""

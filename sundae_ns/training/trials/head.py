@@ -161,8 +161,6 @@ class HeadTrials(Extension):
         self._engine = engine
         engine.enable_head(state, False)
 
-    # ------------------------------------------------------------------------------------------------- checkpoints
-
     def state_dict(self) -> dict[str, Any]:
         """Numbers of the decision, and the state of the engine."""
         return {"numbers": asdict(self.progress), "engine": self._engine.state_dict()}
@@ -192,8 +190,6 @@ class HeadTrials(Extension):
         if self.progress.phase == "trials":
             self._engine.require("start", *self.progress.tried)
         self._engine.enable_head(state, self.progress.candidate != "plain")
-
-    # ---------------------------------------------------------------------------------------------------- training
 
     def before_training(self, run: TrainingRun) -> None:
         """Decide at once where trials cannot; otherwise hold out the views of the phase."""
@@ -234,8 +230,6 @@ class HeadTrials(Extension):
     def held_out(self, run: TrainingRun) -> list[int]:
         """Indices of the views that the chosen field has not seen since before its trial; none without trials."""
         return [] if self.progress.reason else self._planned(run).folds[-1]
-
-    # ------------------------------------------------------------------------------------------------------- trials
 
     def _planned(self, run: TrainingRun) -> TrialPlan:
         if self._plan is None:

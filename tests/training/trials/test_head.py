@@ -12,8 +12,8 @@ from models import Training
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError
 from sundae_ns.model import SundaeModel
-from sundae_ns.training.trials import HeadTrials, Trial
-from sundae_ns.training.trials.head import CANDIDATES, MOST_HELD_OUT, HeadTrialProgress, plan_trials
+from sundae_ns.training.trials.engine import Trial
+from sundae_ns.training.trials.head import CANDIDATES, MOST_HELD_OUT, HeadTrialProgress, HeadTrials, plan_trials
 
 Build = Callable[..., SundaeModel]
 SIZES = [100, 110, 120]
