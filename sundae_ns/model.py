@@ -10,7 +10,7 @@ from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -111,7 +111,7 @@ class SundaeModel(SplatfactoModel):
         self.state, self.extensions, self._start = build(
             config, num_images=self.num_train_data, points=self.seed_points, frame=frame
         )
-        self.gauss_params, self.networks = self.state.field.params, self.state.networks
+        self.gauss_params, self.networks = cast(Any, self.state.field.params), self.state.networks
         self.source = LocalField(self.state.field)
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)

@@ -387,7 +387,6 @@ def test_one_budget_is_enough(budget: dict[str, object]) -> None:
         ({"mode": "continuous", "target_primitives": 30}, 30, 10),
         ({"mode": "continuous", "max_primitives": 30, "keep_ratio": 0.6}, 30, 6),
         ({"mode": "continuous", "keep_ratio": 0.6}, 36, 6),
-        ({"mode": "off"}, 60, 10),
     ],
 )
 def test_the_schedule_decides_how_many_stay(options: dict[str, Any], of_60: int, of_10: int) -> None:
