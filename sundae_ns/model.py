@@ -108,9 +108,7 @@ class SundaeModel(SplatfactoModel):
         """Build field, head and extensions. The device of the model is not known yet."""
         config = self.config
         frame = (self.kwargs.get("metadata") or {}).get(DATASET_FRAME)
-        self.state, self.extensions, self._start = build(
-            config, num_images=self.num_train_data, points=self.seed_points, frame=frame
-        )
+        self.state, self.extensions, self._start = build(config, self.num_train_data, self.seed_points, frame)
         self.gauss_params, self.networks = cast(Any, self.state.field.params), self.state.networks
         self.source = LocalField(self.state.field)
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")

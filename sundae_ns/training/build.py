@@ -48,7 +48,7 @@ def check(options: ModelOptions) -> None:
 
 
 def build(
-    options: ModelOptions, *, num_images: int, points: Points | None, frame: Frame | None
+    options: ModelOptions, num_images: int, points: Points | None, frame: Frame | None
 ) -> tuple[FieldState, list[Extension], Start]:
     """Build the parts on the CPU.
 

@@ -118,7 +118,7 @@ class FieldState:
                 self.optimizers[name].state.clear()
 
     def reshape_head(self, config: HeadConfig) -> None:
-        """Give head and features the shapes of a configuration; values are loaded afterwards, parameter objects stay."""
+        """Give head and features the shapes of a configuration, in the same parameters; values are loaded later."""
         assert self.head is not None
         self.head.resize(config)
         features = self.field[FEATURES]

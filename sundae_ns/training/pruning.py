@@ -10,11 +10,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sundae_ns.errors import SundaeError
+from sundae_ns.evaluation import peak_memory
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rendering.contribution import contribution
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.report import report_peak, write_report
+from sundae_ns.training.report import write_report
 from sundae_ns.training.schedulers import notify_pruned
 from sundae_ns.training.schedules import PruningSchedule
 from sundae_ns.training.warning import warn
@@ -84,7 +85,10 @@ class ScheduledPruning(Extension):
 
     def finish(self, run: TrainingRun) -> None:
         """Report the peak, and warn if nothing was pruned; a budget search reports by itself."""
-        report_peak(run)
+        state = run.state
+        primitives, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
+        CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {state.device.type} memory")
+        run.log_scalars("Peak", {"primitives": primitives, "memory_mb": memory})
         if self.schedule.config.mode != "auto":
             _warn_if_too_short(run, self.schedule.config, run.state.step)
 

@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
-from sundae_ns.evaluation import peak_memory, without_nan
+from sundae_ns.evaluation import without_nan
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.runs.folder import prunes_before
 from sundae_ns.training.extension import TrainingRun
@@ -78,11 +76,3 @@ def write_report(
         reports.append({**asdict(report), "warm_up": dict(before), "pruned": dict(after)})
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, json.dumps(reports, indent=2))
-
-
-def report_peak(run: TrainingRun) -> None:
-    """Log the highest number of primitives and the peak memory of the training."""
-    state = run.state
-    primitives, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
-    CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {state.device.type} memory")
-    run.log_scalars("Peak", {"primitives": primitives, "memory_mb": memory})

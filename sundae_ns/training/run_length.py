@@ -115,7 +115,7 @@ def step_options(config: Any) -> list[str]:
 def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
     """Scale the schedule to ``config.schedule_length``, but for options that were set by hand.
 
-    A warm start skips the steps before the prune. Its schedule is only compressed, and only if the rest would not fit.
+    A warm start skips the steps before the prune. Its schedule is compressed only if the steps after it do not fit.
 
     Args:
         config: ``SundaeTrainerConfig``; its schedule changes.

@@ -81,7 +81,7 @@ class TrialEngine:
             raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
 
     def start(self, run: TrainingRun, trial: Trial) -> None:
-        """Start a trial from the field as it is."""
+        """Start a trial from the present field."""
         state = run.state
         self.trial, self._mean = replace(trial, began=state.schedule_step), RunningMean()
         self.resume(run)

@@ -2,10 +2,10 @@
 
 A head gains where views are many and agree; where they are few or differ, it fits their differences. So some training
 views are held out from shortly before the prune. From the pruned field, trials of one length follow in turn, each of a
-larger scene than the one before, until one does not pay. Its held-out views are rendered with the mean of the weights
-over its last steps, because the weights of a single step fit the last images best. The chosen field continues on all
-views; the steps of the others are the cost. Test views are never used. After a warm start the field has seen the
-held-out views before, and only the steps of the trials make it forget them.
+larger scene than the one before, until one does not pay. The mean of the weights over its last steps renders the
+held-out views: the weights of a single step fit the last images best. The chosen field continues on all views; the
+steps of the others are the cost. Test views are never used. After a warm start the field has seen the held-out views
+before, and only the steps of the trials make it forget them.
 """
 
 from __future__ import annotations
