@@ -10,7 +10,7 @@ from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -108,13 +108,12 @@ class SundaeModel(SplatfactoModel):
         """Build field, head and extensions. The device of the model is not known yet."""
         config = self.config
         frame = (self.kwargs.get("metadata") or {}).get(DATASET_FRAME)
-        parts = build(config, num_images=self.num_train_data, points=self.seed_points, frame=frame)
-        self.gauss_params, self.networks = parts.gauss_params, parts.networks
-        self.state, self.extensions, self._start = parts.state, parts.extensions, parts.start
+        self.state, self.extensions, self._start = build(config, self.num_train_data, self.seed_points, frame)
+        self.gauss_params, self.networks = cast(Any, self.state.field.params), self.state.networks
         self.source = LocalField(self.state.field)
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
-        self.losses = StepLosses.of(config, self.ssim, self.num_train_data)
+        self.losses = StepLosses(config, self.ssim, self.num_train_data)
         self.lpips = Lpips()  # type: ignore[assignment]
         self.crop_box: OrientedBox | None = None
         self.background_color = torch.tensor(SHOWN_BACKGROUNDS[config.background_color])

@@ -27,7 +27,7 @@ from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rendering import LocalField, render
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.schedules import make_schedule
+from sundae_ns.training.schedules import PruningSchedule
 from sundae_ns.viewer import RuleName, previewed_rule
 
 N = 90
@@ -150,7 +150,7 @@ def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None
     seen = as_the_viewer(lambda: picture(model))
     model.config.pruning.keep_ratio = 0.2
     optimizers = {name: torch.optim.Adam([value], lr=1e-3) for name, value in model.gauss_params.items()}
-    schedule = make_schedule(model.config.pruning)
+    schedule = PruningSchedule(model.config.pruning)
     report = schedule.after_step(
         FieldPruner(model.state.field, optimizers),
         schedule.initialize_state(),

@@ -20,7 +20,12 @@ AVERAGED_EVERY = 10
 """Steps between two weights that count: neighbours differ by little."""
 
 NamedTensors = Mapping[str, Tensor]
-"""Tensors by name."""
+
+
+@torch.no_grad()
+def _put(values: NamedTensors, weights: NamedTensors) -> None:
+    for name, value in values.items():
+        weights[name].copy_(value)
 
 
 class RunningMean:
@@ -54,26 +59,27 @@ class RunningMean:
         self.count += 1
         torch._foreach_lerp_([self.values[name] for name in weights], list(weights.values()), 1 / self.count)
 
-    @torch.no_grad()
     def replace(self, weights: NamedTensors) -> dict[str, Tensor]:
-        """Put the mean in the place of weights; returns their copies."""
+        """Put the mean, if one fits, in the place of weights; returns their copies, which are empty without a mean."""
+        if not self.fits(weights):
+            return {}
         copies = {name: value.clone() for name, value in weights.items()}
-        put(self.values, weights)
+        _put(self.values, weights)
         return copies
 
     @contextmanager
     def shown(self, weights: NamedTensors) -> Iterator[None]:
-        """Put the mean, if there is one that fits, in the place of weights for the length of a block."""
-        own = self.replace(weights) if self.fits(weights) else None
+        """Put the mean, if one fits, in the place of weights for the length of a block."""
+        own = self.replace(weights)
         try:
             yield
         finally:
-            if own is not None:
-                put(own, weights)
+            _put(own, weights)
 
     def fits(self, weights: NamedTensors) -> bool:
         """Whether there is a mean, and of weights of these names and shapes."""
-        return self.count > 0 and same_shapes(self.values, weights)
+        same_names = self.count > 0 and self.values.keys() == weights.keys()
+        return same_names and all(value.shape == self.values[name].shape for name, value in weights.items())
 
 
 def weights_of(state: FieldState) -> dict[str, Tensor]:
@@ -82,18 +88,6 @@ def weights_of(state: FieldState) -> dict[str, Tensor]:
     if state.head_enabled and state.head is not None:
         weights |= {f"head.{name}": value.data for name, value in state.head.named_parameters()}
     return weights
-
-
-@torch.no_grad()
-def put(values: NamedTensors, weights: NamedTensors) -> None:
-    """Copy values into the weights of the same names."""
-    for name, value in weights.items():
-        value.copy_(values[name])
-
-
-def same_shapes(some: NamedTensors, others: NamedTensors) -> bool:
-    """Whether names and shapes are the same."""
-    return some.keys() == others.keys() and all(value.shape == others[name].shape for name, value in some.items())
 
 
 class Averaging(Extension):
@@ -121,9 +115,7 @@ class Averaging(Extension):
 
         Several ranks save neither, because each has those of its own shard: resumed, they go on from the mean.
         """
-        if not self._alone:
-            return {}
-        return {**self._mean.state_dict(), "replaced": self._replaced}
+        return {**self._mean.state_dict(), "replaced": self._replaced} if self._alone else {}
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`."""
@@ -133,9 +125,8 @@ class Averaging(Extension):
     def before_training(self, run: TrainingRun) -> None:
         """Put back the weights that a mean has replaced, so that two trainings end as one of their length."""
         self._alone = run.images_per_step == 1
-        weights = weights_of(run.state)
-        if self._alone and same_shapes(weights, self._replaced):
-            put(self._replaced, weights)
+        if self._alone:
+            RunningMean(self._replaced, 1).replace(weights_of(run.state))
         self._replaced = {}
 
     def after_step(self, run: TrainingRun) -> None:

@@ -1,4 +1,4 @@
-"""Memory with room for more primitives than a field has, so that recorded work survives its growth.
+"""Memory for more primitives than a field has, so that recorded work survives its growth.
 
 A CUDA graph reads and writes fixed addresses and a fixed number of primitives. :class:`Buffers` holds the parameters of
 a field, Adam's moments and the running state of densification at a capacity. The field's own tensors become the first N

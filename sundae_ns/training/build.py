@@ -2,59 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal, Protocol, cast
+from typing import Any, cast
 
 import torch
 
-from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.compensation import CompensationHead
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.training.averaging import Averaging
 from sundae_ns.training.budget import BudgetSearch
-from sundae_ns.training.densification import Densification, GrowthOptions, make_strategy
+from sundae_ns.training.densification import Densification, make_strategy
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.initial_field import Frame, PointOptions, Points, Start, initial_field
+from sundae_ns.training.initial_field import Frame, Points, Start, initial_field
+from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.pruning import ScheduledPruning
-from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.schedules import make_schedule
-from sundae_ns.training.trials import EarlyStopping, HeadTrials, TrialEngine
+from sundae_ns.training.schedules import PruningSchedule
+from sundae_ns.training.trials.engine import TrialEngine
+from sundae_ns.training.trials.head import HeadTrials
+from sundae_ns.training.trials.stopping import EarlyStopping
 
 
-class BuildOptions(GrowthOptions, PointOptions, Protocol):
-    """Options of a model that the parts depend on; ``SundaeModelConfig`` has them all."""
-
-    pruning: PruningConfig
-    head: HeadConfig
-    warmup: Literal["densify", "mcmc"]
-    mcmc_cap: int
-    warm_start: Path | None
-    sh_degree_interval: int
-    evaluate_prune: bool
-    base_loss_weight: float
-    prior_after_prune: float
-    average_share: float
-    ssim_lambda: float
-    use_bilateral_grid: bool
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What a model is made of."""
-
-    gauss_params: torch.nn.ParameterDict
-    networks: torch.nn.ModuleDict
-    state: FieldState
-    """On these parameters and networks."""
-    extensions: list[Extension]
-    """Densification, scheduled pruning and, where asked for, budget search or trials and stopping, and averaging; in order."""
-    start: Start
-    """To announce when training starts."""
-
-
-def check(options: BuildOptions) -> None:
+def check(options: ModelOptions) -> None:
     """Check options that cannot work, alone or together.
 
     Raises:
@@ -65,10 +34,9 @@ def check(options: BuildOptions) -> None:
         options.head.validate()
     if options.mcmc_cap < 1:
         raise ConfigError(f"mcmc-cap is {options.mcmc_cap}; give the highest number of primitives, at least 1")
-    if options.base_loss_weight < 0:
-        raise ConfigError(f"base-loss-weight is {options.base_loss_weight}; give 0 or more")
-    if options.prior_after_prune < 0:
-        raise ConfigError(f"prior-after-prune is {options.prior_after_prune}; give 0 or more")
+    for name in ("base_loss_weight", "prior_after_prune"):
+        if getattr(options, name) < 0:
+            raise ConfigError(f"{name.replace('_', '-')} is {getattr(options, name)}; give 0 or more")
     if not 0 <= options.average_share <= 1:
         raise ConfigError(
             f"average-share is {options.average_share}; give a share of the schedule, 0.1 for the last tenth"
@@ -79,7 +47,9 @@ def check(options: BuildOptions) -> None:
         raise ConfigError("sundae has no bilateral grid: the head would learn against it; use splatfacto for it")
 
 
-def build(options: BuildOptions, *, num_images: int, points: Points | None, frame: Frame | None) -> Parts:
+def build(
+    options: ModelOptions, num_images: int, points: Points | None, frame: Frame | None
+) -> tuple[FieldState, list[Extension], Start]:
     """Build the parts on the CPU.
 
     Args:
@@ -88,22 +58,17 @@ def build(options: BuildOptions, *, num_images: int, points: Points | None, fram
         points: sparse points of the capture, if it has any.
         frame: transform from the capture's coordinates to the model's, if known.
 
+    Returns:
+        State of field and head; extensions in their order (densification, scheduled pruning, and the optional ones:
+        budget search or trials and stopping, averaging); what to announce when training starts.
+
     Raises:
         ConfigError: an option cannot work.
     """
     check(options)
     pruning, head, warm = options.pruning, options.head.resolved, options.warm_start is not None
-    mcmc_cap = options.mcmc_cap if options.warmup == "mcmc" else None
-    strategy = make_strategy(options, pruning, mcmc_cap=mcmc_cap, num_images=num_images)
-    params, start = initial_field(
-        options,
-        points,
-        frame,
-        num_features=0 if head.mode == "off" else head.num_features,
-        cap=strategy.cap,
-        chain=mcmc_cap is not None,
-        seed=pruning.seed,
-    )
+    strategy, num_features = make_strategy(options, num_images), 0 if head.mode == "off" else head.num_features
+    params, start = initial_field(options, points, frame, num_features=num_features, cap=strategy.cap)
     gauss_params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
     networks = torch.nn.ModuleDict({} if head.mode == "off" else {"head": CompensationHead(head)})
     state = FieldState(
@@ -114,7 +79,7 @@ def build(options: BuildOptions, *, num_images: int, points: Points | None, fram
         head_starts_at=pruning.settled_at if head.start_at is None else head.start_at,
         sh_degree_interval=None if warm else options.sh_degree_interval,
     )
-    densification, schedule = Densification(strategy), make_schedule(pruning)
+    densification, schedule = Densification(strategy), PruningSchedule(pruning)
     densification.initialize(state)
     state.pruning = schedule.initialize_state()
     extensions: list[Extension] = [densification, ScheduledPruning(schedule, evaluate=options.evaluate_prune)]
@@ -127,4 +92,4 @@ def build(options: BuildOptions, *, num_images: int, points: Points | None, fram
         extensions += [decision, EarlyStopping(decision, options.ssim_lambda, engine)]
     if options.average_share > 0:
         extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))
-    return Parts(gauss_params, networks, state, extensions, start)
+    return state, extensions, start

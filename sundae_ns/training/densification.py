@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -20,7 +20,7 @@ from torch.optim import Optimizer
 from sundae_ns.gaussians.relocation import grow, jitter, relocate
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.pruning_config import PruningConfig
+from sundae_ns.training.options import ModelOptions
 
 STATISTICS = ("grad2d", "count", "radii")
 """Tensors ``[N]`` in the running state of gsplat's strategy."""
@@ -43,16 +43,15 @@ def limit_growth(
     """
     gradients = state["grad2d"] / state["count"].clamp_min(1)
     high = gradients > threshold
-    wide = torch.zeros_like(high)
-    if radius is not None and state.get("radii") is not None:
-        wide = state["radii"] > radius
+    radii = None if radius is None else state.get("radii")
+    wide = torch.zeros_like(high) if radii is None else radii > radius
     added = (high & small).long() + ((high & ~small) | wide).long()
     candidates = added.nonzero().squeeze(1)
     candidates = candidates[gradients[candidates].argsort(descending=True, stable=True)]
     left_out = candidates[added[candidates].cumsum(0) > capacity]
     state["grad2d"][left_out] = 0
-    if radius is not None and state.get("radii") is not None:
-        state["radii"][left_out] = state["radii"][left_out].clamp_max(radius)
+    if radii is not None:
+        radii[left_out] = radii[left_out].clamp_max(radius)
 
 
 class Statistics(NamedTuple):
@@ -236,60 +235,32 @@ class Densification(Extension):
             )
 
     def after_step(self, run: TrainingRun) -> None:
-        """Densify."""
+        """Let the strategy add, move and remove primitives."""
         state = run.state
         if state.densifying:
             self.densify(state)
 
     def densify(self, state: FieldState) -> None:
-        """Let the strategy add, move and remove primitives."""
-        self.strategy.step_post_backward(
-            params=state.field.params,
-            optimizers=state.optimizers,
-            state=state.densification,
-            step=state.schedule_step,
-            info=state.info,
-            packed=False,
-        )
+        """The strategy's step; several ranks have their own."""
+        params, running = state.field.params, state.densification
+        self.strategy.step_post_backward(params, state.optimizers, running, state.schedule_step, state.info)
 
 
-class GrowthOptions(Protocol):
-    """Options of splatfacto that control the growth of the field."""
-
-    warmup_length: int
-    refine_every: int
-    cull_alpha_thresh: float
-    densify_grad_thresh: float
-    densify_size_thresh: float
-    split_screen_size: float
-    cull_scale_thresh: float
-    cull_screen_size: float
-    stop_screen_size_at: int
-    stop_split_at: int
-    reset_alpha_every: int
-    use_absgrad: bool
-
-
-def make_strategy(
-    options: GrowthOptions, pruning: PruningConfig, *, mcmc_cap: int | None, num_images: int
-) -> CappedStrategy | ChainStrategy:
+def make_strategy(options: ModelOptions, num_images: int) -> CappedStrategy | ChainStrategy:
     """Strategy of the warm-up. It ends before the prune that would undo it.
 
     Args:
-        options: of splatfacto.
-        pruning: gives the end of growth and, for continuous pruning, the cap.
-        mcmc_cap: most primitives of a warm-up by MCMC; None densifies by gradients.
+        options: of the model; those of pruning give the end of growth and, for continuous pruning, the cap.
         num_images: training images. Each is seen once after opacities are reset, before anything grows.
     """
-    stop = options.stop_split_at
-    continuous = pruning.mode == "continuous"
-    ends = pruning.stop if continuous else pruning.ends_growth_at
-    if ends is not None:
-        stop = min(stop, ends)
-    cap = pruning.max_primitives if continuous else None
-    if mcmc_cap is not None:
+    stop, cap, pruning = options.stop_split_at, None, options.pruning
+    if pruning.mode == "continuous":
+        stop, cap = min(stop, pruning.stop), pruning.max_primitives
+    elif pruning.ends_growth_at is not None:
+        stop = min(stop, pruning.ends_growth_at)
+    if options.warmup == "mcmc":
         return ChainStrategy(
-            cap=min(mcmc_cap, cap or mcmc_cap),
+            cap=min(options.mcmc_cap, cap or options.mcmc_cap),
             refine_start_iter=options.warmup_length,
             refine_stop_iter=stop,
             refine_every=options.refine_every,

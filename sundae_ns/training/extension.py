@@ -27,17 +27,12 @@ class HeldOutView(NamedTuple):
 class TrainingRun(Protocol):
     """What an extension may ask of the program that trains. nerfstudio's trainer stands behind it in ``ns-train``."""
 
-    @property
-    def state(self) -> FieldState:
-        """The field in training."""
-
-    @property
-    def source(self) -> FieldSource:
-        """Where views get their primitives from."""
-
-    @property
-    def background(self) -> Tensor:
-        """Background of images that are not trained on ``[3]``."""
+    state: FieldState
+    """The field in training."""
+    source: FieldSource
+    """Where views get their primitives from."""
+    background: Tensor
+    """Background of images that are not trained on ``[3]``."""
 
     @property
     def settings(self) -> RenderSettings:
@@ -76,7 +71,7 @@ class TrainingRun(Protocol):
         """The held-out training views, loaded one at a time."""
 
     def evaluate(self) -> dict[str, float]:
-        """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without test views. With several ranks, collective."""
+        """Mean ``psnr`` (dB) and ``ssim`` over all test views; empty without any. With several ranks, collective."""
 
     def save(self) -> None:
         """Save a checkpoint, if there is a trainer."""

@@ -27,13 +27,13 @@ _HEAD = "head"
 class FieldState:
     """Everything that training changes, and when it changes.
 
-    Surgery (densification, prunes) replaces parameters in ``field`` and in ``optimizers``, and slices the running states.
+    Surgery (densification, prunes) replaces parameters in ``field`` and ``optimizers``, and slices the running states.
     """
 
     field: Field
     """The primitives of this process."""
     networks: torch.nn.ModuleDict
-    """Holds the head under ``head``; the model registers this module, so checkpoints follow when the head is removed."""
+    """Holds the head under ``head``. The model registers this module, so checkpoints lack a head that was removed."""
     optimizers: Mapping[str, Optimizer] = dataclasses.field(default_factory=dict)
     """By parameter name; ``compensation`` is the head's."""
     schedulers: Mapping[str, LRScheduler] = dataclasses.field(default_factory=dict)
@@ -118,20 +118,11 @@ class FieldState:
                 self.optimizers[name].state.clear()
 
     def reshape_head(self, config: HeadConfig) -> None:
-        """Give head and features the shapes of a configuration; values are loaded afterwards. Parameters stay the same objects.
-
-        Args:
-            config: of a field with a head.
-        """
+        """Give head and features the shapes of a configuration, in the same parameters; values are loaded later."""
         assert self.head is not None
         self.head.resize(config)
         features = self.field[FEATURES]
         features.data = features.data.new_zeros(len(features), config.num_features)
-
-    def remember_focal(self, focal: float) -> None:
-        """Note the focal length of an image that the head is trained on, pixels."""
-        low, high = self.trained_focal or (focal, focal)
-        self.trained_focal = (min(low, focal), max(high, focal))
 
     def render_settings(
         self, backend: Backend, *, antialiased: bool, training: bool = False, absgrad: bool = False

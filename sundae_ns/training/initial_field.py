@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -17,6 +16,7 @@ from sundae_ns.pruning import select_random
 from sundae_ns.storage.runs.checkpoint import read_field
 from sundae_ns.storage.transform import similarity
 from sundae_ns.training.densification import start_of_chain
+from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.warning import warn
 
 Points = tuple[Tensor, Tensor]
@@ -26,29 +26,9 @@ Frame = tuple[Tensor, float]
 """Transform ``[3, 4]`` and scale from the capture's coordinates to those of the model."""
 
 
-class PointOptions(Protocol):
-    """Options of the model that control its first field."""
-
-    sh_degree: int
-    random_init: bool
-    """Whether to start from random points although the capture has a sparse cloud."""
-    num_random: int
-    """Number of random points."""
-    random_scale: float
-    """Side of the cube of random points, scene units."""
-
-    @property
-    def warm_start(self) -> Path | None:
-        """A splatfacto or sundae checkpoint, the folder of checkpoints, or a 3DGS ``.ply`` to start from."""
-
-    @property
-    def warm_start_frame(self) -> str:
-        """Coordinates of the warm start: ``model``, ``capture``, or ``auto`` by the kind of file."""
-
-
 @dataclass(frozen=True)
 class Start:
-    """Warnings, or an error, to report when training starts. A checkpoint that is loaded first makes them irrelevant."""
+    """Warnings or an error to report when training starts. A checkpoint that is loaded first makes them irrelevant."""
 
     warnings: tuple[str, ...] = ()
     failure: CheckpointError | None = None
@@ -67,14 +47,7 @@ class Start:
 
 
 def initial_field(
-    options: PointOptions,
-    points: Points | None,
-    frame: Frame | None,
-    *,
-    num_features: int,
-    cap: int | None,
-    chain: bool,
-    seed: int,
+    options: ModelOptions, points: Points | None, frame: Frame | None, *, num_features: int, cap: int | None
 ) -> tuple[dict[str, Tensor], Start]:
     """Parameters of a new model, float32 on the CPU, and what to report if it is trained.
 
@@ -87,18 +60,16 @@ def initial_field(
         frame: of the capture, if known.
         num_features: length of the feature vectors; 0 for none.
         cap: highest number of primitives to start with; None for no cap.
-        chain: whether the field grows by MCMC, which starts from small, half transparent primitives.
-        seed: of the choice under the cap.
     """
     start = Start()
     try:
         if options.warm_start is None:
-            params, start = _sparse_field(options, points, num_features, cap, seed)
+            params, start = _sparse_field(options, points, num_features, cap)
         else:
             params = _warm_field(options, options.warm_start, frame, num_features)
     except CheckpointError as error:
-        params, start = _sparse_field(options, points, num_features, cap, seed)[0], Start(failure=error)
-    if chain and options.warm_start is None:
+        params, start = _sparse_field(options, points, num_features, cap)[0], Start(failure=error)
+    if options.warmup == "mcmc" and options.warm_start is None:
         params = start_of_chain(params)
     if options.sh_degree == 0:
         # splatfacto and nerfstudio's exporter store logits of colours at SH degree 0.
@@ -107,7 +78,7 @@ def initial_field(
 
 
 def _sparse_field(
-    options: PointOptions, points: Points | None, num_features: int, cap: int | None, seed: int
+    options: ModelOptions, points: Points | None, num_features: int, cap: int | None
 ) -> tuple[dict[str, Tensor], Start]:
     warnings: list[str] = []
     if points is not None and len(points[0]) > 0 and not options.random_init:
@@ -121,13 +92,13 @@ def _sparse_field(
         xyz, rgb = random_points(options.num_random, options.random_scale)
     if cap is not None and len(xyz) > cap:
         warnings.append(f"{len(xyz):,} points are more than the cap; starting from {cap:,} of them")
-        chosen = select_random(len(xyz), cap, seed, xyz.device)
+        chosen = select_random(len(xyz), cap, options.pruning.seed, xyz.device)
         xyz, rgb = xyz[chosen], rgb[chosen]
     params = from_points(xyz, rgb, sh_degree=options.sh_degree, num_features=num_features)
     return params, Start(tuple(warnings))
 
 
-def _warm_field(options: PointOptions, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
+def _warm_field(options: ModelOptions, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
     params, in_model_frame = read_field(source)
     if options.warm_start_frame != "auto":
         in_model_frame = options.warm_start_frame == "model"

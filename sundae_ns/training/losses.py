@@ -7,7 +7,6 @@ import logging
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
 
 import torch
 from pytorch_msssim import SSIM
@@ -17,6 +16,7 @@ from sundae_ns.errors import BackendError
 from sundae_ns.gpu.fused_loss import SSIM_WINDOW, fused_loss, loss_kernels
 from sundae_ns.rasterization.select import numba_problem
 from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.options import ModelOptions
 
 CHAIN_PRIOR = 0.01
 """Weights of opacities and scales in the loss of a chain (lambda_o and lambda_Sigma of 3DGS-MCMC)."""
@@ -32,48 +32,16 @@ LEAST_SQUARE = 1e-8
 _log = logging.getLogger(__name__)
 
 
-class LossOptions(Protocol):
-    """Options of a model that its losses depend on."""
-
-    ssim_lambda: float
-    base_loss_weight: float
-    warmup: Literal["densify", "mcmc"]
-    loss_after_prune: Literal["l1", "rms"]
-    prior_after_prune: float
-
-
 @dataclass(frozen=True)
 class StepLosses:
     """Terms of the loss of a training step."""
 
+    options: ModelOptions
+    """Options of the model."""
     ssim: SSIM
     """SSIM of images ``[1, 3, H, W]``."""
-    ssim_weight: float
-    """lambda_2 of the paper."""
-    base_weight: float
-    """Weight of the L1 loss of the base colours while the head is enabled."""
-    chain: bool
-    """Whether the field grows as a Markov chain, whose loss has a prior."""
-    squares: bool = False
-    """Whether the root of the mean square takes the place of L1 once the field is pruned."""
-    prior: float = 0.0
-    """Weight of opacities and scales once the field is pruned."""
-    num_images: int = 0
+    num_images: int
     """Number of training images; 0 if it is not known."""
-
-    @classmethod
-    def of(cls, options: LossOptions, ssim: SSIM, num_images: int) -> StepLosses:
-        """The losses of a model.
-
-        Args:
-            options: of the model.
-            ssim: see the attribute.
-            num_images: number of training images.
-        """
-        chain, squares = options.warmup == "mcmc", options.loss_after_prune == "rms"
-        # A prior counts once, and the loss is of one image: its weight falls with their number.
-        prior = options.prior_after_prune / max(num_images, 1)  # an opened run may have none
-        return cls(ssim, options.ssim_lambda, options.base_loss_weight, chain, squares, prior, num_images)
 
     def __call__(
         self,
@@ -88,7 +56,7 @@ class StepLosses:
 
         Args:
             state: says what is enabled at this step.
-            params: trained parameters.
+            params: trained parameters, with logits ``opacities`` ``[N, 1]`` and logarithms ``scales`` ``[N, 3]``.
             rgb: the image ``[H, W, 3]``.
             base: its base colours ``[H, W, 3]``.
             target: the truth ``[H, W, 3]``.
@@ -99,15 +67,19 @@ class StepLosses:
         emphasis = self.emphasis(state)
         if emphasis != 1:
             rgb = torch.lerp(base, rgb, emphasis)
-        compared = base if state.head_enabled and self.base_weight > 0 else None
-        squares = self.squares and state.pruned
-        main_loss, base_loss = image_losses(rgb, compared, target, self.ssim, self.ssim_weight, squares=squares)
+        options = self.options
+        compared = base if state.head_enabled and options.base_loss_weight > 0 else None
+        squares = options.loss_after_prune == "rms" and state.pruned
+        main_loss, base_loss = image_losses(rgb, compared, target, self.ssim, options.ssim_lambda, squares=squares)
         losses = {"main_loss": main_loss}
         if base_loss is not None:
-            losses["base_loss"] = self.base_weight * base_loss
+            losses["base_loss"] = options.base_loss_weight * base_loss
         weight = self.prior_weight(state)
         if weight > 0:
-            losses.update(prior_losses(params, weight))
+            # Unused primitives become transparent and small (equation 10 of 3DGS-MCMC). A chain moves such primitives;
+            # in a pruned field they would fit what differs between the training images.
+            losses["opacity_loss"] = weight * params["opacities"].sigmoid().mean()
+            losses["scale_loss"] = weight * params["scales"].exp().mean()
         return losses
 
     def emphasis(self, state: FieldState) -> float:
@@ -127,9 +99,10 @@ class StepLosses:
 
     def prior_weight(self, state: FieldState) -> float:
         """Weight of opacities and scales at this step."""
-        if self.chain and state.densifying:
+        if self.options.warmup == "mcmc" and state.densifying:
             return CHAIN_PRIOR
-        return self.prior if state.pruned else 0.0
+        # A prior counts once, and the loss is of one image: its weight falls with their number.
+        return self.options.prior_after_prune / max(self.num_images, 1) if state.pruned else 0.0
 
 
 def image_losses(
@@ -197,18 +170,3 @@ def _kernel_runs(device: torch.device) -> bool:
         _log.warning("SSIM runs as convolutions, not in its kernel, on %s: %s", device, error)
         return False
     return True
-
-
-def prior_losses(params: Mapping[str, Tensor], weight: float) -> dict[str, Tensor]:
-    """Losses that make unused primitives transparent and small (equation 10 of 3DGS-MCMC).
-
-    A chain moves such primitives. In a pruned field they would fit what differs between the training images.
-
-    Args:
-        params: trained parameters, with logits ``opacities`` ``[N, 1]`` and logarithms ``scales`` ``[N, 3]``.
-        weight: of both means.
-    """
-    return {
-        "opacity_loss": weight * params["opacities"].sigmoid().mean(),
-        "scale_loss": weight * params["scales"].exp().mean(),
-    }

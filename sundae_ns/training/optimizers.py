@@ -38,11 +38,10 @@ class NetworkAdamConfig(FusedAdamConfig):
     """Adam for a network without normalisation layers, whose loss bursts at usual settings.
 
     The output is a product of layers, so aligned steps of all weights multiply it. Two measures keep such steps short.
-    The mean of squares forgets fast and follows gradients that suddenly grow: with the usual betas a weight moves by
-    3.2 times the rate at the first large gradient after small ones, and by up to 7.3 while they grow; with these by 0.4
-    and up to 1.2 (``sundae_ns.distributed.ahead.longest_step``). Weights of layers with many inputs get a smaller rate,
-    because their sum grows with the inputs (Yang et al. 2022, "Tensor Programs V"). Weight decay shrinks weights, not
-    biases.
+    The mean of squares forgets fast and follows gradients that suddenly grow. With the usual betas a weight moves by up
+    to 7.3 times the rate while they grow, with these by up to 1.2 (``sundae_ns.distributed.ahead.longest_step``).
+    Weights of layers with many inputs get a smaller rate, because their sum grows with the inputs (Yang et al. 2022,
+    "Tensor Programs V"). Weight decay shrinks weights, not biases.
 
     Rates follow the shapes at setup: a head that is resized in training keeps them.
     """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from typing import Any
 
 from nerfstudio.utils.writer import EVENT_STORAGE, GLOBAL_BUFFER, EventName, LocalWriter
@@ -40,24 +39,13 @@ class ProgressWriter(LocalWriter):
         trained = events.get(EventName.ITER_TRAIN_TIME.value)
         if trained is not None and self._metrics is not None and time.monotonic() - self._printed_at >= LINE_EVERY:
             self._printed_at = time.monotonic()
-            done, seconds = trained["step"] + 1, float(trained["event"])
-            print(progress_line(done, GLOBAL_BUFFER["max_iter"], seconds, self._metrics), flush=True)
-
-
-def progress_line(done: int, total: int, seconds: float, metrics: Mapping[str, Any]) -> str:
-    """One line on a training.
-
-    Args:
-        done: number of steps trained.
-        total: number of steps of the whole run.
-        seconds: time of a step.
-        metrics: ``psnr`` (dB) and ``gaussian_count`` of a recent training image.
-    """
-    left = duration((total - done) * seconds)
-    return (
-        f"{done} ({100 * done / max(total, 1):.2f}%)  {left} left at {1000 * seconds:.0f} ms a step  "
-        f"PSNR {float(metrics['psnr']):.2f} dB  {metrics['gaussian_count']:,} primitives"
-    )
+            done, seconds, total = trained["step"] + 1, float(trained["event"]), GLOBAL_BUFFER["max_iter"]
+            left = duration((total - done) * seconds)
+            print(
+                f"{done} ({100 * done / max(total, 1):.2f}%)  {left} left at {1000 * seconds:.0f} ms a step  "
+                f"PSNR {float(self._metrics['psnr']):.2f} dB  {self._metrics['gaussian_count']:,} primitives",
+                flush=True,
+            )
 
 
 def long_on_cpu(seconds: float, left: int) -> str | None:
@@ -71,8 +59,8 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
         return None
     return (
         f"this training runs on a CPU and takes at least {duration(seconds * left)} more ({1000 * seconds:.0f} ms a "
-        "step). sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images are "
-        "faster: end the command with nerfstudio-data --downscale-factor 4"
+        "step). sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images "
+        "are faster: end the command with nerfstudio-data --downscale-factor 4"
     )
 
 

@@ -10,11 +10,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sundae_ns.errors import SundaeError
+from sundae_ns.evaluation import peak_memory
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rendering.contribution import contribution
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.report import report_peak, write_report
+from sundae_ns.training.report import write_report
 from sundae_ns.training.schedulers import notify_pruned
 from sundae_ns.training.schedules import PruningSchedule
 from sundae_ns.training.warning import warn
@@ -35,11 +36,6 @@ class ScheduledPruning(Extension):
         self.evaluate = evaluate
         self.pruner: Callable[..., FieldPruner] = FieldPruner
         """Makes the pruner of field, optimizers and running states; several ranks have their own."""
-
-    @property
-    def _searching(self) -> bool:
-        """Whether a budget search prunes in place of the schedule."""
-        return self.schedule.config.mode == "auto"
 
     def before_training(self, run: TrainingRun) -> None:
         """Warn if training ends before the prune or the head."""
@@ -74,7 +70,7 @@ class ScheduledPruning(Extension):
             raise
         settled = state.schedule_step >= config.settled_at
         pruned = settled or (config.ends_growth_at is not None and state.pruning["num_prunes"] > 0)
-        if pruned and not self._searching:
+        if pruned and config.mode != "auto":
             with_head = settled and state.schedule_step >= state.head_starts_at
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
@@ -89,17 +85,19 @@ class ScheduledPruning(Extension):
 
     def finish(self, run: TrainingRun) -> None:
         """Report the peak, and warn if nothing was pruned; a budget search reports by itself."""
-        report_peak(run)
-        if not self._searching:
+        state = run.state
+        primitives, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
+        CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {state.device.type} memory")
+        run.log_scalars("Peak", {"primitives": primitives, "memory_mb": memory})
+        if self.schedule.config.mode != "auto":
             _warn_if_too_short(run, self.schedule.config, run.state.step)
 
 
 def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:
     """Warn if a training that ends with this step does not reach its first prune, its last prune, or its head."""
-    state = run.state
+    state, target, pruned = run.state, pruning.target_primitives, run.state.pruning["num_prunes"]
     # A warm start is pruned at once.
     first = pruning.first_prune if state.offset == 0 else None
-    target, pruned = pruning.target_primitives, state.pruning["num_prunes"]
     begins, ends = ("start", "stop") if pruning.mode == "continuous" else ("prune-at", "prune-at")
     # A head whose start is not known yet is decided upon elsewhere.
     scheduled = state.head is not None and math.isfinite(state.head_starts_at)

@@ -45,8 +45,8 @@ class PruningConfig(PruneRule):
     search_every: int = 250
     """Auto: steps from one measurement on the held-out views to the next."""
     patience: int = 4
-    """Auto: measurements after which a cut that has not recovered is undone, unless half of its predicted gain is
-    enough."""
+    """Auto: measurements after which a cut that has not recovered is taken back, unless half of its predicted gain
+    is enough."""
 
     @property
     def tolerated_drop(self) -> float:

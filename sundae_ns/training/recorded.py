@@ -134,8 +134,12 @@ class RecordedStep:
     ) -> StepResult:
         """One step on the buffers; all of its work is recorded."""
         tensors, head, view = self._buffers.tensors, settings.head, inputs.view
-        field = Field({name: tensors[name] for name in held.trained}, state.field.encoding)
-        step = TrainingStep(LocalField(_complete(field, state.field)), state, self._losses, field)
+        trained = {name: tensors[name] for name in held.trained}
+        # With parameters that have no values, such as the features of a field without a head.
+        empty = {name: value for name, value in state.field.items() if name not in trained and value.numel() == 0}
+        field = Field(trained, state.field.encoding)
+        source = LocalField(Field({**empty, **trained}, state.field.encoding))
+        step = TrainingStep(source, state, self._losses, field)
         loss, splatted, result = step(inputs, settings)
         network = [] if head is None else list(head.parameters())
         counting, centers = state.densifying and "grad2d" in tensors, splatted.info["means2d"]
@@ -171,12 +175,6 @@ class RecordedStep:
                 updates.append(Update(whole, grad, mean, square, own["step"]))
             groups.append((group, updates))
         return groups
-
-
-def _complete(field: Field, whole: Field) -> Field:
-    """The trained parameters, and those without values, such as the features of a field without a head."""
-    empty = {name: value for name, value in whole.items() if name not in field and value.numel() == 0}
-    return Field({**empty, **field}, field.encoding)
 
 
 def _kind(state: FieldState, inputs: StepInputs, settings: RenderSettings) -> Hashable:

@@ -5,12 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
-from sundae_ns.evaluation import peak_memory, without_nan
+from sundae_ns.evaluation import without_nan
 from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.runs.folder import prunes_before
 from sundae_ns.training.extension import TrainingRun
@@ -73,20 +70,9 @@ def write_report(
     scalars = {"before": report.before, "after": report.after, "seconds": report.seconds, "peak": report.peak}
     run.log_scalars("Prune", scalars)
     if run.folder is not None:
-        _append(run.folder / "prune.json", report, before, after)
-
-
-def _append(path: Path, report: PruneReport, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-    # A run that was killed between a prune and the next save repeats that prune.
-    reports = prunes_before(path, report.step)
-    reports.append({**asdict(report), "warm_up": dict(before), "pruned": dict(after)})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, json.dumps(reports, indent=2))
-
-
-def report_peak(run: TrainingRun) -> None:
-    """Log the highest number of primitives and the peak memory of the training."""
-    state = run.state
-    primitives, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
-    CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {state.device.type} memory")
-    run.log_scalars("Peak", {"primitives": primitives, "memory_mb": memory})
+        path = run.folder / "prune.json"
+        # A run that was killed between a prune and the next save repeats that prune.
+        reports = prunes_before(path, report.step)
+        reports.append({**asdict(report), "warm_up": dict(before), "pruned": dict(after)})
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, json.dumps(reports, indent=2))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,6 @@ _SHAPES = ("sh_degree", "head.size", "head.num_features", "head.pixel_unshuffle"
 """Options of the model that the shapes in a checkpoint depend on."""
 RESETS = "pipeline.model.reset_alpha_every"
 """Counts rounds of densification, not steps."""
-_REFINE = "pipeline.model.refine_every"
 
 
 def set_schedule(config: Any, words: Iterable[str]) -> None:
@@ -59,8 +58,7 @@ def set_schedule(config: Any, words: Iterable[str]) -> None:
         run = _resumed_run(config, place)
         if run is not None and usual is not None:
             for line in take_options(config, run, usual, given):
-                late = "; a prune that is done is not repeated" if ".pruning." in line else ""
-                warn(line + late)
+                warn(line + ("; a prune that is done is not repeated" if ".pruning." in line else ""))
             config.schedule_length = config.schedule_length or run.schedule_length or run.max_num_iterations
             if "max_num_iterations" not in given and config.max_num_iterations == usual.max_num_iterations:
                 config.max_num_iterations = _steps_left(config, place)
@@ -78,11 +76,7 @@ def set_schedule(config: Any, words: Iterable[str]) -> None:
 
 
 def _steps_left(config: Any, place: Path) -> int:
-    """Steps from the checkpoint to resume to the end of the schedule.
-
-    Raises:
-        ConfigError: there are none.
-    """
+    """Steps from the checkpoint that is resumed to the end of the schedule."""
     step = checkpoint.newest_step(place) if config.load_step is None else config.load_step
     left: int = config.schedule_length if step is None else config.schedule_length - step - 1
     if left < 1:
@@ -121,7 +115,7 @@ def step_options(config: Any) -> list[str]:
 def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
     """Scale the schedule to ``config.schedule_length``, but for options that were set by hand.
 
-    A warm start skips the steps before the prune. Its schedule is only compressed, and only if the rest would not fit.
+    A warm start skips the steps before the prune. Its schedule is compressed only if the steps after it do not fit.
 
     Args:
         config: ``SundaeTrainerConfig``; its schedule changes.
@@ -137,7 +131,8 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
         left = usual.max_num_iterations - usual_model.pruning.prune_at
         steps_share = min(config.schedule_length / max(left, 1), 1.0)
     config.optimizers = deepcopy(config.optimizers)  # methods share them with every configuration that tyro makes
-    for name in _free(config, usual, given):
+    free = _free(config, usual, given, step_options(usual))
+    for name in free:
         value = option(usual, name)
         if name == RESETS or not value:
             continue
@@ -145,10 +140,10 @@ def fit_to_length(config: Any, usual: Any, given: Collection[str]) -> None:
             scaled = min(value, config.schedule_length // LONGEST_RISE)
         else:
             scaled = max(round(value * (share if name.startswith("optimizers.") else steps_share)), 1)
-        if name == _REFINE and model.warmup == "densify":
+        if name == "pipeline.model.refine_every" and model.warmup == "densify":
             scaled = max(scaled, min(value, LEAST_IMAGES))
         set_option(config, name, scaled)
-    if RESETS in _free(config, usual, given):
+    if RESETS in free:
         period = round(usual_model.reset_alpha_every * usual_model.refine_every * steps_share)
         never = model.stop_split_at // model.refine_every + 1
         model.reset_alpha_every = max(round(period / model.refine_every), 1) if period >= LEAST_RECOVERY else never
@@ -186,47 +181,22 @@ def take_options(config: Any, run: Any, usual: Any, given: Collection[str]) -> l
     return differing
 
 
-def resumed_config(config: Any) -> Any:
-    """The configuration of the run that ``config`` resumes; None if it cannot be read, which is warned of."""
-    path = find_config(config.load_dir or config.load_checkpoint)
-    try:
-        return None if path is None else load_config(path)
-    except CheckpointError as error:
-        warn(f"{error}; the run is resumed with the options of this command")
-        return None
-
-
-def steps_left(config: Any) -> int:
-    """Steps from the checkpoint that ``config`` resumes to the end of its schedule.
-
-    Raises:
-        ConfigError: there are none.
-    """
-    step, length = config.load_step, config.schedule_length
-    if step is None:
-        step = checkpoint.newest_step(config.load_dir or config.load_checkpoint)
-    left: int = length if step is None else length - step - 1
-    if left < 1:
-        raise ConfigError(
-            f"the run has trained all of its {length:,} steps; give the number of further ones with "
-            "--max-num-iterations"
-        )
-    return left
-
-
 def schedule_table(config: Any) -> list[tuple[str, str]]:
     """What happens when, for the log: pairs of a part of training and its steps."""
     model = config.pipeline.model
-    pruning, warm = model.pruning, model.warm_start is not None
+    warm, head = model.warm_start is not None, model.head
+    schedulers = (parts["scheduler"] for parts in config.optimizers.values())
+    ends = sorted({scheduler.max_steps for scheduler in schedulers if scheduler is not None})
     rows = [
         ("images", "full size" if warm else _resolution(model)),
         ("densification", "none: warm start" if warm else _growth(model)),
         ("SH degree", f"{model.sh_degree}" if warm else f"+1 every {model.sh_degree_interval:,} steps"),
-        ("prune", _prune(pruning, warm)),
-        ("head", _head(model, warm)),
-        ("learning rates", _rates(config)),
+        ("prune", _prune(model.pruning, warm)),
+        ("head", "none" if head.mode == "off" else _head(model, warm)),
     ]
-    return [(name, text) for name, text in rows if text]
+    if ends:
+        rows.append(("learning rates", f"decay until {', '.join(f'{end:,}' for end in ends)}"))
+    return rows
 
 
 def _resolution(model: Any) -> str:
@@ -260,8 +230,6 @@ def _prune(pruning: Any, warm: bool) -> str:
 
 
 def _head(model: Any, warm: bool) -> str:
-    if model.head.mode == "off":
-        return "none"
     if model.pruning.mode == "auto":
         return "when the search enables it"
     at = model.pruning.settled_at if model.head.start_at is None else model.head.start_at
@@ -270,14 +238,8 @@ def _head(model: Any, warm: bool) -> str:
     return f"{when}, if trials favour it" if model.head.mode == "auto" else when
 
 
-def _rates(config: Any) -> str:
-    ends = {parts["scheduler"].max_steps for parts in config.optimizers.values() if parts["scheduler"] is not None}
-    return f"decay until {', '.join(f'{end:,}' for end in sorted(ends))}" if ends else ""
-
-
-def _free(config: Any, usual: Any, given: Collection[str], names: Sequence[str] | None = None) -> Sequence[str]:
-    """Those of ``names``, by default the step options, that nobody set by hand."""
-    names = step_options(usual) if names is None else names
+def _free(config: Any, usual: Any, given: Collection[str], names: Iterable[str]) -> list[str]:
+    """The options among ``names`` that nobody set by hand."""
     return [name for name in names if name not in given and option(config, name) == option(usual, name)]
 
 

@@ -7,7 +7,7 @@ nerfstudio's exponential decay leaves numpy numbers in its state, which a weight
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -24,6 +24,7 @@ MOST_FACTOR = 5.0
 """Largest factor on the rate of the centres, that of 600 primitives; nothing smaller was measured."""
 
 
+@dataclass
 class Decay:
     """Multiplier of the learning rate as a function of the step. Its state is plain numbers.
 
@@ -32,24 +33,15 @@ class Decay:
     ``shape`` is exponential, or half a cosine (Loshchilov & Hutter 2017, "SGDR").
     """
 
-    def __init__(
-        self,
-        final: float,
-        max_steps: int,
-        restart: float | None,
-        hold_until_prune: bool,
-        warmup_steps: int,
-        shape: DecayShape = "exponential",
-    ) -> None:
-        self.final = final
-        self.max_steps = max_steps
-        self.restart = restart
-        self.hold_until_prune = hold_until_prune
-        self.warmup_steps = warmup_steps
-        self.shape = shape
-        self.pruned_at: int | None = None
-        self.after_prune = 1.0
-        """Factor on the rate after the prune."""
+    final: float
+    max_steps: int
+    restart: float | None
+    hold_until_prune: bool
+    warmup_steps: int
+    shape: DecayShape = "exponential"
+    pruned_at: int | None = None
+    after_prune: float = 1.0
+    """Factor on the rate after the prune."""
 
     def __call__(self, step: int) -> float:
         """The multiplier at ``step``."""
@@ -94,16 +86,12 @@ class PruneAwareDecay(Scheduler):
 
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LRScheduler:
         """A ``LambdaLR`` whose state holds Python numbers only."""
-        restart = None if self.config.lr_restart is None else self.config.lr_restart / lr_init
-        decay = Decay(
-            self.config.lr_final / lr_init,
-            self.config.max_steps,
-            restart,
-            self.config.hold_until_prune,
-            self.config.warmup_steps,
-            self.config.shape,
+        config = self.config
+        restart = None if config.lr_restart is None else config.lr_restart / lr_init
+        hold, rise = config.hold_until_prune, config.warmup_steps
+        return LambdaLR(
+            optimizer, Decay(config.lr_final / lr_init, config.max_steps, restart, hold, rise, config.shape)
         )
-        return LambdaLR(optimizer, lr_lambda=decay)
 
 
 def notify_pruned(schedulers: Mapping[str, LRScheduler], step: int, primitives: int, *, last: bool = True) -> None:
@@ -115,10 +103,8 @@ def notify_pruned(schedulers: Mapping[str, LRScheduler], step: int, primitives: 
         primitives: number of primitives that were kept. With fewer than :data:`SPARSE` the rate of the centres rises.
         last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
     """
-    for name, scheduler in schedulers.items():
-        for decay in _decays(scheduler):
-            if decay.pruned_at is not None or not (last or not decay.hold_until_prune):
-                continue
+    for name, scheduler, decay in _decays(schedulers):
+        if decay.pruned_at is None and (last or not decay.hold_until_prune):
             decay.pruned_at = step
             if name == "means":
                 decay.after_prune = min(max(1.0, math.sqrt(SPARSE / max(primitives, 1))), MOST_FACTOR)
@@ -127,34 +113,30 @@ def notify_pruned(schedulers: Mapping[str, LRScheduler], step: int, primitives: 
 
 def postpone(schedulers: Mapping[str, LRScheduler], steps: int) -> None:
     """Let every :class:`Decay` that has restarted begin this many steps later, as for a trial that starts again."""
-    for scheduler in schedulers.values():
-        for decay in _decays(scheduler):
-            if decay.pruned_at is not None:
-                decay.pruned_at += steps
-                _apply(scheduler)
+    for _, scheduler, decay in _decays(schedulers):
+        if decay.pruned_at is not None:
+            decay.pruned_at += steps
+            _apply(scheduler)
 
 
 def limit_rise(schedulers: Mapping[str, LRScheduler], steps: int) -> None:
     """Let every :class:`Decay` that has not restarted rise over at most this many steps when it does."""
-    for scheduler in schedulers.values():
-        for decay in _decays(scheduler):
-            if decay.pruned_at is None:
-                decay.warmup_steps = min(decay.warmup_steps, steps)
+    for _, _, decay in _decays(schedulers):
+        if decay.pruned_at is None:
+            decay.warmup_steps = min(decay.warmup_steps, steps)
 
 
-def _decays(scheduler: LRScheduler) -> list[Decay]:
-    """The multipliers of a scheduler, each once: torch lists one for each group of parameters, and the groups share
-    theirs."""
-    found = [one for one in getattr(scheduler, "lr_lambdas", []) if isinstance(one, Decay)]
-    return list({id(one): one for one in found}.values())
+def _decays(schedulers: Mapping[str, LRScheduler]) -> Iterator[tuple[str, LRScheduler, Decay]]:
+    """Name, scheduler and multiplier, each once: torch lists one for each group of parameters, which share theirs."""
+    for name, scheduler in schedulers.items():
+        found = {id(one): one for one in getattr(scheduler, "lr_lambdas", []) if isinstance(one, Decay)}
+        yield from ((name, scheduler, decay) for decay in found.values())
 
 
 def _apply(scheduler: LRScheduler) -> None:
     """Give the optimizer the rate of the next step anew; it has one from before its multiplier changed."""
-    rates = [
-        base * multiplier(scheduler.last_epoch)
-        for base, multiplier in zip(scheduler.base_lrs, scheduler.lr_lambdas, strict=True)  # type: ignore[attr-defined]
-    ]
+    multipliers = scheduler.lr_lambdas  # type: ignore[attr-defined]
+    rates = [base * at(scheduler.last_epoch) for base, at in zip(scheduler.base_lrs, multipliers, strict=True)]
     for group, rate in zip(scheduler.optimizer.param_groups, rates, strict=True):
         group["lr"] = rate
     scheduler._last_lr = rates

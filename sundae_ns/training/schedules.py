@@ -30,26 +30,47 @@ of :func:`sundae_ns.rendering.contribution`."""
 
 @dataclass(frozen=True)
 class PruningSchedule:
-    """Never prunes, and records the peak. Subclasses say when a prune is due, and how many it keeps."""
+    """The schedule of a pruning mode.
+
+    ``one-shot`` is the paper's main strategy: training, one prune that keeps ``keep_ratio``, then fine-tuning.
+    ``continuous`` is the paper's alternative: periodic pruning during densification, for a lower peak of memory. Each
+    prune keeps ``keep_ratio``, so the final number is only roughly known; with ``target_primitives`` it is exact,
+    because the last prune comes after densification. ``max_primitives`` caps every prune, and every step in between
+    through :class:`sundae_ns.training.densification.CappedStrategy`. The other modes only record the peak: in ``auto``
+    the budget search prunes.
+    """
 
     config: PruningConfig
-    """Options; not changed."""
+    """Valid options; not changed."""
 
     def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """Whether a field of ``n`` primitives is to be pruned after this step."""
-        return False
+        """Whether a field of ``n`` primitives is to be pruned after this step.
+
+        One-shot: after ``prune_at``, or at once if training was resumed from a later step without a prune. Continuous:
+        at ``start`` and every ``every`` steps until ``stop``; with a target only if there are more primitives. From
+        ``stop`` on at every step with more primitives than the target or, without a target, the cap.
+        """
+        config = self.config
+        if config.mode == "one-shot":
+            return state["pruned_at"] == NEVER and step >= config.prune_at
+        if config.mode != "continuous":
+            return False
+        target = config.target_primitives
+        scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
+        most = config.max_primitives if target is None else target
+        by_count = most is not None and n > most and (scheduled or step >= config.stop)
+        return ((scheduled and target is None) or by_count) and step > state["pruned_at"]
 
     def target(self, n: int) -> int:
-        """Number of primitives that a prune keeps of ``n`` finite ones. The one place that decides this number."""
-        return n
+        """Number of primitives that a prune keeps of ``n`` finite ones. The one place that decides this number.
 
-    def rule_at(self, step: int) -> PruneRule:
-        """Rule of the prune at a step."""
-        return self.config
-
-    def lacking(self, step: int, n: int) -> int:
-        """Number of primitives to add to ``n`` after this step."""
-        return 0
+        ``target_primitives``, or ``round(keep_ratio * n)``, at least 1, under the cap.
+        """
+        config = self.config
+        if config.target_primitives is not None:
+            return min(config.target_primitives, n)
+        count = kept_count(config.keep_ratio, n)
+        return count if config.max_primitives is None else min(count, config.max_primitives)
 
     def initialize_state(self) -> dict[str, Any]:
         """Running state: step of the last prune (-1 for none), number of prunes, peak number of primitives."""
@@ -58,7 +79,7 @@ class PruningSchedule:
     def after_step(
         self, pruner: FieldPruner, state: MutableMapping[str, Any], step: int, contribute: Contribute | None = None
     ) -> PruneReport | None:
-        """Prune if it is due, and add primitives if they are lacking. Call it after optimizers and densification.
+        """Prune if it is due; add the primitives that lack to the target. Call it after optimizers and densification.
 
         Args:
             pruner: of the field.
@@ -73,78 +94,17 @@ class PruningSchedule:
             ConfigError: the rule needs a contribution and there is none.
             DataError: the field cannot be pruned, see :func:`sundae_ns.pruning.decide`.
         """
+        config, report = self.config, None
         state["peak"] = max(state["peak"], pruner.total)
-        report = None
         if self.due(state, step, pruner.total):
-            report = prune_to(self.target, self.rule_at(step), pruner, state, step, contribute)
-        lacking = self.lacking(step, pruner.total)
-        if lacking > 0:
+            # Continuous pruning draws anew each time, and the same after a resume.
+            rule = replace(config, seed=config.seed + step) if config.mode == "continuous" else config
+            report = prune_to(self.target, rule, pruner, state, step, contribute)
+        lacking = (config.target_primitives or 0) - pruner.total
+        if config.mode == "continuous" and step >= config.stop and lacking > 0:
             pruner.add(lacking, LEAST_OPACITY)
             state["peak"] = max(state["peak"], pruner.total)
         return report
-
-
-class OneShotPruning(PruningSchedule):
-    """Training, one prune that keeps ``keep_ratio``, then fine-tuning: the paper's main strategy."""
-
-    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """After ``prune_at``, or at once if training was resumed from a later step without a prune."""
-        return state["pruned_at"] == NEVER and step >= self.config.prune_at
-
-    def target(self, n: int) -> int:
-        """``round(keep_ratio * n)``, at least 1."""
-        return kept_count(self.config.keep_ratio, n)
-
-
-class ContinuousPruning(PruningSchedule):
-    """Periodic pruning during densification, for a lower peak of memory.
-
-    The paper's alternative (section "Continuous Pruning as a Strategy"): each prune keeps ``keep_ratio``, so that the
-    final number is only roughly known. With ``target_primitives`` each prune goes down to exactly that number; the last
-    one comes after densification, so this is the final number. ``max_primitives`` is a cap on every prune, and on every
-    step in between through :class:`sundae_ns.training.densification.CappedStrategy`.
-    """
-
-    def due(self, state: Mapping[str, Any], step: int, n: int) -> bool:
-        """At ``start`` and every ``every`` steps until ``stop``; with a target only if there are more primitives.
-
-        From ``stop`` on at every step with more primitives than the target or, without a target, the cap.
-        """
-        config, target = self.config, self.config.target_primitives
-        scheduled = config.start <= step <= config.stop and (step - config.start) % config.every == 0
-        most = config.max_primitives if target is None else target
-        above = most is not None and n > most
-        by_share = scheduled and target is None
-        by_count = above and (scheduled or step >= config.stop)
-        return (by_share or by_count) and step > state["pruned_at"]
-
-    def target(self, n: int) -> int:
-        """``target_primitives``, or the keep ratio's share under the cap."""
-        config = self.config
-        if config.target_primitives is not None:
-            return min(config.target_primitives, n)
-        count = kept_count(config.keep_ratio, n)
-        return count if config.max_primitives is None else min(count, config.max_primitives)
-
-    def rule_at(self, step: int) -> PruneRule:
-        """The rule with a new draw at each prune, and the same one after a resume."""
-        return replace(self.config, seed=self.config.seed + step)
-
-    def lacking(self, step: int, n: int) -> int:
-        """Those below ``target_primitives`` once densification has ended."""
-        return (self.config.target_primitives or 0) - n if step >= self.config.stop else 0
-
-
-def make_schedule(config: PruningConfig) -> PruningSchedule:
-    """Schedule of the configured mode.
-
-    Raises:
-        ConfigError: an option cannot work.
-    """
-    config.validate()
-    # In auto mode the budget search prunes; the schedule only records the peak.
-    schedules = {"one-shot": OneShotPruning, "continuous": ContinuousPruning}
-    return schedules.get(config.mode, PruningSchedule)(config)
 
 
 def prune_to(

@@ -77,7 +77,8 @@ def training_part(state: FieldState, view: View, at: StepResolution) -> tuple[Vi
         at: resolution at this step.
     """
     if state.head_enabled and at.downscale == 1:
-        state.remember_focal(view.focal)
+        low, high = state.trained_focal or (view.focal, view.focal)
+        state.trained_focal = (min(low, view.focal), max(high, view.focal))
     window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
     return view if window is None else view.cut(window), window
 

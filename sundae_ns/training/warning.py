@@ -6,5 +6,5 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 
 def warn(text: str) -> None:
-    """Print a warning on the console, as it is: names of files may hold brackets, which are markup elsewhere."""
+    """Print a warning on the console, without markup: names of files may hold brackets."""
     CONSOLE.print(f"Warning: {text}", style="yellow", markup=False, soft_wrap=True)

@@ -22,7 +22,7 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.surgery import per_primitive
 from sundae_ns.storage.runs.checkpoint import FORMAT
 from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.schedules import make_schedule
+from sundae_ns.training.schedules import PruningSchedule
 
 NAMES = ("means", "quats", "scales", "opacities", "features_dc", "features_rest", "features")
 RANKS = 3
@@ -178,7 +178,7 @@ def test_a_prune_within_the_first_batch_is_not_repeated(ranks: int, pruned_at: i
     whole["schedulers"]["means"]["lr_lambdas"][1]["pruned_at"] = max(pruned_at, 0)
     part = checkpoints.state_of_rank(whole, 0, ranks, NAMES)
     state = part["pipeline"]["_model._extra_state"]["running"]["pruning"]
-    assert make_schedule(PruningConfig(prune_at=0)).due(state, 30, 10) == (pruned_at < 0)
+    assert PruningSchedule(PruningConfig(prune_at=0)).due(state, 30, 10) == (pruned_at < 0)
     assert part["schedulers"]["means"]["lr_lambdas"][1]["pruned_at"] >= 0
     assert state["pruned_at"] <= pruned_at
 

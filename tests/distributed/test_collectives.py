@@ -37,7 +37,7 @@ from sundae_ns.rendering.source import colors_from
 from sundae_ns.training.densification import CappedStrategy
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.schedules import make_schedule
+from sundae_ns.training.schedules import PruningSchedule
 
 RunRanks = Callable[[str, Path], None]
 Passed = Callable[[Path, str], None]
@@ -451,7 +451,7 @@ def check_pruning(shards: Shards, **options: Any) -> None:
     params = shard_of(whole, start, end)
     optimizers, counts = adams(params, start), {"grad2d": torch.arange(start, end)}
     shards.recount(params)
-    schedule = make_schedule(config)
+    schedule = PruningSchedule(config)
     state = schedule.initialize_state()
     asked = []
 
@@ -487,7 +487,7 @@ def check_refusal(shards: Shards) -> None:
     """All ranks raise the error that rank 0 finds."""
     params = own_half(shards)
     shards.recount(params)
-    schedule = make_schedule(PruningConfig(prune_at=1, keep_ratio=0.3))
+    schedule = PruningSchedule(PruningConfig(prune_at=1, keep_ratio=0.3))
     with pytest.raises(ConfigError, match="pass over the training views"):
         schedule.after_step(RankPruner(params, {}, shards=shards), schedule.initialize_state(), 2)
 

@@ -22,7 +22,7 @@ from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.pruning_config import PruningConfig
-from sundae_ns.training.schedules import make_schedule
+from sundae_ns.training.schedules import PruningSchedule
 
 
 @pytest.fixture
@@ -76,7 +76,7 @@ def test_ranks_densify_and_prune_as_one() -> None:
     assert isinstance(densification, ShardedDensification)
     assert densification.strategy is strategy
     assert strategy.pause_refine_after_reset == 4 + 6, "each of 7 images is seen in 4 steps of 2"
-    pruning = team._sharded(ScheduledPruning(make_schedule(PruningConfig(prune_at=3)), evaluate=True), 7)
+    pruning = team._sharded(ScheduledPruning(PruningSchedule(PruningConfig(prune_at=3)), evaluate=True), 7)
     assert isinstance(pruning, ScheduledPruning)
     assert (pruning.schedule.config.prune_at, pruning.evaluate) == (3, True)
     pruner = pruning.pruner({}, {}, [])

@@ -225,7 +225,7 @@ def test_a_run_resumed_while_training_is_paused_has_figures(
         put_scalar(name, scalar, step)
 
     monkeypatch.setattr(writer, "put_scalar", noted)
-    monkeypatch.setattr(progress, "SECONDS_A_LINE", 0.0)
+    monkeypatch.setattr(progress, "LINE_EVERY", 0.0)
     resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
     served, centres, _ = _watched(resumed)
     capsys.readouterr()

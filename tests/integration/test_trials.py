@@ -45,7 +45,7 @@ def make(scenes: Callable[[int], Path], tmp_path: Path) -> Iterator[Make]:
 
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Fixes what the candidates gain on every held-out view: PSNR in dB, SSIM. Bytes do not count: the field is tiny."""
+    """Fixes what the candidates gain on every held-out view: PSNR in dB, SSIM. Bytes of a tiny field do not count."""
     monkeypatch.setattr(head_trials, "GAIN_PER_DOUBLING", 0.0)
     monkeypatch.setattr(engine, "AVERAGED_EVERY", 1)  # means, in trials of five steps
     monkeypatch.setattr(head_trials, "MEAN_SHARE", 0.6)

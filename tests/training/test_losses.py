@@ -89,12 +89,12 @@ def test_a_pruned_field_has_a_prior_that_counts_once(
     assert "opacity_loss" not in model.get_loss_dict(outputs, target)
     model.state.pruning["num_prunes"] = 1
     for count in (1, 2, 4):
-        model.losses = StepLosses.of(model.config, model.ssim, count)
+        model.losses = StepLosses(model.config, model.ssim, count)
         found = model.get_loss_dict(outputs, target)
         opacities, scales = model.gauss_params["opacities"].sigmoid(), model.gauss_params["scales"].exp()
         torch.testing.assert_close(found["opacity_loss"], 0.6 / count * opacities.mean())
         torch.testing.assert_close(found["scale_loss"], 0.6 / count * scales.mean())
-    model.losses = StepLosses.of(build(prior_after_prune=0.0).config, model.ssim, 1)
+    model.losses = StepLosses(build(prior_after_prune=0.0).config, model.ssim, 1)
     assert set(model.get_loss_dict(outputs, target)) == {"main_loss", "base_loss"}
 
 
@@ -120,21 +120,21 @@ def test_a_correction_is_stronger_in_the_loss_the_more_often_images_were_seen(
     model = perturb(build())
     model.eval()
     outputs, target = model.get_outputs(camera()), batch()
-    model.losses = StepLosses.of(model.config, model.ssim, 10)
+    model.losses = StepLosses(model.config, model.ssim, 10)
     model.state.head_starts_at = 0
     for name, value in changes.items():
         setattr(model.state, name, value)
     assert model.losses.emphasis(model.state) == pytest.approx(expected)
     rgb, base, truth = outputs["rgb"], outputs["base_rgb"], target["image"].float() / 255
     assert (rgb - base).abs().max() > 0.01
-    compared, _ = image_losses(base + expected * (rgb - base), None, truth, model.ssim, model.losses.ssim_weight)
+    compared, _ = image_losses(base + expected * (rgb - base), None, truth, model.ssim, model.config.ssim_lambda)
     torch.testing.assert_close(model.get_loss_dict(outputs, target)["main_loss"], compared)
 
 
 def test_only_the_correction_of_a_known_number_of_images_shrinks(build: Build) -> None:
     for model, count in ((build(head={"mode": "features"}), 10), (build(head={"mode": "off"}), 10), (build(), 0)):
         model.state.step = 1050
-        assert StepLosses.of(model.config, model.ssim, count).emphasis(model.state) == 1
+        assert StepLosses(model.config, model.ssim, count).emphasis(model.state) == 1
 
 
 def test_a_negative_prior_is_refused(build: Build) -> None:

@@ -18,13 +18,13 @@ from sundae_ns.training.run_length import (
     step_options,
     take_options,
 )
-from sundae_ns.training.schedules import make_schedule
+from sundae_ns.training.schedules import PruningSchedule
 
 OURS = sorted(name for name in all_methods if name.startswith("sundae"))
 
 
 def fitted(method: str, length: int, *words: str, **model: Any) -> Any:
-    """A configuration of ``length`` steps; ``words`` are options that keep their value, ``model`` changes the model's."""
+    """A configuration of ``length`` steps; ``words`` are options that keep their value, ``model`` are new values."""
     config = deepcopy(all_methods[method])
     config.max_num_iterations = config.schedule_length = length
     for name, value in model.items():
@@ -118,7 +118,7 @@ def test_a_chain_keeps_its_number_of_rounds() -> None:
 @pytest.mark.parametrize("length", [300, 1500, 7000, 50000])
 def test_continuous_pruning_keeps_its_number_of_prunes(length: int) -> None:
     def prunes(config: Any) -> int:
-        schedule = make_schedule(config.pipeline.model.pruning)
+        schedule = PruningSchedule(config.pipeline.model.pruning)
         state = schedule.initialize_state()
         return sum(schedule.due(state, step, 1000) for step in range(config.max_num_iterations))
 

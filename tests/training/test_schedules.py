@@ -18,12 +18,7 @@ from sundae_ns.graphs import build_graph
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.report import PruneReport
-from sundae_ns.training.schedules import (
-    ContinuousPruning,
-    OneShotPruning,
-    PruningSchedule,
-    make_schedule,
-)
+from sundae_ns.training.schedules import PruningSchedule
 
 Field = tuple[dict[str, Parameter], dict[str, Optimizer]]
 
@@ -77,7 +72,7 @@ def saved_and_loaded(state: dict[str, Any]) -> dict[str, Any]:
 
 def test_one_shot_prunes_once_and_training_goes_on() -> None:
     made = field()
-    policy = make_schedule(PruningConfig(prune_at=3, keep_ratio=0.25))
+    policy = PruningSchedule(PruningConfig(prune_at=3, keep_ratio=0.25))
     losses = []
     state = policy.initialize_state()
     for step in range(8):
@@ -94,7 +89,7 @@ def test_one_shot_prunes_once_and_training_goes_on() -> None:
 
 
 def test_a_resumed_run_does_not_prune_twice() -> None:
-    policy = make_schedule(PruningConfig(prune_at=3, keep_ratio=0.5))
+    policy = PruningSchedule(PruningConfig(prune_at=3, keep_ratio=0.5))
     made = field()
     _, state = run(policy, made, range(5))
     reports, state = run(policy, made, range(2, 9), saved_and_loaded(state))
@@ -104,7 +99,7 @@ def test_a_resumed_run_does_not_prune_twice() -> None:
 
 
 def test_a_warm_start_behind_the_step_prunes_at_once() -> None:
-    reports, _ = run(make_schedule(PruningConfig(prune_at=3)), field(), range(10, 14))
+    reports, _ = run(PruningSchedule(PruningConfig(prune_at=3)), field(), range(10, 14))
     assert [report.step for report in reports] == [10]
 
 
@@ -112,14 +107,16 @@ def test_the_same_seed_gives_the_same_field() -> None:
     kept = []
     for seed in (1, 1, 2):
         made = field()
-        run(make_schedule(PruningConfig(prune_at=1, seed=seed)), made, range(3))
+        run(PruningSchedule(PruningConfig(prune_at=1, seed=seed)), made, range(3))
         kept.append(made[0]["means"].detach())
     assert torch.equal(kept[0], kept[1])
     assert not torch.equal(kept[0], kept[2])
 
 
 def test_continuous_keeps_a_share_on_schedule() -> None:
-    policy = make_schedule(PruningConfig(mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, num_neighbors=4))
+    policy = PruningSchedule(
+        PruningConfig(mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, num_neighbors=4)
+    )
     reports, state = run(policy, field(), range(13))
     assert [report.step for report in reports] == [2, 5, 8]
     assert [report.after for report in reports] == [70, 49, 34]
@@ -132,7 +129,7 @@ def test_continuous_caps_a_growing_field_and_counts_the_peak() -> None:
     config = PruningConfig(
         mode="continuous", start=0, every=2, stop=100, max_primitives=110, keep_ratio=1.0, num_neighbors=4
     )
-    policy = make_schedule(config)
+    policy = PruningSchedule(config)
     state = policy.initialize_state()
     counts, peaks = [], []
     params, optimizers = field(100)
@@ -152,7 +149,7 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
     config = PruningConfig(
         mode="continuous", start=0, every=2, stop=3, target_primitives=80, max_primitives=120, num_neighbors=4
     )
-    policy = make_schedule(config)
+    policy = PruningSchedule(config)
     made = field()
     reports, state = run(policy, made, range(2))
     assert [report.after for report in reports] == [80]
@@ -171,9 +168,9 @@ def test_continuous_ends_at_exactly_the_target(last: int) -> None:
 def test_a_resumed_continuous_run_goes_on_as_if_never_stopped() -> None:
     config = PruningConfig(mode="continuous", start=1, every=2, stop=7, keep_ratio=0.8, num_neighbors=4)
     whole, halves = field(), field()
-    run(make_schedule(config), whole, range(8))
-    _, state = run(make_schedule(config), halves, range(4))
-    run(make_schedule(config), halves, range(4, 8), saved_and_loaded(state))
+    run(PruningSchedule(config), whole, range(8))
+    _, state = run(PruningSchedule(config), halves, range(4))
+    run(PruningSchedule(config), halves, range(4, 8), saved_and_loaded(state))
     assert torch.equal(whole[0]["means"], halves[0]["means"])
 
 
@@ -181,7 +178,7 @@ def test_continuous_draws_anew_each_time() -> None:
     config = PruningConfig(
         mode="continuous", start=0, every=1, keep_ratio=0.5, score="random", selection="sampled", redistribution="none"
     )
-    policy = make_schedule(config)
+    policy = PruningSchedule(config)
     kept = []
     for step in (3, 3, 4):
         made = field()
@@ -202,7 +199,7 @@ def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> 
         asked.append((count, len(params["means"])))
         return torch.ones(len(params["means"]))
 
-    policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=0.5))
+    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
     report = policy.after_step(FieldPruner(params, optimizers), policy.initialize_state(), 0, contribute)
     assert report is not None
     assert asked == [(49, 98)]
@@ -217,7 +214,7 @@ def test_the_state_of_densification_is_sliced_along() -> None:
     strategy_state = {"grad2d": torch.arange(100), "scene_scale": 2.0}
     config = PruningConfig(prune_at=0, score="opacity", selection="top", redistribution="none", keep_ratio=0.1)
     opacities = made[0]["opacities"].detach().squeeze(1).clone()
-    policy = make_schedule(config)
+    policy = PruningSchedule(config)
     policy.after_step(FieldPruner(*made, [strategy_state]), policy.initialize_state(), 0)
     assert strategy_state["grad2d"].tolist() == sorted((opacities[1:].topk(10).indices + 1).tolist())
     assert strategy_state["scene_scale"] == 2.0
@@ -225,21 +222,21 @@ def test_the_state_of_densification_is_sliced_along() -> None:
 
 def test_full_keep_ratio_keeps_all_and_asks_for_nothing() -> None:
     made = field(10)
-    policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=1.0))
+    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=1.0))
     report = policy.after_step(FieldPruner(*made), policy.initialize_state(), 0)
     assert report is not None
     assert (report.before, report.after, report.sigma) == (10, 10, None)
 
 
 def test_off_never_prunes_but_counts() -> None:
-    reports, state = run(make_schedule(PruningConfig(mode="off", prune_at=0, start=0, every=1)), field(), range(4))
+    reports, state = run(PruningSchedule(PruningConfig(mode="off", prune_at=0, start=0, every=1)), field(), range(4))
     assert reports == []
     assert state == {"pruned_at": -1, "num_prunes": 0, "peak": 100}
 
 
 def test_a_failed_prune_leaves_field_and_state() -> None:
     made = field(10)
-    policy = make_schedule(PruningConfig(prune_at=0))
+    policy = PruningSchedule(PruningConfig(prune_at=0))
     state = policy.initialize_state()
     with pytest.raises(DataError, match=r"contribution has shape \[9\] for 10 primitives"):
         policy.after_step(FieldPruner(*made), state, 0, lambda _: torch.ones(9))
@@ -248,7 +245,7 @@ def test_a_failed_prune_leaves_field_and_state() -> None:
 
 
 def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
-    policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=0.5))
+    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
     params, optimizers = field()
     foreign = {**params, "means": Parameter(torch.zeros(100, 3))}
     with pytest.raises(DataError, match="optimizer of 'means'"):
@@ -257,7 +254,7 @@ def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
 
 
 def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
-    policy = make_schedule(PruningConfig(prune_at=0, keep_ratio=0.5))
+    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
     params, optimizers = field(10)
     params["opacities"].data[:] = torch.nan
     with pytest.raises(DataError, match="none of 10 primitives is finite: the training has diverged"):
@@ -265,14 +262,14 @@ def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
 
 
 def test_report_is_one_line_of_plain_numbers() -> None:
-    (report,), _ = run(make_schedule(PruningConfig(prune_at=0)), field(), range(1))
+    (report,), _ = run(PruningSchedule(PruningConfig(prune_at=0)), field(), range(1))
     assert all(type(getattr(report, f.name)) in (int, float) for f in fields(report))
     summary = report.summary()
     assert "\n" not in summary
     assert summary.startswith("step 0: kept 10 of 100 primitives in ")
     assert f"sigma {report.sigma:.3g}, tau {report.tau:.3g}, {report.isolated:,} isolated" in summary
     (unscored,), _ = run(
-        make_schedule(PruningConfig(prune_at=0, score="opacity", redistribution="none")), field(), range(1)
+        PruningSchedule(PruningConfig(prune_at=0, score="opacity", redistribution="none")), field(), range(1)
     )
     assert "sigma" not in unscored.summary()
 
@@ -293,7 +290,7 @@ def test_the_last_options_that_work() -> None:
 
 
 def test_continuous_leaves_a_field_alone_that_holds_the_target() -> None:
-    policy = make_schedule(PruningConfig(mode="continuous", start=0, stop=10, every=1, target_primitives=100))
+    policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=1, target_primitives=100))
     state = policy.initialize_state()
     assert [policy.due(state, 0, n) for n in (99, 100, 101)] == [False, False, True]
 
@@ -303,29 +300,22 @@ def test_continuous_under_a_cap_keeps_the_share_too(cap: int, expected: list[int
     config = PruningConfig(
         mode="continuous", start=2, every=3, stop=9, keep_ratio=0.7, max_primitives=cap, num_neighbors=4
     )
-    reports, _ = run(make_schedule(config), field(), range(13))
+    reports, _ = run(PruningSchedule(config), field(), range(13))
     assert [report.step for report in reports] == [2, 5, 8]
     assert [report.after for report in reports] == expected
 
 
 def test_a_field_above_the_cap_is_pruned_when_continuous_pruning_has_ended() -> None:
     """As after a resume under a lower cap."""
-    policy = make_schedule(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_primitives=100))
+    policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=20, max_primitives=100))
     state = policy.initialize_state()
     assert [policy.due(state, step, 101) for step in (9, 10, 30)] == [False, True, True]
     assert not policy.due(state, 30, 100)
 
 
 def test_continuous_prunes_a_step_once() -> None:
-    policy = make_schedule(PruningConfig(mode="continuous", start=0, stop=10, every=1))
+    policy = PruningSchedule(PruningConfig(mode="continuous", start=0, stop=10, every=1))
     assert [policy.due({**policy.initialize_state(), "pruned_at": 5}, step, 100) for step in (5, 6)] == [False, True]
-
-
-@pytest.mark.parametrize(
-    ("mode", "kind"), [("one-shot", OneShotPruning), ("continuous", ContinuousPruning), ("off", PruningSchedule)]
-)
-def test_mode_names_the_policy(mode: Any, kind: type[PruningSchedule]) -> None:
-    assert type(make_schedule(PruningConfig(mode=mode))) is kind
 
 
 @pytest.mark.parametrize(
@@ -357,7 +347,7 @@ def test_mode_names_the_policy(mode: Any, kind: type[PruningSchedule]) -> None:
 )
 def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))) as caught:
-        make_schedule(replace(PruningConfig(), **wrong))
+        replace(PruningConfig(), **wrong).validate()
     assert "\n" not in str(caught.value)
 
 
@@ -397,11 +387,10 @@ def test_one_budget_is_enough(budget: dict[str, object]) -> None:
         ({"mode": "continuous", "target_primitives": 30}, 30, 10),
         ({"mode": "continuous", "max_primitives": 30, "keep_ratio": 0.6}, 30, 6),
         ({"mode": "continuous", "keep_ratio": 0.6}, 36, 6),
-        ({"mode": "off"}, 60, 10),
     ],
 )
 def test_the_schedule_decides_how_many_stay(options: dict[str, Any], of_60: int, of_10: int) -> None:
-    schedule = make_schedule(PruningConfig(**options))
+    schedule = PruningSchedule(PruningConfig(**options))
     assert (schedule.target(60), schedule.target(10)) == (of_60, of_10)
 
 

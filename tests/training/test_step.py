@@ -32,7 +32,8 @@ def test_both_halves_are_the_whole_step(
             terms, images = result.losses, result.images
         else:
             outputs = model.get_outputs(camera())
-            terms, images = model.get_loss_dict(outputs, batch()), {name: outputs[name] for name in ("rgb", "base_rgb")}  # type: ignore[arg-type]
+            terms = model.get_loss_dict(outputs, batch())  # type: ignore[arg-type]
+            images = {name: outputs[name] for name in ("rgb", "base_rgb")}
             loss = sum(terms.values(), torch.zeros(()))
         values = [value for value in model.gauss_params.values() if value.numel() and value.requires_grad]
         grads = [grad for grad in torch.autograd.grad(loss, values, allow_unused=True) if grad is not None]

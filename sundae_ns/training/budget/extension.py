@@ -13,13 +13,12 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.errors import CheckpointError, ConfigError, DataError, SundaeError
+from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import accounting, megabytes, stored_bytes
 from sundae_ns.training.budget import heads
 from sundae_ns.training.budget.search import NO_IMAGE, SearchProgress
 from sundae_ns.training.budget.searched_field import SearchedField
-from sundae_ns.training.budget.sh_degree import end_trial, flatten, start_trial, trained
 from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
@@ -30,6 +29,8 @@ from sundae_ns.training.warning import warn
 
 MAX_REJECTED = 5
 """Cuts that may be rejected, before and after the head is enabled."""
+TRIAL_EVALUATIONS = 3
+"""Length of the training at one SH degree, in evaluations."""
 FLAT_SHARE = 0.25
 """Share of the tolerated drop that view-independent colours may cost when they are introduced."""
 
@@ -56,16 +57,15 @@ class BudgetSearch(Extension):
         self._engine = TrialEngine()
         self._engine.enable_head(state, False)
         self._flat: Tensor | None = None
+        """Primitives with view-independent colours, bool ``[N]``; None before the search has ended."""
 
     def searched(self, run: TrainingRun) -> SearchedField:
         """The field of a run under this search."""
-        return SearchedField(run, self.config, self.search, self._engine)
-
-    # ------------------------------------------------------------------------------------------------- checkpoints
+        return SearchedField(run, self.config, self.search, self._engine, self._largest)
 
     def state_dict(self) -> dict[str, Any]:
         """Numbers of the search and, while it goes on, copies of the fields that it may return to."""
-        return {"numbers": self.search.state(), "engine": self._engine.state_dict(), "flat": self._flat}
+        return {"numbers": asdict(self.search), "engine": self._engine.state_dict(), "flat": self._flat}
 
     def prepare_loading(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Give field and head the shapes of a checkpoint.
@@ -73,7 +73,7 @@ class BudgetSearch(Extension):
         Raises:
             CheckpointError: the checkpoint carries no search, or a damaged one.
         """
-        heads.reshape(state, _search_of(saved), self._largest)
+        heads.reshape(state, SearchProgress.from_state(saved.get("numbers")), self._largest)
 
     def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
         """Counterpart of :meth:`state_dict`.
@@ -81,15 +81,12 @@ class BudgetSearch(Extension):
         Raises:
             CheckpointError: the checkpoint carries no search, or a damaged one.
         """
-        search = _search_of(saved)
+        search, engine = SearchProgress.from_state(saved.get("numbers")), TrialEngine()
         needed = {"accepted": search.trying, "fallback": search.phase in ("degrees", "head")}
-        engine = TrialEngine()
         engine.load_state_dict(state, saved.get("engine", {}))
         engine.require(*(name for name, due in needed.items() if due), trial=False)
         self.search, self._engine, self._flat = search, engine, saved.get("flat")
         engine.enable_head(state, search.head)
-
-    # ---------------------------------------------------------------------------------------------------- training
 
     def before_training(self, run: TrainingRun) -> None:
         """Check that views are held out, and that the budget suffices for one primitive.
@@ -116,7 +113,6 @@ class BudgetSearch(Extension):
         Raises:
             DataError: the budget is too small for one primitive, or the field cannot be scored. A checkpoint is saved.
         """
-        search = self.search
         searched = self.searched(run)
         if self._flat is not None:
             rest = searched.field["features_rest"]
@@ -130,7 +126,7 @@ class BudgetSearch(Extension):
             # Do not lose the warm-up to an option that can be corrected.
             run.save()
             raise
-        search.seconds += time.perf_counter() - started
+        self.search.seconds += time.perf_counter() - started
         self._write(searched)
 
     def _act(self, searched: SearchedField) -> bool:
@@ -138,9 +134,8 @@ class BudgetSearch(Extension):
         phase = self.search.phase
         if phase == "before" and searched.state.schedule_step >= self.config.prune_at:
             self._begin(searched)
-        elif phase == "degrees" and (trained(searched) or self._time_is_up(searched)):
-            if end_trial(searched):
-                self._after_degrees(searched)
+        elif phase == "degrees" and (self._trained(searched) or self._time_is_up(searched)):
+            self._end_trial(searched)
         elif phase in ("field", "head") and self._evaluation_is_due(searched):
             self._evaluate(searched)
         else:
@@ -155,32 +150,29 @@ class BudgetSearch(Extension):
             return
         searched, state = self.searched(run), run.state
         end = searched.evaluation(searched.measure(), "final", "reached")
-        drop, stored, count = search.reference - end.psnr, end.bytes, searched.count
+        drop, count = search.reference - end.psnr, searched.count
         option, limit = budget_of(config)
-        cost = {"max_psnr_drop": drop, "max_bytes": stored, "max_primitives": count}[option]
+        cost = {"max_psnr_drop": drop, "max_bytes": end.bytes, "max_primitives": count}[option]
         end.verdict = "reached" if cost <= limit else "missed"
         search.curve = [old for old in search.curve if old.phase != "final"] + [end]
         unfinished = ""
-        if search.searching:
+        if search.phase != "done":
             # After a warm start, steps of the schedule run ahead of training steps.
             last = max(config.stop, state.schedule_step + config.search_every) - state.schedule_step + state.step
             unfinished = f" The search had not ended: train on to step {last}."
         CONSOLE.log(
             f"budget {option} {limit:,}: {end.verdict}. {count:,} of {search.before:,} primitives, "
-            f"{megabytes(stored)}, SH degree {searched.field.sh_degree}, "
+            f"{megabytes(end.bytes)}, SH degree {searched.field.sh_degree}, "
             f"{'with' if search.head else 'no'} head, {drop:+.3f} dB lost on {search.views} held-out views.{unfinished}"
         )
         self._write(searched)
-
-    # ---------------------------------------------------------------------------------------------------- the steps
 
     def _begin(self, searched: SearchedField) -> None:
         search, state = self.search, searched.state
         searched.drop_nonfinite()
         # Densification has ended, and its statistics would not match a field that is restored with more primitives.
         self._densification.initialize(state)
-        search.began, search.before = state.schedule_step, searched.count
-        search.views = searched.run.num_heldout
+        search.began, search.before, search.views = state.schedule_step, searched.count, searched.run.num_heldout
         search.reference = searched.measure()
         if search.reference == NO_IMAGE:
             raise DataError(
@@ -195,11 +187,45 @@ class BudgetSearch(Extension):
         searched.restart_rates(head=False)
         search.degree = searched.field.sh_degree
         if search.degree > 0 and not self._time_is_up(searched):
-            search.phase = "degrees"
+            search.phase, search.cut_at = "degrees", state.schedule_step
             searched.keep("fallback")
-            start_trial(searched, search.degree)
         else:
             self._after_degrees(searched)
+
+    def _trained(self, searched: SearchedField) -> bool:
+        """Whether the trial of an SH degree has its full length."""
+        return searched.state.schedule_step - self.search.cut_at >= TRIAL_EVALUATIONS * self.config.search_every
+
+    def _end_trial(self, searched: SearchedField) -> None:
+        """Measure the trial of an SH degree; start the next one from the warm-up field, or choose a degree."""
+        search, tolerated, step = self.search, self.config.tolerated_drop, searched.state.schedule_step
+        if self._trained(searched):
+            value = search.degrees[str(search.degree)] = searched.measure_finite()
+            top = max(int(name) for name in search.degrees)
+            if search.degree == search.lowest_degree(top, tolerated):
+                if value > NO_IMAGE:
+                    searched.keep("accepted")
+                else:
+                    self._engine.kept["accepted"] = self._engine.kept["fallback"]
+            degree = search.next_degree(top, tolerated)
+            if len(search.degrees) > 1 or value == NO_IMAGE:  # this trial, or the one that it has replaced
+                search.steps_lost += step - search.cut_at
+            if degree is not None:
+                searched.go_back("fallback")
+                if degree < search.degree:
+                    searched.lower_degree(degree)
+                search.cut_at = step
+                return
+            if search.degree != search.lowest_degree(top, tolerated) or value == NO_IMAGE:
+                searched.go_back("accepted")
+        elif search.degrees:  # the run ends during the trial; the warm-up's own degree needs no proof
+            search.steps_lost += step - search.cut_at
+            searched.go_back("accepted")
+        del self._engine.kept["fallback"]
+        if search.degrees:
+            levels = ", ".join(f"{name}: {value:.3f}" for name, value in search.degrees.items())
+            CONSOLE.log(f"SH degree {search.degree} (PSNR by degree after the same training: {levels} dB)")
+        self._after_degrees(searched)
 
     def _after_degrees(self, searched: SearchedField) -> None:
         if budget_of(self.config)[0] != "max_psnr_drop":
@@ -207,11 +233,11 @@ class BudgetSearch(Extension):
             self._done(searched)
             return
         self.search.begin("field", searched.count)
-        value = searched.measure()
-        if self._clock(searched)[2]:
+        value, (_, _, over) = searched.measure(), self._clock(searched)
+        if over:
             self._end_phase(searched, value)
         else:
-            self._cut_or_rest(searched, value)
+            self._cut_or_wait(searched, value)
 
     def _time_is_up(self, searched: SearchedField) -> bool:
         """Whether the search must end at this step. A run that ends before ``stop`` may be trained on."""
@@ -219,12 +245,11 @@ class BudgetSearch(Extension):
 
     def _clock(self, searched: SearchedField) -> tuple[bool, int, bool]:
         """Whether a head may follow this phase, steps in which a cut must recover, whether another is too late."""
-        config, search, step = self.config, self.search, searched.state.schedule_step
-        # Half of the time belongs to the head, if one may be enabled.
-        head_to_come = search.phase == "field" and heads.may_pay(searched, self._largest)
-        deadline = (search.began + config.stop) // 2 if head_to_come else config.stop
-        left = deadline - step if head_to_come else searched.steps_left
-        return head_to_come, left, self._is_over(searched, deadline, left)
+        search, step = self.search, searched.state.schedule_step
+        if search.phase != "field" or searched.head_for(searched.count) is None:
+            return False, searched.steps_left, self._is_over(searched, self.config.stop, searched.steps_left)
+        deadline = (search.began + self.config.stop) // 2  # half of the time belongs to the head
+        return True, deadline - step, self._is_over(searched, deadline, deadline - step)
 
     def _is_over(self, searched: SearchedField, deadline: int, left: int) -> bool:
         """Whether too few steps are left to judge another cut."""
@@ -259,9 +284,9 @@ class BudgetSearch(Extension):
         if over or lost or search.looks >= tired * config.patience or search.rejected >= MAX_REJECTED:
             self._end_phase(searched, value)
         else:
-            self._cut_or_rest(searched, value)
+            self._cut_or_wait(searched, value)
 
-    def _cut_or_rest(self, searched: SearchedField, value: float) -> None:
+    def _cut_or_wait(self, searched: SearchedField, value: float) -> None:
         """Cut as deep as the margin allows, or not at all."""
         config, search = self.config, self.search
         count = search.next_count(value, config.num_neighbors + 1 if config.uses_graph else 1, config.patience)
@@ -272,13 +297,13 @@ class BudgetSearch(Extension):
         search.cut(value, count, searched.state.schedule_step)
 
     def _end_phase(self, searched: SearchedField, value: float) -> None:
-        search, step = self.search, searched.state.schedule_step
+        search, step, head = self.search, searched.state.schedule_step, searched.head_for(searched.count)
         too_late = self._is_over(searched, self.config.stop, searched.steps_left)
-        if search.phase == "field" and heads.may_pay(searched, self._largest) and not too_late:
+        if search.phase == "field" and head is not None and not too_late:
             searched.keep("fallback")
             search.begin("head", search.accepted)
             search.head_at, search.lost_at_join = step, search.steps_lost
-            heads.enable(searched, self._largest, searched.count)
+            searched.enable_head(head)
             return
         if search.phase == "head":
             without = len(self._engine.kept["fallback"]["field"]["means"]["value"]) * searched.row
@@ -287,8 +312,8 @@ class BudgetSearch(Extension):
                 search.head = False
                 self._engine.enable_head(searched.state, False)
                 searched.go_back("fallback")
-        if not search.head and self._largest is not None:
-            heads.remove(searched)
+        if not search.head:
+            searched.remove_head()
         self._done(searched)
 
     def _fit(self, searched: SearchedField) -> None:
@@ -301,10 +326,12 @@ class BudgetSearch(Extension):
                 raise DataError(
                     f"pruning.max-bytes is {config.max_bytes:,}, and one primitive takes {row:,}; give more"
                 )
-        if not heads.enable(searched, self._largest, count) and self._largest is not None:
-            heads.remove(searched)
+        head = searched.head_for(count)
+        if head is None:
+            searched.remove_head()
+        else:
+            searched.enable_head(head)
         if config.max_bytes is not None:
-            head = heads.chosen_head(search, self._largest) if search.head else None
             count = accounting.rows_within(searched.field, config.max_bytes, lambda rows: stored_bytes(rows, head))
         if count < searched.count:
             searched.cut_to(count)
@@ -321,7 +348,7 @@ class BudgetSearch(Extension):
             least = value - FLAT_SHARE * self.config.tolerated_drop
             if searched.steps_left == 0:  # no training follows that could recover it
                 least = max(least, min(value, search.target))
-            self._flat = flatten(searched, least)
+            self._flat = searched.flatten(least)
             search.zeroed = int(self._flat.sum())
             CONSOLE.log(f"{search.zeroed:,} of {searched.count:,} primitives get view-independent colours")
         report = PruneReport(
@@ -336,7 +363,7 @@ class BudgetSearch(Extension):
         write_report(searched.run, report, before={}, after={})
 
     def _write(self, searched: SearchedField) -> None:
-        """Write curve, choice and cost of the search.
+        """Write curve, choice and cost of the search to ``budget.json``.
 
         Raises:
             StorageError: no space or no right to write.
@@ -344,12 +371,10 @@ class BudgetSearch(Extension):
         run, search = searched.run, self.search
         if run.last_step is None:
             return
-        share = search.steps_lost / (run.last_step + 1)
+        (option, limit), share = budget_of(self.config), search.steps_lost / (run.last_step + 1)
         cost = {"steps_lost": search.steps_lost, "share_of_steps": share, "seconds": search.seconds}
-        budget = dict([budget_of(self.config)])
-        write_record(
-            run, "budget.json", {"budget": budget, **asdict(search), "primitives": searched.count, "cost": cost}
-        )
+        record = {"budget": {option: limit}, **asdict(search), "primitives": searched.count, "cost": cost}
+        write_record(run, "budget.json", record)
 
 
 def budget_of(config: PruningConfig) -> tuple[str, float]:
@@ -359,10 +384,3 @@ def budget_of(config: PruningConfig) -> tuple[str, float]:
         if value is not None:
             return name, value
     return "max_psnr_drop", config.tolerated_drop
-
-
-def _search_of(saved: Mapping[str, Any]) -> SearchProgress:
-    """The search of a checkpoint."""
-    if not isinstance(saved.get("numbers"), Mapping):
-        raise CheckpointError("the checkpoint is of a run without a budget search; load it with its own method")
-    return SearchProgress.from_state(saved["numbers"])

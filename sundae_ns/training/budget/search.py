@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from sundae_ns.compensation.head import SIZES
@@ -37,7 +37,7 @@ NO_IMAGE = 0.0
 _KINDS: dict[str, tuple[type, ...]] = {"int": (int,), "float": (int, float), "bool": (bool,)}
 
 SearchPhase = Literal["before", "degrees", "field", "head", "done"]
-Verdict = Literal["accepted", "waiting", "rejected", "resting"]
+Verdict = Literal["accepted", "waiting", "rejected", "no cut"]
 
 
 @dataclass
@@ -126,11 +126,6 @@ class SearchProgress:
     degrees: dict[str, float] = field(default_factory=dict)
     """PSNR by SH degree, dB, each after the same training of the warm-up field."""
     curve: list[Point] = field(default_factory=list)
-
-    @property
-    def searching(self) -> bool:
-        """Whether the search is under way."""
-        return self.phase in ("degrees", "field", "head")
 
     def begin(self, phase: Literal["field", "head"], accepted: int) -> None:
         """Start to cut a field that meets the target; the cost of a halving is kept from an earlier phase."""
@@ -228,8 +223,8 @@ class SearchProgress:
         if psnr >= self.target:
             self.lowered = math.nan
         if not self.trying:
-            self._rest(psnr, patience)
-            return "resting"
+            self._wait(psnr, patience)
+            return "no cut"
         self.trail.append([step - self.cut_at, psnr])
         margin, seen = psnr - self.aim, psnr > NO_IMAGE
         if margin < 0 and left > 0 and seen and self._may_recover(left, patience):
@@ -254,7 +249,7 @@ class SearchProgress:
             return self.looks == 1 or self.predicted(left, trust=1.0) >= self.aim - self.tolerated
         return self.predicted(left, TRUST) >= self.aim
 
-    def _rest(self, psnr: float, patience: int) -> None:
+    def _wait(self, psnr: float, patience: int) -> None:
         if psnr <= self.best:
             self.stuck += 1
         else:
@@ -265,17 +260,15 @@ class SearchProgress:
             # Half of the tolerated drop below it, because the field would have gone on losing.
             self.lowered = psnr - 0.5 * self.tolerated
 
-    def state(self) -> dict[str, Any]:
-        """Plain numbers for a checkpoint."""
-        return asdict(self)
-
     @classmethod
-    def from_state(cls, state: Mapping[str, Any]) -> SearchProgress:
-        """Counterpart of :meth:`state`.
+    def from_state(cls, state: Any) -> SearchProgress:
+        """The progress that a checkpoint holds as a dict.
 
         Raises:
-            CheckpointError: it is not what :meth:`state` gives.
+            CheckpointError: it holds none, or a damaged one.
         """
+        if not isinstance(state, Mapping):
+            raise CheckpointError("the checkpoint is of a run without a budget search; load it with its own method")
         try:
             if set(state) != {f.name for f in fields(cls)}:
                 raise ValueError("other entries")

@@ -1,4 +1,4 @@
-"""The field under search: its PSNR on held-out views, its contribution, cuts, and returns to snapshots."""
+"""The field under search: its PSNR on held-out views, its contribution, cuts, its head, and returns to snapshots."""
 
 from __future__ import annotations
 
@@ -8,17 +8,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES, finite_mask
 from sundae_ns.gaussians.field import Field
-from sundae_ns.gaussians.sh_folding import mean_basis
+from sundae_ns.gaussians.sh_folding import fold, mean_basis, view_dependence
+from sundae_ns.gaussians.snapshot import narrow
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering.contribution import contribution, weights_by_batch
 from sundae_ns.rendering.source import TrainingView
 from sundae_ns.storage import bytes_of, stored_bytes
+from sundae_ns.training.budget import heads
 from sundae_ns.training.budget.search import NO_IMAGE, Point, SearchProgress
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
@@ -30,6 +34,8 @@ from sundae_ns.training.warning import warn
 
 MAX_VIEWS = 64
 """Training views, evenly chosen, for each score: a search scores the field at every cut."""
+BISECTIONS = 6
+"""Steps of the bisection for the number of view-independent primitives."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +47,8 @@ class SearchedField:
     search: SearchProgress
     engine: TrialEngine
     """Keeps the fields that the search may go back to."""
+    largest: HeadConfig | None
+    """The largest head that may be enabled; None for none."""
 
     @property
     def state(self) -> FieldState:
@@ -58,24 +66,15 @@ class SearchedField:
         return self.field.num_primitives
 
     @property
-    def _pruner(self) -> FieldPruner:
-        return FieldPruner(self.field, self.state.optimizers)
-
-    @property
-    def bare(self) -> dict[str, Tensor]:
-        """Parameters without features."""
-        return {name: value for name, value in self.field.items() if name != FEATURES}
-
-    @property
     def row(self) -> int:
         """Bytes of a primitive without features."""
-        return bytes_of({name: value[:1] for name, value in self.bare.items()})
+        return bytes_of({name: value[:1] for name, value in self.field.items() if name != FEATURES})
 
     @property
     def stored(self) -> int:
         """Bytes of the field, with the head if it is enabled."""
-        head = self.state.head
-        return stored_bytes(self.field, head.config) if self.search.head and head else stored_bytes(self.bare, None)
+        head = self.state.head if self.search.head else None
+        return self.count * self.row if head is None else stored_bytes(self.field, head.config)
 
     @property
     def steps_left(self) -> int:
@@ -83,7 +82,10 @@ class SearchedField:
         last = self.run.last_step
         return self.config.stop - self.state.schedule_step if last is None else last - self.state.step
 
-    # ------------------------------------------------------------------------------------------------------- views
+    def evaluation(self, psnr: float, phase: str, verdict: str) -> Point:
+        """A point of the curve for the present field."""
+        state, age = self.state, self.state.schedule_step - self.search.cut_at
+        return Point(state.step, phase, self.count, self.stored, psnr, verdict, age)
 
     def _views(self) -> list[TrainingView]:
         views = self.run.training_views()
@@ -130,18 +132,10 @@ class SearchedField:
         self.search.accepted = self.count
         return self.measure()
 
-    def evaluation(self, psnr: float, phase: str, verdict: str) -> Point:
-        """A point of the curve for the field as it is."""
-        state = self.state
-        return Point(
-            state.step, phase, self.count, self.stored, psnr, verdict, state.schedule_step - self.search.cut_at
-        )
-
-    # ------------------------------------------------------------------------------------------------------- fields
-
     def drop_nonfinite(self) -> int:
         """Remove primitives with a NaN or infinite parameter; returns their number, 0 if no primitive is finite."""
-        return self._count_dropped(self._pruner.drop_nonfinite() if finite_mask(self.field).any() else 0)
+        pruner = FieldPruner(self.field, self.state.optimizers)
+        return self._count_dropped(pruner.drop_nonfinite() if finite_mask(self.field).any() else 0)
 
     def _count_dropped(self, count: int) -> int:
         self.search.dropped_nonfinite += count
@@ -155,10 +149,48 @@ class SearchedField:
         Raises:
             DataError: the field cannot be scored.
         """
-        step = self.state.schedule_step
-        rule = replace(self.config, seed=self.config.seed + step)
-        report = prune_to(lambda n: min(count, n), rule, self._pruner, self.state.pruning, step, self.contribution)
+        state, step = self.state, self.state.schedule_step
+        rule, pruner = replace(self.config, seed=self.config.seed + step), FieldPruner(self.field, state.optimizers)
+        report = prune_to(lambda n: min(count, n), rule, pruner, state.pruning, step, self.contribution)
         self._count_dropped(report.dropped_nonfinite)
+
+    def lower_degree(self, degree: int) -> None:
+        """Drop the SH coefficients above ``degree``; their mean over the views moves into the constant colour."""
+        dc, rest = self.field["features_dc"], self.field["features_rest"]
+        mean, _ = self.mean_basis(self.field.sh_degree)
+        dc.data.copy_(fold(dc.data, rest.data, mean, degree)[0])
+        narrow(self.field, self.state.optimizers, "features_rest", (degree + 1) ** 2 - 1)
+        self.search.degree = degree
+
+    def flatten(self, least: float) -> Tensor:
+        """Give view-independent colours to as many primitives as held-out views allow, the least view-dependent first.
+
+        Args:
+            least: mean PSNR over the held-out views to keep, dB.
+
+        Returns:
+            True for the primitives whose higher coefficients are now 0, bool ``[N]``.
+        """
+        dc, rest = self.field["features_dc"].data, self.field["features_rest"].data
+        weight = self.contribution()
+        mean, square = self.mean_basis(self.field.sh_degree)
+        order = view_dependence(rest, mean, square, weight).cpu().argsort(stable=True).to(rest.device)
+        colors, coefficients = dc.clone(), rest.clone()
+        folded, _ = fold(colors, coefficients, mean, 0)
+
+        def flattened(count: int) -> Tensor:
+            flat = torch.zeros(len(order), dtype=torch.bool, device=rest.device)
+            flat[order[:count]] = True
+            dc.copy_(torch.where(flat[:, None], folded, colors))
+            rest.copy_(coefficients * ~flat[:, None, None])
+            return flat
+
+        low, high = 0, len(order)
+        for _ in range(BISECTIONS):
+            middle = (low + high + 1) // 2
+            flattened(middle)
+            low, high = (middle, high) if self.measure() >= least else (low, middle)
+        return flattened(low)
 
     def keep(self, name: str) -> None:
         """Keep a copy of the field, and of the head if it is enabled."""
@@ -167,12 +199,33 @@ class SearchedField:
     def go_back(self, name: str) -> None:
         """Continue with a kept copy; rates and steps go on."""
         self.engine.go_back(name, self.state, rates=False)
-        # Whatever is cached by the number of prunes is stale.
-        self.state.pruning["num_prunes"] += 1
+        self.state.pruning["num_prunes"] += 1  # what is cached by this number is stale
         self.search.degree = self.field.sh_degree
 
     def restart_rates(self, *, head: bool) -> None:
         """Restart the learning rates of the field, or those of the head."""
         schedulers = self.state.schedulers
         restarted = {name: value for name, value in schedulers.items() if (name == "compensation") == head}
-        notify_pruned(restarted, self.state.step, self.state.field.num_primitives)
+        notify_pruned(restarted, self.state.step, self.count)
+
+    def head_for(self, primitives: int) -> HeadConfig | None:
+        """The head that is small beside ``primitives`` of this field; None for none."""
+        return None if self.largest is None else heads.head_for(primitives, self.row, self.largest)
+
+    def enable_head(self, config: HeadConfig) -> None:
+        """Enable a head, with features of its width."""
+        state, search = self.state, self.search
+        assert state.head is not None
+        search.head, search.head_size, search.num_features = True, config.size, config.num_features
+        if config != state.head.config:
+            state.head.resize(config)
+            narrow(state.field, state.optimizers, FEATURES, config.num_features)
+        self.engine.enable_head(state, True)
+        CONSOLE.log(f"a {config.size} head is enabled, with {config.num_features} features a primitive")
+        self.restart_rates(head=True)
+
+    def remove_head(self) -> None:
+        """Remove head and features for good, if the field was made with them."""
+        if self.largest is not None:
+            self.state.remove_head()
+            self.search.head_dropped, self.search.head_size, self.search.num_features = True, "", 0

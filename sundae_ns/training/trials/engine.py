@@ -16,7 +16,7 @@ import torch
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES, initial_features
 from sundae_ns.gaussians.surgery import replace_parameter
-from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, put, weights_of
+from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, measure_heldout
@@ -58,8 +58,6 @@ class TrialEngine:
         self._head_starts_at = head_starts_at
         self._mean = RunningMean()
 
-    # ------------------------------------------------------------------------------------------------- checkpoints
-
     def state_dict(self) -> dict[str, Any]:
         """Plain values and tensors for a checkpoint."""
         trial = None if self.trial is None else asdict(self.trial)
@@ -82,10 +80,8 @@ class TrialEngine:
         if (trial and self.trial is None) or not all(isinstance(self.kept.get(name), Mapping) for name in names):
             raise CheckpointError("the checkpoint lacks a field that its trials would return to; give another")
 
-    # ----------------------------------------------------------------------------------------------------- trials
-
     def start(self, run: TrainingRun, trial: Trial) -> None:
-        """Start a trial from the field as it is."""
+        """Start a trial from the present field."""
         state = run.state
         self.trial, self._mean = replace(trial, began=state.schedule_step), RunningMean()
         self.resume(run)
@@ -120,9 +116,7 @@ class TrialEngine:
 
     def take_mean(self, state: FieldState) -> None:
         """Continue with the mean of the weights, if there is one."""
-        weights = weights_of(state)
-        if self._mean.fits(weights):
-            put(self._mean.values, weights)
+        self._mean.replace(weights_of(state))
         self._mean = RunningMean()
         state.restored += 1  # another mean must not contain the weights before it
 

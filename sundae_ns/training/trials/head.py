@@ -2,10 +2,10 @@
 
 A head gains where views are many and agree; where they are few or differ, it fits their differences. So some training
 views are held out from shortly before the prune. From the pruned field, trials of one length follow in turn, each of a
-larger scene than the one before, until one does not pay. Its held-out views are rendered with the mean of the weights
-over its last steps, because the weights of a single step fit the last images best. The chosen field continues on all
-views; the steps of the others are the cost. Test views are never used. After a warm start the field has seen the
-held-out views before, and only the steps of the trials make it forget them.
+larger scene than the one before, until one does not pay. The mean of the weights over its last steps renders the
+held-out views: the weights of a single step fit the last images best. The chosen field continues on all views; the
+steps of the others are the cost. Test views are never used. After a warm start the field has seen the held-out views
+before, and only the steps of the trials make it forget them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import Any
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.storage import megabytes, stored_bytes
@@ -156,12 +155,11 @@ class HeadTrials(Extension):
         self.progress = HeadTrialProgress()
         assert state.head is not None
         self._head = state.head.config
+        self._wide = replace(self._head, num_features=MORE_FEATURES)
         self._candidates = CANDIDATES if self._head.num_features < MORE_FEATURES else CANDIDATES[:2]
         self._plan: TrialPlan | None = None
         self._engine = engine
         engine.enable_head(state, False)
-
-    # ------------------------------------------------------------------------------------------------- checkpoints
 
     def state_dict(self) -> dict[str, Any]:
         """Numbers of the decision, and the state of the engine."""
@@ -192,8 +190,6 @@ class HeadTrials(Extension):
         if self.progress.phase == "trials":
             self._engine.require("start", *self.progress.tried)
         self._engine.enable_head(state, self.progress.candidate != "plain")
-
-    # ---------------------------------------------------------------------------------------------------- training
 
     def before_training(self, run: TrainingRun) -> None:
         """Decide at once where trials cannot; otherwise hold out the views of the phase."""
@@ -227,43 +223,32 @@ class HeadTrials(Extension):
 
     def finish(self, run: TrainingRun) -> None:
         """Warn if training ended before a decision."""
-        if self.progress.phase != "done" and run.last_step is not None and run.last_step + 1 >= self._end_of(run):
+        last = run.last_step
+        if self.progress.phase != "done" and last is not None and last + 1 >= (run.schedule_length or 0):
             warn(f"training ended before the head could be tried, {_DISABLED}")
 
     def held_out(self, run: TrainingRun) -> list[int]:
         """Indices of the views that the chosen field has not seen since before its trial; none without trials."""
         return [] if self.progress.reason else self._planned(run).folds[-1]
 
-    # ------------------------------------------------------------------------------------------------------- trials
-
-    @property
-    def _wide(self) -> HeadConfig:
-        """The head of the last candidate."""
-        return replace(self._head, num_features=MORE_FEATURES)
-
     def _planned(self, run: TrainingRun) -> TrialPlan:
         if self._plan is None:
             self._plan = plan_trials(run.view_indices(), self.progress.steps)
         return self._plan
 
-    def _most_trials(self, plan: TrialPlan) -> int:
-        return len(self._candidates) * len(plan.folds)
-
     def _fits(self, run: TrainingRun) -> bool:
         """Whether the chosen candidate can train on for the length of a trial."""
         plan = self._planned(run)
-        return self._end_of(run) + run.state.offset > self.begins_at + (self._most_trials(plan) + 1) * plan.length
-
-    def _end_of(self, run: TrainingRun) -> int:
-        """Number of training steps of the run, whose first part this training may be; 0 if it does not train."""
-        return 0 if run.last_step is None else max(run.last_step + 1, run.schedule_length or 0)
+        trials = len(self._candidates) * len(plan.folds) + 1
+        # This training may be the first part of the run.
+        steps = 0 if run.last_step is None else max(run.last_step + 1, run.schedule_length or 0)
+        return steps + run.state.offset > self.begins_at + trials * plan.length
 
     def _begin(self, run: TrainingRun) -> None:
-        """Begin the first trial."""
         plan, progress, state = self._planned(run), self.progress, run.state
         CONSOLE.log(
-            f"step {state.step}: is the head worth it? Up to {self._most_trials(plan)} trials of {plan.length:,} "
-            f"steps; {len(plan.views)} of {len(run.view_indices())} training views are held out"
+            f"step {state.step}: is the head worth it? Up to {len(self._candidates) * len(plan.folds)} trials of "
+            f"{plan.length:,} steps; {len(plan.views)} of {len(run.view_indices())} training views are held out"
         )
         progress.phase, progress.folds = "trials", len(plan.folds)
         plain = {name: value for name, value in state.field.items() if name != FEATURES}
@@ -276,7 +261,6 @@ class HeadTrials(Extension):
         self._start_trial(run)
 
     def _start_trial(self, run: TrainingRun) -> None:
-        """Start the next trial from the field as it is."""
         plan, progress = self._planned(run), self.progress
         width = {"plain": 0, "head": self._head.num_features, "features": MORE_FEATURES}[progress.candidate]
         fold = plan.folds[len(progress.measured) % progress.folds]
@@ -300,7 +284,13 @@ class HeadTrials(Extension):
     def _decide(self, run: TrainingRun, trained: str) -> None:
         """Continue with the best candidate; ``trained`` is the one that the field is."""
         progress, decision = self.progress, self.progress.best()
-        figures = {one: self._figures(one) for one in progress.tried}
+        figures: dict[str, Any] = {}
+        for candidate in progress.tried:
+            views = progress.qualities(candidate)
+            decibels, similarity = mean_quality(views)
+            size = progress.bytes[CANDIDATES.index(candidate)]
+            shown = [view._asdict() for view in views]
+            figures[candidate] = {"psnr": decibels, "ssim": similarity, "bytes": size, "views": shown}
         seen = all(one["views"] for one in figures.values())
         if seen:
             text = "; ".join(
@@ -312,13 +302,6 @@ class HeadTrials(Extension):
         if decision != trained:
             self._engine.go_back(decision, run.state)
         self._settle(run, decision, "" if seen else "masks leave no pixel of the held-out training views", figures)
-
-    def _figures(self, candidate: str) -> dict[str, Any]:
-        """Figures of a candidate for the record."""
-        views = self.progress.qualities(candidate)
-        decibels, similarity = mean_quality(views)
-        size = self.progress.bytes[CANDIDATES.index(candidate)]
-        return {"psnr": decibels, "ssim": similarity, "bytes": size, "views": [view._asdict() for view in views]}
 
     def _settle(self, run: TrainingRun, decision: str, reason: str, figures: Mapping[str, Any] | None = None) -> None:
         """Take a decision, serve all training views from now on, and record it."""

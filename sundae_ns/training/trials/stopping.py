@@ -57,11 +57,6 @@ class StoppingProgress:
         return bool(self.measured) and self.measured[-1][0] >= (1 + LEAST_LOSS) * self.measured[self.best - 1][0]
 
 
-def heldout_loss(decibels: float, similarity: float, ssim_weight: float) -> float:
-    """Loss of images as in training after the prune: of the root of the mean squared error, and SSIM."""
-    return float((1 - ssim_weight) * 10 ** (-decibels / 20) + ssim_weight * (1 - similarity))
-
-
 class EarlyStopping(Extension):
     """Ends the training of a field on few views where held-out ones ask for it.
 
@@ -78,8 +73,6 @@ class EarlyStopping(Extension):
         self.ssim_weight = ssim_weight
         self._decision = decision
         self._engine = engine
-
-    # ------------------------------------------------------------------------------------------------- checkpoints
 
     def state_dict(self) -> dict[str, Any]:
         """Numbers of the watch."""
@@ -103,8 +96,6 @@ class EarlyStopping(Extension):
             self._engine.require(_START)
         elif self.progress.phase == "repeating":
             self._engine.require()
-
-    # ---------------------------------------------------------------------------------------------------- training
 
     def trains(self, state: FieldState) -> bool:
         """False while training is paused. After the end of the schedule it goes on: the user has asked for more."""
@@ -139,8 +130,6 @@ class EarlyStopping(Extension):
             else:
                 self._watch(run)
 
-    # ------------------------------------------------------------------------------------------------------ phases
-
     @property
     def _window(self) -> int:
         return max(round(WINDOW_SHARE * self._decision.progress.steps), 1)
@@ -169,16 +158,21 @@ class EarlyStopping(Extension):
     def _measure(self, run: TrainingRun) -> None:
         """Measure the held-out views with the mean of the window."""
         decibels, similarity = mean_quality(self._engine.measure(run))
-        self.progress.measured.append([heldout_loss(decibels, similarity, self.ssim_weight), decibels, similarity])
+        # As in training after the prune: the root of the mean squared error, and SSIM.
+        loss = (1 - self.ssim_weight) * 10 ** (-decibels / 20) + self.ssim_weight * (1 - similarity)
+        self.progress.measured.append([float(loss), decibels, similarity])
         run.log_scalars("Stopping", {"psnr": decibels, "ssim": similarity})
 
     def _go_back(self, run: TrainingRun) -> None:
-        """Return to the field of the decision, and train on all views for as long as was best."""
+        """Return to the field of the decision, and train on all views for as many steps as were best."""
         progress, length = self.progress, self.progress.best * self._window
-        (_, *best), (_, *now) = progress.measured[progress.best - 1], progress.measured[-1]
+        best, now = (
+            f"{decibels:.2f} dB, SSIM {similarity:.4f}"
+            for _, decibels, similarity in (progress.measured[progress.best - 1], progress.measured[-1])
+        )
         CONSOLE.log(
-            f"step {run.state.step}: the held-out views were best after {length:,} steps, {_text(best)}; "
-            f"now {_text(now)}. Going back, to train as long on all views"
+            f"step {run.state.step}: the held-out views were best after {length:,} steps, {best}; now {now}. "
+            "Going back, to train as long on all views"
         )
         self._engine.go_back(_START, run.state)
         self._engine.end(run)
@@ -203,9 +197,3 @@ class EarlyStopping(Extension):
             "steps_on_all_views": length,
         }
         write_record(run, "stopping.json", record)
-
-
-def _text(figures: list[float]) -> str:
-    """PSNR and SSIM for the log."""
-    decibels, similarity = figures
-    return f"{decibels:.2f} dB, SSIM {similarity:.4f}"

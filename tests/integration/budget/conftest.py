@@ -37,8 +37,6 @@ def done(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]
 
 @pytest.fixture
 def small_head(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Options of a head with 13 features; the search enables one of half a megabyte with 5, beside a field of kilobytes."""
-    monkeypatch.setattr(
-        heads, "head_for", lambda _stored, _count, largest: replace(largest, size="tiny", num_features=5)
-    )
+    """Options of a head with 13 features. The search enables one of 500 kB with 5, beside a field of a few kB."""
+    monkeypatch.setattr(heads, "head_for", lambda _count, _row, largest: replace(largest, size="tiny", num_features=5))
     return {"head": HeadConfig(mode="residual", size="small", pixel_unshuffle=1, num_features=13)}

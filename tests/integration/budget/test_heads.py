@@ -75,11 +75,17 @@ def test_a_head_that_does_not_pay_is_removed(make: Make, small_head: dict[str, A
 
 @pytest.mark.parametrize(
     ("primitives", "row", "expected"),
-    [(10**6, 236, ("wide", 13)), (40_000, 236, ("compact", 13)), (20_000, 236, ("tiny", 13)), (20_000, 152, ("tiny", 5)),
-     (60_000, 56, ("tiny", 1)), (3_000, 236, None)],
-)  # fmt: skip
+    [
+        (10**6, 236, ("wide", 13)),
+        (40_000, 236, ("compact", 13)),
+        (20_000, 236, ("tiny", 13)),
+        (20_000, 152, ("tiny", 5)),
+        (60_000, 56, ("tiny", 1)),
+        (3_000, 236, None),
+    ],
+)
 def test_the_head_that_suits_a_field(primitives: int, row: int, expected: tuple[str, int] | None) -> None:
-    found = heads.head_for(primitives * row, primitives, HeadConfig())
+    found = heads.head_for(primitives, row, HeadConfig())
     assert (found and (found.size, found.num_features)) == expected
     if found is not None:
         assert bytes_of_head(found) <= heads.HEAD_SHARE * primitives * row

@@ -53,7 +53,7 @@ def test_a_head_that_is_not_finite_is_removed(
     trainer.train()
     found = Run(trainer).found
     points = [(point["verdict"], point["psnr"]) for point in found["curve"]]
-    assert ("rejected" if trying else "resting", NO_IMAGE) in points
+    assert ("rejected" if trying else "no cut", NO_IMAGE) in points
     assert (found["phase"], found["head"], points[-1][0]) == ("done", False, "reached")
     assert [psnr for _, psnr in points].count(NO_IMAGE) == 1, "the search does not wait for it"
     assert all(value.isfinite().all() for value in trainer.pipeline.model.gauss_params.values())
@@ -107,14 +107,14 @@ def test_primitives_that_are_not_finite_are_removed_at_the_next_evaluation(
         return about_to_evaluate(extension, searched, "field", trying=False)
 
     spoil(monkeypatch, when, lambda state: state.field["features_dc"][:3])
-    # Nothing is cut at once: the verdict of the next evaluation is "resting".
+    # Nothing is cut at once: the verdict of the next evaluation is "no cut".
     monkeypatch.setattr(
         SearchProgress, "next_count", lambda self, *_: 100 if self.looks > 1 and self.accepted == 197 else None
     )
     trainer = make(max_psnr_drop=3.0)
     trainer.train()
     found = Run(trainer).found
-    rested = [point["primitives"] for point in found["curve"] if point["verdict"] == "resting"]
+    rested = [point["primitives"] for point in found["curve"] if point["verdict"] == "no cut"]
     assert rested[:1] == [197], "the other primitives are evaluated"
     assert found["dropped_nonfinite"] == 3
     assert "removed 3 primitives that were not finite" in capsys.readouterr().out

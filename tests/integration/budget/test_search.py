@@ -30,7 +30,6 @@ from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.scenes.measure import sizes
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.storage import bytes_of
-from sundae_ns.training.budget import extension
 from sundae_ns.training.budget.search import SearchProgress
 from sundae_ns.training.budget.searched_field import SearchedField
 from sundae_ns.training.field_state import FieldState
@@ -82,7 +81,7 @@ def test_the_last_cut_may_take_until_the_last_step(
         return torch.zeros(searched.count, dtype=torch.bool)
 
     trainer = make(model_options={"head": HeadConfig(mode="off")})
-    monkeypatch.setattr(extension, "flatten", flatten)
+    monkeypatch.setattr(SearchedField, "flatten", flatten)
     search = search_of(trainer.pipeline.model.extensions).search
     monkeypatch.setattr(SearchedField, "measure", recovering(search, at_last))
     trainer.train()

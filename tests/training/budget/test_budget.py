@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from typing import Any
 
 import pytest
@@ -36,7 +37,7 @@ def numbers(phase: str, *, trying: bool = False, **changes: Any) -> dict[str, An
     search.begin(phase, 1000)  # type: ignore[arg-type]
     if trying:
         search.cut(30.2, 500, step=3)
-    return {**search.state(), **changes}
+    return {**asdict(search), **changes}
 
 
 @pytest.mark.parametrize(

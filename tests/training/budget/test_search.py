@@ -1,10 +1,11 @@
-"""The search for a budget by itself: what it accepts, takes back and tries next."""
+"""Decisions of a budget search: what it accepts, takes back and tries next."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import pytest
@@ -20,11 +21,11 @@ def search(accepted: int = 1000, **options: Any) -> SearchProgress:
 
 
 END = 200
-"""Steps of training, a look each."""
+"""Steps of training, with an evaluation after each."""
 
 
 def play(found: SearchProgress, recovered: Callable[[int], float], *, patience: int = 4, least: int = 5) -> list[int]:
-    """Search on a field whose PSNR is a function of its count once it has recovered, half the way a look; cuts made."""
+    """The cuts of a search on a field that recovers half of the way to a PSNR by its count in each step."""
     psnr, count, before, cuts = recovered(found.accepted), found.accepted, found.accepted, []
     for step in range(1, END + 1):
         count = count if found.trying else found.accepted
@@ -43,12 +44,12 @@ def play(found: SearchProgress, recovered: Callable[[int], float], *, patience: 
             found.cut(psnr, following, step)
             cuts.append(following)
             count, psnr = following, psnr - 3.0
-    assert not found.trying, "the last look has to say"
+    assert not found.trying, "the last evaluation decides"
     return cuts
 
 
 def verdicts(found: SearchProgress, *values: float, left: int = 100, patience: int = 4) -> list[str]:
-    """Of looks at a cut, every 10 steps, with so many steps left after the last of them."""
+    """Verdicts of evaluations of a cut, every 10 steps, with ``left`` steps after the last of them."""
     steps = range(found.cut_at + 10, found.cut_at + 10 * len(values) + 1, 10)
     return [found.judge(psnr, step, left + steps[-1] - step, patience) for psnr, step in zip(values, steps)]
 
@@ -64,14 +65,14 @@ def test_finds_about_what_a_scene_needs(needed: int) -> None:
     assert recovered(found.accepted) >= found.target
 
 
-def test_nothing_is_cut_where_nothing_can_go() -> None:
+def test_a_field_that_cannot_lose_primitives_keeps_them() -> None:
     found = search()
     play(found, lambda count: 30.01 if count == 1000 else 20.0)
     assert (found.accepted, found.rejected) == (1000, 5)
-    assert 0 < found.steps_lost <= 5 * 4, "a few looks each"
+    assert 0 < found.steps_lost <= 5 * 4, "a few evaluations each"
 
 
-def test_a_field_that_needs_nothing_is_cut_to_the_least() -> None:
+def test_a_field_that_loses_no_quality_is_cut_to_the_least() -> None:
     found = search()
     cuts = play(found, lambda _: 40.0, least=17)
     assert found.accepted == cuts[-1] == 17
@@ -85,11 +86,11 @@ def cut_in_half() -> SearchProgress:
     return found
 
 
-def test_a_cut_is_accepted_once_it_is_seen_to_reach_the_target() -> None:
+def test_a_cut_is_accepted_once_it_reaches_the_target() -> None:
     assert verdicts(cut_in_half(), 29.0, 29.99, 30.0) == ["waiting", "waiting", "accepted"]
 
 
-def test_a_cut_may_take_as_long_as_it_is_foreseen_to_recover() -> None:
+def test_a_cut_may_take_as_long_as_it_is_predicted_to_recover() -> None:
     slowly = [28.0 + 0.5 * math.log2(1 + look) for look in range(15)]
     assert verdicts(cut_in_half(), *slowly, 30.0, left=1000) == ["waiting"] * 15 + ["accepted"]
     found = cut_in_half()
@@ -98,24 +99,24 @@ def test_a_cut_may_take_as_long_as_it_is_foreseen_to_recover() -> None:
     assert found.steps_lost == 160
 
 
-def test_a_cut_is_taken_back_at_once_where_even_the_whole_gain_would_not_do() -> None:
+def test_a_cut_is_taken_back_at_once_if_the_whole_predicted_gain_is_too_small() -> None:
     found = cut_in_half()
     assert verdicts(found, 28.0, 29.0, left=15) == ["waiting", "rejected"]  # 1 dB a doubling, and 0.8 to come
     assert (found.rejected, found.steps_lost, found.accepted) == (1, 20, 1000)
-    assert found.slope == pytest.approx(0.1 + 1.0 - 0.5 * math.log2(35 / 20)), "by what was foreseen of it"
+    assert found.slope == pytest.approx(0.1 + 1.0 - 0.5 * math.log2(35 / 20)), "by the prediction"
     assert verdicts(cut_in_half(), 28.0, 29.0, left=18) == ["waiting", "waiting"], (
-        "0.926 may be enough: looks differ by 0.1"
+        "0.926 may be enough: evaluations differ by 0.1"
     )
 
 
-def test_after_some_patience_half_of_the_gain_has_to_do() -> None:
+def test_after_some_patience_half_of_the_predicted_gain_must_suffice() -> None:
     values = [28.0, 29.0, 28.0 + math.log2(3)]  # a line: 1 dB a doubling
     assert verdicts(cut_in_half(), *values, left=20, patience=3) == ["waiting", "waiting", "rejected"]
     assert verdicts(cut_in_half(), *values, left=20, patience=4) == ["waiting", "waiting", "waiting"]
     assert verdicts(cut_in_half(), *values, left=30, patience=3) == ["waiting", "waiting", "waiting"]
 
 
-def test_what_is_foreseen_lies_on_a_line_over_the_logarithm_of_the_steps() -> None:
+def test_the_prediction_is_a_line_over_the_logarithm_of_the_steps() -> None:
     found = cut_in_half()
     verdicts(found, 28.0, 29.0, 28.0 + math.log2(3))
     assert found.predicted(0, 1.0) == pytest.approx(28.0 + math.log2(3))
@@ -128,26 +129,26 @@ def test_what_is_foreseen_lies_on_a_line_over_the_logarithm_of_the_steps() -> No
 
 def rest(found: SearchProgress, *values: float) -> SearchProgress:
     for psnr in values:
-        assert found.judge(psnr, 10, 100, patience=3) == "resting"
+        assert found.judge(psnr, 10, 100, patience=3) == "no cut"
     return found
 
 
-def test_a_field_that_loses_the_target_by_itself_is_cut_on_by_what_it_has_left() -> None:
+def test_a_field_that_falls_below_the_target_by_itself_gets_a_lower_one() -> None:
     found = rest(search(), 29.8, 29.9, 29.8, 29.85)
     assert (found.aim, found.next_count(29.85, 1, 3)) == (30.0, None), "it may still gain"
     rest(found, 29.82)
-    assert found.aim == pytest.approx(29.77), "less by half of what may be lost"
+    assert found.aim == pytest.approx(29.77), "less by half of the tolerated drop"
     found.slope = 1.0
     assert found.next_count(29.82, 1, 3) == int(1000 * 0.5**SHALLOWEST)
     found.cut(29.82, 901, step=100)
     assert found.before_cut == pytest.approx(29.82)
     assert verdicts(found, 29.7, 29.78) == ["waiting", "accepted"]
-    assert found.next_count(30.02, 1, 3) == int(901 * 0.5**0.5), "by its margin, where it has one"
+    assert found.next_count(30.02, 1, 3) == int(901 * 0.5**0.5), "by its margin"
     rest(found, 30.0)
     assert found.aim == 30.0, "the target is in reach again"
 
 
-def test_a_field_that_gains_no_more_is_cut_by_the_least_however_small_its_margin() -> None:
+def test_a_field_that_gains_no_more_gets_the_smallest_cut() -> None:
     found = rest(search(), 30.02, 30.05, 30.01, 30.02)
     found.slope = 1.0
     assert found.next_count(30.02, 1, 3) is None
@@ -160,7 +161,7 @@ def test_a_field_that_gains_or_has_reached_the_target_keeps_it(values: tuple[flo
     assert rest(search(), *values).aim == 30.0
 
 
-def test_a_head_that_has_not_let_anything_go_yet_lowers_nothing() -> None:
+def test_a_head_without_an_accepted_cut_does_not_lower_the_target() -> None:
     found = search()
     found.begin("head", 1000)
     assert rest(found, *[29.5] * 9).aim == 30.0
@@ -170,26 +171,26 @@ def test_a_head_that_has_not_let_anything_go_yet_lowers_nothing() -> None:
     assert (found.aim, found.stuck) == (30.0, 0)
 
 
-def test_a_picture_that_is_not_a_number_is_no_success() -> None:
+def test_an_image_that_is_not_finite_is_no_success() -> None:
     found = cut_in_half()
     assert verdicts(found, NO_IMAGE) == ["rejected"]
     assert (found.accepted, found.failed) == (1000, 500)
-    assert found.slope == 0, "it says nothing of what a halving costs"
+    assert found.slope == 0, "it does not measure the cost of a halving"
     assert found.next_count(30.1, 1, 3) == int(1000 * 0.5**0.5)
-    assert SearchProgress.from_state(found.state()).state()["trail"] == [[10, NO_IMAGE]]
+    assert SearchProgress.from_state(asdict(found)).trail == [[10, NO_IMAGE]]
 
 
-def test_a_field_no_images_error_is_trained_and_neither_cut_nor_taken_for_all_there_is() -> None:
+def test_a_field_without_a_finite_image_is_trained_and_not_cut() -> None:
     found = rest(search(), 30.1, *[NO_IMAGE] * 9)
     assert (found.stuck, found.aim, found.next_count(NO_IMAGE, 1, 3)) == (9, 30.0, None)
 
 
-def test_no_band_goes_where_all_of_them_have_made_no_picture() -> None:
+def test_the_sh_degree_stays_if_no_degree_renders_a_finite_image() -> None:
     found = SearchProgress(reference=30.0, degrees={"3": NO_IMAGE})
     assert (found.next_degree(3, 0.1), found.lowest_degree(3, 0.1)) == (None, 3)
 
 
-def test_what_has_failed_is_come_up_to_from_above() -> None:
+def test_cuts_approach_a_rejected_count_from_above() -> None:
     found = search()
     found.cut(30.1, 500, step=0)
     assert found.judge(29.0, 1, 0, patience=4) == "rejected"
@@ -200,7 +201,7 @@ def test_what_has_failed_is_come_up_to_from_above() -> None:
     assert found.next_count(40.0, 1, 3) == 260
 
 
-def test_what_has_failed_is_forgotten_once_a_field_as_small_is_accepted() -> None:
+def test_a_rejected_count_is_forgotten_once_a_field_as_small_is_accepted() -> None:
     found = search()
     found.cut(30.1, 500, step=0)
     assert found.judge(29.0, 1, 0, patience=4) == "rejected"
@@ -209,10 +210,10 @@ def test_what_has_failed_is_forgotten_once_a_field_as_small_is_accepted() -> Non
     found.cut(30.5, 490, step=4)
     assert (found.judge(30.5, 5, 50, patience=4), found.failed) == ("accepted", 0)
     found.slope = 0.5
-    assert found.next_count(30.5, 1, 3) == 245, "by what a halving costs alone"
+    assert found.next_count(30.5, 1, 3) == 245, "by the cost of a halving alone"
 
 
-def test_how_deep_to_cut_follows_from_what_the_last_cut_cost() -> None:
+def test_the_depth_of_a_cut_follows_from_the_cost_of_the_last_one() -> None:
     found = search()
     assert found.next_count(30.0, 1, 3) == round(1000 * 0.5**DEEPEST)
     found.cut(31.0, 500, step=0)
@@ -221,7 +222,7 @@ def test_how_deep_to_cut_follows_from_what_the_last_cut_cost() -> None:
     assert found.next_count(30.3, 1, 3) == int(500 * 0.5**0.5)
     assert found.next_count(30.05, 1, 3) is None
     assert search().next_count(29.99, 1, 3) is None, "a field below the target is trained, not cut"
-    assert found.judge(30.05, 2, 50, patience=4) == "resting"
+    assert found.judge(30.05, 2, 50, patience=4) == "no cut"
     found.cut(30.3, 353, step=3)
     assert found.judge(30.3, 4, 50, patience=4) == "accepted"
     assert found.slope == pytest.approx(0.3), "a lucky cut does not make the next one cheap"
@@ -253,13 +254,13 @@ def test_state_goes_through_a_checkpoint() -> None:
     found.judge(29.0, 110, 50, patience=4)
     found.lowered, found.best = 29.0, 29.1
     found.curve.append(Point(1, "field", 10, 100, 30.0, "waiting", 5))
-    assert SearchProgress.from_state(found.state()) == found
-    assert json.loads(json.dumps(found.state()))["curve"][0]["primitives"] == 10
+    assert SearchProgress.from_state(asdict(found)) == found
+    assert json.loads(json.dumps(asdict(found)))["curve"][0]["primitives"] == 10
 
 
 @pytest.mark.parametrize("name", ["target", "trail", "stuck"])
 def test_a_state_that_lacks_an_entry_is_refused(name: str) -> None:
-    state = search().state()
+    state = asdict(search())
     del state[name]
     with pytest.raises(CheckpointError, match="other entries"):
         SearchProgress.from_state(state)
@@ -286,17 +287,12 @@ def test_a_state_that_lacks_an_entry_is_refused(name: str) -> None:
 )
 def test_a_foreign_state_is_refused(change: dict[str, Any]) -> None:
     with pytest.raises(CheckpointError, match="damaged budget search"):
-        SearchProgress.from_state({**search().state(), **change})
+        SearchProgress.from_state({**asdict(search()), **change})
 
 
-def test_states_at_the_ends_of_what_can_be_are_taken() -> None:
+def test_states_at_the_limits_are_accepted() -> None:
     for change in ({"degree": 4}, {"degree": -1}, {"num_features": 1024}, {"num_features": -1}):
-        SearchProgress.from_state({**search().state(), **change})
-
-
-@pytest.mark.parametrize("phase", ["before", "degrees", "field", "head", "done"])
-def test_a_search_is_under_way_between_its_first_and_its_last_phase(phase: Any) -> None:
-    assert SearchProgress(phase=phase).searching == (phase not in ("before", "done"))
+        SearchProgress.from_state({**asdict(search()), **change})
 
 
 def test_a_new_phase_counts_anew_and_remembers_the_cost_of_a_halving() -> None:

@@ -16,7 +16,8 @@ from torch.optim.lr_scheduler import LambdaLR
 from sundae_ns.errors import CheckpointError
 from sundae_ns.training.heldout import HeldOutQuality
 from sundae_ns.training.schedulers import Decay
-from sundae_ns.training.trials import Trial, TrialEngine, engine
+from sundae_ns.training.trials import engine
+from sundae_ns.training.trials.engine import Trial, TrialEngine
 
 VIEW = HeldOutQuality(10, 20.0, 0.5)
 

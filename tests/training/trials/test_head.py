@@ -12,8 +12,8 @@ from models import Training
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import CheckpointError
 from sundae_ns.model import SundaeModel
-from sundae_ns.training.trials import HeadTrials, Trial
-from sundae_ns.training.trials.head import CANDIDATES, MOST_HELD_OUT, HeadTrialProgress, plan_trials
+from sundae_ns.training.trials.engine import Trial
+from sundae_ns.training.trials.head import CANDIDATES, MOST_HELD_OUT, HeadTrialProgress, HeadTrials, plan_trials
 
 Build = Callable[..., SundaeModel]
 SIZES = [100, 110, 120]
@@ -52,7 +52,7 @@ def test_deciding_costs_at_most_a_tenth_of_the_steps(views: int, steps: int) -> 
 
 @pytest.mark.parametrize(("steps", "length"), [(7000, 350), (18000, 900), (30000, 1200), (60000, 2400)])
 def test_short_runs_have_longer_trials_for_their_length(steps: int, length: int) -> None:
-    """In a trial of 720 steps with a rise over 500 of them, a head on bonsai showed 0.08 of the 1.8 dB that it gains."""
+    """In a trial of 720 steps, 500 of them a rise, a head on bonsai showed 0.08 of the 1.8 dB that it gains."""
     assert plan_trials(range(255), steps).length == length
 
 
