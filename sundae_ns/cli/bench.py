@@ -55,11 +55,11 @@ def bench(
 
     from sundae_ns.evaluation import without_nan
     from sundae_ns.scenes.measure import rendered_as
-    from sundae_ns.scenes.opening import load_run
+    from sundae_ns.scenes.opening import open_scene
 
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
-        run = load_run(load_config, data=data)
+        run = open_scene(load_config, data=data)
     run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
     device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
     head = run.model.head is not None

@@ -1,4 +1,4 @@
-"""Subprocesses: with their output in a log file, or in a process group that gets this process's signals."""
+"""A spinner while a command loads, and subprocesses: logged, or in a process group that gets this one's signals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
 from sundae_ns.errors import SundaeError
@@ -22,6 +22,13 @@ def console_script(name: str) -> str:
     """Path of a command beside this interpreter, or its bare name if there is none."""
     path = Path(sys.executable).parent / name
     return str(path) if path.exists() else name
+
+
+def loading() -> AbstractContextManager[object]:
+    """Shows that a command imports its modules, which takes seconds."""
+    from rich.console import Console
+
+    return Console(stderr=True).status("Loading")
 
 
 def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], None] | None = None) -> None:

@@ -19,10 +19,10 @@ from sundae_ns.errors import CheckpointError, ConfigError
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.scenes.finetune_step import Through, TunedStep
 from sundae_ns.scenes.opening import open_pipeline
-from sundae_ns.scenes.packed import is_unpacked, place
+from sundae_ns.scenes.packed import place
 from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene
 from sundae_ns.storage.runs.config_file import load_config
-from sundae_ns.storage.runs.folder import config_of
+from sundae_ns.storage.runs.folder import UNPACKED, config_of
 from sundae_ns.training.optimizers import NetworkAdamConfig
 
 RATES = {
@@ -83,7 +83,7 @@ def finetune(
     if steps < 1:
         raise ConfigError(f"a fine-tune of {steps} steps changes nothing; give 1 or more")
     path = config_of(run)
-    if is_unpacked(load_config(path)):
+    if load_config(path).timestamp == UNPACKED:
         raise CheckpointError(
             f"{run} was unpacked from a packed scene and cannot be fine-tuned; fine-tune the run that was packed"
         )

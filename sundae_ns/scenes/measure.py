@@ -134,15 +134,14 @@ def rendered_as(
 @contextmanager
 def head_as(model: SundaeModel, *, precision: str | None = None, phases: int | None = None) -> Iterator[None]:
     """Inside the block the head has another arithmetic, or runs another number of times; as in :func:`rendered_as`."""
-    head, on_cpu = model.head, model.device.type == "cpu"
-    if on_cpu and precision not in (None, "fp32"):
+    if model.device.type == "cpu" and precision not in (None, "fp32"):
         raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
+    head = model.head
     if head is None:
         yield
         return
     before: Any = head.config
-    precision = precision or ("fp32" if on_cpu else before.precision)
-    changed = replace(before, precision=precision, phases=phases or before.phases)
+    changed = replace(before, precision=precision or _precision(model), phases=phases or before.phases)
     changed.validate()
     head.config = changed
     try:
@@ -237,11 +236,10 @@ def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None, *, with_fl
     )
 
 
-@torch.no_grad()
-def comparison_of(opened: Opened, index: int) -> ComparisonRow:
-    """Ground truth, base colours and complete rendering of one test view."""
-    outputs = opened.model.get_outputs_for_camera(opened.cameras[index])
-    return ComparisonRow(opened.truths[index], outputs["base_rgb"], outputs["rgb"])
+def comparison_of(model: SundaeModel, camera: Cameras, truth: Tensor, title: str) -> ComparisonRow:
+    """True image, base colours and complete rendering of one view."""
+    outputs = model.get_outputs_for_camera(camera)
+    return ComparisonRow(truth, outputs["base_rgb"], outputs["rgb"], title)
 
 
 def _precision(model: SundaeModel) -> str:
@@ -251,6 +249,5 @@ def _precision(model: SundaeModel) -> str:
 
 def _resolution(cameras: Sequence[Cameras]) -> str:
     """Width x height of the first camera, and a note if others differ."""
-    found = {(int(camera.width), int(camera.height)) for camera in cameras}
-    width, height = int(cameras[0].width), int(cameras[0].height)
-    return f"{width}x{height}" + (" and others" if len(found) > 1 else "")
+    found = [f"{int(camera.width)}x{int(camera.height)}" for camera in cameras]
+    return found[0] + (" and others" if len(set(found)) > 1 else "")

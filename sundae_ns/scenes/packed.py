@@ -39,7 +39,7 @@ from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import check_run, load_config
-from sundae_ns.storage.runs.folder import UNPACKED, config_of, unpacked_folder
+from sundae_ns.storage.runs.folder import config_of, unpacked_folder
 
 _PARSERS: dict[str, type[DataParserConfig]] = {
     "colmap": ColmapDataParserConfig,
@@ -74,10 +74,10 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
     if not isinstance(config, TrainerConfig) or not isinstance(model, SplatfactoModelConfig):
         raise CheckpointError(f"{path} is a run of another method; give one of sundae or splatfacto")
     scene = load(path)
-    manager = _manager(config)
+    manager = stock.datamanager_config(copy.deepcopy(config.pipeline.datamanager))
     if data is not None and not manager.images:
         raise no_images_error(path.parent)
-    manager.data = data or manager.data
+    manager.data = data or manager.data or config.data
     source = {"method": config.method_name, **scene.meta["source"]}
     meta = {**scene.meta, "source": source, "capture": _describe(manager)}
     return contents_of(
@@ -89,13 +89,6 @@ def packed_run(run: Path, *, data: Path | None = None) -> tuple[Scene, bytes]:
     """The scene of a finished run with its training cameras, and the packed file that holds it; see above for errors."""
     contents = contents_of_run(run, data=data)
     return scene_of(contents), pack_bytes(*fit_scene(contents))
-
-
-def _manager(config: TrainerConfig) -> SundaeDatamanagerConfig:
-    """Configuration of our datamanager for a run of sundae or splatfacto."""
-    manager = stock.datamanager_config(copy.deepcopy(config.pipeline.datamanager))
-    manager.data = manager.data or config.data
-    return manager
 
 
 def _cameras(manager: SundaeDatamanagerConfig, most: int) -> dict[str, Tensor]:
@@ -161,27 +154,14 @@ def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | 
     config.output_dir, (config.experiment_name, _, config.timestamp) = output_dir.resolve(), folder.parts[-3:]
     model = model_of(scene_of(packed))
     config.pipeline.model = model.config
-    manager = config.pipeline.datamanager
-    assert isinstance(manager, SundaeDatamanagerConfig)
-    if data is None:
-        manager.dataparser = NerfstudioDataParserConfig(
-            downscale_factor=1,
-            orientation_method="none",
-            center_method="none",
-            auto_scale_poses=False,
-            eval_mode="all",
-        )
-        manager.images = False
-        config.data = folder / "cameras"
-    else:
-        manager = config.pipeline.datamanager = capture_of(packed, data)
-        config.data = data.resolve()
-    manager.data = config.data
+    cameras = folder / "cameras"
+    manager = _without_images(cameras) if data is None else datamanager_of(packed, data)
+    config.pipeline.datamanager, config.data = manager, manager.data
     with writing(f"cannot write to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         if data is None:
-            config.data.mkdir(exist_ok=True)
-            write_text(config.data / "transforms.json", json.dumps(_transforms(packed), indent=1))
+            cameras.mkdir(exist_ok=True)
+            write_text(cameras / "transforms.json", json.dumps(_transforms(packed), indent=1))
         if is_frame(frame := packed.meta.get("frame")):
             write_text(folder / FRAME_FILE, json.dumps(frame, indent=4))
     state = {f"_model.{name}": value for name, value in model.state_dict().items()}
@@ -192,9 +172,16 @@ def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | 
     return folder / "config.yml"
 
 
-def is_unpacked(config: TrainerConfig) -> bool:
-    """Whether a run was written by :func:`write_run`; it cannot be trained on."""
-    return config.timestamp == UNPACKED
+def _without_images(cameras: Path) -> SundaeDatamanagerConfig:
+    """Configuration that reads cameras without images, whose coordinates are those of the model."""
+    parser = NerfstudioDataParserConfig(
+        downscale_factor=1,
+        orientation_method="none",
+        center_method="none",
+        auto_scale_poses=False,
+        eval_mode="all",
+    )
+    return SundaeDatamanagerConfig(dataparser=parser, images=False, data=cameras, cache_images_type="uint8")
 
 
 def model_of(scene: Scene) -> SundaeModel:
@@ -241,7 +228,7 @@ def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
         value.data = new
 
 
-def capture_of(packed: PackedScene, data: Path) -> SundaeDatamanagerConfig:
+def datamanager_of(packed: PackedScene, data: Path) -> SundaeDatamanagerConfig:
     """Configuration that parses, splits and scales a capture as in the training of a packed scene.
 
     Raises:
@@ -288,20 +275,13 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
 def _transforms(packed: PackedScene) -> dict[str, Any]:
     """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
     cameras = cameras_of(packed)
-    frames = []
-    for i, pose in enumerate(cameras["poses"].double().tolist()):
-        fx, fy, cx, cy = cameras["intrinsics"][i].tolist()
-        width, height = cameras["sizes"][i].tolist()
-        frames.append(
-            {
-                "file_path": f"view-{i:05d}",
-                "fl_x": fx,
-                "fl_y": fy,
-                "cx": cx,
-                "cy": cy,
-                "w": int(width),
-                "h": int(height),
-                "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]],
-            }
-        )
+    frames = [
+        {
+            "file_path": f"view-{i:05d}",
+            **dict(zip(("fl_x", "fl_y", "cx", "cy"), cameras["intrinsics"][i].tolist(), strict=True)),
+            **dict(zip(("w", "h"), cameras["sizes"][i].long().tolist(), strict=True)),
+            "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]],
+        }
+        for i, pose in enumerate(cameras["poses"].double().tolist())
+    ]
     return {"camera_model": "PINHOLE", "frames": frames}

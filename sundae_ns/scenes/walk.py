@@ -9,16 +9,12 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.evaluation import ComparisonRow
+from sundae_ns.scenes.measure import comparison_of
 from sundae_ns.scenes.opening import Opened
 
 
-def count_views(opened: Opened) -> int:
-    """Number of training and test views of a scene's capture."""
-    return len(opened.datamanager.train_dataset) + len(opened.cameras)
-
-
 def largest_view(opened: Opened) -> tuple[int, int]:
-    """Largest width and largest height of the views, in pixels."""
+    """Largest width and largest height of the training and test views, in pixels."""
     _ = opened.datamanager.cached_train  # undistortion, which comes with loading, changes the cameras
     cameras = [opened.datamanager.train_dataset.cameras, *opened.cameras]
     return max(int(each.width.max()) for each in cameras), max(int(each.height.max()) for each in cameras)
@@ -47,6 +43,4 @@ def walk(opened: Opened) -> Iterator[ComparisonRow]:
     )
     for path, held_out, index in order:
         camera, truth = (opened.cameras[index], opened.truths[index]) if held_out else training_view(index)
-        outputs = model.get_outputs_for_camera(camera)
-        title = f"{path.name}, {'test' if held_out else 'training'} view"
-        yield ComparisonRow(truth, outputs["base_rgb"], outputs["rgb"], title)
+        yield comparison_of(model, camera, truth, f"{path.name}, {'test' if held_out else 'training'} view")
