@@ -9,7 +9,6 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,7 +26,6 @@ from sundae_ns.distributed.shards import Shards, bounds
 from sundae_ns.distributed.source import ShardedField
 from sundae_ns.distributed.start import check_options, without_viewer
 from sundae_ns.rendering.source import FieldSource
-from sundae_ns.storage.atomic import writing
 from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
@@ -57,9 +55,6 @@ class OneProcess:
         """The configuration, unchanged."""
         return config
 
-    def make_folder(self, folder: Path) -> None:
-        """Nothing to do: nerfstudio makes the folder of the run."""
-
     def share(
         self, state: FieldState, source: FieldSource, extensions: list[Extension], datamanager: Any, seed: int
     ) -> tuple[FieldSource, list[Extension]]:
@@ -73,10 +68,7 @@ class OneProcess:
     def agree(self, state: FieldState) -> None:
         """Nothing to share."""
 
-    def check_copies(self, head: CompensationHead | None) -> None:
-        """Nothing to compare."""
-
-    def gathered(self, state: State, names: list[str]) -> State | None:
+    def gathered(self, state: State, head: CompensationHead | None, names: list[str]) -> State | None:
         """The state, unchanged."""
         return state
 
@@ -125,15 +117,6 @@ class Ranks(OneProcess):
             torch.cuda.set_device(self.rank)
         return config
 
-    def make_folder(self, folder: Path) -> None:
-        """Make the folder of the run; nerfstudio's own way fails if two ranks do so at once.
-
-        Raises:
-            StorageError: no right to write.
-        """
-        with writing(f"cannot make the run's folder {folder}"):
-            folder.mkdir(parents=True, exist_ok=True)
-
     def share(
         self, state: FieldState, source: FieldSource, extensions: list[Extension], datamanager: Any, seed: int
     ) -> tuple[FieldSource, list[Extension]]:
@@ -177,17 +160,14 @@ class Ranks(OneProcess):
         """Share what each rank has noted by itself: the focal lengths that the head was trained on."""
         state.trained_focal = self.shards.widest(state.trained_focal)
 
-    def check_copies(self, head: CompensationHead | None) -> None:
-        """Warn if the copies of the head differ between ranks."""
+    def gathered(self, state: State, head: CompensationHead | None, names: list[str]) -> State | None:
+        """The checkpoint of the whole field on rank 0, None on the others; warns if the copies of the head differ."""
         apart = 0.0 if head is None else self.shards.apart(head.parameters())
         if apart != 0 and self.shards.rank == 0:
             warn(
                 f"the heads of the ranks differ by up to {apart:.2g}, which is a bug of sundae; the checkpoint holds "
                 "the head of the first rank, and resuming from it makes them equal"
             )
-
-    def gathered(self, state: State, names: list[str]) -> State | None:
-        """The checkpoint of the whole field on rank 0; None on the others."""
         return whole_state(state, self.shards, names)
 
     def part(self, loaded: State, names: list[str]) -> State:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,12 +31,10 @@ def config() -> Any:
     return config
 
 
-def test_one_process_changes_nothing(config: Any, tmp_path: Path) -> None:
+def test_one_process_changes_nothing(config: Any) -> None:
     team = team_of(0, 1)
     assert type(team) is OneProcess
     assert team.configured(config) is config
-    team.make_folder(tmp_path / "run")
-    assert not (tmp_path / "run").exists()
     state = FieldState(field=Field({"means": torch.zeros(2, 3)}), networks=torch.nn.ModuleDict())
     source, extensions = LocalField(state.field), [Extension()]
     shared = team.share(state, source, extensions, None, 0)
@@ -46,23 +43,20 @@ def test_one_process_changes_nothing(config: Any, tmp_path: Path) -> None:
     made: Any = object()
     assert team.optimizers(lambda: made, None, None, []) is made
     checkpoint = {"step": 3}
-    assert team.gathered(checkpoint, []) is checkpoint
+    assert team.gathered(checkpoint, None, []) is checkpoint
     assert team.part(checkpoint, []) is checkpoint
     random = torch.get_rng_state()
-    team.check_copies(None)
     team.restored(state, 0, 4)
     assert torch.equal(torch.get_rng_state(), random)
 
 
-def test_ranks_train_in_larger_batches_without_a_viewer(config: Any, tmp_path: Path) -> None:
+def test_ranks_train_in_larger_batches_without_a_viewer(config: Any) -> None:
     team = team_of(0, 2)
     assert type(team) is Ranks
     found = team.configured(config)
     assert (found.max_num_iterations, found.vis) == (config.max_num_iterations // 2, "wandb")
     assert found.pipeline.datamanager.cache_images == "cpu"
     assert config.vis == "viewer+wandb"
-    for _ in range(2):  # two ranks make the same folder
-        team.make_folder(tmp_path / "a" / "run")
     config.pipeline.model.pruning.mode = "auto"
     with pytest.raises(ConfigError, match="several GPUs"):
         team.configured(config)
