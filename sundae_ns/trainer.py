@@ -128,7 +128,7 @@ class SundaeTrainer(Trainer):
     config: SundaeTrainerConfig
 
     def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        self.team = distributed.team_of(local_rank, world_size)
+        self.team = distributed.Team(local_rank, world_size)
         # nerfstudio sees one process. For more it would use DDP, which breaks when the field changes its size.
         super().__init__(self.team.configured(config), local_rank, world_size=1)
         with writing(f"cannot make the run's folder {self.base_dir}"):

@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from sundae_ns.distributed import team_of
+from sundae_ns.distributed import Team
 from sundae_ns.distributed.densification import ShardedDensification
 from sundae_ns.distributed.pruning import RankPruner
-from sundae_ns.distributed.team import OneProcess, Ranks
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.method_configs import sundae_tiny
@@ -32,8 +31,8 @@ def config() -> Any:
 
 
 def test_one_process_changes_nothing(config: Any) -> None:
-    team = team_of(0, 1)
-    assert type(team) is OneProcess
+    team = Team()
+    assert not team.collective
     assert team.configured(config) is config
     state = FieldState(field=Field({"means": torch.zeros(2, 3)}), networks=torch.nn.ModuleDict())
     source, extensions = LocalField(state.field), [Extension()]
@@ -51,8 +50,8 @@ def test_one_process_changes_nothing(config: Any) -> None:
 
 
 def test_ranks_train_in_larger_batches_without_a_viewer(config: Any) -> None:
-    team = team_of(0, 2)
-    assert type(team) is Ranks
+    team = Team(0, 2)
+    assert team.collective
     found = team.configured(config)
     assert (found.max_num_iterations, found.vis) == (config.max_num_iterations // 2, "wandb")
     assert found.pipeline.datamanager.cache_images == "cpu"
@@ -63,7 +62,7 @@ def test_ranks_train_in_larger_batches_without_a_viewer(config: Any) -> None:
 
 
 def test_ranks_densify_and_prune_as_one() -> None:
-    team, shards = Ranks(0, 2), object()
+    team, shards = Team(0, 2), object()
     team.shards = shards  # type: ignore[assignment]
     strategy = CappedStrategy(refine_every=6)
     densification = team._sharded(Densification(strategy), 7)
