@@ -29,7 +29,7 @@ class NerfstudioRun:
         self.model = model
         self.state: FieldState = model.state
         self.source: FieldSource = model.source
-        self.background: Tensor = model.shown_background
+        self.background: Tensor = model.background_color.to(model.device)
         self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
         self._trainer = cast(Any, attributes.trainer)
 

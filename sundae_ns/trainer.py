@@ -24,7 +24,7 @@ from rich.table import Table
 from torch import Tensor
 
 from sundae_ns import distributed
-from sundae_ns.datamanager import SundaeDatamanager, check_before_training
+from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError, one_line
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
@@ -62,7 +62,9 @@ class SundaeTrainerConfig(TrainerConfig):
         if self.machine.num_devices > 1:
             distributed.forward_signals()
         self.make_paths_absolute()
-        check_before_training(self.pipeline.datamanager)
+        datamanager = self.pipeline.datamanager
+        if isinstance(datamanager, SundaeDatamanagerConfig):
+            datamanager.check()
         set_schedule(self, sys.argv[1:])
         scaled = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
         table = Table(

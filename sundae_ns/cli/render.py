@@ -90,6 +90,6 @@ def _chosen(views: list[View], index: int | None) -> View:
 
 
 def _resized(view: View, width: int | None, *, even: bool) -> View:
-    """The camera with images of another width, and with even sides for a video, which stores colours at half the size."""
+    """The camera with images of another width, and with even sides for a video, whose colours have half the size."""
     view = view if width is None else view.zoomed(width / view.width)
     return view._replace(width=view.width // 2 * 2, height=view.height // 2 * 2) if even else view

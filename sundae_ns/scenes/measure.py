@@ -47,8 +47,7 @@ class FrameTimes:
     splat: float
     """The same without head and features."""
     head: float
-    """The head alone; 0 if it does not run. At another scale than the trained one a second splatting pass is needed, which
-    only ``frame`` contains."""
+    """The head alone; 0 if it does not run. Its second splatting pass at another scale counts in ``frame`` only."""
 
 
 @contextmanager
@@ -112,8 +111,8 @@ def rendered_as(
     """The run with images of another size, and inside the block with another arithmetic of its head.
 
     Args:
-        run: a finished run.
-        factor: factor on the sides of the images; the truths are resized alike.
+        run: a finished scene.
+        factor: on the sides of the images; the true images are resized alike.
         precision: of the head, one of ``PRECISIONS``; by default the run's own, and fp32 on a CPU.
         phases: runs of the head for a frame, one of ``PHASES``; by default the run's own.
 

@@ -1,4 +1,4 @@
-"""The one opener of finished scenes: runs of sundae or splatfacto and packed scenes, each as a model with its test views."""
+"""Finished scenes as models with their test views: runs of sundae or splatfacto, and packed scenes."""
 
 from __future__ import annotations
 
@@ -155,8 +155,7 @@ def open_pipeline(
 ) -> OpenedPipeline:
     """Open a run of sundae or splatfacto by its ``config.yml``, on the GPU if there is one. The run is only read.
 
-    A field of splatfacto becomes a model of ours without a head, so that one code path renders and times all methods, on a
-    CPU too.
+    A field of splatfacto becomes a model of ours without a head: one code path renders and times all methods.
 
     Args:
         path: the run's ``config.yml``.

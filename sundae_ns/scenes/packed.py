@@ -1,6 +1,6 @@
 """Finished runs as packed scenes, and packed scenes as runs that nerfstudio's commands open.
 
-A ``config.yml`` can run code in nerfstudio, so no part of it is packed: a packed scene states plain values. Each value is
+A ``config.yml`` can run code in nerfstudio, so no part of it is packed. A packed scene states plain values; each one is
 checked, and a new configuration is made from them.
 """
 
@@ -46,8 +46,8 @@ _PARSERS: dict[str, type[DataParserConfig]] = {
     "nerfstudio-data": NerfstudioDataParserConfig,
 }
 _FOLDER = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*")
-"""Paths that a packed scene may name: below the capture, without special characters of a shell, because nerfstudio passes
-paths of images to ffmpeg through one."""
+"""Paths that a packed scene may name: below the capture, and without special characters of a shell, because nerfstudio
+passes paths of images to ffmpeg through one."""
 
 
 # -------------------------------------------------------------------------------------------------------------- packing
@@ -86,7 +86,7 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
 
 
 def packed_run(run: Path, *, data: Path | None = None) -> tuple[Scene, bytes]:
-    """The scene of a finished run with its training cameras, and the packed file that holds it; see above for errors."""
+    """The scene of a finished run with its training cameras, and its packed file; errors as :func:`contents_of_run`."""
     contents = contents_of_run(run, data=data)
     return scene_of(contents), pack_bytes(*fit_scene(contents))
 
@@ -131,7 +131,7 @@ def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
 
 
 def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | None = None) -> Path:
-    """Write a packed scene as a run that ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval`` open.
+    """Write a packed scene as a run for ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval``.
 
     Args:
         packed: from ``read_scene``; its values are checked.
@@ -220,7 +220,7 @@ def hold(model: SundaeModel, scene: Scene) -> None:
 
 
 def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
-    """Load a field into a model, in place and in the field's order; parameters and coefficients that it lacks become 0."""
+    """Load a field into a model in place; parameters and coefficients that the field lacks become 0."""
     for name, value in model.gauss_params.items():
         new = value.data.new_zeros(len(field["means"]), *value.shape[1:])
         if name in field:
@@ -252,24 +252,23 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
     if not is_number(scale) or not 0 < scale <= 1:
         raise refusal("an impossible scale of its images")
     parser = _PARSERS[kind](load_3D_points=False)  # type: ignore[call-arg]
-    known = _options(_PARSERS[kind])
+    known, hints = _options(_PARSERS[kind]), get_type_hints(_PARSERS[kind])
     for name, value in options.items():
-        default = known.get(name)
-        known_values = (
-            get_args(get_type_hints(_PARSERS[kind])[name]) if isinstance(default, str) and name in known else ()
-        )
-        fits = (
-            (isinstance(default, bool) and isinstance(value, bool))
-            or (isinstance(default, float) and is_number(value))
-            or (name in known and default is None and (value is None or (type(value) is int and value > 0)))
-            or (type(default) is int and type(value) is int)
-            or value in known_values
-            or (isinstance(default, Path) and isinstance(value, str) and _FOLDER.fullmatch(value) is not None)
-        )
-        if not fits:
+        if name not in known or not _is_possible(value, known[name], hints[name]):
             raise refusal(f"an impossible option {str(name)[:40]!r} of its capture")
-        setattr(parser, name, Path(value) if isinstance(default, Path) else value)
+        setattr(parser, name, Path(value) if isinstance(known[name], Path) else value)
     return parser, float(scale)
+
+
+def _is_possible(value: Any, default: Any, hint: Any) -> bool:
+    """Whether a value of JSON can stand for an option with this default and type."""
+    if default is None:
+        return value is None or (type(value) is int and value > 0)
+    if isinstance(default, Path):
+        return isinstance(value, str) and _FOLDER.fullmatch(value) is not None
+    if isinstance(default, float):
+        return is_number(value)
+    return value in get_args(hint) if isinstance(default, str) else type(value) is type(default)
 
 
 def _transforms(packed: PackedScene) -> dict[str, Any]:
