@@ -78,17 +78,7 @@ def method(
     plain_optimizers: bool = False,
     **model: Any,
 ) -> MethodSpecification:
-    """One method.
-
-    Args:
-        name: name after ``ns-train``.
-        description: line in ``ns-train --help``.
-        pruning: options of pruning.
-        head: options of the head; by default those of :class:`HeadConfig`.
-        steps: length of the run.
-        plain_optimizers: see :func:`optimizers`.
-        model: other options of the model.
-    """
+    """One method: its name and line in ``ns-train --help``, its length, and options of the model."""
     config = SundaeTrainerConfig(
         method_name=name,
         steps_per_eval_image=500,

@@ -87,10 +87,6 @@ class SundaeModel(SplatfactoModel):
     A subclass of ``SplatfactoModel``, because nerfstudio's exporter and viewer test for it. Everything that ties the
     original to CUDA or to downloads is replaced: initialisation, view matrix, outputs, LPIPS.
 
-    Args:
-        config: the configuration.
-        scene_box, num_train_data, metadata, seed_points: from nerfstudio's pipeline.
-
     Raises:
         ConfigError: options that cannot work.
         CheckpointError: the warm start cannot be read.

@@ -183,14 +183,7 @@ def lpips() -> Finding:
 
 
 def installed(name: str, place: str | None, purpose: str, package: str) -> Finding:
-    """Whether a library or program of the system is there.
-
-    Args:
-        name: name of the finding.
-        place: where it was found; None if it is missing.
-        purpose: the commands that need it.
-        package: package of apt that has it.
-    """
+    """Whether a library or program of the system has a place; if not, the package of apt that has it."""
     if place:
         return Finding(name, True, f"{place}, for {purpose}")
     return Finding(name, False, f"not found, for {purpose}", f"apt-get install {package}")
@@ -216,11 +209,7 @@ def examine(compile_kernels: bool = False) -> list[Finding]:
 
 
 def run_doctor(compile_kernels: bool = False) -> int:
-    """Print the report; the exit code is 1 if training lacks something.
-
-    Args:
-        compile_kernels: build gsplat's kernels if they are missing.
-    """
+    """Print the report, and build gsplat's kernels if asked to; the exit code is 1 if training lacks something."""
     console = Console()
     with console.status("Building gsplat's kernels, some minutes" if compile_kernels else "Checking"):
         findings = examine(compile_kernels)

@@ -85,13 +85,9 @@ def _dispatch(words: Sequence[str]) -> int:
 
 
 def exit_with(command: Callable[[], int], name: str) -> NoReturn:
-    """Run a command and exit with its code.
+    """Run a command and exit with the code that it returns; errors of the file system name the command.
 
     A :class:`SundaeError` is printed on one line, and the code is 2. An interrupt is 130.
-
-    Args:
-        command: returns the code.
-        name: of the command, for errors of the file system.
     """
     for variable, value in ENVIRONMENT.items():
         os.environ.setdefault(variable, value)

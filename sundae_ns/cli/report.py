@@ -20,7 +20,7 @@ from sundae_ns.errors import ConfigError, SundaeError, writing
 if TYPE_CHECKING:
     from PIL import Image
 
-    from sundae_ns.evaluation import Lpips, Measured
+    from sundae_ns.evaluation import Measured
     from sundae_ns.evaluation.curves import Curves
     from sundae_ns.evaluation.plots import Cost
     from sundae_ns.scenes.opening import Opened
@@ -70,9 +70,10 @@ def report(
         from rich.markup import escape
         from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeRemainingColumn
 
-        from sundae_ns.evaluation import Lpips, csv_text, lpips_weights_available
+        from sundae_ns.evaluation import Lpips, csv_text, flip_available, lpips_weights_available
         from sundae_ns.evaluation.curves import read_curves
         from sundae_ns.evaluation.document import document
+        from sundae_ns.evaluation.flip import INSTALL
         from sundae_ns.scenes.measure import measure_scene
         from sundae_ns.scenes.opening import open_scene
         from sundae_ns.storage.atomic import write_text
@@ -81,7 +82,11 @@ def report(
     words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
     command = shlex.join([*words, *(["--video", str(video)] if video else [])])
     lpips = Lpips(lpips_net, download=False) if lpips_weights_available(lpips_net) else None
-    notes = _missing_metrics(lpips_net, lpips)
+    notes = []
+    if not flip_available():
+        notes.append(f"FLIP: the package is not installed; run {INSTALL}.")
+    if lpips is None:
+        notes.append(f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them.")
     done: list[Measured] = []
     curves: dict[str, Curves] = {}
     comparisons: dict[str, list[tuple[str, str]]] = {}
@@ -143,7 +148,11 @@ def report(
         scenes = {scene: [run for run in done if run.scene == scene] for scene in dict.fromkeys(r.scene for r in done)}
         with writing(f"cannot write to {out}"):
             plots = _plot(out, scenes, curves)
-        notes += _differences(scenes)
+        notes += [
+            f"Comparison within {scene}: its runs have different test views, so their numbers do not compare."
+            for scene, own in scenes.items()
+            if len({(run.resolution, len(run.full.views)) for run in own}) > 1
+        ]
     images = {scene: [*plots[scene], *comparisons[scene]] for scene in scenes}
     write_text(out / "report.json", json.dumps([run.as_json() for run in done], indent=1) + "\n")
     write_text(out / "report.csv", csv_text([run.as_json() for run in done]))
@@ -168,27 +177,6 @@ def _label(opened: Opened, taken: Collection[str]) -> str:
     return label
 
 
-def _missing_metrics(net: str, lpips: Lpips | None) -> list[str]:
-    from sundae_ns.evaluation import flip_available
-    from sundae_ns.evaluation.flip import INSTALL
-
-    notes = []
-    if not flip_available():
-        notes.append(f"FLIP: the package is not installed; run {INSTALL}.")
-    if lpips is None:
-        notes.append(f"LPIPS: the weights of its net ({net}) are missing; sundae doctor says where to put them.")
-    return notes
-
-
-def _differences(scenes: dict[str, list[Measured]]) -> list[str]:
-    """A warning for each scene whose runs were measured on different images."""
-    return [
-        f"Comparison within {scene}: its runs have different test views, so their numbers do not compare."
-        for scene, own in scenes.items()
-        if len({(run.resolution, len(run.full.views)) for run in own}) > 1
-    ]
-
-
 def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
     """Write a comparison image of the views with the lowest and the median PSNR."""
     from sundae_ns.evaluation import save_comparison
@@ -207,7 +195,7 @@ def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
 def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> None:
     """Write every view of a scene beside its photograph; ``progress`` is called after each."""
     from sundae_ns.evaluation.video import side_by_side, write_video
-    from sundae_ns.scenes.walk import largest_view, walk
+    from sundae_ns.scenes.measure import largest_view, walk
     from sundae_ns.storage.atomic import replacing
 
     head = opened.model.state.head_enabled

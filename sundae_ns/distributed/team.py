@@ -108,7 +108,7 @@ class Team:
         cameras = datamanager.train_dataset.cameras
         timetable = Timetable(cameras, datamanager.view_of_step, state.device)
         sharded = ShardedField(shards, state.field, timetable)
-        shards.on_change(sharded.forget_plan)
+        shards.changed = sharded.forget_plan
         datamanager.place = (shards.rank, shards.ranks)
         return sharded, [self._sharded(extension, len(cameras)) for extension in extensions]
 
