@@ -33,7 +33,7 @@ from harness.script import run_script
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.evaluation import without_nan
 from sundae_ns.evaluation.document import number
-from sundae_ns.scenes.measure import head_as
+from sundae_ns.scenes.measure import rendered_as
 from sundae_ns.scenes.opening import Opened, open_scene
 
 FRAMES_APART = (1, 7)
@@ -253,7 +253,7 @@ def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int], phases: Seque
         camera = camera.to(model.device)
         compensated = []
         for count in phases:
-            with head_as(model, phases=count):
+            with rendered_as(opened, phases=count):
                 outputs = model.get_outputs_for_camera(camera)
                 compensated.append(outputs["rgb"].clone())
         images = torch.stack([*compensated, outputs["base_rgb"]]).float()

@@ -122,29 +122,23 @@ def rendered_as(
     """
     if not 0 < factor < MOST_ZOOM:
         raise ConfigError(f"images cannot be {factor} times as large; give a factor above 0 and below {MOST_ZOOM}")
+    model, head = run.model, run.model.head
+    if model.device.type == "cpu" and precision not in (None, "fp32"):
+        raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
     cameras, truths = [zoomed(camera, factor) for camera in run.cameras], []
     for camera, truth in zip(cameras, run.truths, strict=True):
         size = int(camera.height), int(camera.width)
         truths.append(truth if truth.shape[:2] == size else resize(truth, *size))
-    with head_as(run.model, precision=precision, phases=phases):
-        yield replace(run, cameras=cameras, truths=truths)
-
-
-@contextmanager
-def head_as(model: SundaeModel, *, precision: str | None = None, phases: int | None = None) -> Iterator[None]:
-    """Inside the block the head has another arithmetic, or runs another number of times; as in :func:`rendered_as`."""
-    if model.device.type == "cpu" and precision not in (None, "fp32"):
-        raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
-    head = model.head
+    shown = replace(run, cameras=cameras, truths=truths)
     if head is None:
-        yield
+        yield shown
         return
     before: Any = head.config
     changed = replace(before, precision=precision or _precision(model), phases=phases or before.phases)
     changed.validate()
     head.config = changed
     try:
-        yield
+        yield shown
     finally:
         head.config = before
 

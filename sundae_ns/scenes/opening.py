@@ -11,7 +11,6 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
 from sundae_ns.api.opening import load
@@ -24,7 +23,6 @@ from sundae_ns.scenes.packed import datamanager_of, hold, model_of
 from sundae_ns.storage.kinds import kind_of, refuse
 from sundae_ns.storage.packing import read_scene
 from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.storage.runs.fingerprint import fingerprint
 from sundae_ns.storage.runs.folder import config_of, prunes_of
 
@@ -166,11 +164,8 @@ def open_pipeline(
         CheckpointError: the run is of another method, or has no whole checkpoint.
         DataError: its capture is missing, or cannot be used, or it was unpacked without one.
     """
-    config = load_config(path)
-    pipeline_config = config.pipeline if isinstance(config, TrainerConfig) else None
-    model_config = getattr(pipeline_config, "model", None)
-    if pipeline_config is None or not isinstance(model_config, SplatfactoModelConfig):
-        raise CheckpointError(f"{path} is of a method without Gaussians; give runs of sundae or splatfacto")
+    config, model_config = stock.config_with_field(path)
+    pipeline_config = config.pipeline
     if not getattr(pipeline_config.datamanager, "images", True):
         raise no_images_error(path.parent)  # a capture given now would not be parsed as in training
     options = fingerprint(config)  # before a run of splatfacto becomes one of ours

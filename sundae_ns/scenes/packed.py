@@ -23,7 +23,6 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
 from sundae_ns.api.opening import FRAME_FILE, load
@@ -32,13 +31,13 @@ from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import is_frame, is_number
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, no_images_error
-from sundae_ns.errors import CheckpointError, PackError
+from sundae_ns.errors import PackError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.scenes import stock
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
 from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.runs.config_file import check_run, load_config
+from sundae_ns.storage.runs.config_file import check_run
 from sundae_ns.storage.runs.folder import config_of, unpacked_folder
 
 _PARSERS: dict[str, type[DataParserConfig]] = {
@@ -69,10 +68,7 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
     """
     check_run(run)
     path = config_of(run)
-    config = load_config(path)
-    model = getattr(getattr(config, "pipeline", None), "model", None)
-    if not isinstance(config, TrainerConfig) or not isinstance(model, SplatfactoModelConfig):
-        raise CheckpointError(f"{path} is a run of another method; give one of sundae or splatfacto")
+    config, _ = stock.config_with_field(path)
     scene = load(path)
     manager = stock.datamanager_config(copy.deepcopy(config.pipeline.datamanager))
     if data is not None and not manager.images:

@@ -19,8 +19,7 @@ from sundae_ns.cli.packing import pack
 from sundae_ns.errors import CheckpointError, ConfigError, MemoryExhaustedError
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes import finetune as packing_finetune
-from sundae_ns.scenes.finetune import finetune, rate_factor
-from sundae_ns.scenes.finetune_step import Through, TunedStep
+from sundae_ns.scenes.finetune import Through, TunedStep, finetune, rate_factor
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run, write_run
 from sundae_ns.storage.packing import (
