@@ -247,7 +247,7 @@ class SundaeTrainer(Trainer):
             result = self._recorded(model.state, inputs, model.render_settings(training=True))
         except (BackendError, torch.cuda.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0]
-            warn(f"training goes on without recordings, slower: {reason}")
+            warn(f"training continues without recordings, slower: {reason}")
             self._recorded = None
             torch.cuda.empty_cache()
             return None

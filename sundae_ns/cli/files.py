@@ -93,7 +93,7 @@ def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
         return packed_run(path, data=data)
 
 
-def prune(
+def prune_file(
     source: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     keep: float | None = None,

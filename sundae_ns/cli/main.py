@@ -15,10 +15,10 @@ import tyro
 
 from sundae_ns.cli.bench import bench
 from sundae_ns.cli.demo import demo
-from sundae_ns.cli.files import export, prune
+from sundae_ns.cli.files import export, prune_file
 from sundae_ns.cli.packing import pack, unpack
 from sundae_ns.cli.process import loading
-from sundae_ns.cli.render import render
+from sundae_ns.cli.render import render_file
 from sundae_ns.cli.report import report
 from sundae_ns.cli.run import run
 from sundae_ns.cli.train import train
@@ -51,12 +51,12 @@ def doctor(compile: bool = False) -> int:  # noqa: A002
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "run": (run, "photos to a packed scene, its report and its web page; resumes"),
     "train": (train, "train by ns-train, with short options"),
-    "prune": (prune, "make any splat scene smaller, without its photos"),
+    "prune": (prune_file, "make any splat scene smaller, without its photos"),
     "pack": (pack, "pack a finished run into one file"),
     "unpack": (unpack, "unpack a scene into a run, for the commands of nerfstudio"),
     "export": (export, "write a scene as a web page, .ply, .spz or .sog"),
     "view": (view, "show a scene with its head in the browser"),
-    "render": (render, "render a scene to a picture, or a camera path to a video"),
+    "render": (render_file, "render a scene to an image, or a camera path to a video"),
     "report": (report, "measure and compare finished runs: quality, speed, size"),
     "bench": (bench, "time the frames of a run"),
     "demo": (demo, "train and evaluate the embedded capture; takes minutes on a CPU"),

@@ -19,7 +19,7 @@ from sundae_ns.datamanager import SundaeDatamanager, no_images_error
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.scenes import stock
-from sundae_ns.scenes.packed import datamanager_of, hold, model_of
+from sundae_ns.scenes.packed import datamanager_of, model_of, put_scene
 from sundae_ns.storage.kinds import kind_of, refuse
 from sundae_ns.storage.packing import read_scene
 from sundae_ns.storage.runs import checkpoint
@@ -181,7 +181,7 @@ def open_pipeline(
     pipeline: Any = pipeline_config.setup(device=_device(), test_mode=test_mode)
     loaded = checkpoint.load(newest)
     if foreign:
-        hold(pipeline.model, load(newest))
+        put_scene(pipeline.model, load(newest))
         pipeline.model.step = int(loaded["step"])
     else:
         pipeline.load_pipeline(loaded["pipeline"], loaded["step"])

@@ -196,13 +196,13 @@ def model_of(scene: Scene) -> SundaeModel:
     seeds = (torch.eye(3)[:2], torch.zeros(2, 3))
     box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
     model: SundaeModel = config.setup(scene_box=box, num_train_data=0, metadata={}, seed_points=seeds)
-    hold(model, scene)
+    put_scene(model, scene)
     # A step at which all SH degrees are active and the head is enabled.
     model.step = max(degree, 1)
     return model.eval()
 
 
-def hold(model: SundaeModel, scene: Scene) -> None:
+def put_scene(model: SundaeModel, scene: Scene) -> None:
     """Put a finished scene in place of a model's field and head.
 
     Args:

@@ -1,4 +1,4 @@
-"""``sundae render``: pictures, videos, and refusals in one line."""
+"""``sundae render``: images, videos, and refusals in one line."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("index", [0, 1])
-def test_a_picture_of_a_stored_view(folder: Path, tmp_path: Path, index: int) -> None:
+def test_an_image_of_a_stored_view(folder: Path, tmp_path: Path, index: int) -> None:
     out = tmp_path / "a.png"
     assert run(folder / "packed.sundae", "-o", out, "--view", index) == 0
     scene = sundae_ns.load(folder / "packed.sundae")
@@ -89,7 +89,7 @@ def test_a_picture_of_a_stored_view(folder: Path, tmp_path: Path, index: int) ->
     assert np.array_equal(pixels(out), expected)
 
 
-def test_a_picture_of_the_camera_in_a_file(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_image_of_the_camera_in_a_file(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     camera, out = capture_file(tmp_path / "camera.json", 1), tmp_path / "a.jpg"
     assert run(folder / "cloud.ply", "--camera", camera, "-o", out) == 0
     assert capsys.readouterr().out == f"{out}: 40 x 30 px\n"
@@ -128,7 +128,7 @@ def test_refusals_are_one_line_and_write_nothing(
         ((packed, "-o", out), "there are 2 cameras; choose one with --view 0 to 1, or write an .mp4"),
         ((packed, "-o", out, "--view", 2), "there is no camera 2; give --view 0 to 1"),
         ((packed, "-o", out, "--view", -1), "there is no camera -1"),
-        ((packed, "-o", tmp_path / "a.gif", "--view", 0), "is neither a picture nor a video"),
+        ((packed, "-o", tmp_path / "a.gif", "--view", 0), "is neither an image nor a video"),
         ((packed, "-o", out, "--view", 0, "--width", 1), "width is 1; give 2 pixels or more"),
         ((packed, "-o", out, "--camera", damaged), "damaged.json is not JSON"),
         ((packed, "-o", out, "--camera", few), "few.json has an empty camera_path"),
