@@ -250,13 +250,12 @@ def walk(opened: Opened) -> Iterator[ComparisonRow]:
         DataError: an image cannot be decoded.
     """
     model, manager = opened.model, opened.datamanager
-    background = model._get_background_color()
+    outputs = {"background": model._get_background_color()}
 
     def training_view(index: int) -> tuple[Cameras, Tensor]:
-        image = model.get_gt_img(manager.cached_train[index]["image"].to(model.device))
+        truth = model.truth(manager.cached_train[index], outputs)
         # After its image, whose undistortion changes the camera.
-        camera = manager.train_dataset.cameras[index : index + 1].to(model.device)
-        return camera, model.composite_with_background(image, background)
+        return manager.train_dataset.cameras[index : index + 1].to(model.device), truth
 
     order = sorted(
         (path, held_out, index)

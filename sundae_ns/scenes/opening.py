@@ -208,8 +208,7 @@ def views_to_test(model: SundaeModel, datamanager: SundaeDatamanager) -> tuple[l
     cameras, truths = [], []
     for camera, batch in datamanager.fixed_indices_eval_dataloader:
         cameras.append(camera.to(model.device))
-        image = model.get_gt_img(batch["image"])
-        truths.append(model.composite_with_background(image, model._get_background_color()))
+        truths.append(model.truth(batch, {"background": model._get_background_color()}))
     return cameras, truths
 
 
