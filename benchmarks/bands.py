@@ -118,7 +118,7 @@ def _cameras_of_run(source: Path) -> Cameras:
     config = find_config(source) if kind_of(source) != "ply" else None
     if config is None:
         raise DataError("the field has no run, and so no cameras")
-    from sundae_ns.scenes.cameras import training_cameras  # loads nerfstudio, which fields without a run do not need
+    from harness.cameras import training_cameras  # loads nerfstudio, which fields without a run do not need
 
     return training_cameras(config)
 

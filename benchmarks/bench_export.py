@@ -28,7 +28,7 @@ from torch.nn.functional import avg_pool2d
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering import LocalField, render
-from sundae_ns.scenes.opening import Opened, load_run
+from sundae_ns.scenes.opening import Opened, open_scene
 from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage import read_ply
 from sundae_ns.storage.viewers import ANTIALIASED, write_for_viewers
@@ -77,7 +77,7 @@ def main() -> None:
             "splat-transform is not in PATH; npm install @playcanvas/splat-transform, or give --splat-transform"
         )
 
-    run = load_run(options.run / "config.yml")
+    run = open_scene(options.run / "config.yml")
     model = run.model
     scene = contents_of_run(options.run, max_cameras=0)
     antialiased = model.config.rasterize_mode == "antialiased"

@@ -33,7 +33,7 @@ from torch import Tensor
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.finetune import RATE, finetune
-from sundae_ns.scenes.opening import load_run, open_scene
+from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage.packing import (
     FINETUNED,
@@ -111,7 +111,7 @@ def sizes(report: PackReport) -> dict[str, Any]:
 
 @torch.no_grad()
 def quality(run: Path, file: Path, views: int) -> dict[str, Any]:
-    before = load_run(run / "config.yml")
+    before = open_scene(run / "config.yml")
     after = open_scene(file, data=before.capture).model
     chosen = torch.linspace(0, len(before.cameras) - 1, min(views, len(before.cameras))).round().long().tolist()
     names = ("psnr", "psnr_packed", "psnr_between", "ssim", "ssim_packed")

@@ -33,8 +33,8 @@ from harness.script import run_script
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.evaluation import without_nan
 from sundae_ns.evaluation.document import number
-from sundae_ns.scenes.measure import head_as
-from sundae_ns.scenes.opening import Opened, load_run
+from sundae_ns.scenes.measure import rendered_as
+from sundae_ns.scenes.opening import Opened, open_scene
 
 FRAMES_APART = (1, 7)
 """Distances of compared frames, as in StopThePop: flicker from one frame to the next, and what builds up slowly."""
@@ -253,7 +253,7 @@ def _path(opened: Opened, cameras: Cameras, pair: tuple[int, int], phases: Seque
         camera = camera.to(model.device)
         compensated = []
         for count in phases:
-            with head_as(model, phases=count):
+            with rendered_as(opened, phases=count):
                 outputs = model.get_outputs_for_camera(camera)
                 compensated.append(outputs["rgb"].clone())
         images = torch.stack([*compensated, outputs["base_rgb"]]).float()
@@ -280,7 +280,7 @@ def flicker(
     """
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
-        run = load_run(load_config, data=data)
+        run = open_scene(load_config, data=data)
         _ = run.datamanager.cached_train  # loads the training images, whose undistortion changes their cameras
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Rendering paths", total=places * FRAMES)

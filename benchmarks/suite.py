@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -119,9 +120,9 @@ def check(data: Path, parser: Words, method: str) -> None:
     """
     # Late, since it loads the trainer.
     from harness.job import parse
-    from sundae_ns.datamanager import check_before_training
 
-    check_before_training(parse((method, "--data", str(data), *parser)).pipeline.datamanager)  # type: ignore[arg-type]
+    datamanager: Any = parse((method, "--data", str(data), *parser)).pipeline.datamanager
+    datamanager.check()
 
 
 def suite_page(results: Sequence[Result], arms: Sequence[Arm], left_out: Mapping[str, str], command: str) -> str:

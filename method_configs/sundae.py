@@ -76,23 +76,9 @@ def method(
     head: HeadConfig | None = None,
     steps: int = 30000,
     plain_optimizers: bool = False,
-    trainer: dict[str, Any] | None = None,
-    datamanager: dict[str, Any] | None = None,
     **model: Any,
 ) -> MethodSpecification:
-    """One method.
-
-    Args:
-        name: name after ``ns-train``.
-        description: line in ``ns-train --help``.
-        pruning: options of pruning.
-        head: options of the head; by default those of :class:`HeadConfig`.
-        steps: length of the run.
-        plain_optimizers: see :func:`optimizers`.
-        trainer: other options of the trainer.
-        datamanager: other options of the datamanager.
-        model: other options of the model.
-    """
+    """One method: its name and line in ``ns-train --help``, its length, and options of the model."""
     config = SundaeTrainerConfig(
         method_name=name,
         steps_per_eval_image=500,
@@ -106,7 +92,8 @@ def method(
             datamanager=SundaeDatamanagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
                 cache_images_type="uint8",
-                **(datamanager or {}),
+                # The search decides by views that it does not train on.
+                holdout_every=8 if pruning.mode == "auto" else 0,
             ),
             model=SundaeModelConfig(
                 pruning=pruning,
@@ -125,8 +112,6 @@ def method(
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, quit_on_train_completion=True),
         vis="viewer",
     )
-    for option, value in (trainer or {}).items():
-        setattr(config, option, value)
     return MethodSpecification(config=config, description=description)
 
 
@@ -157,7 +142,6 @@ sundae_auto = method(
     "SUNDAE that searches its budget: the smallest field and head within 0.1 dB, or the best in bytes or primitives.",
     pruning=PruningConfig(mode="auto", stop=28000),
     head=HeadConfig(mode="residual"),
-    datamanager={"holdout_every": 8},
 )
 
 sundae_fast = method(
@@ -204,7 +188,6 @@ sundae_tiny = method(
     pruning=PruningConfig(keep_ratio=0.25, prune_at=600),
     head=HeadConfig(mode="residual", size="tiny", pixel_unshuffle=1, num_features=5),
     steps=1200,
-    trainer={"vis": "tensorboard", "steps_per_save": 400, "steps_per_eval_all_images": 10000},
     num_downscales=0,
     sh_degree=2,
     sh_degree_interval=200,
@@ -215,3 +198,6 @@ sundae_tiny = method(
     densify_grad_thresh=0.0016,
     cull_alpha_thresh=0.02,
 )
+sundae_tiny.config.vis = "tensorboard"
+sundae_tiny.config.steps_per_save = 400
+sundae_tiny.config.steps_per_eval_all_images = 10000

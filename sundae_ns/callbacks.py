@@ -4,59 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils import writer
 from torch import Tensor
 
 from sundae_ns.datamanager import SundaeDatamanager
-from sundae_ns.rendering import FieldSource, RenderSettings, TrainingView, View
+from sundae_ns.rendering import FieldSource, RenderSettings, TrainingView
 from sundae_ns.training.extension import Extension, HeldOutView
 from sundae_ns.training.field_state import FieldState
-
-
-class ModelInTraining(Protocol):
-    """What the callbacks need of the model."""
-
-    state: FieldState
-    source: FieldSource
-    extensions: list[Extension]
-
-    @property
-    def shown_background(self) -> Tensor:
-        """Background of images that are not trained on ``[3]``."""
-
-    def view_of(self, camera: Cameras, downscale: int = 1) -> View:
-        """The rasteriser's form of a camera."""
-
-    def truth(self, batch: dict[str, Any], outputs: Mapping[str, Any], downscale: int | None = None) -> Tensor:
-        """The true image of outputs, over their background ``[H, W, 3]``."""
-
-    def render_settings(self, *, training: bool) -> RenderSettings:
-        """Settings of images at this step."""
 
 
 class NerfstudioRun:
     """A training by nerfstudio's trainer; see :class:`sundae_ns.training.extension.TrainingRun` for the members.
 
     Args:
-        model: the model.
+        model: a ``SundaeModel``, which imports this module.
         attributes: of nerfstudio's callbacks. Trainer and pipeline may be missing, as in a test.
     """
 
-    def __init__(self, model: ModelInTraining, attributes: TrainingCallbackAttributes) -> None:
-        self.model, self.state, self.source = model, model.state, model.source
-        self.background = model.shown_background
+    def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
+        self.model = model
+        self.state: FieldState = model.state
+        self.source: FieldSource = model.source
+        self.background: Tensor = model.background_color.to(model.device)
         self._optimizers, self._pipeline = attributes.optimizers, cast(Any, attributes.pipeline)
         self._trainer = cast(Any, attributes.trainer)
 
     @property
     def settings(self) -> RenderSettings:
         """Settings of images that are not trained on, at this step."""
-        return self.model.render_settings(training=False)
+        settings: RenderSettings = self.model.render_settings(training=False)
+        return settings
 
     @property
     def last_step(self) -> int | None:
@@ -134,7 +115,7 @@ class NerfstudioRun:
         places = TrainingCallbackLocation
         return [
             TrainingCallback([places.BEFORE_TRAIN_ITERATION], self._begin_step),
-            TrainingCallback([places.AFTER_TRAIN_ITERATION], self._end_step),
+            TrainingCallback([places.AFTER_TRAIN_ITERATION], lambda step: self.act(self.model.extensions)),
             TrainingCallback([places.AFTER_TRAIN], self._finish),
         ]
 
@@ -147,9 +128,6 @@ class NerfstudioRun:
 
     def _begin_step(self, step: int) -> None:
         self.state.step = step
-
-    def _end_step(self, step: int) -> None:
-        self.act(self.model.extensions)
 
     def act(self, extensions: Sequence[Extension]) -> None:
         """Let extensions act after a step, in their order."""
@@ -166,7 +144,7 @@ class NerfstudioRun:
         writer.write_out_storage()
 
 
-def training_views(model: ModelInTraining, datamanager: SundaeDatamanager) -> list[TrainingView]:
+def training_views(model: Any, datamanager: SundaeDatamanager) -> list[TrainingView]:
     """The training views of a datamanager that are not held out."""
     with torch.no_grad():  # a camera optimizer moves them
         return [TrainingView(model.view_of(camera), mask) for camera, mask in datamanager.training_views()]

@@ -90,17 +90,6 @@ def view_index(camera: Cameras) -> int | None:
     return (camera.metadata or {}).get("cam_idx")
 
 
-def capture_of(config: FullImageDatamanagerConfig) -> Path:
-    """Path of a datamanager's capture."""
-    return Path(config.dataparser.data if config.data is None else config.data)
-
-
-def check_before_training(config: Any) -> None:
-    """Run :func:`check_capture` before anything else of a training, if the datamanager of ``config`` is ours."""
-    if isinstance(config, SundaeDatamanagerConfig):
-        check_capture(config.dataparser, capture_of(config), ("train", "val"), images=config.images)
-
-
 def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
     """Check the poses and focal lengths of cameras ``[N]`` of training images with these names, in any units.
 
@@ -181,6 +170,15 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
     images: bool = True
     """False for cameras without images, as sundae unpack writes them without a capture: for the viewer only."""
 
+    @property
+    def capture(self) -> Path:
+        """Path of the capture."""
+        return Path(self.dataparser.data if self.data is None else self.data)
+
+    def check(self) -> None:
+        """Check the capture before anything else of a training; see :func:`check_capture`."""
+        check_capture(self.dataparser, self.capture, ("train", "val"), images=self.images)
+
 
 class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
     """The stock datamanager of whole images, which also caches them on machines without CUDA and can hold out views.
@@ -208,7 +206,7 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         if config.dataparser._target is Nerfstudio:
             config.dataparser._target = LightNerfstudioParser
         self._checked: list[InputDataset] = []
-        data = capture_of(config)
+        data = config.capture
         check_capture(
             config.dataparser,
             data,

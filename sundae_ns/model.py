@@ -1,7 +1,7 @@
 """The SUNDAE model: splatfacto's field with spectral pruning and neural compensation.
 
-It connects nerfstudio to the rooms below: state, source of primitives, extensions, rendering. Module path and class
-names are written into every run's ``config.yml``, so moving them breaks saved runs.
+It connects nerfstudio to state, source of primitives, extensions and rendering. Module path and class names are written
+into every run's ``config.yml``, so moving them breaks saved runs.
 """
 
 from __future__ import annotations
@@ -87,10 +87,6 @@ class SundaeModel(SplatfactoModel):
     A subclass of ``SplatfactoModel``, because nerfstudio's exporter and viewer test for it. Everything that ties the
     original to CUDA or to downloads is replaced: initialisation, view matrix, outputs, LPIPS.
 
-    Args:
-        config: the configuration.
-        scene_box, num_train_data, metadata, seed_points: from nerfstudio's pipeline.
-
     Raises:
         ConfigError: options that cannot work.
         CheckpointError: the warm start cannot be read.
@@ -153,12 +149,6 @@ class SundaeModel(SplatfactoModel):
             BackendError: ``gsplat`` was asked for and cannot run here.
         """
         return select_backend(self.config.rasterizer, self.device)
-
-    @property
-    def shown_background(self) -> Tensor:
-        """Background of images that are not trained on, on the model's device ``[3]``."""
-        color: Tensor = self.background_color.to(self.device)
-        return color
 
     def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         """One group for each parameter of the field, features included."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -24,8 +24,8 @@ from rich.table import Table
 from torch import Tensor
 
 from sundae_ns import distributed
-from sundae_ns.datamanager import SundaeDatamanager, check_before_training
-from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError
+from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
+from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError, one_line
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage.atomic import write_text, writing
@@ -62,8 +62,10 @@ class SundaeTrainerConfig(TrainerConfig):
         if self.machine.num_devices > 1:
             distributed.forward_signals()
         self.make_paths_absolute()
-        check_before_training(self.pipeline.datamanager)
-        self.make_schedule(sys.argv[1:])
+        datamanager = self.pipeline.datamanager
+        if isinstance(datamanager, SundaeDatamanagerConfig):
+            datamanager.check()
+        set_schedule(self, sys.argv[1:])
         scaled = "" if self.schedule_length == self.max_num_iterations else f" of {self.schedule_length:,}"
         table = Table(
             "part of training", "steps", title=f"{self.max_num_iterations:,}{scaled} steps", title_justify="left"
@@ -84,13 +86,6 @@ class SundaeTrainerConfig(TrainerConfig):
         # An unset path is nerfstudio's example.
         if datamanager.data is None and isinstance(getattr(parser, "data", None), Path):
             parser.data = parser.data.absolute()
-
-    def make_schedule(self, words: Iterable[str]) -> None:
-        """Fit the options that count steps to the length of the run, or take those of the run that is resumed.
-
-        See :func:`sundae_ns.training.run_length.set_schedule`.
-        """
-        set_schedule(self, words)
 
     def set_timestamp(self) -> None:
         """Name the run, unless ``--timestamp`` did; runs that start in the same second get different names."""
@@ -135,10 +130,11 @@ class SundaeTrainer(Trainer):
     config: SundaeTrainerConfig
 
     def __init__(self, config: SundaeTrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        self.team = distributed.team_of(local_rank, world_size)
+        self.team = distributed.Team(local_rank, world_size)
         # nerfstudio sees one process. For more it would use DDP, which breaks when the field changes its size.
         super().__init__(self.team.configured(config), local_rank, world_size=1)
-        self.team.make_folder(self.base_dir)
+        with writing(f"cannot make the run's folder {self.base_dir}"):
+            self.base_dir.mkdir(parents=True, exist_ok=True)  # nerfstudio's own way fails if two ranks do so at once
         self._recorded: RecordedStep | None = None
         """Runs whole steps; None where they run kernel by kernel."""
         self._result: Any = None
@@ -251,7 +247,7 @@ class SundaeTrainer(Trainer):
             result = self._recorded(model.state, inputs, model.render_settings(training=True))
         except (BackendError, torch.cuda.OutOfMemoryError) as error:
             reason = str(error).splitlines()[0]
-            warn(f"training goes on without recordings, slower: {reason}")
+            warn(f"training continues without recordings, slower: {reason}")
             self._recorded = None
             torch.cuda.empty_cache()
             return None
@@ -322,7 +318,6 @@ class SundaeTrainer(Trainer):
         """
         model = self.model
         self.team.agree(model.state)
-        self.team.check_copies(model.head)
         own = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
@@ -331,7 +326,7 @@ class SundaeTrainer(Trainer):
             "scalers": self.grad_scaler.state_dict(),
             "random": checkpoint.random_state(),
         }
-        state = self.team.gathered(own, list(model.state.field))
+        state = self.team.gathered(own, model.head, list(model.state.field))
         if state is None:  # another rank writes
             return
         path = self.checkpoint_dir / f"step-{state['step']:09d}.ckpt"
@@ -353,9 +348,8 @@ class SundaeTrainer(Trainer):
         except SundaeError:
             raise
         except Exception as error:  # torch and nerfstudio raise many kinds; each means that the checkpoint does not fit
-            reason = " ".join(str(error).split()) or type(error).__name__
             raise CheckpointError(
-                f"{path} does not fit this run ({reason}); load it with the options that it was trained with"
+                f"{path} does not fit this run ({one_line(error)}); load it with the options that it was trained with"
             ) from error
         CONSOLE.print(f"Resuming after step {loaded['step']} from {path}")
 

@@ -20,7 +20,7 @@ from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerControl, Vie
 from torch import Tensor
 
 from sundae_ns.compensation import PHASES
-from sundae_ns.errors import ConfigError, SundaeError
+from sundae_ns.errors import ConfigError, SundaeError, one_line
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import Pruned, PruneRule, band_rule, field_graph, kept_count, prune
@@ -76,22 +76,16 @@ class _FieldVersion:
     """Identifies a field without keeping it alive: exactly, or to within some steps while it is trained."""
 
     def __init__(self, state: FieldState, training: bool) -> None:
-        self._parameters = [weakref.ref(value) for value in state.field.values()]
-        self._version = self._version_of(state, training)
-
-    @staticmethod
-    def _version_of(state: FieldState, training: bool) -> list[int]:
-        # Each change in place raises a tensor's version, in training at every step; there, count steps instead. Surgery
-        # makes new parameters.
-        if training:
-            return [state.field.num_primitives, state.step // STEPS_BETWEEN_SCORES]
-        return [state.field.num_primitives, *(value._version for value in state.field.values())]
-
-    def matches(self, state: FieldState, training: bool) -> bool:
-        """Whether the state still has this field."""
         values = list(state.field.values())
-        same = len(values) == len(self._parameters) and all(r() is v for r, v in zip(self._parameters, values))
-        return same and self._version == self._version_of(state, training)
+        self._parameters = [weakref.ref(value) for value in values]  # surgery makes new parameters
+        # Each change in place raises a tensor's version, in training at every step; there, count steps instead.
+        steps = [state.step // STEPS_BETWEEN_SCORES] if training else [value._version for value in values]
+        self._version = [state.field.num_primitives, *steps]
+
+    def matches(self, other: _FieldVersion) -> bool:
+        """Whether both are of one field, which is still alive."""
+        pairs = zip(self._parameters, other._parameters)
+        return self._version == other._version and all(mine() is not None and mine() is its() for mine, its in pairs)
 
 
 class ViewerControls(torch.nn.Module):
@@ -115,18 +109,11 @@ class ViewerControls(torch.nn.Module):
             hint="Mean over this many offsets of its pixel grid: slower, with less flicker",
             cb_hook=self._set_phases,
         )
-        self.keep_ratio = ViewerSlider(
-            "Keep ratio",
-            1.0,
-            STEP,
-            1.0,
-            STEP,
-            hint="Show only what a prune to this share would keep; 1 shows everything",
-        )
+        hint = "Show only what a prune to this share would keep; 1 shows everything"
+        self.keep_ratio = ViewerSlider("Keep ratio", 1.0, STEP, 1.0, STEP, hint=hint)
         rules = list(get_args(RuleName))
-        self.rule = ViewerDropdown(
-            "Rule", rules[0], rules, hint="Rule of the previewed prune; the head is disabled in a preview"
-        )
+        hint = "Rule of the previewed prune; the head is disabled in a preview"
+        self.rule = ViewerDropdown("Rule", rules[0], rules, hint=hint)
         self.control = ViewerControl()
         """Gives access to the viewer, and so to the training views."""
         self.training_field = False
@@ -181,8 +168,9 @@ class ViewerControls(torch.nn.Module):
             return None
         asked = (name, share)
         with self._lock:
-            if self._seen is None or not self._seen.matches(self._state, self.training_field):
-                self._seen = _FieldVersion(self._state, self.training_field)
+            now = _FieldVersion(self._state, self.training_field)
+            if self._seen is None or not self._seen.matches(now):
+                self._seen = now
                 self._graphs, self._contribution, self._found = {}, None, None
             if self._found is None or self._found[0] != asked:
                 found: Pruned | None = None
@@ -190,8 +178,7 @@ class ViewerControls(torch.nn.Module):
                     found = self._prune(previewed_rule(self._configured, name), share)
                 except (SundaeError, torch.cuda.OutOfMemoryError) as error:
                     # An exception in the viewer's thread would end all rendering.
-                    reason = " ".join(str(error).split())[:200]
-                    CONSOLE.log(f"[yellow]No preview of {name}: {reason}")
+                    CONSOLE.log(f"[yellow]No preview of {name}: {one_line(error)}")
                 self._found = (asked, found)
             return self._found[1]
 

@@ -29,6 +29,7 @@ from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import load_config
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 from sundae_ns.training.interruption import Interruption
+from sundae_ns.training.run_length import set_schedule
 
 
 def state(step: int, n: int = 50) -> dict[str, Any]:
@@ -288,7 +289,7 @@ def configured(tmp_path: Path, *words: str) -> Any:
     arguments = ["sundae", "--output-dir", str(tmp_path), "--experiment-name", "e", *words]
     config = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)  # type: ignore[call-overload]
     config.timestamp = "t"
-    config.make_schedule(arguments)
+    set_schedule(config, arguments)
     return config
 
 

@@ -33,6 +33,7 @@ from sundae_ns.storage.atomic import write_text
 from sundae_ns.storage.packing import PackConfig, fit_scene, write_fitted
 from sundae_ns.storage.runs.fingerprint import fingerprint
 from sundae_ns.trainer import SundaeTrainerConfig
+from sundae_ns.training.run_length import set_schedule
 
 NEVER = 10**9
 """A step that no training reaches."""
@@ -196,7 +197,7 @@ def parse(arguments: Sequence[str]) -> TrainerConfig:
     assert isinstance(config, TrainerConfig)
     config.pipeline.datamanager.data = config.data
     if isinstance(config, SundaeTrainerConfig):
-        config.make_schedule(arguments)
+        set_schedule(config, arguments)
     return config
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,6 +14,7 @@ from sundae_ns.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from sundae_ns.evaluation import Measured
     from sundae_ns.scenes.opening import Opened
 
 
@@ -28,19 +29,19 @@ def bench(
     data: Path | None = None,
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """Time the frames of a finished run: splat, head and whole frame, with the error of the timed frames.
+    """Time the frames of a finished scene: splat, head and whole frame, with the error of the timed frames.
 
     The folder benchmarks/ of the repository has other measurements.
 
     Args:
         measurement: frame.
-        load_config: the run's folder, or its config.yml.
+        load_config: the run's folder, its config.yml, or a packed scene.
         factors: on the sides of the images; the test images are resized alike.
         precisions: arithmetic of the head; by default all three on CUDA, and fp32 on a CPU, the only one there.
         phases: passes of the head for a frame, at as many offsets of its grid; by default those of the run.
         views: number of test views to measure on, from the first; by default all.
         repeats: timed runs of each view; their median counts.
-        data: folder of the capture, if it moved.
+        data: folder of the capture, if it moved; a packed scene needs it.
         as_json: print one line of JSON for each size and precision, instead of a table.
     """
     if repeats < 1 or (views is not None and views < 1):
@@ -54,17 +55,17 @@ def bench(
     from rich.progress import Progress
 
     from sundae_ns.evaluation import without_nan
-    from sundae_ns.scenes.measure import rendered_as
-    from sundae_ns.scenes.opening import load_run
+    from sundae_ns.scenes.measure import measure_scene, rendered_as
+    from sundae_ns.scenes.opening import open_scene
 
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
-        run = load_run(load_config, data=data)
+        run = open_scene(load_config, data=data)
     run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
-    device = torch.cuda.get_device_name() if run.model.device.type == "cuda" else "cpu"
-    head = run.model.head is not None
-    every = ("fp32", "bf16", "fp16") if device != "cpu" and head else (None,)
-    runs = phases if head and phases else (None,)
+    on_gpu, has_head = run.model.device.type == "cuda", run.model.head is not None
+    device = torch.cuda.get_device_name() if on_gpu else "cpu"
+    every = ("fp32", "bf16", "fp16") if on_gpu and has_head else (None,)
+    runs = phases if has_head and phases else (None,)
     jobs = [(factor, precision, count) for factor in factors for precision in precisions or every for count in runs]
     found: list[dict[str, Any]] = []
     with Progress(console=console, transient=True) as progress:
@@ -72,7 +73,10 @@ def bench(
         for factor, precision, count in jobs:
             line = {"config": str(load_config), "device": device, "primitives": run.model.num_points, "factor": factor}
             with rendered_as(run, factor=factor, precision=precision, phases=count) as shown:
-                line |= {"repeats": repeats, **_figures(shown, repeats, lambda: progress.advance(task))}
+                measured = measure_scene(
+                    shown, label="", repeats=repeats, with_flip=False, progress=lambda: progress.advance(task)
+                )
+                line |= {"repeats": repeats, **_figures(shown, measured)}
             found.append(line)
             if as_json:
                 rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in line.items()}
@@ -83,13 +87,9 @@ def bench(
     return 0
 
 
-def _figures(run: Opened, repeats: int, progress: Callable[[], None]) -> dict[str, Any]:
+def _figures(run: Opened, measured: Measured) -> dict[str, Any]:
     """Speed of a configuration beside its error: means over the test views."""
-    from sundae_ns.scenes.measure import measure_scene
-
-    measured = measure_scene(run, label="", repeats=repeats, with_flip=False, progress=progress)
-    head = run.model.head
-    full, base = measured.full, measured.base
+    head, full, base = run.model.head, measured.full, measured.base
     return {
         "width": int(run.cameras[0].width),
         "height": int(run.cameras[0].height),

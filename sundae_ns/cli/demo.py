@@ -5,17 +5,13 @@ from __future__ import annotations
 import json
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Annotated
 
-import numpy as np
-import torch
-from PIL import Image
-from rich.console import Console
-from rich.progress import Progress
+import tyro
 
-from sundae_ns.cli.process import console_script, percent_of, run_logged
-from sundae_ns.data import write_demo_capture
+from sundae_ns.cli.outputs import Overwrite, check_folder
+from sundae_ns.cli.process import console_script, loading, percent_of, run_logged
 from sundae_ns.errors import ConfigError, writing
-from sundae_ns.evaluation import ComparisonRow, report_text, save_comparison
 
 METHOD = "sundae-tiny"
 SHOWN = 3
@@ -24,38 +20,30 @@ BACKGROUND = "white"
 """Colour where no training view looks, above all beside the sky; a dark one shows as stains."""
 
 
-def _read_image(path: Path) -> torch.Tensor:
-    """Pixels ``[H, W, 3]``, float32 in [0, 1]."""
-    with Image.open(path) as image:
-        return torch.from_numpy(np.asarray(image.convert("RGB"), dtype=np.float32) / 255)
-
-
-def _comparison(renders: Path, out: Path) -> None:
-    """Write the comparison image of a few test views from the images that ``ns-eval`` wrote."""
-    pairs = sorted(renders.glob("eval_img_*.png"))
-    rows = []
-    for path in pairs[:: max(len(pairs) // SHOWN, 1)][:SHOWN]:
-        truth, compensated = _read_image(path).chunk(2, dim=1)
-        base = _read_image(path.with_name(path.name.replace("img", "base")))
-        rows.append(ComparisonRow(truth, base, compensated, title=f"test view {int(path.stem[-4:])}"))
-    save_comparison(out, rows)
-
-
-def run_demo(out: Path, steps: int | None = None, console: Console | None = None) -> int:
-    """Write the capture, train, evaluate, and print the results.
+def demo(
+    out: Annotated[Path, tyro.conf.Positional] = Path(".demo"),
+    steps: int | None = None,
+    overwrite: Overwrite = False,
+) -> int:
+    """Write the embedded capture, train it with ns-train, evaluate it with ns-eval, and print the results.
 
     Args:
-        out: folder for scene, run, logs, images and web page; an earlier demo in it is replaced.
-        steps: number of training steps, to which the schedule is scaled; None takes the method's default.
-        console: where to print.
-
-    Raises:
-        ConfigError: there is no step.
-        SundaeError: a command failed; the message ends with the last lines of its output.
+        out: folder for the capture, the run and the images.
+        steps: number of training steps; by default that of sundae-tiny.
+        overwrite: replace an earlier demo in the folder.
     """
+    check_folder(out, reads=[], overwrite=overwrite)
     if steps is not None and steps < 1:
         raise ConfigError(f"steps is {steps}; give at least 1")
-    console = console or Console()
+    with loading():
+        import torch
+        from rich.console import Console
+        from rich.progress import Progress
+
+        from sundae_ns.data import write_demo_capture
+        from sundae_ns.evaluation import report_text, save_comparison
+
+    console = Console()
     scene, run = out / "scene", out / "runs" / "demo" / METHOD / "run"
     device = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "CPU"
     console.print(f"SUNDAE demo on {device}: train a small scene with ns-train, evaluate it with ns-eval.")
@@ -80,26 +68,27 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         progress.update(training, completed=100)
         progress.add_task("ns-eval", total=None)
         evaluate = [console_script("ns-eval"), "--load-config", str(run / "config.yml")]
-        evaluate += ["--output-path", str(out / "eval.json"), "--render-output-path", str(out / "renders")]
-        run_logged(evaluate, out / "eval.log")
+        run_logged([*evaluate, "--output-path", str(out / "eval.json")], out / "eval.log")
         progress.add_task("Timing frames", total=None)
 
         # nerfstudio prints messages while it imports and loads.
         with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
             from sundae_ns.api.page import write_page
-            from sundae_ns.scenes.measure import frame_times, sizes
-            from sundae_ns.scenes.opening import load_run
+            from sundae_ns.scenes.measure import comparison_of, frame_times, sizes
+            from sundae_ns.scenes.opening import open_scene
             from sundae_ns.scenes.packed import packed_run
             from sundae_ns.storage.atomic import replacing
 
-            opened = load_run(run / "config.yml")
+            opened = open_scene(run / "config.yml")
             model, cameras = opened.model, opened.cameras
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
+            chosen = range(0, len(cameras), max(len(cameras) // SHOWN, 1))[:SHOWN]
+            rows = [comparison_of(model, cameras[i], opened.truths[i], f"test view {i}") for i in chosen]
+            save_comparison(out / "comparison.png", rows)
             finished, packed = packed_run(run)
             with replacing(out / "scene.sundae") as partial:
                 partial.write_bytes(packed)
             write_page(out / "scene.html", finished, packed, title="sundae demo")
-    _comparison(out / "renders", out / "comparison.png")
 
     results = json.loads((out / "eval.json").read_text())["results"]
     prunes = json.loads((run / "prune.json").read_text()) if (run / "prune.json").exists() else []
@@ -112,8 +101,7 @@ def run_demo(out: Path, steps: int | None = None, console: Console | None = None
         ("final, compensated", prune["after"], results),
     )
     title = f"sundae demo, {cameras[0].width.item()} x {cameras[0].height.item()} px, {device}"
-    sizes_of_parts = (stored.primitives, stored.head)
-    text = report_text(title, stages, sizes_of_parts, (times.splat, times.head, times.frame))
+    text = report_text(title, stages, (stored.primitives, stored.head), (times.splat, times.head, times.frame))
     console.print(text, highlight=False)
     console.print(f"Images: {out / 'comparison.png'}   In a browser: {out / 'scene.html'}")
     console.print(f"View: ns-viewer --load-config {run / 'config.yml'}")

@@ -21,6 +21,7 @@ from rich.table import Table
 PACKAGES = ("sundae-ns", "nerfstudio", "gsplat", "torch", "torchvision", "numpy", "scipy", "tyro")
 LEAST_DRIVERS = {"12": 525, "13": 580}
 """Oldest Linux driver by the CUDA version of torch, from the release notes of NVIDIA's CUDA toolkit."""
+NOT_BUILT = "not built yet"
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,7 @@ def _release_of(compiler: Path) -> str:
         output = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=True, timeout=60).stdout
     except (OSError, subprocess.SubprocessError):
         return ""
-    found = re.search(r"release (\d+\.\d+)", output)
-    return found[1] if found else ""
+    return next(iter(re.findall(r"release (\d+\.\d+)", output)), "")
 
 
 def kernels_built() -> bool:
@@ -119,7 +119,7 @@ def kernels(compile_kernels: bool) -> Finding:
         return Finding("gsplat kernels", False, "need a CUDA device", fix)
     if not compile_kernels and not kernels_built():
         fix = "sundae doctor --compile (takes minutes; otherwise the first training step builds them)"
-        return Finding("gsplat kernels", False, "not built yet", fix)
+        return Finding("gsplat kernels", False, NOT_BUILT, fix)
     from sundae_ns.errors import BackendError
     from sundae_ns.rasterization import select_backend
 
@@ -159,19 +159,17 @@ def rasterizer(kernels_finding: Finding) -> Finding:
     from sundae_ns.rasterization import numba_problem
 
     if torch.cuda.is_available():
-        if kernels_finding.ok:
-            return Finding("rasteriser", True, "auto selects gsplat")
-        if kernels_finding.detail == "not built yet":
-            return Finding("rasteriser", True, "auto selects gsplat, after its kernels are built")
-    elif problem := numba_problem():
-        cause, fix = problem.rsplit("; ", 1)
-        detail = f"auto selects reference, in plain PyTorch; it is several times slower than cpu. {cause}"
-        return Finding("rasteriser", False, detail, fix)
-    else:
-        return Finding(
-            "rasteriser", True, "auto selects cpu, compiled by numba; it suits small scenes, a capture needs CUDA"
-        )
-    return Finding("rasteriser", True, "auto selects reference, in plain PyTorch, which is slow; fix gsplat's kernels")
+        chosen = "gsplat" if kernels_finding.ok else "gsplat, after its kernels are built"
+        if not kernels_finding.ok and kernels_finding.detail != NOT_BUILT:
+            chosen = "reference, in plain PyTorch, which is slow; fix gsplat's kernels"
+        return Finding("rasteriser", True, f"auto selects {chosen}")
+    problem = numba_problem()
+    if problem is None:
+        detail = "auto selects cpu, compiled by numba; it suits small scenes, a capture needs CUDA"
+        return Finding("rasteriser", True, detail)
+    cause, fix = problem.rsplit("; ", 1)
+    detail = f"auto selects reference, in plain PyTorch; it is several times slower than cpu. {cause}"
+    return Finding("rasteriser", False, detail, fix)
 
 
 def lpips() -> Finding:
@@ -184,25 +182,11 @@ def lpips() -> Finding:
     return Finding("LPIPS weights", False, "missing; metrics leave out LPIPS", fix)
 
 
-def system_library(name: str, package: str) -> Finding:
-    """Whether a library is installed that open3d loads, and with it ns-export."""
-    if ctypes.util.find_library(name):
-        return Finding(f"lib{name}", True, "found, for ns-export")
-    return Finding(f"lib{name}", False, "not found; ns-export needs it", f"apt-get install {package}")
-
-
-def program(name: str, command: str, purpose: str) -> Finding:
-    """Whether a program is installed that nerfstudio's commands call; its package has the same name.
-
-    Args:
-        name: name of the finding.
-        command: program to find in PATH.
-        purpose: the commands that need it.
-    """
-    found = shutil.which(command)
-    if found:
-        return Finding(name, True, f"{found}, for {purpose}")
-    return Finding(name, False, f"not found, for {purpose}", f"apt-get install {command}")
+def installed(name: str, place: str | None, purpose: str, package: str) -> Finding:
+    """Whether a library or program of the system has a place; if not, the package of apt that has it."""
+    if place:
+        return Finding(name, True, f"{place}, for {purpose}")
+    return Finding(name, False, f"not found, for {purpose}", f"apt-get install {package}")
 
 
 def examine(compile_kernels: bool = False) -> list[Finding]:
@@ -216,22 +200,17 @@ def examine(compile_kernels: bool = False) -> list[Finding]:
         own_kernels(),
         rasterizer(kernels_finding),
         lpips(),
-        system_library("usb-1.0", "libusb-1.0-0"),
-        system_library("GL", "libgl1"),
-        program("COLMAP", "colmap", "ns-process-data, which makes captures from images and videos"),
+        installed("libusb-1.0", ctypes.util.find_library("usb-1.0"), "ns-export", "libusb-1.0-0"),
+        installed("libGL", ctypes.util.find_library("GL"), "ns-export", "libgl1"),
+        installed("COLMAP", shutil.which("colmap"), "ns-process-data, which makes captures", "colmap"),
         # ns-render requires it even if it writes only images.
-        program("ffmpeg", "ffmpeg", "ns-process-data and ns-render"),
+        installed("ffmpeg", shutil.which("ffmpeg"), "ns-process-data and ns-render", "ffmpeg"),
     ]
 
 
-def run_doctor(compile_kernels: bool = False, console: Console | None = None) -> int:
-    """Print the report; the exit code is 1 if training lacks something.
-
-    Args:
-        compile_kernels: build gsplat's kernels if they are missing.
-        console: where to print.
-    """
-    console = console or Console()
+def run_doctor(compile_kernels: bool = False) -> int:
+    """Print the report, and build gsplat's kernels if asked to; the exit code is 1 if training lacks something."""
+    console = Console()
     with console.status("Building gsplat's kernels, some minutes" if compile_kernels else "Checking"):
         findings = examine(compile_kernels)
     table = Table(show_header=False, box=None, pad_edge=False)

@@ -51,7 +51,11 @@ def export(
     if page:
         if upright:
             raise ConfigError("a page turns the scene upright by itself; leave out --upright")
-        return _export_page(scene, out, data)
+        from sundae_ns.api.page import write_page
+
+        size = write_page(out, *open_packed_file(scene, data), title=out.resolve().stem)
+        print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
+        return 0
     if kind_of(scene) == "ply" and out.suffix.lower() == ".ply":
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
     from sundae_ns.api.opening import load
@@ -73,14 +77,6 @@ def export(
     return 0
 
 
-def _export_page(scene: Path, out: Path, data: Path | None) -> int:
-    from sundae_ns.api.page import write_page
-
-    written = write_page(out, *open_packed_file(scene, data), title=out.resolve().stem)
-    print(f"{out}: {written:,} bytes; open it in a browser" if out.suffix else f"{out}: {written:,} bytes; serve it")
-    return 0
-
-
 def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     """A scene, and the packed file that holds it; a run, whose capture may have moved, is packed in memory."""
     from sundae_ns.storage.kinds import kind_of
@@ -97,7 +93,7 @@ def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
         return packed_run(path, data=data)
 
 
-def prune(
+def prune_file(
     source: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     keep: float | None = None,
@@ -150,21 +146,14 @@ def prune(
     if out.suffix.lower() not in saving.SUFFIXES:
         raise ConfigError(f"{out} has no supported suffix; name it {', '.join(saving.SUFFIXES)}")
     check_file(out, reads=[source], overwrite=overwrite)
-    rule = PruneRule(
-        score=score,
-        selection=selection,
-        redistribution="merge" if merge else "none",
-        signal=signal,
-        gamma=gamma,
-        seed=seed,
-    )
+    redistribution: Literal["merge", "none"] = "merge" if merge else "none"
+    rule = PruneRule(selection, score, signal, redistribution=redistribution, gamma=gamma, seed=seed)
     rule.validate()
     scene = opening.load(source)
     seen = None
     if rule.uses_contribution:
-        seen = (
-            views_of(cameras, scene) if cameras is not None else scene.views or virtual_views(scene, views, seed=seed)
-        )
+        stored = views_of(cameras, scene) if cameras is not None else scene.views
+        seen = stored or virtual_views(scene, views, seed=seed)
     if keep is None and count is None:
         keep = 0.1
     pruned = pruning.prune_with_mask(scene, keep=keep, count=count, views=seen, rule=rule, progress=True)

@@ -8,18 +8,18 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from difflib import get_close_matches
-from pathlib import Path
-from typing import Annotated, Literal, NoReturn
+from typing import NoReturn
 
 import tyro
 
 from sundae_ns.cli.bench import bench
-from sundae_ns.cli.files import export, prune
-from sundae_ns.cli.outputs import Overwrite, check_file, check_folder
+from sundae_ns.cli.demo import demo
+from sundae_ns.cli.files import export, prune_file
 from sundae_ns.cli.packing import pack, unpack
-from sundae_ns.cli.render import render
+from sundae_ns.cli.process import loading
+from sundae_ns.cli.render import render_file
+from sundae_ns.cli.report import report
 from sundae_ns.cli.run import run
 from sundae_ns.cli.train import train
 from sundae_ns.cli.view import view
@@ -36,87 +36,27 @@ ENVIRONMENT = {
 """Variables of threads and memory; those that the user has set stay."""
 
 
-def _loading() -> AbstractContextManager[object]:
-    """Shows that a command imports its modules, which takes seconds."""
-    from rich.console import Console
-
-    return Console(stderr=True).status("Loading")
-
-
 def doctor(compile: bool = False) -> int:  # noqa: A002
     """Check this machine, and print the command that installs or repairs each missing part.
 
     Args:
         compile: build gsplat's CUDA kernels if they are not built yet; this takes minutes and needs nvcc.
     """
-    with _loading():
+    with loading():
         from sundae_ns.cli.doctor import run_doctor
 
     return run_doctor(compile_kernels=compile)
 
 
-def demo(
-    out: Annotated[Path, tyro.conf.Positional] = Path(".demo"),
-    steps: int | None = None,
-    overwrite: Overwrite = False,
-) -> int:
-    """Write the embedded capture, train it with ns-train, evaluate it with ns-eval, and print the results.
-
-    Args:
-        out: folder for the capture, the run and the images.
-        steps: number of training steps; by default that of sundae-tiny.
-        overwrite: replace an earlier demo in the folder.
-    """
-    check_folder(out, reads=[], overwrite=overwrite)
-    with _loading():
-        from sundae_ns.cli.demo import run_demo
-
-    return run_demo(out, steps=steps)
-
-
-def report(
-    runs: Annotated[list[Path], tyro.conf.Positional],
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    data: Path | None = None,
-    lpips_net: Literal["alex", "vgg", "squeeze"] = "alex",
-    warmup: int = 3,
-    repeats: int = 5,
-    video: Path | None = None,
-    overwrite: Overwrite = False,
-) -> int:
-    """Measure quality, speed and size of finished runs on their test views; write tables, plots and training curves.
-
-    Args:
-        runs: runs of sundae or splatfacto (their folders or config.yml), and packed scenes; no code in them runs.
-        out: folder to write.
-        data: folder of the capture, if it moved; packed scenes need it, because they do not record it.
-        lpips_net: net of LPIPS, which is measured if its weights are on disk; values of different nets do not compare.
-        warmup: untimed renderings of each view before timing.
-        repeats: timed renderings of each view; 0 measures no times.
-        video: .mp4 to write of one scene: base colours, compensated image and photograph of every view, side by side.
-        overwrite: replace the files of an earlier report in the folder.
-    """
-    check_folder(out, reads=[*runs, data], overwrite=overwrite)
-    if video is not None:
-        if video.suffix.lower() != ".mp4":
-            raise ConfigError(f"{video} does not end in .mp4, the only format of videos; rename it")
-        if video.resolve().parent != out.resolve():  # the report's folder was checked
-            check_file(video, reads=[*runs, data], overwrite=overwrite)
-    with _loading():
-        from sundae_ns.cli.report import run_report
-
-    return run_report(runs, out, data=data, lpips_net=lpips_net, warmup=warmup, repeats=repeats, video=video)
-
-
 COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "run": (run, "photos to a packed scene, its report and its web page; resumes"),
     "train": (train, "train by ns-train, with short options"),
-    "prune": (prune, "make any splat scene smaller, without its photos"),
+    "prune": (prune_file, "make any splat scene smaller, without its photos"),
     "pack": (pack, "pack a finished run into one file"),
     "unpack": (unpack, "unpack a scene into a run, for the commands of nerfstudio"),
     "export": (export, "write a scene as a web page, .ply, .spz or .sog"),
     "view": (view, "show a scene with its head in the browser"),
-    "render": (render, "render a scene to a picture, or a camera path to a video"),
+    "render": (render_file, "render a scene to an image, or a camera path to a video"),
     "report": (report, "measure and compare finished runs: quality, speed, size"),
     "bench": (bench, "time the frames of a run"),
     "demo": (demo, "train and evaluate the embedded capture; takes minutes on a CPU"),
@@ -145,13 +85,9 @@ def _dispatch(words: Sequence[str]) -> int:
 
 
 def exit_with(command: Callable[[], int], name: str) -> NoReturn:
-    """Run a command and exit with its code.
+    """Run a command and exit with the code that it returns; errors of the file system name the command.
 
     A :class:`SundaeError` is printed on one line, and the code is 2. An interrupt is 130.
-
-    Args:
-        command: returns the code.
-        name: of the command, for errors of the file system.
     """
     for variable, value in ENVIRONMENT.items():
         os.environ.setdefault(variable, value)

@@ -38,7 +38,7 @@ def check_file(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> N
 
 
 def check_folder(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> None:
-    """Refuse an output folder with files in it, unless ``overwrite`` is set, and always one that holds what is read.
+    """Refuse an output folder with files, unless ``overwrite`` is set, and always one that holds an input.
 
     Args:
         out: folder to write; files of other names in it stay.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import redirect_stdout
+from dataclasses import asdict, dataclass
 from io import StringIO
 from json import dumps
 from pathlib import Path
@@ -14,6 +15,28 @@ import tyro
 from sundae_ns.cli.outputs import Overwrite, check_file
 
 
+@dataclass(frozen=True)
+class Precision:
+    """Options of ``PackConfig`` whose defaults a fine-tune changes."""
+
+    position_bits: int | None = None
+    """bits per coordinate within a block, 4 to 16; by default 13, 12 with a fine-tune."""
+    scale_step: float | None = None
+    """rounding step of log-scales; by default 0.05, 0.1 with a fine-tune."""
+    rotation_step: float | None = None
+    """rounding step of x, y and z of unit quaternions; by default 0.008, 0.018 with a fine-tune."""
+    color_step: float | None = None
+    """rounding step of the view-independent colour; by default 0.03, 0.07 with a fine-tune."""
+    opacity_step: float | None = None
+    """rounding step of the opacity's logit; by default 0.2, 0.4 with a fine-tune."""
+    harmonics_step: float | None = None
+    """rounding step of the view-dependent colour; by default 0.02, 0.06 with a fine-tune."""
+    feature_step: float | None = None
+    """rounding step of features; by default 0.09, 0.2 with a fine-tune."""
+    head_step: float | None = None
+    """rounding step of weights, as a share of their channel's largest; by default 0.02, 0.14 with a fine-tune."""
+
+
 def pack(
     run: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
@@ -22,15 +45,8 @@ def pack(
     data: Path | None = None,
     target_bytes: int | None = None,
     target_drop: float | None = None,
-    position_bits: int | None = None,
     block: int = 1024,
-    scale_step: float | None = None,
-    rotation_step: float | None = None,
-    color_step: float | None = None,
-    opacity_step: float | None = None,
-    harmonics_step: float | None = None,
-    feature_step: float | None = None,
-    head_step: float | None = None,
+    precision: Annotated[Precision, tyro.conf.arg(name="")] = Precision(),  # noqa: B008
     json: bool = False,
     overwrite: Overwrite = False,
 ) -> int:
@@ -45,15 +61,7 @@ def pack(
         data: folder of the capture, if it moved.
         target_bytes: find the finest steps whose file has at most this many bytes.
         target_drop: find the coarsest steps that lose at most this PSNR on some test views, dB.
-        position_bits: bits per coordinate within a block, 4 to 16; by default 13, 12 with a fine-tune.
         block: number of primitives per block of positions; smaller blocks are more exact and larger on disk.
-        scale_step: rounding step of log-scales; by default 0.05, 0.1 with a fine-tune.
-        rotation_step: rounding step of x, y and z of unit quaternions; by default 0.008, 0.018 with a fine-tune.
-        color_step: rounding step of the view-independent colour; by default 0.03, 0.07 with a fine-tune.
-        opacity_step: rounding step of the opacity's logit; by default 0.2, 0.4 with a fine-tune.
-        harmonics_step: rounding step of the view-dependent colour; by default 0.02, 0.06 with a fine-tune.
-        feature_step: rounding step of features; by default 0.09, 0.2 with a fine-tune.
-        head_step: rounding step of weights, as a share of their channel's largest; by default 0.02, 0.14 with a fine-tune.
         json: print one JSON object in place of the table.
         overwrite: replace an existing file, once the new one is complete.
     """
@@ -75,18 +83,7 @@ def pack(
         raise ConfigError(f"target-bytes is {target_bytes}; give 1 or more")
     if target_drop is not None and not 0 < target_drop < 100:
         raise ConfigError(f"target-drop is {target_drop}; give a positive number of dB")
-    # A fine-tune changes the defaults of these options.
-    given = {
-        "position_bits": position_bits,
-        "scale_step": scale_step,
-        "rotation_step": rotation_step,
-        "color_step": color_step,
-        "opacity_step": opacity_step,
-        "harmonics_step": harmonics_step,
-        "feature_step": feature_step,
-        "head_step": head_step,
-    }
-    chosen = {name: value for name, value in given.items() if value is not None}
+    chosen = {name: value for name, value in asdict(precision).items() if value is not None}
     config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, "block": block})  # type: ignore[arg-type]
     config.validate()
     check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
@@ -100,11 +97,9 @@ def pack(
             scene = contents_of_run(run, max_cameras=max_cameras, data=data)
             progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
             if finetune:
-                from sundae_ns.scenes.finetune import finetune as train
+                from sundae_ns.scenes.finetune import finetune as tune
 
-                scene, codecs = train(
-                    run, scene, config, finetune, data=data, progress=lambda _: progress.advance(task)
-                )
+                scene, codecs = tune(run, scene, config, finetune, data=data, progress=lambda _: progress.advance(task))
             else:
                 scene, codecs = fit_scene(scene, config)
             progress.update(task, description="Packing")

@@ -1,4 +1,4 @@
-"""Subprocesses: with their output in a log file, or in a process group that gets this process's signals."""
+"""A spinner while a command loads, and subprocesses: logged, or in a process group that gets this one's signals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
 from sundae_ns.errors import SundaeError
@@ -24,6 +24,13 @@ def console_script(name: str) -> str:
     return str(path) if path.exists() else name
 
 
+def loading() -> AbstractContextManager[object]:
+    """Shows that a command imports its modules, which takes seconds."""
+    from rich.console import Console
+
+    return Console(stderr=True).status("Loading")
+
+
 def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], None] | None = None) -> None:
     """Run a command with its output in ``log``.
 
@@ -35,7 +42,6 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
     Raises:
         SundaeError: the command failed; the message ends with the last lines of its output.
     """
-    environment = {**os.environ, "COLUMNS": "160"}
     last: deque[str] = deque(maxlen=_TAIL)
     with open(log, "w", encoding="utf-8") as file:
         process = subprocess.Popen(
@@ -44,7 +50,7 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            env=environment,
+            env={**os.environ, "COLUMNS": "160"},
             errors="replace",
         )
         assert process.stdout is not None
@@ -68,10 +74,7 @@ def run_in_group(words: Sequence[str]) -> int:
     """Run a command with its output on the terminal; returns its exit code, or 128 + n if signal n arrived.
 
     A signal reaches the command once, with all processes that it started, whether it comes from a terminal or from
-    another process. The command gets no input.
-
-    Args:
-        words: the command; its program is looked for beside this interpreter first.
+    another process. The command gets no input. Its program is looked for beside this interpreter first.
     """
     # A training that loses its terminal saves itself too.
     passed_on = {signal.SIGINT: signal.SIGINT, signal.SIGTERM: signal.SIGTERM, signal.SIGHUP: signal.SIGTERM}

@@ -1,4 +1,4 @@
-"""``sundae render``: a scene as a picture or a video."""
+"""``sundae render``: a scene as an image or a video."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sundae_ns.cli.outputs import Overwrite, check_file
 if TYPE_CHECKING:
     from sundae_ns.rendering import View
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+IMAGES = (".png", ".jpg", ".jpeg", ".webp")
 FRAMES_PER_SECOND = 24
 
 
-def render(
+def render_file(
     scene: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     camera: Path | None = None,
@@ -25,13 +25,13 @@ def render(
     width: int | None = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Render a scene to a picture, or along a camera path to a video.
+    """Render a scene to an image, or along a camera path to a video.
 
     Args:
         scene: a packed scene, a run, or a .ply, .spz or .sog.
-        out: picture (.png, .jpg or .webp) or video (.mp4) to write.
+        out: image (.png, .jpg or .webp) or video (.mp4) to write.
         camera: a transforms.json or a camera path of the viewer; by default the cameras stored with the scene.
-        view: index of the camera for a picture; needed if there are several.
+        view: index of the camera for an image; needed if there are several.
         head: let the head correct the images.
         width: width of the images in pixels; by default that of the camera.
         overwrite: replace an existing file, once the new one is complete.
@@ -47,8 +47,8 @@ def render(
     from sundae_ns.storage.atomic import replacing
 
     suffix = out.suffix.lower()
-    if suffix not in (*PICTURES, ".mp4"):
-        raise ConfigError(f"{out} is neither a picture nor a video; name it {', '.join(PICTURES)} or .mp4")
+    if suffix not in (*IMAGES, ".mp4"):
+        raise ConfigError(f"{out} is neither an image nor a video; name it {', '.join(IMAGES)} or .mp4")
     if width is not None and width < 2:
         raise ConfigError(f"width is {width}; give 2 pixels or more")
     check_file(out, reads=[scene, camera], overwrite=overwrite)
@@ -59,7 +59,7 @@ def render(
         cameras = CameraFile(list(opened.views) or [view_in_front(opened)], None)
     views = [_resized(each, width, even=suffix == ".mp4") for each in cameras.views]
 
-    def picture(view: View) -> Image.Image:
+    def image_of(view: View) -> Image.Image:
         image = rendering.render(opened, view, head=head).rgb
         return Image.fromarray((image * 255).round().byte().cpu().numpy())
 
@@ -67,12 +67,12 @@ def render(
         shown = track(views, "Rendering", transient=True, console=Console(stderr=True))
         speed = cameras.frames_per_second or FRAMES_PER_SECOND
         with writing(f"cannot write {out}"), replacing(out) as partial:
-            count = write_video(partial, (picture(each) for each in shown), frames_per_second=speed)
+            count = write_video(partial, (image_of(each) for each in shown), frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
     chosen = _chosen(views, view)
     with writing(f"cannot write {out}"), replacing(out) as partial:
-        picture(chosen).save(partial, format={".jpg": "jpeg"}.get(suffix, suffix[1:]))
+        image_of(chosen).save(partial, format={".jpg": "jpeg"}.get(suffix, suffix[1:]))
     print(f"{out}: {chosen.width} x {chosen.height} px")
     return 0
 
@@ -90,6 +90,6 @@ def _chosen(views: list[View], index: int | None) -> View:
 
 
 def _resized(view: View, width: int | None, *, even: bool) -> View:
-    """The camera with images of another width, and with even sides for a video, which stores colours at half the size."""
+    """The camera with images of another width, and with even sides for a video, whose colours have half the size."""
     view = view if width is None else view.zoomed(width / view.width)
     return view._replace(width=view.width // 2 * 2, height=view.height // 2 * 2) if even else view

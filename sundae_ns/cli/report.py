@@ -4,36 +4,26 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from PIL import Image
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
+import tyro
 
-from sundae_ns.errors import ConfigError, SundaeError
-from sundae_ns.evaluation import Lpips, Measured, csv_text, flip_available, lpips_weights_available, save_comparison
-from sundae_ns.evaluation.curves import Curves, read_curves
-from sundae_ns.evaluation.document import document
-from sundae_ns.evaluation.flip import INSTALL
-from sundae_ns.evaluation.lpips import Net
-from sundae_ns.evaluation.plots import (
-    MOST_SERIES,
-    Cost,
-    colors_of,
-    plot_curves,
-    plot_quality,
-    plot_views,
-)
-from sundae_ns.evaluation.video import side_by_side, write_video
-from sundae_ns.scenes.measure import comparison_of, measure_scene
-from sundae_ns.scenes.opening import Opened, open_scene
-from sundae_ns.scenes.walk import count_views, largest_view, walk
-from sundae_ns.storage.atomic import replacing, write_text, writing
+from sundae_ns.cli.outputs import Overwrite, check_file, check_folder
+from sundae_ns.cli.process import loading
+from sundae_ns.errors import ConfigError, SundaeError, writing
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+    from sundae_ns.evaluation import Measured
+    from sundae_ns.evaluation.curves import Curves
+    from sundae_ns.evaluation.plots import Cost
+    from sundae_ns.scenes.opening import Opened
 
 PNG_WIDTH = 400
 """Widest images, in pixels, whose comparison is written as PNG; wider ones are JPEG files, which are much smaller."""
@@ -41,53 +31,80 @@ COSTS: Mapping[Cost, str] = {"size": "size", "time": "time per frame", "primitiv
 """Axes of the plots of quality, with their names in titles."""
 
 
-def run_report(
-    paths: Sequence[Path],
-    out: Path,
-    *,
+def report(
+    runs: Annotated[list[Path], tyro.conf.Positional],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     data: Path | None = None,
-    lpips_net: Net = "alex",
+    lpips_net: Literal["alex", "vgg", "squeeze"] = "alex",
     warmup: int = 3,
     repeats: int = 5,
     video: Path | None = None,
-    console: Console | None = None,
+    overwrite: Overwrite = False,
 ) -> int:
-    """Measure runs and write the report; the options are those of the command.
+    """Measure quality, speed and size of finished runs on their test views; write tables, plots and training curves.
 
-    Returns:
-        The exit code: 1 if a run was left out because of an error, else 0.
-
-    Raises:
-        ConfigError: there is no run, a number is negative, or a video is asked of several runs.
-        CheckpointError: no run can be opened; the error is that of the first.
-        DataError: no run has a capture with test views; the error is that of the first.
-        StorageError: the folder cannot be written to.
+    Args:
+        runs: runs of sundae or splatfacto (their folders or config.yml), and packed scenes; no code in them runs.
+        out: folder to write.
+        data: folder of the capture, if it moved; packed scenes need it, because they do not record it.
+        lpips_net: net of LPIPS, which is measured if its weights are on disk; values of different nets do not compare.
+        warmup: untimed renderings of each view before timing.
+        repeats: timed renderings of each view; 0 measures no times.
+        video: .mp4 to write of one scene: base colours, compensated image and photograph of every view, side by side.
+        overwrite: replace the files of an earlier report in the folder.
     """
-    if not paths:
+    check_folder(out, reads=[*runs, data], overwrite=overwrite)
+    if video is not None:
+        if video.suffix.lower() != ".mp4":
+            raise ConfigError(f"{video} does not end in .mp4, the only format of videos; rename it")
+        if video.resolve().parent != out.resolve():  # the report's folder was checked
+            check_file(video, reads=[*runs, data], overwrite=overwrite)
+        if len(runs) > 1:
+            raise ConfigError(f"a video shows one scene, and there are {len(runs)}; give one, or leave --video out")
+    if not runs:
         raise ConfigError("there is nothing to report on; give the folders of finished runs")
     if warmup < 0 or repeats < 0:
         raise ConfigError(f"{warmup} warm-up renderings and {repeats} timed renderings; give at least 0 of each")
-    if video is not None and len(paths) > 1:
-        raise ConfigError(f"a video shows one scene, and there are {len(paths)}; give one, or leave --video out")
-    console = console or Console()
-    words = ["sundae", "report", *map(str, paths), "-o", str(out), "--lpips-net", lpips_net]
+    with loading():
+        from rich.console import Console
+        from rich.markup import escape
+        from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeRemainingColumn
+
+        from sundae_ns.evaluation import Lpips, csv_text, flip_available, lpips_weights_available
+        from sundae_ns.evaluation.curves import read_curves
+        from sundae_ns.evaluation.document import document
+        from sundae_ns.evaluation.flip import INSTALL
+        from sundae_ns.scenes.measure import measure_scene
+        from sundae_ns.scenes.opening import open_scene
+        from sundae_ns.storage.atomic import write_text
+
+    words = ["sundae", "report", *map(str, runs), "-o", str(out), "--lpips-net", lpips_net]
     words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
-    words += ["--video", str(video)] if video else []
-    command = shlex.join(words)
+    command = shlex.join([*words, *(["--video", str(video)] if video else [])])
     lpips = Lpips(lpips_net, download=False) if lpips_weights_available(lpips_net) else None
-    runs: list[Measured] = []
+    notes = []
+    if not flip_available():
+        notes.append(f"FLIP: the package is not installed; run {INSTALL}.")
+    if lpips is None:
+        notes.append(f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them.")
+    done: list[Measured] = []
     curves: dict[str, Curves] = {}
-    notes = _missing_metrics(lpips_net, lpips)
     comparisons: dict[str, list[tuple[str, str]]] = {}
     failures: list[SundaeError] = []
     columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console()
     with Progress(*columns, console=console, transient=True) as progress:
-        scenes_done = progress.add_task("Scenes", total=len(paths))
-        for number, path in enumerate(paths, start=1):
+        scenes_done = progress.add_task("Scenes", total=len(runs))
+        for number, path in enumerate(runs, start=1):
             task = progress.add_task(f"Opening {escape(str(path))}", total=None)
+
+            def advance(task: TaskID = task) -> None:
+                progress.advance(task)
+
             try:
-                opened = _quietly(path, data)
-                label = _label(opened, {run.label for run in runs})
+                with redirect_stdout(StringIO()), redirect_stderr(StringIO()):  # nerfstudio's messages
+                    opened = open_scene(path, data=data)
+                label = _label(opened, {run.label for run in done})
                 progress.update(task, description=f"Measuring {escape(label)}", total=len(opened.cameras))
                 measured = measure_scene(
                     opened,
@@ -95,7 +112,7 @@ def run_report(
                     lpips=lpips,
                     warmup=warmup,
                     repeats=repeats,
-                    progress=lambda task=task: progress.advance(task),  # type: ignore[misc]
+                    progress=advance,
                     command=command,
                 )
             except SundaeError as error:
@@ -109,31 +126,36 @@ def run_report(
                     _save_errors(out / name, opened, measured)
                 title = f"{label}: worst and median test view by PSNR"
                 comparisons.setdefault(measured.scene, []).append((title, name))
-                found = read_curves(opened.curves) if opened.curves is not None else None
+                found = read_curves(opened.source) if opened.packed_bytes is None else None
                 if found is not None:
                     curves[label] = found
                     measured = replace(measured, peak_vram_mib=max(found.memory.values, default=0.0) or None)
-                elif opened.curves is not None:
+                elif opened.packed_bytes is None:
                     notes.append(
-                        f"Curves of {label}: {opened.curves} holds no tensorboard event files; "
+                        f"Curves of {label}: {opened.source} holds no tensorboard event files; "
                         "train with --vis viewer+tensorboard to record them."
                     )
-                runs.append(measured)
+                done.append(measured)
                 if video is not None:
-                    progress.update(task, description="Rendering the video", completed=0, total=count_views(opened))
-                    _save_video(video, opened, lambda task=task: progress.advance(task))  # type: ignore[misc]
+                    views = len(opened.datamanager.train_dataset) + len(opened.cameras)
+                    progress.update(task, description="Rendering the video", completed=0, total=views)
+                    _save_video(video, opened, advance)
             progress.remove_task(task)
             progress.advance(scenes_done)
-        if not runs:
+        if not done:
             raise failures[0]
         progress.add_task("Plotting", total=None)
-        scenes = {scene: [run for run in runs if run.scene == scene] for scene in dict.fromkeys(r.scene for r in runs)}
+        scenes = {scene: [run for run in done if run.scene == scene] for scene in dict.fromkeys(r.scene for r in done)}
         with writing(f"cannot write to {out}"):
             plots = _plot(out, scenes, curves)
-        notes += _differences(scenes)
+        notes += [
+            f"Comparison within {scene}: its runs have different test views, so their numbers do not compare."
+            for scene, own in scenes.items()
+            if len({(run.resolution, len(run.full.views)) for run in own}) > 1
+        ]
     images = {scene: [*plots[scene], *comparisons[scene]] for scene in scenes}
-    write_text(out / "report.json", json.dumps([run.as_json() for run in runs], indent=1) + "\n")
-    write_text(out / "report.csv", csv_text([run.as_json() for run in runs]))
+    write_text(out / "report.json", json.dumps([run.as_json() for run in done], indent=1) + "\n")
+    write_text(out / "report.csv", csv_text([run.as_json() for run in done]))
     write_text(out / "report.md", document(scenes, images, notes, command))
     for note in notes:
         console.print(f"[yellow]Left out: {escape(note)}", highlight=False)
@@ -141,12 +163,6 @@ def run_report(
         console.print(f"wrote {video}", highlight=False)
     console.print(f"wrote {out / 'report.md'}, with report.csv, report.json and images beside it", highlight=False)
     return 1 if failures else 0
-
-
-def _quietly(path: Path, data: Path | None) -> Opened:
-    """Open a scene; nerfstudio's messages are suppressed."""
-    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        return open_scene(path, data=data)
 
 
 def _label(opened: Opened, taken: Collection[str]) -> str:
@@ -161,36 +177,27 @@ def _label(opened: Opened, taken: Collection[str]) -> str:
     return label
 
 
-def _missing_metrics(net: Net, lpips: Lpips | None) -> list[str]:
-    notes = []
-    if not flip_available():
-        notes.append(f"FLIP: the package is not installed; run {INSTALL}.")
-    if lpips is None:
-        notes.append(f"LPIPS: the weights of its net ({net}) are missing; sundae doctor says where to put them.")
-    return notes
-
-
-def _differences(scenes: dict[str, list[Measured]]) -> list[str]:
-    """A warning for each scene whose runs were measured on different images."""
-    return [
-        f"Comparison within {scene}: its runs have different test views, so their numbers do not compare."
-        for scene, own in scenes.items()
-        if len({(run.resolution, len(run.full.views)) for run in own}) > 1
-    ]
-
-
 def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
     """Write a comparison image of the views with the lowest and the median PSNR."""
+    from sundae_ns.evaluation import save_comparison
+    from sundae_ns.scenes.measure import comparison_of
+
     values = [view.psnr for view in measured.full.views]
     order = sorted(range(len(values)), key=values.__getitem__)
-    rows = []
-    for name, index in (("worst", order[0]), ("median", order[len(order) // 2])):
-        rows.append(replace(comparison_of(opened, index), title=f"{name}: test view {index}"))
+    chosen = {"worst": order[0], "median": order[len(order) // 2]}
+    rows = [
+        comparison_of(opened.model, opened.cameras[index], opened.truths[index], f"{name}: test view {index}")
+        for name, index in chosen.items()
+    ]
     save_comparison(path, rows)
 
 
 def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> None:
     """Write every view of a scene beside its photograph; ``progress`` is called after each."""
+    from sundae_ns.evaluation.video import side_by_side, write_video
+    from sundae_ns.scenes.measure import largest_view, walk
+    from sundae_ns.storage.atomic import replacing
+
     head = opened.model.state.head_enabled
     with redirect_stdout(StringIO()):  # nerfstudio says that it loads the training images
         tile = largest_view(opened)
@@ -208,6 +215,8 @@ def _plot(
     out: Path, scenes: Mapping[str, list[Measured]], curves: Mapping[str, Curves]
 ) -> dict[str, list[tuple[str, str]]]:
     """Write all plots; returns (title, file name) by scene."""
+    from sundae_ns.evaluation.plots import MOST_SERIES, colors_of, plot_curves, plot_quality, plot_views
+
     written: dict[str, list[tuple[str, str]]] = {}
     for number, (scene, runs) in enumerate(scenes.items(), start=1):
         end = "" if len(scenes) == 1 else f"-{number}"

@@ -63,11 +63,6 @@ class Project:
         return self.photos if (self.photos / "transforms.json").is_file() else self.out / "capture"
 
     @property
-    def models(self) -> Path:
-        """Folder of COLMAP's models."""
-        return self.capture / "colmap" / "sparse"
-
-    @property
     def run(self) -> Path:
         """Folder of the training, as ns-train names it."""
         return self.out / "runs" / self.name / self.method / "run"
@@ -100,11 +95,6 @@ class Project:
             ]
         return steps
 
-    def process_photos(self, *options: str) -> list[str]:
-        """Command that finds the camera poses, or reads them from one of COLMAP's models."""
-        words = ["ns-process-data", "images", "--data", str(self.photos), "--output-dir", str(self.capture)]
-        return [*words, *options]
-
     def poses(self) -> list[str]:
         """Command that finds the camera poses.
 
@@ -119,26 +109,29 @@ class Project:
                 )
         return self.process_photos("--matching-method", self.matching, *([] if _colmap_uses_gpu() else ["--no-gpu"]))
 
-    def largest(self) -> Path:
-        """Folder of the COLMAP model with the most photos; COLMAP makes several if it cannot join them into one."""
+    def process_photos(self, *options: str) -> list[str]:
+        """Command that makes the capture of the photos, with further options."""
+        words = ["ns-process-data", "images", "--data", str(self.photos), "--output-dir", str(self.capture)]
+        return [*words, *options]
+
+    def models(self) -> dict[str, int]:
+        """Numbers of photos of COLMAP's models, by their folders; several if it cannot join them into one."""
         from sundae_ns.data.colmap import num_images
 
-        models = sorted(path.parent for path in self.models.glob("*/images.bin"))
-        return max(models, key=num_images, default=self.models / "0")
+        found = sorted(path.parent for path in (self.capture / "colmap" / "sparse").glob("*/images.bin"))
+        return {path.relative_to(self.capture).as_posix(): num_images(path) for path in found}
 
     def is_largest(self) -> bool:
         """Whether the poses are those of the largest model; ns-process-data takes the first one."""
-        from sundae_ns.data.colmap import num_images
-
-        first = self.models / "0"
-        if self.largest() == first or not (first / "images.bin").is_file():
-            return True
-        return self.placed() != num_images(first)
+        models = self.models()
+        first = models.get("colmap/sparse/0")
+        return first is None or first == max(models.values()) or self.placed() != first
 
     def poses_of_largest(self) -> list[str]:
         """Command that replaces the poses by those of the largest model."""
-        model = str(self.largest().relative_to(self.capture))
-        return self.process_photos("--skip-image-processing", "--skip-colmap", "--colmap-model-path", model)
+        models = self.models()
+        largest = max(models, key=models.__getitem__)
+        return self.process_photos("--skip-image-processing", "--skip-colmap", "--colmap-model-path", largest)
 
     def placed(self) -> int:
         """Number of photos with a pose."""
@@ -194,11 +187,15 @@ class Project:
                 self.out.mkdir(parents=True, exist_ok=True)
             write_text(path, json.dumps(settings, indent=1) + "\n")
             return
-        before = _settings(path)
+        try:
+            before = dict(json.loads(path.read_bytes()).items())
+        except (ValueError, AttributeError) as error:
+            raise StorageError(f"{path} is damaged; choose another folder") from error
         for name, value in settings.items():
             if before.get(name) != value:
+                first, now = ("left out" if each is None else each for each in (before.get(name), value))
                 raise ConfigError(
-                    f"{self.out} was made with {name} {_shown(before.get(name))}, not {_shown(value)}; "
+                    f"{self.out} was made with {name} {first}, not {now}; "
                     "repeat the first command, or choose another folder"
                 )
 
@@ -274,17 +271,3 @@ def _colmap_uses_gpu() -> bool:
     """Whether COLMAP was built with CUDA, and an NVIDIA driver is here; otherwise its GPU code asks for a display."""
     text = subprocess.run(["colmap", "-h"], capture_output=True, text=True, check=False, errors="replace").stdout
     return "with CUDA" in text and shutil.which("nvidia-smi") is not None
-
-
-def _settings(path: Path) -> dict[str, object]:
-    try:
-        found = json.loads(path.read_bytes())
-    except ValueError:
-        found = None
-    if not isinstance(found, dict):
-        raise StorageError(f"{path} is damaged; choose another folder")
-    return found
-
-
-def _shown(value: object) -> str:
-    return "left out" if value is None else str(value)

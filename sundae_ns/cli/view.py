@@ -10,45 +10,35 @@ from typing import Annotated
 import tyro
 
 from sundae_ns.cli.files import open_packed_file
+from sundae_ns.errors import ConfigError
 
 
-class _Server(ThreadingHTTPServer):
-    """Serves one page on this machine only."""
-
-    page: bytes
-
-
-class _Handler(BaseHTTPRequestHandler):
-    server: _Server
-
-    def do_GET(self) -> None:
-        """Answer with the page."""
-        found = self.path == "/"
-        self.send_response(200 if found else 404)
-        self.send_header("Content-Type", "text/html; charset=utf-8")
-        self.send_header("Content-Length", str(len(self.server.page) if found else 0))
-        self.end_headers()
-        if found:
-            self.wfile.write(self.server.page)
-
-    def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-        """Stay silent."""
-
-
-def serve(page: str, port: int) -> _Server:
+def serve(page: str, port: int) -> ThreadingHTTPServer:
     """A server of one page on 127.0.0.1, not yet started.
 
     Raises:
         ConfigError: the port is in use or not allowed.
     """
-    from sundae_ns.errors import ConfigError
+    content = page.encode()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            """Answer with the page."""
+            found = self.path == "/"
+            self.send_response(200 if found else 404)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(content) if found else 0))
+            self.end_headers()
+            if found:
+                self.wfile.write(content)
+
+        def log_message(self, format: str, *args: object) -> None:  # noqa: A002
+            """Stay silent."""
 
     try:
-        server = _Server(("127.0.0.1", port), _Handler)
+        return ThreadingHTTPServer(("127.0.0.1", port), Handler)
     except (OSError, OverflowError) as error:
         raise ConfigError(f"port {port} cannot be used ({error}); choose another, or 0 for a free one") from error
-    server.page = page.encode()
-    return server
 
 
 def view(

@@ -3,6 +3,6 @@
 from sundae_ns.distributed.shards import Shards
 from sundae_ns.distributed.source import ShardedField
 from sundae_ns.distributed.start import check_machine, check_options, forward_signals
-from sundae_ns.distributed.team import team_of
+from sundae_ns.distributed.team import Team
 
-__all__ = ["ShardedField", "Shards", "check_machine", "check_options", "forward_signals", "team_of"]
+__all__ = ["ShardedField", "Shards", "Team", "check_machine", "check_options", "forward_signals"]

@@ -38,8 +38,11 @@ class Timetable:
     """
 
     def __init__(self, cameras: Capture, order: Callable[[int], int], device: torch.device | str) -> None:
-        self.ranks, self._cameras, self._order, self._device = dist.get_world_size(), cameras, order, device
-        self._table: _Table | None = None
+        self.ranks = dist.get_world_size()
+        self._cameras, self._order, self._device = cameras, order, device
+        self._downscale: int | None = None
+        self._views: list[View] = []
+        self._rows = torch.empty(0)
 
     def views(self, step: int) -> list[int]:
         """Indices of the views of a step, by rank."""
@@ -47,38 +50,25 @@ class Timetable:
 
     def cameras(self, at: StepResolution) -> Cameras:
         """The cameras of all ranks at a step, by rank; one launch, no collective."""
-        table = self._table_of(at.downscale)
-        return cameras_of_rows(torch.stack([self._row(table, index, at) for index in self.views(at.step)]))
-
-    def _row(self, table: _Table, index: int, at: StepResolution) -> Tensor:
-        view = table.on_host[index]
-        window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
-        if window is None:
-            return table.rows[index]
-        return self._row_of(view.cut(window)).to(self._device, non_blocking=True)
-
-    def _row_of(self, view: View) -> Tensor:
-        return camera_row(view.viewmat, view.K, view.width, view.height, NEAR_PLANE)
-
-    def _table_of(self, downscale: int) -> _Table:
         # Not before the first step: the datamanager corrects cameras in place when it undistorts images.
-        if self._table is None or self._table.downscale != downscale:
+        if self._downscale != at.downscale:
             cameras = (self._cameras[i : i + 1] for i in range(len(self._cameras)))
             # On the host: on a GPU each of these small operations would cost a launch.
-            views = [view_of(camera, "cpu", downscale=downscale) for camera in cameras]
-            rows = torch.stack([self._row_of(view) for view in views])
-            self._table = _Table(downscale, views, rows.to(self._device))
-        return self._table
+            self._views = [view_of(camera, "cpu", downscale=at.downscale) for camera in cameras]
+            self._rows = torch.stack([_row_of(view) for view in self._views]).to(self._device)
+            self._downscale = at.downscale
+        return cameras_of_rows(torch.stack([self._row(index, at) for index in self.views(at.step)]))
+
+    def _row(self, index: int, at: StepResolution) -> Tensor:
+        view = self._views[index]
+        window = training_window(view.width, view.height, at.window_pixels, seed=at.step, mirror=at.mirror)
+        if window is None:
+            return self._rows[index]
+        return _row_of(view.cut(window)).to(self._device, non_blocking=True)
 
 
-@dataclass(frozen=True)
-class _Table:
-    """All training views at one resolution."""
-
-    downscale: int
-    on_host: list[View]
-    rows: Tensor
-    """Rows of ``camera_row``, on the device ``[V, 33]``."""
+def _row_of(view: View) -> Tensor:
+    return camera_row(view.viewmat, view.K, view.width, view.height, NEAR_PLANE)
 
 
 @dataclass(frozen=True)

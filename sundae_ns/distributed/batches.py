@@ -15,16 +15,12 @@ from sundae_ns.training.run_length import RESETS, option, set_option, step_optio
 
 
 class SharedOptimizers(Optimizers):
-    """nerfstudio's optimizers; gradients of replicated groups are averaged over the ranks."""
-
-    replicated: tuple[str, ...] = ("compensation",)
-    """Groups that every rank holds a copy of."""
+    """nerfstudio's optimizers; gradients of the head, which every rank holds a copy of, are averaged over the ranks."""
 
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Average, then step. Collective."""
-        for name in self.replicated:
-            if name in param_groups:
-                average_gradients(self.parameters[name])
+        if "compensation" in param_groups:
+            average_gradients(self.parameters["compensation"])
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
 

@@ -52,16 +52,8 @@ class Shards:
         self.device = torch.device(device)
         self.counts = [0] * self.ranks
         """Primitives of each rank."""
-        self._listeners: list[Callable[[], None]] = []
-
-    def on_change(self, listener: Callable[[], None]) -> None:
-        """Call ``listener`` whenever primitives move between ranks, appear or disappear."""
-        self._listeners.append(listener)
-
-    def changed(self) -> None:
-        """Tell the listeners; whoever changes the field calls this, on all ranks alike."""
-        for listener in self._listeners:
-            listener()
+        self.changed: Callable[[], None] = lambda: None
+        """Called on all ranks alike whenever primitives move between ranks, appear or disappear."""
 
     @property
     def total(self) -> int:

@@ -1,15 +1,10 @@
-"""The processes that train together, one or several, behind one set of verbs.
-
-:class:`OneProcess` has nothing to share; :class:`Ranks` shards the field over the ranks of the default process group.
-The trainer calls the verbs and does not ask which of both it has.
-"""
+"""The processes that train together, one or several, behind one set of verbs that the trainer calls."""
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -27,7 +22,6 @@ from sundae_ns.distributed.shards import Shards, bounds
 from sundae_ns.distributed.source import ShardedField
 from sundae_ns.distributed.start import check_options, without_viewer
 from sundae_ns.rendering.source import FieldSource
-from sundae_ns.storage.atomic import writing
 from sundae_ns.training.densification import CappedStrategy, Densification
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
@@ -40,74 +34,37 @@ AGREED_EVERY = 16
 """Steps after which ranks ask each other whether to stop, which waits for the GPU."""
 
 
-class OneProcess:
-    """One process that holds the whole field."""
+class Team:
+    """The ranks of the default process group, which shard the field. With several, verbs are collective.
 
-    collective = False
-    """Whether there are several processes."""
-
-    def agreed(self, number: int, step: int) -> int:
-        """The signal after which all processes stop with this step; 0 for none."""
-        return number
-
-    def meet(self) -> None:
-        """Nobody to wait for."""
-
-    def configured(self, config: Any) -> Any:
-        """The configuration, unchanged."""
-        return config
-
-    def make_folder(self, folder: Path) -> None:
-        """Nothing to do: nerfstudio makes the folder of the run."""
-
-    def share(
-        self, state: FieldState, source: FieldSource, extensions: list[Extension], datamanager: Any, seed: int
-    ) -> tuple[FieldSource, list[Extension]]:
-        """Source and extensions, unchanged."""
-        return source, extensions
-
-    def optimizers(self, make: Callable[[], Optimizers], config: Any, groups: Any, names: list[str]) -> Optimizers:
-        """The optimizers that ``make`` builds."""
-        return make()
-
-    def agree(self, state: FieldState) -> None:
-        """Nothing to share."""
-
-    def check_copies(self, head: CompensationHead | None) -> None:
-        """Nothing to compare."""
-
-    def gathered(self, state: State, names: list[str]) -> State | None:
-        """The state, unchanged."""
-        return state
-
-    def part(self, loaded: State, names: list[str]) -> State:
-        """The checkpoint, unchanged."""
-        return loaded
-
-    def restored(self, state: FieldState, seed: int, step: int) -> None:
-        """Nothing to share."""
-
-
-class Ranks(OneProcess):
-    """One of several ranks that shard the field. Verbs are collective."""
+    One process holds the whole field: its verbs return what they are given.
+    """
 
     shards: Shards
-    """Set by :meth:`share`."""
+    """Set by :meth:`share` of several ranks."""
 
-    def __init__(self, rank: int, count: int) -> None:
+    def __init__(self, rank: int = 0, count: int = 1) -> None:
         self.rank, self.count = rank, count
-
-    collective = True
+        self.collective = count > 1
+        """Whether there are several processes."""
 
     def agreed(self, number: int, step: int) -> int:
-        """The signal that a rank got, 0 for none; asked for at every :data:`AGREED_EVERY`-th step."""
+        """The signal after which all processes stop with this step; 0 for none.
+
+        Args:
+            number: the signal that this process got; 0 for none.
+            step: ranks agree at every :data:`AGREED_EVERY`-th step.
+        """
+        if not self.collective:
+            return number
         if step % AGREED_EVERY:
             return 0
         return min((got for (got,) in self.shards.numbers(number) if got), default=0)
 
     def meet(self) -> None:
         """Wait for all ranks."""
-        dist.barrier()
+        if self.collective:
+            dist.barrier()
 
     def configured(self, config: Any) -> Any:
         """A copy with as many images in fewer, larger steps, without a viewer, and with images in host memory.
@@ -115,6 +72,8 @@ class Ranks(OneProcess):
         Raises:
             ConfigError: several ranks cannot train with these options.
         """
+        if not self.collective:
+            return config
         check_options(config)
         config = shorten(config, self.count)
         config.vis = without_viewer(config.vis)
@@ -125,15 +84,6 @@ class Ranks(OneProcess):
             torch.cuda.set_device(self.rank)
         return config
 
-    def make_folder(self, folder: Path) -> None:
-        """Make the folder of the run; nerfstudio's own way fails if two ranks do so at once.
-
-        Raises:
-            StorageError: no right to write.
-        """
-        with writing(f"cannot make the run's folder {folder}"):
-            folder.mkdir(parents=True, exist_ok=True)
-
     def share(
         self, state: FieldState, source: FieldSource, extensions: list[Extension], datamanager: Any, seed: int
     ) -> tuple[FieldSource, list[Extension]]:
@@ -141,11 +91,16 @@ class Ranks(OneProcess):
 
         Args:
             state: as built, the same number of primitives on each rank.
+            source: of one process.
+            extensions: of one process.
+            datamanager: gives each rank another view at a step.
             seed: seed of draws that all ranks must share, such as the image to evaluate.
 
         Returns:
             Source and extensions of the shards.
         """
+        if not self.collective:
+            return source, extensions
         shards = self.shards = Shards(state.device)
         state.images_per_step = shards.ranks
         take_shard(state, shards)
@@ -153,7 +108,7 @@ class Ranks(OneProcess):
         cameras = datamanager.train_dataset.cameras
         timetable = Timetable(cameras, datamanager.view_of_step, state.device)
         sharded = ShardedField(shards, state.field, timetable)
-        shards.on_change(sharded.forget_plan)
+        shards.changed = sharded.forget_plan
         datamanager.place = (shards.rank, shards.ranks)
         return sharded, [self._sharded(extension, len(cameras)) for extension in extensions]
 
@@ -168,26 +123,28 @@ class Ranks(OneProcess):
         return extension
 
     def optimizers(self, make: Callable[[], Optimizers], config: Any, groups: Any, names: list[str]) -> Optimizers:
-        """Optimizers for batches of one image a rank."""
+        """The optimizers that ``make`` builds, or those for batches of one image a rank."""
+        if not self.collective:
+            return make()
         optimizers = SharedOptimizers(config.copy(), groups)
         scale_rates(optimizers, names, self.count)
         return optimizers
 
     def agree(self, state: FieldState) -> None:
         """Share what each rank has noted by itself: the focal lengths that the head was trained on."""
-        state.trained_focal = self.shards.widest(state.trained_focal)
+        if self.collective:
+            state.trained_focal = self.shards.widest(state.trained_focal)
 
-    def check_copies(self, head: CompensationHead | None) -> None:
-        """Warn if the copies of the head differ between ranks."""
+    def gathered(self, state: State, head: CompensationHead | None, names: list[str]) -> State | None:
+        """The checkpoint of the whole field on rank 0, None on the others; warns if the copies of the head differ."""
+        if not self.collective:
+            return state
         apart = 0.0 if head is None else self.shards.apart(head.parameters())
         if apart != 0 and self.shards.rank == 0:
             warn(
                 f"the heads of the ranks differ by up to {apart:.2g}, which is a bug of sundae; the checkpoint holds "
                 "the head of the first rank, and resuming from it makes them equal"
             )
-
-    def gathered(self, state: State, names: list[str]) -> State | None:
-        """The checkpoint of the whole field on rank 0; None on the others."""
         return whole_state(state, self.shards, names)
 
     def part(self, loaded: State, names: list[str]) -> State:
@@ -196,17 +153,13 @@ class Ranks(OneProcess):
         Raises:
             CheckpointError: the checkpoint holds no primitives.
         """
-        return state_of_rank(loaded, self.shards.rank, self.count, names)
+        return state_of_rank(loaded, self.shards.rank, self.count, names) if self.collective else loaded
 
     def restored(self, state: FieldState, seed: int, step: int) -> None:
         """Share the counts, and give each rank random numbers of its own."""
-        self.shards.recount(state.field)
-        torch.manual_seed(seed + step * self.count + self.shards.rank)
-
-
-def team_of(rank: int, count: int) -> OneProcess:
-    """The processes of a training: :class:`Ranks` if there are several."""
-    return Ranks(rank, count) if count > 1 else OneProcess()
+        if self.collective:
+            self.shards.recount(state.field)
+            torch.manual_seed(seed + step * self.count + self.shards.rank)
 
 
 def take_shard(state: FieldState, shards: Shards) -> None:

@@ -1,4 +1,4 @@
-"""Measurements of a finished scene: quality, bytes and synchronised times."""
+"""Measurements of a finished scene: quality, bytes and synchronised times, and its images beside the photographs."""
 
 from __future__ import annotations
 
@@ -47,8 +47,7 @@ class FrameTimes:
     splat: float
     """The same without head and features."""
     head: float
-    """The head alone; 0 if it does not run. At another scale than the trained one a second splatting pass is needed, which
-    only ``frame`` contains."""
+    """The head alone; 0 if it does not run. Its second splatting pass at another scale counts in ``frame`` only."""
 
 
 @contextmanager
@@ -112,8 +111,8 @@ def rendered_as(
     """The run with images of another size, and inside the block with another arithmetic of its head.
 
     Args:
-        run: a finished run.
-        factor: factor on the sides of the images; the truths are resized alike.
+        run: a finished scene.
+        factor: on the sides of the images; the true images are resized alike.
         precision: of the head, one of ``PRECISIONS``; by default the run's own, and fp32 on a CPU.
         phases: runs of the head for a frame, one of ``PHASES``; by default the run's own.
 
@@ -123,30 +122,23 @@ def rendered_as(
     """
     if not 0 < factor < MOST_ZOOM:
         raise ConfigError(f"images cannot be {factor} times as large; give a factor above 0 and below {MOST_ZOOM}")
+    model, head = run.model, run.model.head
+    if model.device.type == "cpu" and precision not in (None, "fp32"):
+        raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
     cameras, truths = [zoomed(camera, factor) for camera in run.cameras], []
     for camera, truth in zip(cameras, run.truths, strict=True):
         size = int(camera.height), int(camera.width)
         truths.append(truth if truth.shape[:2] == size else resize(truth, *size))
-    with head_as(run.model, precision=precision, phases=phases):
-        yield replace(run, cameras=cameras, truths=truths)
-
-
-@contextmanager
-def head_as(model: SundaeModel, *, precision: str | None = None, phases: int | None = None) -> Iterator[None]:
-    """Inside the block the head has another arithmetic, or runs another number of times; as in :func:`rendered_as`."""
-    head, on_cpu = model.head, model.device.type == "cpu"
-    if on_cpu and precision not in (None, "fp32"):
-        raise BackendError(f"a CPU runs the head in fp32, not in {precision}; ask for fp32, or for a CUDA device")
+    shown = replace(run, cameras=cameras, truths=truths)
     if head is None:
-        yield
+        yield shown
         return
     before: Any = head.config
-    precision = precision or ("fp32" if on_cpu else before.precision)
-    changed = replace(before, precision=precision, phases=phases or before.phases)
+    changed = replace(before, precision=precision or _precision(model), phases=phases or before.phases)
     changed.validate()
     head.config = changed
     try:
-        yield
+        yield shown
     finally:
         head.config = before
 
@@ -237,11 +229,42 @@ def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None, *, with_fl
     )
 
 
+def comparison_of(model: SundaeModel, camera: Cameras, truth: Tensor, title: str) -> ComparisonRow:
+    """True image, base colours and complete rendering of one view."""
+    outputs = model.get_outputs_for_camera(camera)
+    return ComparisonRow(truth, outputs["base_rgb"], outputs["rgb"], title)
+
+
+def largest_view(opened: Opened) -> tuple[int, int]:
+    """Largest width and largest height of the training and test views, in pixels."""
+    _ = opened.datamanager.cached_train  # undistortion, which comes with loading, changes the cameras
+    cameras = [opened.datamanager.train_dataset.cameras, *opened.cameras]
+    return max(int(each.width.max()) for each in cameras), max(int(each.height.max()) for each in cameras)
+
+
 @torch.no_grad()
-def comparison_of(opened: Opened, index: int) -> ComparisonRow:
-    """Ground truth, base colours and complete rendering of one test view."""
-    outputs = opened.model.get_outputs_for_camera(opened.cameras[index])
-    return ComparisonRow(opened.truths[index], outputs["base_rgb"], outputs["rgb"])
+def walk(opened: Opened) -> Iterator[ComparisonRow]:
+    """Render the views in the order of their file names; titles name the file, and whether it was held out for test.
+
+    Raises:
+        DataError: an image cannot be decoded.
+    """
+    model, manager = opened.model, opened.datamanager
+    outputs = {"background": model._get_background_color()}
+
+    def training_view(index: int) -> tuple[Cameras, Tensor]:
+        truth = model.truth(manager.cached_train[index], outputs)
+        # After its image, whose undistortion changes the camera.
+        return manager.train_dataset.cameras[index : index + 1].to(model.device), truth
+
+    order = sorted(
+        (path, held_out, index)
+        for held_out, dataset in enumerate((manager.train_dataset, manager.eval_dataset))
+        for index, path in enumerate(dataset.image_filenames)
+    )
+    for path, held_out, index in order:
+        camera, truth = (opened.cameras[index], opened.truths[index]) if held_out else training_view(index)
+        yield comparison_of(model, camera, truth, f"{path.name}, {'test' if held_out else 'training'} view")
 
 
 def _precision(model: SundaeModel) -> str:
@@ -251,6 +274,5 @@ def _precision(model: SundaeModel) -> str:
 
 def _resolution(cameras: Sequence[Cameras]) -> str:
     """Width x height of the first camera, and a note if others differ."""
-    found = {(int(camera.width), int(camera.height)) for camera in cameras}
-    width, height = int(cameras[0].width), int(cameras[0].height)
-    return f"{width}x{height}" + (" and others" if len(found) > 1 else "")
+    found = [f"{int(camera.width)}x{int(camera.height)}" for camera in cameras]
+    return found[0] + (" and others" if len(set(found)) > 1 else "")

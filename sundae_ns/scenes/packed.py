@@ -1,6 +1,6 @@
 """Finished runs as packed scenes, and packed scenes as runs that nerfstudio's commands open.
 
-A ``config.yml`` can run code in nerfstudio, so no part of it is packed: a packed scene states plain values. Each value is
+A ``config.yml`` can run code in nerfstudio, so no part of it is packed. A packed scene states plain values; each one is
 checked, and a new configuration is made from them.
 """
 
@@ -23,7 +23,6 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
 from sundae_ns.api.opening import FRAME_FILE, load
@@ -32,22 +31,22 @@ from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import is_frame, is_number
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, no_images_error
-from sundae_ns.errors import CheckpointError, PackError
+from sundae_ns.errors import PackError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.scenes import stock
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
 from sundae_ns.storage.runs import checkpoint
-from sundae_ns.storage.runs.config_file import check_run, load_config
-from sundae_ns.storage.runs.folder import UNPACKED, config_of, unpacked_folder
+from sundae_ns.storage.runs.config_file import check_run
+from sundae_ns.storage.runs.folder import config_of, unpacked_folder
 
 _PARSERS: dict[str, type[DataParserConfig]] = {
     "colmap": ColmapDataParserConfig,
     "nerfstudio-data": NerfstudioDataParserConfig,
 }
 _FOLDER = re.compile(r"(?!.*\.\.)[\w.-]+(/[\w.-]+)*")
-"""Paths that a packed scene may name: below the capture, without special characters of a shell, because nerfstudio passes
-paths of images to ffmpeg through one."""
+"""Paths that a packed scene may name: below the capture, and without special characters of a shell, because nerfstudio
+passes paths of images to ffmpeg through one."""
 
 
 # -------------------------------------------------------------------------------------------------------------- packing
@@ -69,15 +68,12 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
     """
     check_run(run)
     path = config_of(run)
-    config = load_config(path)
-    model = getattr(getattr(config, "pipeline", None), "model", None)
-    if not isinstance(config, TrainerConfig) or not isinstance(model, SplatfactoModelConfig):
-        raise CheckpointError(f"{path} is a run of another method; give one of sundae or splatfacto")
+    config, _ = stock.config_with_field(path)
     scene = load(path)
-    manager = _manager(config)
+    manager = stock.datamanager_config(copy.deepcopy(config.pipeline.datamanager))
     if data is not None and not manager.images:
         raise no_images_error(path.parent)
-    manager.data = data or manager.data
+    manager.data = data or manager.data or config.data
     source = {"method": config.method_name, **scene.meta["source"]}
     meta = {**scene.meta, "source": source, "capture": _describe(manager)}
     return contents_of(
@@ -86,16 +82,9 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
 
 
 def packed_run(run: Path, *, data: Path | None = None) -> tuple[Scene, bytes]:
-    """The scene of a finished run with its training cameras, and the packed file that holds it; see above for errors."""
+    """The scene of a finished run with its training cameras, and its packed file; errors as :func:`contents_of_run`."""
     contents = contents_of_run(run, data=data)
     return scene_of(contents), pack_bytes(*fit_scene(contents))
-
-
-def _manager(config: TrainerConfig) -> SundaeDatamanagerConfig:
-    """Configuration of our datamanager for a run of sundae or splatfacto."""
-    manager = stock.datamanager_config(copy.deepcopy(config.pipeline.datamanager))
-    manager.data = manager.data or config.data
-    return manager
 
 
 def _cameras(manager: SundaeDatamanagerConfig, most: int) -> dict[str, Tensor]:
@@ -138,7 +127,7 @@ def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
 
 
 def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | None = None) -> Path:
-    """Write a packed scene as a run that ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval`` open.
+    """Write a packed scene as a run for ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval``.
 
     Args:
         packed: from ``read_scene``; its values are checked.
@@ -161,27 +150,14 @@ def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | 
     config.output_dir, (config.experiment_name, _, config.timestamp) = output_dir.resolve(), folder.parts[-3:]
     model = model_of(scene_of(packed))
     config.pipeline.model = model.config
-    manager = config.pipeline.datamanager
-    assert isinstance(manager, SundaeDatamanagerConfig)
-    if data is None:
-        manager.dataparser = NerfstudioDataParserConfig(
-            downscale_factor=1,
-            orientation_method="none",
-            center_method="none",
-            auto_scale_poses=False,
-            eval_mode="all",
-        )
-        manager.images = False
-        config.data = folder / "cameras"
-    else:
-        manager = config.pipeline.datamanager = capture_of(packed, data)
-        config.data = data.resolve()
-    manager.data = config.data
+    cameras = folder / "cameras"
+    manager = _without_images(cameras) if data is None else datamanager_of(packed, data)
+    config.pipeline.datamanager, config.data = manager, manager.data
     with writing(f"cannot write to {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
         if data is None:
-            config.data.mkdir(exist_ok=True)
-            write_text(config.data / "transforms.json", json.dumps(_transforms(packed), indent=1))
+            cameras.mkdir(exist_ok=True)
+            write_text(cameras / "transforms.json", json.dumps(_transforms(packed), indent=1))
         if is_frame(frame := packed.meta.get("frame")):
             write_text(folder / FRAME_FILE, json.dumps(frame, indent=4))
     state = {f"_model.{name}": value for name, value in model.state_dict().items()}
@@ -192,9 +168,16 @@ def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | 
     return folder / "config.yml"
 
 
-def is_unpacked(config: TrainerConfig) -> bool:
-    """Whether a run was written by :func:`write_run`; it cannot be trained on."""
-    return config.timestamp == UNPACKED
+def _without_images(cameras: Path) -> SundaeDatamanagerConfig:
+    """Configuration that reads cameras without images, whose coordinates are those of the model."""
+    parser = NerfstudioDataParserConfig(
+        downscale_factor=1,
+        orientation_method="none",
+        center_method="none",
+        auto_scale_poses=False,
+        eval_mode="all",
+    )
+    return SundaeDatamanagerConfig(dataparser=parser, images=False, data=cameras, cache_images_type="uint8")
 
 
 def model_of(scene: Scene) -> SundaeModel:
@@ -213,13 +196,13 @@ def model_of(scene: Scene) -> SundaeModel:
     seeds = (torch.eye(3)[:2], torch.zeros(2, 3))
     box = SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3]))
     model: SundaeModel = config.setup(scene_box=box, num_train_data=0, metadata={}, seed_points=seeds)
-    hold(model, scene)
+    put_scene(model, scene)
     # A step at which all SH degrees are active and the head is enabled.
     model.step = max(degree, 1)
     return model.eval()
 
 
-def hold(model: SundaeModel, scene: Scene) -> None:
+def put_scene(model: SundaeModel, scene: Scene) -> None:
     """Put a finished scene in place of a model's field and head.
 
     Args:
@@ -233,7 +216,7 @@ def hold(model: SundaeModel, scene: Scene) -> None:
 
 
 def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
-    """Load a field into a model, in place and in the field's order; parameters and coefficients that it lacks become 0."""
+    """Load a field into a model in place; parameters and coefficients that the field lacks become 0."""
     for name, value in model.gauss_params.items():
         new = value.data.new_zeros(len(field["means"]), *value.shape[1:])
         if name in field:
@@ -241,7 +224,7 @@ def place(model: SundaeModel, field: Mapping[str, Tensor]) -> None:
         value.data = new
 
 
-def capture_of(packed: PackedScene, data: Path) -> SundaeDatamanagerConfig:
+def datamanager_of(packed: PackedScene, data: Path) -> SundaeDatamanagerConfig:
     """Configuration that parses, splits and scales a capture as in the training of a packed scene.
 
     Raises:
@@ -265,43 +248,35 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
     if not is_number(scale) or not 0 < scale <= 1:
         raise refusal("an impossible scale of its images")
     parser = _PARSERS[kind](load_3D_points=False)  # type: ignore[call-arg]
-    known = _options(_PARSERS[kind])
+    known, hints = _options(_PARSERS[kind]), get_type_hints(_PARSERS[kind])
     for name, value in options.items():
-        default = known.get(name)
-        known_values = (
-            get_args(get_type_hints(_PARSERS[kind])[name]) if isinstance(default, str) and name in known else ()
-        )
-        fits = (
-            (isinstance(default, bool) and isinstance(value, bool))
-            or (isinstance(default, float) and is_number(value))
-            or (name in known and default is None and (value is None or (type(value) is int and value > 0)))
-            or (type(default) is int and type(value) is int)
-            or value in known_values
-            or (isinstance(default, Path) and isinstance(value, str) and _FOLDER.fullmatch(value) is not None)
-        )
-        if not fits:
+        if name not in known or not _is_possible(value, known[name], hints[name]):
             raise refusal(f"an impossible option {str(name)[:40]!r} of its capture")
-        setattr(parser, name, Path(value) if isinstance(default, Path) else value)
+        setattr(parser, name, Path(value) if isinstance(known[name], Path) else value)
     return parser, float(scale)
+
+
+def _is_possible(value: Any, default: Any, hint: Any) -> bool:
+    """Whether a value of JSON can stand for an option with this default and type."""
+    if default is None:
+        return value is None or (type(value) is int and value > 0)
+    if isinstance(default, Path):
+        return isinstance(value, str) and _FOLDER.fullmatch(value) is not None
+    if isinstance(default, float):
+        return is_number(value)
+    return value in get_args(hint) if isinstance(default, str) else type(value) is type(default)
 
 
 def _transforms(packed: PackedScene) -> dict[str, Any]:
     """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
     cameras = cameras_of(packed)
-    frames = []
-    for i, pose in enumerate(cameras["poses"].double().tolist()):
-        fx, fy, cx, cy = cameras["intrinsics"][i].tolist()
-        width, height = cameras["sizes"][i].tolist()
-        frames.append(
-            {
-                "file_path": f"view-{i:05d}",
-                "fl_x": fx,
-                "fl_y": fy,
-                "cx": cx,
-                "cy": cy,
-                "w": int(width),
-                "h": int(height),
-                "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]],
-            }
-        )
+    frames = [
+        {
+            "file_path": f"view-{i:05d}",
+            **dict(zip(("fl_x", "fl_y", "cx", "cy"), cameras["intrinsics"][i].tolist(), strict=True)),
+            **dict(zip(("w", "h"), cameras["sizes"][i].long().tolist(), strict=True)),
+            "transform_matrix": [*pose, [0.0, 0.0, 0.0, 1.0]],
+        }
+        for i, pose in enumerate(cameras["poses"].double().tolist())
+    ]
     return {"camera_model": "PINHOLE", "frames": frames}

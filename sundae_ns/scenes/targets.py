@@ -6,9 +6,9 @@ The ratios between the steps come from renderings: at the defaults, one bit less
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from sundae_ns.errors import DataError, PackError
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes.opening import open_pipeline, views_to_test
 from sundae_ns.scenes.packed import place
-from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene, write_fitted
+from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene, pack_bytes
 from sundae_ns.storage.packing.config import STEPS
 from sundae_ns.storage.runs.folder import config_of
 
@@ -34,8 +34,6 @@ class Try(NamedTuple):
     scene: PackedScene
     codecs: Codecs
     bytes: int
-    drop: float | None
-    """PSNR below the unpacked run, dB; None if it was not measured."""
 
 
 def scaled(config: PackConfig, power: float) -> PackConfig:
@@ -50,7 +48,18 @@ class Search:
 
     def __init__(self, run: Path, scene: PackedScene, config: PackConfig, *, data: Path | None = None) -> None:
         self.run, self.scene, self.config, self.data = run, scene, config, data
-        self._drop: Callable[[PackedScene, Codecs], float] | None = None
+
+    @cached_property
+    def _drop(self) -> Callable[[PackedScene, Codecs], float]:
+        return _drop_of(self.run, self.data)
+
+    def drop(self, tried: Try) -> float:
+        """PSNR of a pack below the unpacked run on some test views, dB.
+
+        Raises:
+            DataError: the capture is missing, or cannot be used.
+        """
+        return self._drop(tried.scene, tried.codecs)
 
     def smaller_than(self, limit: int) -> Try:
         """The finest pack of at most ``limit`` bytes.
@@ -58,11 +67,11 @@ class Search:
         Raises:
             PackError: even the coarsest is larger.
         """
-        found = self._bisected(lambda tried: tried.bytes <= limit, coarse=True, measure=False)
-        if found.bytes <= limit:
+        found, fits = self._bisected(lambda tried: tried.bytes <= limit, first=COARSEST, last=FINEST)
+        if fits:
             return found
         try:
-            lost = f" and loses {self._measured(found):.2f} dB"
+            lost = f" and loses {self.drop(found):.2f} dB"
         except DataError:
             lost = ""
         raise PackError(
@@ -76,46 +85,35 @@ class Search:
             PackError: even the finest loses more.
             DataError: the capture is missing, or cannot be used.
         """
-        found = self._bisected(lambda tried: self._measured(tried) <= limit, coarse=False, measure=True)
-        if found.drop is not None and found.drop <= limit:
+        found, fits = self._bisected(lambda tried: self.drop(tried) <= limit, first=FINEST, last=COARSEST)
+        if fits:
             return found
         raise PackError(
-            f"the finest pack loses {self._measured(found):.3f} dB at {found.bytes:,} bytes; give a larger --target-drop"
+            f"the finest pack loses {self.drop(found):.3f} dB at {found.bytes:,} bytes; give a larger --target-drop"
         )
 
-    def _bisected(self, fits: Callable[[Try], bool], *, coarse: bool, measure: bool) -> Try:
-        """The pack nearest to the border between fitting and not; the last end if none fits."""
-        good, bad = (COARSEST, FINEST) if coarse else (FINEST, COARSEST)
-        best = self._tried(good, measure)
+    def _bisected(self, fits: Callable[[Try], bool], *, first: float, last: float) -> tuple[Try, bool]:
+        """The fitting pack nearest to ``last``; that of ``first`` and False if even this one does not fit."""
+        best = self._tried(first)
         if not fits(best):
-            return best
+            return best, False
         for _ in range(_TRIES):
-            middle = (good + bad) / 2
-            tried = self._tried(middle, measure)
+            middle = (first + last) / 2
+            tried = self._tried(middle)
             if fits(tried):
-                good, best = middle, tried
+                first, best = middle, tried
             else:
-                bad = middle
-        return best
+                last = middle
+        return best, True
 
-    def _tried(self, power: float, measure: bool) -> Try:
+    def _tried(self, power: float) -> Try:
         scene, codecs = fit_scene(self.scene, scaled(self.config, power))
-        with tempfile.TemporaryDirectory() as folder:
-            size = write_fitted(Path(folder) / "a.sundae", scene, codecs).bytes
-        tried = Try(scene, codecs, size, None)
-        return tried._replace(drop=self._measured(tried)) if measure else tried
-
-    def _measured(self, tried: Try) -> float:
-        if tried.drop is not None:
-            return tried.drop
-        if self._drop is None:
-            self._drop = _drop_of(self.run, self.data)
-        return self._drop(tried.scene, tried.codecs)
+        return Try(scene, codecs, len(pack_bytes(scene, codecs)))
 
 
 @torch.no_grad()
 def _drop_of(run: Path, data: Path | None) -> Callable[[PackedScene, Codecs], float]:
-    """What measures the PSNR of a pack below that of the run, on some test views, dB."""
+    """A function that measures the PSNR of a pack below that of the run, on some test views, dB."""
     opened = open_pipeline(config_of(run), data=data, test_mode="test")
     opened.pipeline.eval()
     model = opened.model

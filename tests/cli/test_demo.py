@@ -6,11 +6,9 @@ import os
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
-from sundae_ns.cli.demo import _comparison, run_demo
+from sundae_ns.cli.demo import demo
 from sundae_ns.cli.process import run_logged
 from sundae_ns.errors import SundaeError
 
@@ -30,18 +28,6 @@ def test_lines_reach_the_progress_bar(tmp_path: Path) -> None:
     assert [line.strip() for line in lines] == ["10 (50.00%)", "20 (100.00%)"]
 
 
-def test_comparison_splits_the_images_of_ns_eval(tmp_path: Path) -> None:
-    """Truth is white, the base grey, the compensated light grey; the sheet shows all of them and their error."""
-    for index in range(2):
-        truth, compensated = np.full((40, 40, 3), 255, np.uint8), np.full((40, 40, 3), 245, np.uint8)
-        Image.fromarray(np.concatenate([truth, compensated], axis=1)).save(tmp_path / f"eval_img_{index:04d}.png")
-        Image.fromarray(np.full((40, 40, 3), 200, np.uint8)).save(tmp_path / f"eval_base_{index:04d}.png")
-    _comparison(tmp_path, tmp_path / "sheet.png")
-    with Image.open(tmp_path / "sheet.png") as sheet:
-        colors = {color for _, color in sheet.convert("RGB").getcolors(1 << 20)}
-    assert {(255, 255, 255), (200, 200, 200), (245, 245, 245), (50, 50, 50)} <= colors
-
-
 @pytest.mark.parametrize(
     ("steps", "message"),
     [(steps, f"steps is {steps}; give at least 1") for steps in (-3, 0)] + [(300, "made"), (None, "made")],
@@ -53,9 +39,9 @@ def test_no_step_is_refused_before_anything_is_written(
         scene.mkdir(parents=True)
         raise SundaeError("made")
 
-    monkeypatch.setattr("sundae_ns.cli.demo.write_demo_capture", make)
+    monkeypatch.setattr("sundae_ns.data.write_demo_capture", make)
     with pytest.raises(SundaeError, match=message) as error:
-        run_demo(tmp_path / "demo", steps=steps)
+        demo(tmp_path / "demo", steps=steps)
     assert "\n" not in str(error.value)
     assert (tmp_path / "demo").exists() == (message == "made")
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import ctypes.util
-import io
 import shutil
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from rich.console import Console
 
 from sundae_ns import evaluation
 from sundae_ns.cli import doctor, main
@@ -233,13 +232,14 @@ def test_versions_of_packages() -> None:
     assert {"python", "nerfstudio", "numpy"} <= set(found)
 
 
-def report(**options: Any) -> tuple[int, str]:
-    out = io.StringIO()
-    code = doctor.run_doctor(console=Console(file=out, width=200), **options)
-    return code, out.getvalue()
+@pytest.fixture
+def report(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """Runs the doctor on a wide terminal: exit code and text."""
+    monkeypatch.setenv("COLUMNS", "200")
+    return lambda **options: (doctor.run_doctor(**options), capsys.readouterr().out)
 
 
-def test_a_machine_without_a_gpu_passes(no_cuda: None) -> None:
+def test_a_machine_without_a_gpu_passes(no_cuda: None, report: Callable[..., tuple[int, str]]) -> None:
     code, text = report()
     assert code == 0
     assert "auto selects cpu" in text
@@ -248,14 +248,18 @@ def test_a_machine_without_a_gpu_passes(no_cuda: None) -> None:
         assert one.ok or f"{one.name}: {one.fix}" in text
 
 
-def test_a_missing_package_fails(no_cuda: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_fails(
+    no_cuda: None, monkeypatch: pytest.MonkeyPatch, report: Callable[..., tuple[int, str]]
+) -> None:
     monkeypatch.setattr(doctor, "PACKAGES", ("torch", "no-such-package"))
     code, text = report()
     assert code == 1
     assert "no-such-package: pip install no-such-package" in text
 
 
-def test_everything_on_disk_needs_no_advice(cuda: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_everything_on_disk_needs_no_advice(
+    cuda: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, report: Callable[..., tuple[int, str]]
+) -> None:
     _kernels(monkeypatch, None)
     monkeypatch.setattr(evaluation, "lpips_weights_available", lambda: True)
     monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so")

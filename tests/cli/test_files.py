@@ -179,7 +179,10 @@ def test_prune_does_not_change_kept_rows(
         (["pack", "in.sundae", "-o", "a.sundae"], "in.sundae is a packed scene; give the run that was packed"),
         (["pack", "in.ply", "-o", "a.sundae"], "in.ply is a .ply file; give the folder of a run"),
         (["unpack", "in.ply"], "in.ply is not a packed scene; give a file that sundae pack wrote"),
-        (["bench", "frame", "--load-config", "in.sundae"], "in.sundae is a packed scene; give the folder of a run"),
+        (
+            ["bench", "frame", "--load-config", "in.sundae"],
+            "in.sundae is a packed scene, which does not name its capture",
+        ),
         (["bench", "frame", "--load-config", "in.ply"], "in.ply is a .ply file; it comes without test views"),
         (["report", "in.ply", "-o", "out"], "in.ply is a .ply file; it comes without test views"),
         (["export", "nothing.sundae", "-o", "a.ply"], "nothing.sundae cannot be read"),

@@ -29,7 +29,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     points = torch.rand(400, 3)
     field = from_points(points, points, sh_degree=1, num_features=0)
     write_ply(tmp_path / "a.ply", field)
-    write_scene(tmp_path / "a.sundae", PackedScene(field))
+    model = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "black"}
+    write_scene(tmp_path / "a.sundae", PackedScene(field, meta={"model": model}))
     return tmp_path
 
 
@@ -165,17 +166,6 @@ def test_what_is_no_file_is_refused_at_once(here: Path, refused: Refused, words:
     ],
 )
 def test_names_too_long_are_one_line(here: Path, refused: Refused, words: list[str]) -> None:
-    if words[0] == "unpack":
-        model = {
-            "sh_degree": 1,
-            "rasterize_mode": "classic",
-            "background_color": "black",
-            "head": None,
-            "trained_focal": None,
-        }
-        points = torch.rand(30, 3)
-        field = from_points(points, points, sh_degree=1, num_features=0)
-        write_scene(here / "a.sundae", PackedScene(field, meta={"model": model}))
     assert "too long" in refused(*words)
     assert {path.name for path in here.iterdir()} <= {"a.ply", "a.sundae", "outputs"}
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sundae_ns.cli import main
-from sundae_ns.cli.packing import pack
+from sundae_ns.cli.packing import Precision, pack
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage.packing import FINETUNED, PackConfig, PackedScene, write_scene
 
@@ -25,24 +25,21 @@ def run(*arguments: object) -> int:
 
 def test_options_are_those_of_the_configuration() -> None:
     """They are repeated in the command, so that ``sundae --help`` does not import torch."""
-    options = inspect.signature(pack).parameters
-    for field in fields(PackConfig):
-        # The defaults that a fine-tune changes depend on --finetune.
-        assert options[field.name].default == (None if field.name in FINETUNED else field.default), field.name
-        if field.name in FINETUNED:
-            (line,) = re.findall(rf"^ +{field.name}: (.*)$", pack.__doc__ or "", re.MULTILINE)
-            assert line.endswith(f"; by default {field.default}, {FINETUNED[field.name]} with a fine-tune.")
-    assert set(options) == {
-        "run",
-        "out",
-        "max_cameras",
-        "finetune",
-        "data",
-        "target_bytes",
-        "target_drop",
-        "json",
-        "overwrite",
-    } | {field.name for field in fields(PackConfig)}
+    defaults = {field.name: field.default for field in fields(PackConfig)}
+    assert inspect.signature(pack).parameters["block"].default == defaults.pop("block")
+    assert {field.name for field in fields(Precision)} == set(FINETUNED) == set(defaults)
+    source = inspect.getsource(Precision)
+    for name, default in defaults.items():
+        (line,) = re.findall(rf'^    {name}: .*\n    """(.*)"""$', source, re.MULTILINE)
+        assert line.endswith(f"; by default {default}, {FINETUNED[name]} with a fine-tune.")
+        assert getattr(Precision(), name) is None
+
+
+def test_the_options_of_precision_have_no_prefix(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("pack", "--help") == 0
+    shown = capsys.readouterr().out
+    assert "--position-bits" in shown
+    assert "--precision" not in shown
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def test_view_opens_the_page(
     def serve(server: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sundae_ns.cli.view._Server.serve_forever", serve)
+    monkeypatch.setattr("http.server.ThreadingHTTPServer.serve_forever", serve)
     with pytest.raises(SystemExit) as caught:
         main(["view", str(packed), *([] if opens else ["--no-open-browser"])])
     assert caught.value.code == 0

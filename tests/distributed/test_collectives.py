@@ -107,10 +107,10 @@ def own_half(shards: Shards) -> Field:
 
 
 def source_of(shards: Shards, field: Field) -> ShardedField:
-    """A sharded field whose plans are dropped when it changes, as :meth:`sundae_ns.distributed.Ranks.share` makes it."""
+    """A sharded field whose plans are dropped when it changes, as :meth:`sundae_ns.distributed.Team.share` makes it."""
     views: Any = Views(shards.rank)
     source = ShardedField(shards, field, views)
-    shards.on_change(source.forget_plan)
+    shards.changed = source.forget_plan
     return source
 
 

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import copy
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from sundae_ns.distributed import team_of
+from sundae_ns.distributed import Team
 from sundae_ns.distributed.densification import ShardedDensification
 from sundae_ns.distributed.pruning import RankPruner
-from sundae_ns.distributed.team import OneProcess, Ranks
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.method_configs import sundae_tiny
@@ -32,12 +30,10 @@ def config() -> Any:
     return config
 
 
-def test_one_process_changes_nothing(config: Any, tmp_path: Path) -> None:
-    team = team_of(0, 1)
-    assert type(team) is OneProcess
+def test_one_process_changes_nothing(config: Any) -> None:
+    team = Team()
+    assert not team.collective
     assert team.configured(config) is config
-    team.make_folder(tmp_path / "run")
-    assert not (tmp_path / "run").exists()
     state = FieldState(field=Field({"means": torch.zeros(2, 3)}), networks=torch.nn.ModuleDict())
     source, extensions = LocalField(state.field), [Extension()]
     shared = team.share(state, source, extensions, None, 0)
@@ -46,30 +42,27 @@ def test_one_process_changes_nothing(config: Any, tmp_path: Path) -> None:
     made: Any = object()
     assert team.optimizers(lambda: made, None, None, []) is made
     checkpoint = {"step": 3}
-    assert team.gathered(checkpoint, []) is checkpoint
+    assert team.gathered(checkpoint, None, []) is checkpoint
     assert team.part(checkpoint, []) is checkpoint
     random = torch.get_rng_state()
-    team.check_copies(None)
     team.restored(state, 0, 4)
     assert torch.equal(torch.get_rng_state(), random)
 
 
-def test_ranks_train_in_larger_batches_without_a_viewer(config: Any, tmp_path: Path) -> None:
-    team = team_of(0, 2)
-    assert type(team) is Ranks
+def test_ranks_train_in_larger_batches_without_a_viewer(config: Any) -> None:
+    team = Team(0, 2)
+    assert team.collective
     found = team.configured(config)
     assert (found.max_num_iterations, found.vis) == (config.max_num_iterations // 2, "wandb")
     assert found.pipeline.datamanager.cache_images == "cpu"
     assert config.vis == "viewer+wandb"
-    for _ in range(2):  # two ranks make the same folder
-        team.make_folder(tmp_path / "a" / "run")
     config.pipeline.model.pruning.mode = "auto"
     with pytest.raises(ConfigError, match="several GPUs"):
         team.configured(config)
 
 
 def test_ranks_densify_and_prune_as_one() -> None:
-    team, shards = Ranks(0, 2), object()
+    team, shards = Team(0, 2), object()
     team.shards = shards  # type: ignore[assignment]
     strategy = CappedStrategy(refine_every=6)
     densification = team._sharded(Densification(strategy), 7)

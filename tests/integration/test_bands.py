@@ -14,8 +14,8 @@ from bands import bands
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
+from harness.cameras import training_cameras
 from sundae_ns.errors import ConfigError
-from sundae_ns.scenes.cameras import training_cameras
 
 
 def test_cameras_are_those_of_the_run(tiny: Any) -> None:

@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from nerfstudio.configs.method_configs import method_configs
 
 from sundae_ns.cli import main
 from sundae_ns.compensation import resize
@@ -22,7 +21,7 @@ from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import Measured, psnr
 from sundae_ns.rendering import render, zoomed
 from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, rendered_as, sizes
-from sundae_ns.scenes.opening import Opened, load_run
+from sundae_ns.scenes.opening import Opened, open_scene
 
 
 def figures_of(run: Opened, factor: float = 1.0) -> Measured:
@@ -31,7 +30,7 @@ def figures_of(run: Opened, factor: float = 1.0) -> Measured:
 
 
 def test_figures_of_a_run(tiny: Any) -> None:
-    run = load_run(tiny.config)
+    run = open_scene(tiny.config)
     model, cameras, truths = run.model, run.cameras, run.truths
     assert [truth.shape[:2] for truth in truths] == [(int(c.height), int(c.width)) for c in cameras]
     assert all(0 <= truth.min() <= truth.max() <= 1 for truth in truths)
@@ -46,7 +45,7 @@ def test_figures_of_a_run(tiny: Any) -> None:
 
 
 def test_the_timed_frames_are_those_compared_with_the_truth(tiny: Any) -> None:
-    run = load_run(tiny.config)
+    run = open_scene(tiny.config)
     run = replace(run, cameras=run.cameras[:2], truths=run.truths[:2])
     whole = figures_of(run)
     height, width = run.truths[0].shape[:2]
@@ -66,7 +65,7 @@ def test_the_timed_frames_are_those_compared_with_the_truth(tiny: Any) -> None:
 @pytest.mark.parametrize("factor", [0.4, 1.3])
 @torch.no_grad()
 def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> None:
-    run = load_run(tiny.config)
+    run = open_scene(tiny.config)
     model = run.model
     found = figures_of(run, factor)
     height, width = (round(factor * side) for side in run.truths[0].shape[:2])
@@ -86,7 +85,7 @@ def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> N
 
 @torch.no_grad()
 def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny: Any) -> None:
-    run = load_run(tiny.config)
+    run = open_scene(tiny.config)
     model, whole = run.model, tuple(run.truths[0].shape[:2])
     seen: list[tuple[int, ...]] = []
     model.head.register_forward_pre_hook(lambda _, arguments: seen.append(tuple(arguments[0].shape[:2])))
@@ -105,7 +104,7 @@ def test_the_head_is_timed_at_the_size_at_which_it_runs(tiny: Any) -> None:
 
 
 def test_the_head_is_disabled_inside_a_block(tiny: Any) -> None:
-    run = load_run(tiny.config)
+    run = open_scene(tiny.config)
 
     def corrected() -> bool:
         shown = run.model.get_outputs_for_camera(run.cameras[0])
@@ -140,11 +139,11 @@ def test_a_capture_that_has_moved_is_found_or_named(
         main([*arguments, "--data", str(tiny.scene)])
     assert caught.value.code == 0
     shutil.copytree(tiny.scene, capture)
-    assert load_run(run).capture == capture
+    assert open_scene(run).capture == capture
 
 
 def test_a_head_that_is_not_enabled_yet_counts_no_bytes(tiny: Any) -> None:
-    run = load_run(tiny.config)
+    run = open_scene(tiny.config)
     assert figures_of(run).bytes_head > 0
     run.model.state.head_starts_at = 10**9
     figures = figures_of(run)
@@ -153,14 +152,14 @@ def test_a_head_that_is_not_enabled_yet_counts_no_bytes(tiny: Any) -> None:
 
 
 def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path) -> None:
-    assert load_run(tiny.config).kept == tiny.keep_ratio
+    assert open_scene(tiny.config).kept == tiny.keep_ratio
     run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
     prunes = [{"before": 200, "after": 50, "seconds": 1.0}, {"before": 80, "after": 40, "seconds": 0.5}]
     (run / "prune.json").write_text(json.dumps(prunes))
-    found = load_run(run)
+    found = open_scene(run)
     assert (found.kept, found.prune_s) == (0.125, 1.5)
     (run / "prune.json").unlink()
-    found = load_run(run)
+    found = open_scene(run)
     assert (found.kept, found.prune_s) == (None, None)
 
 
@@ -174,12 +173,12 @@ def test_the_share_kept_is_the_product_over_all_prunes(tiny: Any, tmp_path: Path
     ],
 )
 def test_frames_that_cannot_be_measured(tiny: Any, options: dict[str, Any], error: type, match: str) -> None:
-    with pytest.raises(error, match=match), rendered_as(load_run(tiny.config), **options):
+    with pytest.raises(error, match=match), rendered_as(open_scene(tiny.config), **options):
         pass
 
 
 def test_the_head_runs_as_asked_for_inside_a_block(tiny: Any) -> None:
-    run = load_run(tiny.config)
+    run = open_scene(tiny.config)
     before = run.model.head.config
     with rendered_as(run, phases=2):
         assert run.model.head.config == replace(before, precision="fp32", phases=2)
@@ -225,10 +224,4 @@ def test_bench_frame_prints_null_for_undefined_figures(tiny: Any, capsys: pytest
 
 def test_a_run_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="does not exist"):
-        load_run(tmp_path / "config.yml")
-
-
-def test_a_run_of_another_method(tmp_path: Path) -> None:
-    (tmp_path / "config.yml").write_text(yaml.dump(method_configs["splatfacto"]))
-    with pytest.raises(CheckpointError, match="another method"):
-        load_run(tmp_path / "config.yml")
+        open_scene(tmp_path / "config.yml")

@@ -38,8 +38,7 @@ def test_a_target_of_bytes_is_met_and_used(tiny: Any, tmp_path: Path, capsys: py
 def test_a_target_of_quality_is_met(tiny: Any) -> None:
     search = Search(tiny.folder, contents_of_run(tiny.folder, max_cameras=0), PackConfig())
     found = search.better_than(0.02)
-    assert found.drop is not None
-    assert found.drop <= 0.02
+    assert search.drop(found) <= 0.02
 
 
 def test_the_search_uses_what_is_allowed(tiny: Any, monkeypatch: pytest.MonkeyPatch) -> None:

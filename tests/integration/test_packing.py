@@ -18,7 +18,7 @@ from PIL import Image
 
 from sundae_ns.cli import main
 from sundae_ns.evaluation import psnr
-from sundae_ns.scenes.opening import load_run
+from sundae_ns.scenes.opening import open_scene
 
 
 class Packed(NamedTuple):
@@ -57,7 +57,7 @@ def test_ns_eval_finds_the_same_quality(tiny: Any, packed: Packed, call: Any, tm
     assert "sparse point cloud" not in said.stdout, "the field is finished, wherever it started"
     assert "UserWarning" not in said.stderr
     after = json.loads((tmp_path / "out.json").read_text())["results"]
-    run = load_run(tiny.config)
+    run = open_scene(tiny.config)
     assert after["gaussian_count"] == run.model.num_points
     with torch.no_grad():
         pictures = [run.model.get_outputs_for_camera(camera) for camera in run.cameras]

@@ -19,9 +19,8 @@ from sundae_ns.cli.packing import pack
 from sundae_ns.errors import CheckpointError, ConfigError, MemoryExhaustedError
 from sundae_ns.evaluation import psnr
 from sundae_ns.scenes import finetune as packing_finetune
-from sundae_ns.scenes.finetune import finetune, rate_factor
-from sundae_ns.scenes.finetune_step import Through, TunedStep
-from sundae_ns.scenes.opening import load_run
+from sundae_ns.scenes.finetune import Through, TunedStep, finetune, rate_factor
+from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run, write_run
 from sundae_ns.storage.packing import (
     FINETUNED,
@@ -53,7 +52,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 def quality(run: Any, scene: PackedScene, folder: Path) -> float:
     """Mean PSNR of a scene on the test views, dB."""
-    pipeline = load_run(write_run(scene, folder, "a", data=run.scene))
+    pipeline = open_scene(write_run(scene, folder, "a", data=run.scene))
     with torch.no_grad():
         values = [
             float(psnr(pipeline.model.get_outputs_for_camera(camera)["rgb"], truth))

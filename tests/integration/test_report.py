@@ -20,10 +20,9 @@ from PIL import Image
 from sundae_ns.cli import main
 from sundae_ns.evaluation import COLUMNS, flip_available
 from sundae_ns.rendering import render
-from sundae_ns.scenes.measure import quality
+from sundae_ns.scenes.measure import quality, walk
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run
-from sundae_ns.scenes.walk import walk
 from sundae_ns.storage.packing import write_scene
 
 

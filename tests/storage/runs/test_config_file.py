@@ -10,10 +10,10 @@ import yaml
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.engine.trainer import TrainerConfig
 
+from harness.cameras import training_cameras
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.method_configs import sundae_tiny
-from sundae_ns.scenes.cameras import training_cameras
-from sundae_ns.scenes.opening import load_run, open_scene
+from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage.runs.config_file import load_config, schedule_length
 
@@ -86,7 +86,7 @@ HOSTILE = {
 def test_no_code_that_it_names_runs(tmp_path: Path, kind: str) -> None:
     mark, path = tmp_path / "ran", tmp_path / "config.yml"
     path.write_text(HOSTILE[kind].format(mark) if "{}" in HOSTILE[kind] else HOSTILE[kind])
-    for read in (load_config, contents_of_run, open_scene, load_run, training_cameras):
+    for read in (load_config, contents_of_run, open_scene, training_cameras):
         with pytest.raises(CheckpointError) as raised:
             read(path)
         assert "\n" not in str(raised.value)

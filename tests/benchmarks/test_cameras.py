@@ -14,9 +14,9 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from ray_tracing import write_still_life
 
+from harness.cameras import training_cameras
 from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.method_configs import sundae
-from sundae_ns.scenes.cameras import training_cameras
 
 
 def saved(folder: Path, parser: DataParserConfig, data: Path | None) -> Path:

@@ -1,0 +1,144 @@
+"""``sundae render``: images, videos, and refusals in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import sundae_ns
+from sundae_ns.cli import main
+
+VIEWS = [
+    sundae_ns.View.look_at((0.5 + dx, -2.0, 0.5), (0.5, 0.5, 0.5), fov=60.0, width=41, height=31) for dx in (0.0, 0.8)
+]
+
+
+def run(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as caught:
+        main(["render", *map(str, arguments)])
+    assert isinstance(caught.value.code, int)
+    return caught.value.code
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    assert run(*arguments) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("sundae: ")
+    return line
+
+
+def capture_file(path: Path, count: int) -> Path:
+    """A ``transforms.json`` with cameras that look along y."""
+    pose = torch.eye(4)
+    pose[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    frames = []
+    for index in range(count):
+        pose[:3, 3] = torch.tensor([0.5 + 0.1 * index, -2.0, 0.5])
+        frames.append({"transform_matrix": pose.tolist()})
+    intrinsics = {"fl_x": 40.0, "fl_y": 40.0, "cx": 20.0, "cy": 15.0, "w": 40, "h": 30}
+    path.write_text(json.dumps({**intrinsics, "frames": frames}))
+    return path
+
+
+def camera_path(path: Path, count: int, **options: Any) -> Path:
+    """A camera path of nerfstudio's viewer."""
+    pose = [1.0, 0, 0, 0.5, 0, 0, -1.0, -2.0, 0, 1.0, 0, 0.5, 0, 0, 0, 1.0]
+    cameras = [{"camera_to_world": pose, "fov": 60}] * count
+    path.write_text(json.dumps({"render_width": 41, "render_height": 31, "camera_path": cameras, **options}))
+    return path
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def frames_of(path: Path) -> list[Any]:
+    with av.open(str(path)) as container:
+        return list(container.decode(video=0))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene without views as ``.ply``, and with two of odd sides as ``.sundae``."""
+    folder = tmp_path_factory.mktemp("scenes")
+    generator = torch.Generator().manual_seed(0)
+    points, colors = torch.rand(100, 3, generator=generator), torch.rand(100, 3, generator=generator)
+    scene = sundae_ns.Scene.from_points(points, colors)
+    sundae_ns.save(scene, folder / "cloud.ply")
+    scene = dataclasses.replace(scene, views=tuple(VIEWS))
+    sundae_ns.save(scene, folder / "packed.sundae")
+    return folder
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_an_image_of_a_stored_view(folder: Path, tmp_path: Path, index: int) -> None:
+    out = tmp_path / "a.png"
+    assert run(folder / "packed.sundae", "-o", out, "--view", index) == 0
+    scene = sundae_ns.load(folder / "packed.sundae")
+    expected = (255 * sundae_ns.render(scene, scene.views[index]).rgb).round().byte().numpy()
+    assert expected.std() > 5
+    assert np.array_equal(pixels(out), expected)
+
+
+def test_an_image_of_the_camera_in_a_file(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    camera, out = capture_file(tmp_path / "camera.json", 1), tmp_path / "a.jpg"
+    assert run(folder / "cloud.ply", "--camera", camera, "-o", out) == 0
+    assert capsys.readouterr().out == f"{out}: 40 x 30 px\n"
+    scene = sundae_ns.load(folder / "cloud.ply")
+    expected = 255 * sundae_ns.render(scene, sundae_ns.views_of(camera, scene)[0]).rgb.numpy()
+    assert np.abs(pixels(out) - expected).mean() < 10  # of JPEG
+    assert run(folder / "cloud.ply", "--camera", camera, "-o", tmp_path / "b.png", "--width", 80) == 0
+    assert pixels(tmp_path / "b.png").shape == (60, 80, 3)
+
+
+def test_a_scene_without_cameras_is_seen_from_the_front(folder: Path, tmp_path: Path) -> None:
+    assert run(folder / "cloud.ply", "-o", tmp_path / "a.webp", "--width", 64) == 0
+    assert pixels(tmp_path / "a.webp").shape == (48, 64, 3)
+
+
+def test_a_video_has_a_frame_for_each_camera_and_even_sides(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "a.mp4"
+    assert run(folder / "cloud.ply", "--camera", camera_path(tmp_path / "path.json", 5, fps=10), "-o", out) == 0
+    assert capsys.readouterr().out == f"{out}: 5 frames of 40 x 30 px, 0.5 s\n"
+    frames = frames_of(out)
+    assert [(frame.width, frame.height) for frame in frames] == [(40, 30)] * 5
+    assert run(folder / "packed.sundae", "-o", out, "--overwrite", "--width", 63) == 0
+    assert [(frame.width, frame.height) for frame in frames_of(out)] == [(62, 48)] * 2
+
+
+def test_refusals_are_one_line_and_write_nothing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    packed, out = folder / "packed.sundae", tmp_path / "a.png"
+    damaged, few = tmp_path / "damaged.json", camera_path(tmp_path / "few.json", 0)
+    damaged.write_text("{")
+    before = sorted(tmp_path.iterdir())
+    for words, message in (
+        ((packed, "-o", out), "there are 2 cameras; choose one with --view 0 to 1, or write an .mp4"),
+        ((packed, "-o", out, "--view", 2), "there is no camera 2; give --view 0 to 1"),
+        ((packed, "-o", out, "--view", -1), "there is no camera -1"),
+        ((packed, "-o", tmp_path / "a.gif", "--view", 0), "is neither an image nor a video"),
+        ((packed, "-o", out, "--view", 0, "--width", 1), "width is 1; give 2 pixels or more"),
+        ((packed, "-o", out, "--camera", damaged), "damaged.json is not JSON"),
+        ((packed, "-o", out, "--camera", few), "few.json has an empty camera_path"),
+        ((packed, "-o", out, "--camera", tmp_path / "none.json"), "none.json"),
+        ((tmp_path / "none.sundae", "-o", out), "none.sundae"),
+        ((tmp_path / "none", "-o", out), "none does not exist"),
+        ((packed, "-o", tmp_path / "no" / "a.png"), "no is no folder"),
+    ):
+        assert message in refusal(capsys, *words)
+    assert sorted(tmp_path.iterdir()) == before
+    out.write_text("a thesis")
+    assert "--overwrite" in refusal(capsys, packed, "-o", out, "--view", 0)
+    assert out.read_text() == "a thesis"
