@@ -96,6 +96,28 @@ def writing(failure: str) -> Iterator[None]:
         raise StorageError(f"{failure}: {reason}") from error
 
 
+@contextmanager
+def reading(
+    path: Path, kind: str, failure: type[SundaeError] = DataError, *, mend: str = "export it again"
+) -> Iterator[None]:
+    """Turn every error of reading an untrusted file into one of our own; decoders raise errors of many kinds.
+
+    Args:
+        path: the file.
+        kind: what it should be: ``"a complete .spz"``.
+        failure: class of the error.
+        mend: what to do about a damaged file.
+    """
+    try:
+        yield
+    except SundaeError:
+        raise
+    except OSError as error:
+        raise failure(f"{path} cannot be read ({error.strerror or one_line(error)}); check the path") from error
+    except Exception as error:
+        raise failure(f"{path} is not {kind} ({one_line(error)}); {mend}") from error
+
+
 def _reason(error: Exception) -> str | None:
     """Cause and remedy of a file-system error; None for other errors."""
     if isinstance(error, OSError):

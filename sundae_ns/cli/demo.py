@@ -15,7 +15,7 @@ from rich.progress import Progress
 from sundae_ns.cli.process import console_script, percent_of, run_logged
 from sundae_ns.data import write_demo_capture
 from sundae_ns.errors import ConfigError, writing
-from sundae_ns.evaluation import ComparisonRow, report_text, save_comparison
+from sundae_ns.evaluation import ComparisonRow, comparison_sheet, report_text
 
 METHOD = "sundae-tiny"
 SHOWN = 3
@@ -38,7 +38,7 @@ def _comparison(renders: Path, out: Path) -> None:
         truth, compensated = _read_image(path).chunk(2, dim=1)
         base = _read_image(path.with_name(path.name.replace("img", "base")))
         rows.append(ComparisonRow(truth, base, compensated, title=f"test view {int(path.stem[-4:])}"))
-    save_comparison(out, rows)
+    comparison_sheet(rows).save(out)
 
 
 def run_demo(out: Path, steps: int | None = None, console: Console | None = None) -> int:

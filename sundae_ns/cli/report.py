@@ -16,11 +16,11 @@ from rich.markup import escape
 from rich.progress import MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from sundae_ns.errors import ConfigError, SundaeError
-from sundae_ns.evaluation import Lpips, Measured, csv_text, flip_available, lpips_weights_available, save_comparison
+from sundae_ns.evaluation import Lpips, Measured, comparison_sheet, csv_text, flip_available, lpips_weights_available
 from sundae_ns.evaluation.curves import Curves, read_curves
 from sundae_ns.evaluation.document import document
-from sundae_ns.evaluation.flip import INSTALL
 from sundae_ns.evaluation.lpips import Net
+from sundae_ns.evaluation.metrics import INSTALL_FLIP
 from sundae_ns.evaluation.plots import (
     MOST_SERIES,
     Cost,
@@ -164,7 +164,7 @@ def _label(opened: Opened, taken: Collection[str]) -> str:
 def _missing_metrics(net: Net, lpips: Lpips | None) -> list[str]:
     notes = []
     if not flip_available():
-        notes.append(f"FLIP: the package is not installed; run {INSTALL}.")
+        notes.append(f"FLIP: the package is not installed; run {INSTALL_FLIP}.")
     if lpips is None:
         notes.append(f"LPIPS: the weights of its net ({net}) are missing; sundae doctor says where to put them.")
     return notes
@@ -186,7 +186,7 @@ def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
     rows = []
     for name, index in (("worst", order[0]), ("median", order[len(order) // 2])):
         rows.append(replace(comparison_of(opened, index), title=f"{name}: test view {index}"))
-    save_comparison(path, rows)
+    comparison_sheet(rows).save(path)
 
 
 def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> None:

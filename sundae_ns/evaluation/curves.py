@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 
-@dataclass(frozen=True)
-class Curve:
+class Curve(NamedTuple):
     """One quantity over training, by ascending step."""
 
     steps: tuple[int, ...] = ()
     values: tuple[float, ...] = ()
-
-    def __bool__(self) -> bool:
-        return bool(self.steps)
 
 
 @dataclass(frozen=True)
@@ -35,11 +31,8 @@ class Curves:
     memory: Curve = Curve()
     """Peak device memory so far, MiB."""
 
-    def __bool__(self) -> bool:
-        return any(getattr(self, field.name) for field in fields(self))
 
-
-TAGS = {
+_TAGS = {
     "loss": "Train Loss",
     "primitives": "Train Metrics Dict/gaussian_count",
     "psnr": "Train Metrics Dict/psnr",
@@ -71,8 +64,8 @@ def read_curves(folder: Path) -> Curves | None:
     except Exception:  # a damaged file raises many types; a report works without curves
         return None
     known = set(events.Tags()["scalars"])
-    curves = Curves(**{name: _curve(events.Scalars(tag)) for name, tag in TAGS.items() if tag in known})
-    return curves if curves else None
+    curves = {name: _curve(events.Scalars(tag)) for name, tag in _TAGS.items() if tag in known}
+    return Curves(**curves) if curves else None
 
 
 def _curve(events: Sequence[Any]) -> Curve:

@@ -14,9 +14,9 @@ def fill_depth(depth: Tensor, alpha: Tensor) -> Tensor:
 
 
 def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean ``[F]``, first three principal directions ``[F, 3]`` and standard deviations ``[3]`` of ``features`` ``[N, F]``.
+    """Mean ``[F]``, first three principal directions ``[F, 3]`` and standard deviations ``[3]`` of features ``[N, F]``.
 
-    With fewer than three channels, the missing directions are zero. Signs are fixed, so the displayed colours are stable.
+    With fewer than three channels, the missing directions are zero. Signs are fixed, so displayed colours are stable.
     """
     mean = features.mean(dim=0)
     centred = features - mean

@@ -12,7 +12,6 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from sundae_ns.evaluation.comparison_image import ComparisonRow
 from sundae_ns.evaluation.metrics import psnr
 
-FRAMES_PER_SECOND = 6
 WIDEST = 1920
 """Largest width of a frame in pixels, which every player decodes."""
 _NARROWEST = 240
@@ -21,7 +20,7 @@ _CAPTION = 24
 _FONT_SIZE = 14
 _TEXT = (255, 255, 255)
 _BT709 = 1
-"""Number of the colour space in a video's header, which players otherwise guess from the size."""
+"""Number of the colour space in a video's header; without it, players guess from the size."""
 
 
 def side_by_side(row: ComparisonRow, tile: tuple[int, int], *, head: bool) -> Image.Image:
@@ -58,7 +57,7 @@ def side_by_side(row: ComparisonRow, tile: tuple[int, int], *, head: bool) -> Im
     return frame
 
 
-def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second: float = FRAMES_PER_SECOND) -> int:
+def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second: float = 6) -> int:
     """Write frames of one size as an MP4 (H.264), which browsers play; returns their number.
 
     PyAV brings its own encoder, so no ffmpeg is needed.

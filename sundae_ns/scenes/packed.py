@@ -88,7 +88,7 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
 def packed_run(run: Path, *, data: Path | None = None) -> tuple[Scene, bytes]:
     """The scene of a finished run with its training cameras, and the packed file that holds it; see above for errors."""
     contents = contents_of_run(run, data=data)
-    return scene_of(contents), pack_bytes(*fit_scene(contents))
+    return scene_of(contents), pack_bytes(*fit_scene(contents))[0]
 
 
 def _manager(config: TrainerConfig) -> SundaeDatamanagerConfig:

@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.errors import DataError, regular
+from sundae_ns.errors import DataError, reading, regular
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.morton import scene_order
 from sundae_ns.storage.spz import MAX_SH_DEGREE, checked
@@ -105,7 +105,7 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
             "codebook": values.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-    with replacing(Path(path)) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as bundle:
+    with replacing(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as bundle:
         # ZipInfo has a fixed date, so that equal fields give equal bytes.
         bundle.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
         for name, pixels in images.items():
@@ -122,19 +122,11 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
     Raises:
         DataError: the file is missing, damaged, no bundled .sog, or of another version.
     """
-    try:
-        with zipfile.ZipFile(regular(path)) as bundle:
-            meta = json.loads(_entry(bundle, "meta.json"))
-            if meta["version"] != 2:
-                raise DataError(f"{path} has version {meta['version']} of the format; this program reads 2")
-            arrays = _decoded(bundle, meta)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
-    except DataError:
-        raise
-    except Exception as error:  # zip, JSON and Pillow raise errors of many kinds on damaged files
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DataError(f"{path} is no complete .sog ({reason}); export it again") from error
+    with reading(path, "a complete .sog"), zipfile.ZipFile(regular(path)) as bundle:
+        meta = json.loads(_entry(bundle, "meta.json"))
+        if meta["version"] != 2:
+            raise DataError(f"{path} has version {meta['version']} of the format; this program reads 2")
+        arrays = _decoded(bundle, meta)
     field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
     return field, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
 

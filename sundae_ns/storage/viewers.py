@@ -12,8 +12,7 @@ from torch import Tensor
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import finite_mask, rgb_to_sh
 from sundae_ns.gaussians.parameters import sh_degree_of
-from sundae_ns.storage.ply import write_ply
-from sundae_ns.storage.point_cloud import MODEL_FRAME
+from sundae_ns.storage.ply import MODEL_FRAME, write_ply
 from sundae_ns.storage.sog import write_sog
 from sundae_ns.storage.spz import MAX_SH_DEGREE, clamped, write_spz
 from sundae_ns.storage.transform import similarity

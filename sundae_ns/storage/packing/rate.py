@@ -45,9 +45,8 @@ def _of_rows(levels: Tensor) -> Tensor:
     for run in runs:
         if run.numel():
             means = run.mean(dim=1, keepdim=True)
-            total = (
-                total + _of_magnitudes((run - means).abs().mean(dim=1), run.shape[1]) + _of_magnitudes(means.abs(), 1)
-            )
+            deviations = (run - means).abs().mean(dim=1)
+            total = total + _of_magnitudes(deviations, run.shape[1]) + _of_magnitudes(means.abs(), 1)
     return total
 
 

@@ -25,8 +25,7 @@ from sundae_ns.gaussians.field import Encoding, Field
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, odd_shapes
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.kinds import kind_of, refuse
-from sundae_ns.storage.ply import read_ply
-from sundae_ns.storage.point_cloud import is_nerfstudio_ply
+from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply
 
 EXTRA_STATE = "_extra_state"
 FORMAT = 2

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from sundae_ns.gaussians.rotations import rotation_matrices
 from sundae_ns.storage import morton
 from sundae_ns.storage.packing import quantize, transform
 from sundae_ns.storage.packing.container import Floats
@@ -91,7 +92,7 @@ def hard_quaternions(n: int, seed: int, length: float) -> Floats:
 def covariances(q: Floats, scales: Floats) -> NDArray[np.float64]:
     """Covariances ``[N, 3, 3]`` of ellipsoids with these rotations and log-scales."""
     unit = q.astype(np.float64) / np.linalg.norm(q.astype(np.float64), axis=1, keepdims=True)
-    root = quantize._matrices(unit) * np.exp(scales.astype(np.float64))[:, None]
+    root = rotation_matrices(torch.from_numpy(unit)).numpy() * np.exp(scales.astype(np.float64))[:, None]
     return root @ root.transpose(0, 2, 1)
 
 
