@@ -185,7 +185,7 @@ def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | 
         if is_frame(frame := packed.meta.get("frame")):
             write_text(folder / FRAME_FILE, json.dumps(frame, indent=4))
     state = {f"_model.{name}": value for name, value in model.state_dict().items()}
-    checkpoint.save(
+    checkpoint.write(
         {"step": model.step, "pipeline": state}, config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"
     )
     write_text(folder / "config.yml", yaml.dump(config))

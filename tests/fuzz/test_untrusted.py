@@ -111,7 +111,7 @@ def a_ply(path: Path, place: str) -> None:
 
 
 CASES: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], Any]]] = {
-    "a.ckpt": (a_checkpoint, checkpoint.load),
+    "a.ckpt": (a_checkpoint, checkpoint.read),
     "b.ckpt": (a_checkpoint, checkpoint.read_field),
     "a.sundae": (a_pack, read_scene),
     "a.ply": (a_ply, read_ply),

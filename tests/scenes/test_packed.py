@@ -308,7 +308,7 @@ def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path
     (folder / "config.yml").write_text(yaml.dump(config))
     (folder / "nerfstudio_models").mkdir()
     saved = {"step": step, "pipeline": {f"_model.{name}": value for name, value in state.items()}}
-    checkpoint.save(saved, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
+    checkpoint.write(saved, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
     return folder, truth
 
 

@@ -10,8 +10,7 @@ import pickle
 import random
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from numbers import Integral
 from pathlib import Path
 from typing import Any, get_args
@@ -20,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import CheckpointError, StorageError, regular
+from sundae_ns.errors import CheckpointError, StorageError, one_line, regular
 from sundae_ns.gaussians.field import Encoding, Field
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, odd_shapes
 from sundae_ns.storage.atomic import replacing
@@ -32,7 +31,7 @@ FORMAT = 2
 _PREFIX = "gauss_params."
 _NAME = re.compile(r"step-(\d+)\.ckpt")
 _PARTIAL = "partial--1.{}.tmp"
-"""Name of an unfinished checkpoint of a process. nerfstudio parses a step from every file name; this one gives -1."""
+"""Name of an unfinished checkpoint of a process; nerfstudio, which parses a step from every name, reads -1."""
 
 
 def random_state() -> dict[str, Any]:
@@ -79,7 +78,7 @@ def newest_step(place: Path) -> int | None:
     return None if match is None else int(match[1])
 
 
-def save(state: Mapping[str, Any], path: Path) -> None:
+def write(state: Mapping[str, Any], path: Path) -> None:
     """Write a checkpoint atomically: an older file of that name stays until the new one is on the disk.
 
     Raises:
@@ -123,28 +122,22 @@ def _damage(path: Path) -> str | None:
             broken = archive.testzip()
             return None if broken is None else f"{broken} in it is damaged"
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        return " ".join(reason.split()) or type(error).__name__
+        return getattr(error, "strerror", None) or one_line(error)
 
 
-def _check_extent(value: Any, path: Path) -> None:
-    """Refuse sparse or quantized tensors, and tensors with more elements than their storage, whose copy would fill memory."""
+def _check_tensors(value: Any) -> None:
+    """Refuse sparse or quantized tensors, and tensors larger than their storage, whose copy would fill memory."""
     if isinstance(value, Tensor):
         if value.layout is not torch.strided or value.is_quantized or value.is_meta:
-            raise CheckpointError(
-                f"{path} holds a tensor that is sparse, quantized or without values; give another file"
-            )
+            raise ValueError("it holds a tensor that is sparse, quantized or without values")
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
-            raise CheckpointError(f"{path} holds a tensor that claims more than it has; give another file")
-    elif isinstance(value, Mapping):
-        for inner in value.values():
-            _check_extent(inner, path)
-    elif isinstance(value, (list, tuple)):
-        for inner in value:
-            _check_extent(inner, path)
+            raise ValueError("it holds a tensor that claims more than it has")
+    elif isinstance(value, (Mapping, list, tuple)):
+        for inner in value.values() if isinstance(value, Mapping) else value:
+            _check_tensors(inner)
 
 
-def load(path: Path) -> dict[str, Any]:
+def read(path: Path) -> dict[str, Any]:
     """Read a checkpoint of nerfstudio's trainer on the CPU, without running code from it.
 
     Raises:
@@ -152,25 +145,25 @@ def load(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist; give a .ckpt file, or the folder of them")
-    reason = _damage(path)
-    if reason is None:
-        try:
-            with _numpy_numbers_allowed():
-                loaded = torch.load(path, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError:
+    try:
+        if (damage := _damage(path)) is not None:
+            raise ValueError(damage)
+        with _numpy_numbers_allowed():
+            loaded = torch.load(path, map_location="cpu", weights_only=True)
+        state = loaded.get("pipeline") if isinstance(loaded, dict) else None
+        if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
+            raise ValueError("it holds no model")
+        if not isinstance(loaded.get("step"), Integral):
+            raise ValueError("it does not say after which step it was saved")
+        _check_tensors(loaded)
+    except Exception as error:  # torch.load raises many kinds with one meaning for the user
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        if isinstance(error, pickle.UnpicklingError):
             reason = "it holds more than tensors and plain values, or nothing that can be read"
-        except Exception as error:  # torch.load raises many kinds with one meaning for the user
-            reason = str(error).partition("\n")[0] or type(error).__name__
-        else:
-            state = loaded.get("pipeline") if isinstance(loaded, dict) else None
-            if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
-                reason = "it holds no model"
-            elif not isinstance(loaded.get("step"), Integral):
-                reason = "it does not say after which step it was saved"
-            else:
-                _check_extent(loaded, path)
-                return loaded
-    raise CheckpointError(f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file")
+        raise CheckpointError(
+            f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file"
+        ) from error
+    return loaded
 
 
 def newest_whole(folder: Path) -> tuple[Path, list[str]]:
@@ -279,26 +272,23 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], 
     Raises:
         CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
     """
+    mend = "load it with the options that it was trained with"
     for name, value in expected.items():
         if not isinstance(value, Tensor) or name == EXTRA_STATE:
             continue
         if not isinstance(state.get(name), Tensor):
-            raise CheckpointError(f"the checkpoint has no {name}; load it with the options that it was trained with")
+            raise CheckpointError(f"the checkpoint has no {name}; {mend}")
         per_primitive = name.startswith(_PREFIX)
         theirs, ours = state[name].shape, value.shape
         if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
-            mend = "load it with the options that it was trained with"
-            if name.startswith("networks.head."):
-                mend += ", such as its --pipeline.model.head.size"
-            raise CheckpointError(f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {mend}")
+            hint = ", such as its --pipeline.model.head.size" if name.startswith("networks.head.") else ""
+            raise CheckpointError(
+                f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {mend}{hint}"
+            )
     rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
     if len(rows) != 1 or (rows[0] == 0 and not may_be_empty):
         raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")
-    _check_running_state(state[EXTRA_STATE], rows[0])
-
-
-def _check_running_state(extra: Mapping[str, Any], n: int) -> None:
-    """Check the running states of densification and pruning for ``n`` primitives."""
+    extra, n = state[EXTRA_STATE], rows[0]
     pruning, strategy = extra["running"].get("pruning"), extra["running"].get("densification")
     numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
     if not all(isinstance(value, int) for value in numbers) or not isinstance(strategy, Mapping):
@@ -308,20 +298,12 @@ def _check_running_state(extra: Mapping[str, Any], n: int) -> None:
             raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} primitives; give another")
 
 
-@contextmanager
-def _numpy_numbers_allowed() -> Iterator[None]:
-    """Allow the numpy floats that stock nerfstudio leaves in a scheduler's state."""
+def _numpy_numbers_allowed() -> Any:
+    """A context in which torch reads the numpy floats that stock nerfstudio leaves in a scheduler's state."""
     scalar = np.float64(0.0).__reduce__()[0]
-    allowed: list[Any] = [
-        scalar,
-        (scalar, "numpy.core.multiarray.scalar"),
-        (scalar, "numpy._core.multiarray.scalar"),
-        np.dtype,
-        type(np.dtype(np.float64)),
-        type(np.dtype(np.float32)),
-    ]
-    with torch.serialization.safe_globals(allowed):
-        yield
+    names = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    types = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
+    return torch.serialization.safe_globals([scalar, *names, *types])
 
 
 def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
@@ -331,13 +313,12 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         path: ``.ckpt`` file, a folder of them (the newest counts), or ``.ply`` file.
 
     Returns:
-        Parameters without features, float32 on the CPU, colours as harmonics; and True if they are in the coordinates of
-        nerfstudio's model (checkpoints, ``ns-export``), False if in those of the capture (other ``.ply``).
+        Parameters without features, float32 on the CPU, colours as harmonics; and whether they are in the coordinates
+        of nerfstudio's model (checkpoints, ``ns-export``), not in those of the capture (other ``.ply``).
 
     Raises:
-        CheckpointError: there is no such file, it holds no Gaussian field, or it is a SUNDAE checkpoint of another format.
+        CheckpointError: there is no such file, it holds no Gaussian field, or has another format.
     """
-    path = Path(path)
     if path.is_dir():
         if not checkpoints(folder_of(path)):
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
@@ -347,35 +328,35 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         field = read_ply(path)
         _check_field(field, path)
         return field, is_nerfstudio_ply(path)
-    return dict(field_of(load(path), path).as_harmonics()), True
+    return dict(field_of(read(path), path).as_harmonics()), True
 
 
 def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
     """The field of a checkpoint of splatfacto or sundae as it is stored, without features, float32 on the CPU.
 
     Args:
-        loaded: from :func:`load`.
+        loaded: from :func:`read`.
         path: for error messages.
 
     Raises:
         CheckpointError: it holds no Gaussian field, or is a SUNDAE checkpoint of another format.
     """
     state = model_state(loaded)
-    keys = {name: _PREFIX + name for name in SPLAT_NAMES}
-    if not all(isinstance(state.get(key), Tensor) for key in keys.values()):
+    stored = {name: state.get(_PREFIX + name) for name in SPLAT_NAMES}
+    field = {name: value.float() for name, value in stored.items() if isinstance(value, Tensor)}
+    if len(field) < len(stored):
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
-    field = {name: state[key].float() for name, key in keys.items()}
     _check_field(field, path)
     return Field(field, _encoding(field, state.get(EXTRA_STATE)))
 
 
 def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
     """State of the model in a checkpoint, by its own names."""
-    found = {}
-    for name, value in loaded["pipeline"].items():
-        if name.startswith("_model."):
-            found[name.removeprefix("_model.").removeprefix("module.")] = value
-    return found
+    return {
+        name.removeprefix("_model.").removeprefix("module."): value
+        for name, value in loaded["pipeline"].items()
+        if name.startswith("_model.")
+    }
 
 
 def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:
