@@ -79,11 +79,7 @@ class RankError(SundaeError, RuntimeError):
 def writing(failure: str) -> Iterator[None]:
     """Turn file-system errors that a user can correct into ``StorageError``; others pass.
 
-    Args:
-        failure: start of the message, without a full stop: ``"cannot make runs/a"``.
-
-    Raises:
-        StorageError: the disk is full or not writable.
+    ``failure`` is the start of the message, without a full stop: ``"cannot make runs/a"``.
     """
     try:
         yield
@@ -100,13 +96,9 @@ def writing(failure: str) -> Iterator[None]:
 def reading(
     path: Path, kind: str, failure: type[SundaeError] = DataError, *, mend: str = "export it again"
 ) -> Iterator[None]:
-    """Turn every error of reading an untrusted file into one of our own; decoders raise errors of many kinds.
+    """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
 
-    Args:
-        path: the file.
-        kind: what it should be: ``"a complete .spz"``.
-        failure: class of the error.
-        mend: what to do about a damaged file.
+    ``kind`` names what the file should be, ``"a complete .spz"``, and ``mend`` what to do if it is damaged.
     """
     try:
         yield
@@ -137,22 +129,14 @@ def one_line(error: BaseException) -> str:
 
 
 def regular(path: Path) -> Path:
-    """The path, unless reading it may never end.
-
-    Raises:
-        OSError: it is a pipe, a socket or a device.
-    """
+    """The path; ``OSError`` for a pipe, a socket or a device, whose reading may never end."""
     if path.exists() and not path.is_file() and not path.is_dir():
         raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", str(path))
     return path
 
 
 def rank_ended(error: BaseException) -> RankError:
-    """The error for a rank that ended and stopped the others: which rank, why, and how to resume.
-
-    Args:
-        error: ``ProcessExitedException`` or ``ProcessRaisedException`` of ``torch.multiprocessing``.
-    """
+    """The error for a rank that ended and stopped the others, from an exception of ``torch.multiprocessing``."""
     rank, signal = getattr(error, "error_index", 0), getattr(error, "signal_name", None)
     last = (str(error).strip().splitlines() or [""])[-1]
     kind, _, message = last.partition(": ")
@@ -166,12 +150,7 @@ def rank_ended(error: BaseException) -> RankError:
 
 
 def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError:
-    """The error for a full CUDA device: the number of primitives, the allocation that failed, what to try.
-
-    Args:
-        error: ``torch.cuda.OutOfMemoryError``; its message states the size of the allocation.
-        primitives: number of primitives in the field.
-    """
+    """The error for a full CUDA device: the number of primitives, the allocation that failed, what to try."""
     found = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", str(error))
     asked = f"cannot allocate {found[1]} more" if found else "cannot allocate more"
     return MemoryExhaustedError(

@@ -101,22 +101,14 @@ def document(
     return "\n".join(lines)
 
 
-def report_text(
-    title: str,
-    stages: Sequence[Stage],
-    sizes: tuple[int, int],
-    times: tuple[float, float, float],
-    *,
-    width: int = 100,
-) -> str:
-    """Tables of quality and cost as text.
+def report_text(title: str, stages: Sequence[Stage], sizes: tuple[int, int], times: tuple[float, float, float]) -> str:
+    """Tables of quality and cost as text, at most 100 characters wide.
 
     Args:
         title: of the tables.
         stages: from the full field to the final one.
         sizes: bytes of the primitives and of the head.
         times: milliseconds of splatting, of the head, and of the whole frame.
-        width: most characters of a line.
     """
     quality = Table(title=f"{title}: quality on the test views", title_justify="left")
     quality.add_column("stage")
@@ -135,7 +127,7 @@ def report_text(
     cost.add_row("size, MB (1e6 bytes)", *(number(size / MEGABYTE, 2) for size in (*sizes, sum(sizes))))
     cost.add_row("time per frame, ms", *(number(value, 2) for value in times))
 
-    console = Console(file=StringIO(), width=width, color_system=None, force_terminal=False)
+    console = Console(file=StringIO(), width=100, color_system=None, force_terminal=False)
     with console.capture() as capture:
         console.print(quality, cost)
     return "\n".join(line.rstrip() for line in capture.get().splitlines())

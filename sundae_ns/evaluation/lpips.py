@@ -62,11 +62,7 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
-        """Distance of two images; lower is better.
-
-        Args:
-            pred: ``[H, W, 3]``; clamped to [0, 1].
-            target: ``[H, W, 3]``; clamped to [0, 1].
+        """Distance of two images ``[H, W, 3]``, clamped to [0, 1]; lower is better.
 
         Returns:
             A float32 scalar on the inputs' device. None if a side is shorter than 32 pixels, or if the weights are

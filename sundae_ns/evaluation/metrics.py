@@ -65,13 +65,9 @@ def flip_available() -> bool:
 
 @torch.no_grad()
 def flip(pred: Tensor, target: Tensor) -> Tensor | None:
-    """Mean FLIP error (Andersson et al. 2020) of two sRGB images, in [0, 1]; lower is better.
+    """Mean FLIP error (Andersson et al. 2020) of two sRGB images ``[H, W, 3]``, in [0, 1]; lower is better.
 
-    Its authors' package computes it on the CPU.
-
-    Args:
-        pred: ``[H, W, 3]``; clamped to [0, 1].
-        target: ``[H, W, 3]``; clamped to [0, 1].
+    Images are clamped to [0, 1]. The authors' package computes the error on the CPU.
 
     Returns:
         A float32 scalar on the inputs' device; None if the package is not installed.

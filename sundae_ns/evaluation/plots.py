@@ -85,13 +85,7 @@ def plot_quality(path: Path, runs: Sequence[Measured], cost: Cost, colors: Mappi
 
 
 def plot_views(path: Path, runs: Sequence[Measured], colors: Mapping[str, str]) -> None:
-    """PSNR of every test view; solid lines with the head, dashed lines without it.
-
-    Args:
-        path: the file to write.
-        runs: of one scene, at most :data:`MOST_SERIES`.
-        colors: from :func:`colors_of`.
-    """
+    """PSNR of every test view of at most :data:`MOST_SERIES` runs of a scene; dashed lines are without the head."""
     count = max(len(run.full.views) for run in runs)
     figure, panels = _figure(1, 1, width=min(7 + 0.12 * count, 16), height=3.8)
     panel = panels[0, 0]
@@ -110,13 +104,9 @@ def plot_views(path: Path, runs: Sequence[Measured], colors: Mapping[str, str]) 
 
 
 def plot_curves(path: Path, curves: Mapping[str, Curves], colors: Mapping[str, str], *, title: str) -> None:
-    """Loss, number of primitives, PSNR of training views, and peak memory over training.
+    """Loss, number of primitives, PSNR of training views, and peak memory over training, by label.
 
-    Args:
-        path: the file to write.
-        curves: by label; at least one and at most :data:`MOST_SERIES`.
-        colors: from :func:`colors_of`.
-        title: of the figure.
+    There are at least one and at most :data:`MOST_SERIES` runs in ``curves``.
     """
     figure, panels = _figure(2, 2, width=5.6, height=3.2)
     titles = (

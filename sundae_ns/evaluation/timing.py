@@ -23,15 +23,9 @@ def now(device: torch.device | str) -> float:
 
 
 def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: int = 5, repeats: int = 20) -> float:
-    """Median milliseconds of a function, from its call until the device is idle again.
+    """Median milliseconds of a function on a device, from its call until the device is idle again.
 
-    The host's clock is read after a synchronisation on both sides of the call, so the time includes launching the work.
-
-    Args:
-        fn: called without arguments; its result is discarded.
-        device: the device that ``fn`` uses.
-        warmup: number of untimed calls first.
-        repeats: number of timed calls.
+    ``warmup`` untimed calls come before the ``repeats`` timed ones.
 
     Raises:
         ConfigError: ``warmup`` is negative, or ``repeats`` less than 1.

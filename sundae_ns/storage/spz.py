@@ -46,12 +46,9 @@ _COLOR, _HARMONIC = 0.5 / 0.15, 1.0  # largest SH coefficients of degree 0, and 
 
 
 def fractional_bits(means: Tensor) -> int:
-    """Fractional bits of the positions: the largest number, at most 24, with which the farthest primitive fits.
+    """Most fractional bits, at most 24, of positions ``[N, 3]`` with which the farthest primitive fits.
 
     The error of a coordinate is at most ``2^-(bits + 1)``, plus the rounding of float32.
-
-    Args:
-        means: centres ``[N, 3]``, finite, N at least 1.
 
     Raises:
         DataError: a primitive is so far away that fewer than 8 bits are left.
@@ -126,11 +123,7 @@ def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
 
 
 def _checked_flags(path: Path) -> int:
-    """Flags of a .spz. gsply unpacks without a limit, so the size is checked before.
-
-    Raises:
-        DataError: the file is no .spz, or its header contradicts its size.
-    """
+    """Flags of a .spz. gsply unpacks without a limit, so this checks the size before."""
     raw = regular(path).read_bytes()
     most = (8 << 20) + 64 * len(raw)
     packed = raw[:2] == b"\x1f\x8b"

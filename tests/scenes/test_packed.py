@@ -172,7 +172,7 @@ def test_an_interrupted_unpack_leaves_no_run(tmp_path: Path, monkeypatch: pytest
         raise StorageError("the disk is full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "save", full)
+        patch.setattr(checkpoint, "write", full)
         with pytest.raises(StorageError):
             write_run(scene(), tmp_path, "a")
     assert not list(tmp_path.rglob("config.yml"))

@@ -271,14 +271,14 @@ def predecessors(count: int) -> Near:
     return np.maximum(rows, -1)
 
 
-def encode(levels: Array, near: Near) -> Stream:
+def encode_levels(levels: Array, near: Near) -> Stream:
     """Code numbers ``[N, C]`` of at most :data:`LARGEST`, given the neighbours of each row."""
     values = np.ascontiguousarray(levels, np.int32).copy()
     return _written(_run, values.size * 5 + 16, values, near)
 
 
-def decode(stream: Stream, width: int, near: Near) -> Levels:
-    """Numbers ``[N, C]`` from :func:`encode`.
+def decode_levels(stream: Stream, width: int, near: Near) -> Levels:
+    """Numbers ``[N, C]`` from :func:`encode_levels`.
 
     Raises:
         PackError: the stream does not end with its last number.

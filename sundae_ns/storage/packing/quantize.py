@@ -135,9 +135,9 @@ def rotations_at(levels: Tensor, step: float) -> Tensor:
 def rotation_bound(step: float) -> float:
     """Maximum error of the angle of an aligned rotation, radians.
 
-    The vector v of x, y and z has an error of at most sqrt(3) / 2 steps, and w is sqrt(1 - |v|^2). On the sphere of unit
-    quaternions, a step of v is stretched by at most 1 / w. Aligned rotations turn by at most 62.8 degrees, so |v| is at
-    most 0.522 before rounding. The angle of a rotation is twice the angle on that sphere.
+    The vector v of x, y and z has an error of at most sqrt(3) / 2 steps. On the sphere of unit quaternions, a step of v
+    is stretched by at most 1 / w, and w is sqrt(1 - |v|^2). Aligned rotations turn by at most 62.8 degrees, so |v| is
+    at most 0.522 before rounding. The angle of a rotation is twice the angle on that sphere.
     """
     off = 3**0.5 * step / 2
     return 2 * off / (1 - min(0.522 + off, 0.999) ** 2) ** 0.5

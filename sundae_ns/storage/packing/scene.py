@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import PackError
-from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, odd_shapes, sh_degree_of
+from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, sh_degree_of
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.packing import container, entropy, quantize, transform
-from sundae_ns.storage.packing.codecs import Codecs, Sensitivity, as_matrix, fit
+from sundae_ns.storage.packing.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
 from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array, DamagedError, Levels
 from sundae_ns.storage.packing.entropy import Near
 from sundae_ns.storage.packing.quantize import Blocks
+from sundae_ns.storage.ply import check_field
 
 CAMERAS = {"poses": ("<f4", (3, 4)), "intrinsics": ("<f8", (4,)), "sizes": ("<u4", (2,))}
 """dtype and shape, after ``[M, ...]``, of the arrays of M cameras: camera-to-world with OpenGL axes in the model's
@@ -73,23 +74,16 @@ class PackReport(NamedTuple):
 
     def summary(self) -> dict[str, Any]:
         """JSON values: primitives, bytes, and the bits per primitive of each attribute and of all."""
-        bits = {name: round(value, 2) for name, value in self.bits.items()}
-        return {
-            "primitives": self.primitives,
-            "bytes": self.bytes,
-            "bits": {**bits, "all": round(8 * self.bytes / self.primitives, 2)},
-        }
+        bits = {**self.bits, "all": 8 * self.bytes / self.primitives}
+        rounded = {name: round(value, 2) for name, value in bits.items()}
+        return {"primitives": self.primitives, "bytes": self.bytes, "bits": rounded}
 
 
 def _check(params: Mapping[str, Tensor]) -> None:
-    missing = [name for name in SPLAT_NAMES if name not in params]
-    if missing:
-        raise PackError(f"the field has no {', '.join(missing)}; it needs all of {', '.join(SPLAT_NAMES)}")
+    check_field(params, PackError)
     n = num_primitives(params)
     if n == 0:
         raise PackError("the field has no primitives; there is nothing to pack")
-    for odd in odd_shapes(params):
-        raise PackError(odd)
     features = params.get(FEATURES)
     if features is not None and not (
         features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MAX_WIDTH
@@ -117,7 +111,7 @@ def fit_scene(scene: PackedScene, config: PackConfig | None = None) -> tuple[Pac
     config = config or PackConfig()
     config.validate()
     _check(scene.field)
-    field, codecs = fit(scene.field, scene.head, config, scene.sensitivity)
+    field, codecs = fit_codecs(scene.field, scene.head, config, scene.sensitivity)
     return replace(scene, field=field), codecs
 
 
@@ -160,7 +154,7 @@ def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int
         head = codecs.head.encode(scene.head)
         coded["head"] = head, entropy.predecessors(len(head[1]))
     with ThreadPoolExecutor(2) as pool:
-        streams = pool.map(lambda one: entropy.encode(one[0][1], one[1]), coded.values())
+        streams = pool.map(lambda one: entropy.encode_levels(one[0][1], one[1]), coded.values())
         for (name, ((entry, _, parts), _)), stream in zip(coded.items(), streams, strict=True):
             about[name] = entry
             arrays |= {f"{name}/levels": stream, **{f"{name}/{part}": array for part, array in parts.items()}}
@@ -214,7 +208,7 @@ class _Reader:
         step = self.about(name, codec).get("step")
         if type(step) not in (int, float) or not abs(step) < _LARGEST_STEP:
             raise DamagedError(f"the step of {name} is not a number within float32")
-        return self.decoded(f"{name}/levels", entropy.decode, width, near), float(step)
+        return self.decoded(f"{name}/levels", entropy.decode_levels, width, near), float(step)
 
 
 def _whole(about: Mapping[str, Any], key: str, minimum: int, maximum: int) -> int:
@@ -242,7 +236,7 @@ def _decode_rows(reader: _Reader, name: str, near: Near, width: int) -> NDArray[
     levels, step = reader.levels(name, "transform", near, width)
     mean = reader.section(f"{name}/mean", "<f4", (width,))
     basis = reader.section(f"{name}/basis", "|i1", (width * width,)).reshape(width, width)
-    return transform.restore(levels, mean, basis, step)
+    return transform.rows_at(levels, mean, basis, step)
 
 
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:
@@ -256,7 +250,7 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
     if _whole(about, "weights", 0, 1 << 28) != count:
         raise DamagedError("the head has another number of weights than it states")
     container.check_ratio(4 * count, reader.size)
-    sources["levels"] = reader.decoded("head/levels", entropy.decode, 1, entropy.predecessors(count)).reshape(-1)
+    sources["levels"] = reader.decoded("head/levels", entropy.decode_levels, 1, entropy.predecessors(count)).reshape(-1)
 
     def take(part: str, count: int) -> Tensor:
         if count > len(sources[part]):

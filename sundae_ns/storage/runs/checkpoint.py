@@ -68,22 +68,14 @@ def folder_of(place: Path) -> Path:
 
 
 def newest_step(place: Path) -> int | None:
-    """Step of the newest checkpoint by its name; None if there is none.
-
-    Args:
-        place: a checkpoint, the folder of checkpoints, or the folder of a run.
-    """
+    """Step of the newest checkpoint by its name, given it, its folder, or the run's; None if there is none."""
     found = [place] if place.is_file() else checkpoints(folder_of(place))
     match = _NAME.fullmatch(found[-1].name) if found else None
     return None if match is None else int(match[1])
 
 
 def write(state: Mapping[str, Any], path: Path) -> None:
-    """Write a checkpoint atomically: an older file of that name stays until the new one is on the disk.
-
-    Raises:
-        StorageError: no space or no right to write; names the newest older checkpoint that is whole.
-    """
+    """Write a checkpoint atomically; a ``StorageError`` names the newest older checkpoint that is whole."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Through a Python file, because torch's own writer hides the reason of a failed write.
@@ -109,10 +101,7 @@ def _compact(value: Any) -> Any:
 
 
 def _damage(path: Path) -> str | None:
-    """Reason why a file is no whole checkpoint; None if its checksums are right.
-
-    torch neither verifies checksums nor refuses a file that unpacks to more than its size.
-    """
+    """Reason why a file is no whole checkpoint; None if its checksums are right, which torch does not verify."""
     try:
         with zipfile.ZipFile(regular(path)) as archive:
             entries = archive.infolist()
@@ -167,10 +156,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def newest_whole(folder: Path) -> tuple[Path, list[str]]:
-    """The newest whole checkpoint of a folder, and a line for each newer damaged one.
-
-    Args:
-        folder: of checkpoints, or of a run.
+    """The newest whole checkpoint of a folder or a run, and a line for each newer damaged one.
 
     Raises:
         CheckpointError: there is none.
@@ -257,7 +243,8 @@ def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Enc
 def _check_format(extra: Mapping[str, Any]) -> None:
     if extra.get("format") != FORMAT:
         raise CheckpointError(
-            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; use the version that wrote it"
+            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; "
+            "use the version that wrote it"
         )
 
 
@@ -332,11 +319,7 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
 
 
 def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
-    """The field of a checkpoint of splatfacto or sundae as it is stored, without features, float32 on the CPU.
-
-    Args:
-        loaded: from :func:`read`.
-        path: for error messages.
+    """The stored field of a checkpoint from :func:`read`, without features, float32 on the CPU.
 
     Raises:
         CheckpointError: it holds no Gaussian field, or is a SUNDAE checkpoint of another format.

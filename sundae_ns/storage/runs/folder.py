@@ -27,11 +27,7 @@ def new_name() -> str:
 
 
 def unpacked_folder(output_dir: Path, name: str) -> Path:
-    """Folder of the run that a packed scene is unpacked to.
-
-    Args:
-        output_dir: folder of runs.
-        name: of the experiment; characters beside letters, digits, ``_``, ``.`` and ``-`` are replaced.
+    """Folder below ``output_dir`` of the run that a packed scene is unpacked to; odd characters of its name change.
 
     Raises:
         PackError: there is a run already.
@@ -44,10 +40,7 @@ def unpacked_folder(output_dir: Path, name: str) -> Path:
 
 
 def reserve(run: Path) -> None:
-    """Reserve a run's folder for this process until it ends, and remove files that killed processes left unfinished.
-
-    Args:
-        run: folder of the run; created if missing.
+    """Make a run's folder, reserve it for this process, and remove files that killed processes left unfinished.
 
     Raises:
         StorageError: another process trains in it, or the folder cannot be written.

@@ -143,7 +143,7 @@ def test_transform(kind: str, n: int, seed: int) -> None:
     codec = transform.fit(x, 0.03)
     _, levels, arrays = codec.encode(x)
     arrays["basis"] = arrays["basis"].reshape(9, 9)
-    found = transform.restore(levels, step=codec.step, **arrays).astype(np.float64)
+    found = transform.rows_at(levels, step=codec.step, **arrays).astype(np.float64)
     # Sums of nine products in float32.
     slack = 20 * ulp(np.linalg.norm(x.astype(np.float64), axis=1, keepdims=True))
     assert (np.abs(found - x) <= codec.bound + slack).all()
@@ -171,7 +171,7 @@ def test_rows_of_zeros_stay_exact() -> None:
 
 
 def test_a_form_makes_errors_that_show_smaller() -> None:
-    """At as many bits: the sum of the errors by the form is less than half, and errors of its least direction are larger."""
+    """At as many bits: less than half of the errors by the form, and larger errors in its least direction."""
     rng = np.random.default_rng(0)
     x = rng.normal(size=(4000, 6)).astype(np.float32)
     axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]

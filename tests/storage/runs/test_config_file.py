@@ -57,7 +57,7 @@ HOSTILE = {
     "a call": "!!python/object/apply:os.mkdir ['{}']",
     "a new object": "!!python/object/new:os.mkdir\nargs: ['{}']",
     "a call of nerfstudio's": "!!python/object/apply:nerfstudio.utils.scripts.run_command ['mkdir {}']",
-    "a call of what nerfstudio imports": "!!python/object/apply:nerfstudio.utils.scripts.subprocess.run [[mkdir, '{}']]",
+    "a call of an import": "!!python/object/apply:nerfstudio.utils.scripts.subprocess.run [[mkdir, '{}']]",
     "a call of ours": "!!python/object/apply:sundae_ns.storage.atomic.write_text ['{}', a]",
     "a name from elsewhere": "!!python/name:os.mkdir ''",
     "a name that ours imports": "!!python/name:sundae_ns.storage.atomic.os.mkdir ''",
