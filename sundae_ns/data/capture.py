@@ -32,7 +32,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 
-def checked_number(value: Any, name: str, where: str, *, positive: bool = False) -> float:
+def finite(value: Any, name: str, where: str, *, positive: bool = False) -> float:
     """``value`` as a float; ``DataError`` if it is no number, not finite, too large, or not positive if asked."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise DataError(f"{where}: {name} is {_short(value)}; it must be a number")
@@ -45,7 +45,7 @@ def checked_number(value: Any, name: str, where: str, *, positive: bool = False)
 
 def side(value: Any, name: str, where: str) -> int:
     """``value`` as the side of an image in pixels; ``DataError`` unless it is a whole number from 1 to 65,535."""
-    length = checked_number(value, name, where)
+    length = finite(value, name, where)
     if length != int(length) or not 1 <= length <= _MAX_SIDE:
         raise DataError(
             f"{where}: {name} is {_short(value)}; it must be a whole number of pixels from 1 to {_MAX_SIDE}"
@@ -63,7 +63,7 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
     if not whole or not all(isinstance(row, list) and len(row) == 4 for row in value):
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
     for entry in chain(*value):
-        checked_number(entry, name, where)
+        finite(entry, name, where)
     array = np.array(value, dtype=np.float64)
     if abs(np.linalg.det(array[:3, :3])) < 1e-9:
         raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
@@ -158,16 +158,16 @@ def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -
         if key in ("w", "h"):
             side(entry[key], key, where)
         else:
-            checked_number(entry[key], key, where, positive=key.startswith("fl"))
+            finite(entry[key], key, where, positive=key.startswith("fl"))
     for key in _DISTORTION:
         if key in entry:
-            checked_number(entry[key], key, where)
+            finite(entry[key], key, where)
     if "distortion_params" in entry:
         values = entry["distortion_params"]
         if not isinstance(values, list) or len(values) not in (4, 6, 12):
             raise DataError(f"{where}: distortion_params must be a list of 4, 6 or 12 numbers")
         for value in values:
-            checked_number(value, "distortion_params", where)
+            finite(value, "distortion_params", where)
 
 
 def _check_round_lens(meta: Mapping[str, Any], masked: bool, where: str) -> None:
@@ -203,7 +203,7 @@ def _check_frame_of_capture(meta: Mapping[str, Any], where: str) -> None:
     if "applied_transform" in meta:
         matrix(meta["applied_transform"], (3,), "applied_transform", where)
     if "applied_scale" in meta:
-        checked_number(meta["applied_scale"], "applied_scale", where, positive=True)
+        finite(meta["applied_scale"], "applied_scale", where, positive=True)
     if meta.get("orientation_override", "up") not in _ORIENTATIONS:
         raise DataError(
             f"{where}: orientation_override is {_short(meta['orientation_override'])}; "
@@ -220,14 +220,9 @@ def _path(value: Any, name: str, where: str) -> str:
 
 
 def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
-    """Check by its header that an image can be used for training.
+    """Width and height in pixels of an image, after a check by its header that training can use it.
 
-    Args:
-        path: the file.
-        mask: expect a mask of one channel instead of a photograph of 8 bits per channel.
-
-    Returns:
-        Width and height in pixels.
+    A ``mask`` has one channel, a photograph 8 bits per channel.
 
     Raises:
         DataError: the file is missing, not an image, of another pixel type, or too short for its size in pixels.

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from sundae_ns.data.capture import checked_number, read_bytes, side
+from sundae_ns.data.capture import finite, read_bytes, side
 from sundae_ns.errors import DataError, one_line, reading
 
 # Identifier: name, number of parameters, number of focal lengths; only models that nerfstudio supports.
@@ -125,12 +125,12 @@ def _check_camera(
     if len(params) != model[1]:
         raise DataError(f"{where}: {model[0]} has {model[1]} parameters, not {len(params)}; export it again")
     for index, value in enumerate(params):
-        checked_number(value, f"parameter {index}", where, positive=index < model[2])
+        finite(value, f"parameter {index}", where, positive=index < model[2])
 
 
 def _check_pose(pose: Sequence[float], camera: int, cameras: set[int], where: str) -> None:
     for value in pose:
-        checked_number(value, "the pose", where)
+        finite(value, "the pose", where)
     if not abs(math.hypot(*pose[:4]) - 1) < 0.01:
         raise DataError(f"{where}: its quaternion is not of length 1, so it is not a rotation; remove the image")
     if camera not in cameras:

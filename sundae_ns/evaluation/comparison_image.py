@@ -60,9 +60,7 @@ def comparison_sheet(rows: Sequence[ComparisonRow]) -> Image.Image:
     """A captioned image with one row per view: truth, base colours, compensated, and five times the absolute error.
 
     The PSNR of each rendering is printed below it. Images narrower than 240 pixels are enlarged by a whole factor.
-
-    Args:
-        rows: the views; sizes may differ between rows.
+    Sizes may differ between rows.
 
     Raises:
         DataError: ``rows`` is empty, or the images of a row differ in shape.

@@ -43,13 +43,9 @@ _TAGS = {
 
 
 def read_curves(folder: Path) -> Curves | None:
-    """Read the curves of a run.
+    """Read the curves of a run from its folder; None if it holds no readable event file.
 
-    Args:
-        folder: the run's folder. A resumed run has several event files in it.
-
-    Returns:
-        The curves, with the parts of a resumed run joined; None if the folder holds no readable event file.
+    A resumed run has several event files; its parts are joined.
     """
     if not any(folder.glob("events.out.tfevents.*")):
         return None

@@ -56,7 +56,7 @@ def document(
     notes: Sequence[str],
     command: str,
 ) -> str:
-    """The page.
+    """The Markdown page.
 
     Args:
         scenes: measured fields by scene.
@@ -134,11 +134,7 @@ def report_text(title: str, stages: Sequence[Stage], sizes: tuple[int, int], tim
 
 
 def csv_text(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Runs as CSV with a header; an empty cell means not measured.
-
-    Args:
-        runs: from :meth:`sundae_ns.evaluation.Measured.as_json`.
-    """
+    """Runs of :meth:`sundae_ns.evaluation.Measured.as_json` as CSV; an empty cell means not measured."""
     buffer = StringIO()
     writer = csv.DictWriter(buffer, COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()

@@ -47,16 +47,9 @@ def colors_of(labels: Sequence[str]) -> dict[str, str]:
 
 
 def plot_quality(path: Path, runs: Sequence[Measured], cost: Cost, colors: Mapping[str, str]) -> bool:
-    """PSNR and SSIM against a cost; a line connects a field with its head and without.
+    """PSNR and SSIM of the runs of a scene against a cost; a line connects a field with its head and without.
 
-    Args:
-        path: the file to write.
-        runs: all of one scene; those without this cost are left out.
-        cost: the horizontal axis: size in MB, time in ms per frame, or number of primitives.
-        colors: from :func:`colors_of`.
-
-    Returns:
-        Whether there was a point to plot; otherwise no file is written.
+    Runs without this cost are left out. Returns whether there was a point to plot; otherwise no file is written.
     """
     value, cost_label = _COSTS[cost]
     places = [(run, way, x) for run in runs for way in run.configurations if (x := value(run, way)) is not None]

@@ -24,16 +24,15 @@ _BT709 = 1
 
 
 def side_by_side(row: ComparisonRow, tile: tuple[int, int], *, head: bool) -> Image.Image:
-    """A frame: base colours, the compensated image and the truth of one view, with PSNR and the row's title below.
+    """A frame of a view: base colours, compensated image and truth, with PSNR and the row's title below.
+
+    It is an RGB image with even sides, at most ``WIDEST`` pixels wide.
 
     Args:
         row: the view.
-        tile: width and height in pixels that each image gets; one of another shape gets black borders. Narrow tiles are
+        tile: width and height in pixels for each image; one of another shape gets black borders. Narrow tiles are
             enlarged, and wide ones reduced.
         head: whether the field has a head; without one, the compensated image is left out.
-
-    Returns:
-        RGB image with even sides, at most ``WIDEST`` pixels wide.
     """
     truth = torch.as_tensor(row.truth)
     base = float(psnr(torch.as_tensor(row.base), truth))
@@ -58,14 +57,9 @@ def side_by_side(row: ComparisonRow, tile: tuple[int, int], *, head: bool) -> Im
 
 
 def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second: float = 6) -> int:
-    """Write frames of one size as an MP4 (H.264), which browsers play; returns their number.
+    """Write RGB frames of one size with even sides as an MP4 (H.264), which browsers play; returns their number.
 
-    PyAV brings its own encoder, so no ffmpeg is needed.
-
-    Args:
-        path: file to write, of any suffix.
-        frames: RGB images of one size with even sides, rendered one at a time.
-        frames_per_second: speed.
+    PyAV brings its own encoder, so no ffmpeg is needed. The path may have any suffix.
     """
     import av
 

@@ -81,10 +81,10 @@ def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
     field = checked(path, params)
     bits = fractional_bits(field["means"])
     field["features_rest"] = (field["features_rest"] / _HARMONICS_STEP).round() * _HARMONICS_STEP
-    arrays = {name: value.numpy() for name, value in field.items()}
-    colors, rest = arrays.pop("features_dc"), arrays.pop("features_rest")
-    arrays["opacities"] = arrays["opacities"][:, 0]
-    data = GSData.from_arrays(**arrays, sh0=colors, shN=rest if rest.size else None, format="ply")
+    opacities, colors, rest = (field[name].numpy() for name in ("opacities", "features_dc", "features_rest"))
+    means, scales, quats = (field[name].numpy() for name in ("means", "scales", "quats"))
+    harmonics = rest if rest.size else None
+    data = GSData.from_arrays(means, scales, quats, opacities[:, 0], colors, harmonics, format="ply")
     with replacing(path) as partial:
         write(partial, data, version=_VERSION, fractional_bits=bits)
         # gsply 0.4 has no option for the flag.

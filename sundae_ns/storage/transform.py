@@ -45,15 +45,9 @@ def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tenso
 
 
 def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) -> dict[str, Tensor]:
-    """Transform a field by ``x -> scale * (R x + t)``.
+    """A field moved by ``x -> scale * (R x + t)``; ``transform`` ``[3, 4]`` holds rotation R and translation t.
 
-    Args:
-        params: a field; see :mod:`sundae_ns.gaussians.parameters`.
-        transform: rotation R and translation t ``[3, 4]``.
-        scale: factor.
-
-    Returns:
-        New parameters; opacities, SH coefficients of degree 0 and features are the tensors of ``params``.
+    Opacities, SH coefficients of degree 0 and features are the tensors of ``params``.
     """
     rotation, translation = transform[:, :3].to(params["means"]), transform[:, 3].to(params["means"])
     moved = dict(params)

@@ -60,7 +60,7 @@ def write_for_viewers(
     Drops primitives that are not finite, and SH coefficients above the format's degree.
 
     Args:
-        path: a .ply, .spz or .sog; its folder must exist.
+        path: its folder must exist.
         params: the field; see :mod:`sundae_ns.gaussians.parameters`.
         antialiased: mark the scene as trained with antialiasing.
         sigmoid_colors: ``features_dc`` are logits of colours, as in a model of SH degree 0, not SH coefficients.

@@ -258,11 +258,7 @@ def _section(entry: Any, offset: int) -> Section | None:
 
 
 def read_sections(path: Path, header: Header) -> dict[str, Array]:
-    """Read all sections except padding.
-
-    Raises:
-        PackError: a section is altered or truncated.
-    """
+    """Read all sections except padding; ``PackError`` if one is altered or truncated."""
     with naming(path):
         content = memoryview(path.read_bytes())
         for section in header.sections.values():

@@ -243,23 +243,14 @@ def encode_gaps(codes: NDArray[np.uint64], block: int, bits: int) -> Stream:
 
 
 def decode_gaps(stream: Stream, count: int, block: int, bits: int) -> NDArray[np.uint64]:
-    """Morton codes ``[N]`` from :func:`encode_gaps`.
-
-    Raises:
-        PackError: the stream does not end with its last number.
-    """
+    """Morton codes ``[N]`` from :func:`encode_gaps`; ``PackError`` if the stream does not end with its last number."""
     codes = np.zeros(count, np.int64)
     _read(_run_gaps, stream, codes, block, bits)
     return codes.astype(np.uint64)
 
 
 def neighbours_of(cells: Array, block: int) -> Near:
-    """Nearest earlier rows ``[N, NEIGHBOURS]`` in the same block, nearest first; -1 for none.
-
-    Args:
-        cells: whole coordinates ``[N, 3]`` below 2^21.
-        block: rows in a block.
-    """
+    """Nearest earlier rows ``[N, NEIGHBOURS]`` in the same block of cells ``[N, 3]`` below 2^21; -1 for none."""
     near = np.full((len(cells), NEIGHBOURS), -1, np.int32)
     _search(np.ascontiguousarray(cells, np.int64), block, near)
     return near
@@ -278,11 +269,7 @@ def encode_levels(levels: Array, near: Near) -> Stream:
 
 
 def decode_levels(stream: Stream, width: int, near: Near) -> Levels:
-    """Numbers ``[N, C]`` from :func:`encode_levels`.
-
-    Raises:
-        PackError: the stream does not end with its last number.
-    """
+    """Numbers ``[N, C]`` from :func:`encode_levels`; ``PackError`` if the stream does not end with its last number."""
     levels = np.zeros((len(near), width), np.int32)
     _read(_run, stream, levels, near)
     return levels

@@ -123,8 +123,7 @@ def write_scene(path: Path, scene: PackedScene, config: PackConfig | None = None
 def write_fitted(path: Path, scene: PackedScene, codecs: Codecs) -> PackReport:
     """Pack a scene, atomically, with codecs that were fitted to it before or after training with rounding.
 
-    Args:
-        scene: primitives in the order of :func:`fit_scene`. Its positions are ignored; the codecs hold them.
+    Primitives are in the order of :func:`fit_scene`. Their positions are ignored; the codecs hold them.
 
     Raises:
         PackError: values are not finite, or the codecs do not fit the scene.
@@ -206,7 +205,7 @@ class _Reader:
     def levels(self, name: str, codec: str, near: Near, width: int) -> tuple[Levels, float]:
         """Levels ``[N, C]`` of an attribute, and their step."""
         step = self.about(name, codec).get("step")
-        if type(step) not in (int, float) or not abs(step) < _LARGEST_STEP:
+        if not isinstance(step, (int, float)) or isinstance(step, bool) or not abs(step) < _LARGEST_STEP:
             raise DamagedError(f"the step of {name} is not a number within float32")
         return self.decoded(f"{name}/levels", entropy.decode_levels, width, near), float(step)
 

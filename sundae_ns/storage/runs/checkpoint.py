@@ -206,12 +206,7 @@ def extra_state(
 
 
 def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Encoding) -> Mapping[str, Any]:
-    """The state beside the tensors, checked against the model.
-
-    Args:
-        state: state of the checkpoint's model, without the pipeline's prefix.
-        num_features: configured length of the model's feature vectors; 0 without a head.
-        encoding: how the model's field stores colours.
+    """The state beside the tensors in a model's ``state``, checked against the model's features and encoding.
 
     Raises:
         CheckpointError: a checkpoint of another method, format, feature width or encoding of colours.
@@ -249,12 +244,9 @@ def _check_format(extra: Mapping[str, Any]) -> None:
 
 
 def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], *, may_be_empty: bool = False) -> None:
-    """Check that the tensors of a checkpoint fit the model.
+    """Check that a ``state``, whose extra state was checked, fits the ``state_dict`` that a model has.
 
-    Args:
-        state: state of the checkpoint's model, whose extra state was checked.
-        expected: ``state_dict`` of the model.
-        may_be_empty: whether there may be no primitive, as in a shard.
+    A shard ``may_be_empty``, without a primitive.
 
     Raises:
         CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
@@ -287,9 +279,9 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], 
 
 def _numpy_numbers_allowed() -> Any:
     """A context in which torch reads the numpy floats that stock nerfstudio leaves in a scheduler's state."""
-    scalar = np.float64(0.0).__reduce__()[0]
+    scalar: Any = np.float64(0.0).__reduce__()[0]
     names = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
-    types = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
+    types: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
     return torch.serialization.safe_globals([scalar, *names, *types])
 
 

@@ -138,10 +138,7 @@ def model_options(path: Path) -> dict[str, Any]:
 
 
 def check_run(run: Path) -> None:
-    """Refuse a path that is no run before the slow import of nerfstudio.
-
-    Args:
-        run: a folder or ``config.yml``, given by the user.
+    """Refuse a path that is no run, nor its ``config.yml``, before the slow import of nerfstudio.
 
     Raises:
         CheckpointError: it is a file of another kind, or has no ``config.yml`` of a run.

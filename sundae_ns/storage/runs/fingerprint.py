@@ -38,9 +38,6 @@ def fingerprint(config: Any) -> str:
 
     Options that are off (None or False) count as absent, so that a new option that is off by default changes nothing.
     Classes count by their bare names, so that a class may move.
-
-    Args:
-        config: nerfstudio's configuration of a trainer, made by ``ns-train`` or read from a ``config.yml``.
     """
     text = json.dumps(_plain(config, ""), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:LENGTH].translate(_LETTERS)
