@@ -68,7 +68,8 @@ def write_scaled(out: Path, scene: Path, side: int) -> PackedScene:
     assert small.cameras is not None
     cameras = {f"cameras/{name}": small.cameras[name].numpy().astype(dtype) for name, (dtype, _) in STORED.items()}
     unpacked = 4 * sum(value.numel() for value in (*small.field.values(), *small.head.values()))
-    container.write(out, meta, {**container.read_sections(scene, header), **cameras}, unpacked=unpacked)
+    sections = {**container.read_sections(scene, header), **cameras}
+    out.write_bytes(container.encode(meta, sections, unpacked=unpacked)[0])
     return read_scene(out)
 
 

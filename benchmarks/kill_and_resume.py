@@ -107,7 +107,7 @@ def half_recorded(original: Callable[..., Any]) -> Callable[..., Any]:
 PLACES: dict[str, Callable[[int], None]] = {
     "save: half written": lambda n: after(n, sundae_ns.storage.runs.checkpoint.torch, "save", half_saved),
     "save: not yet on the disk": lambda n: after(3 * n, sundae_ns.storage.atomic, "_flush", at_once),
-    "save: the older one not yet gone": lambda n: after(n, sundae_ns.storage.runs.checkpoint, "save", when_done),
+    "save: the older one not yet gone": lambda n: after(n, sundae_ns.storage.runs.checkpoint, "write", when_done),
     "prune: deciding": lambda n: after(1, sundae_ns.pruning.cutting, "decide", at_once),
     "prune: sliced": lambda n: after(1, sundae_ns.pruning.cutting, "keep", when_done),
     "prune: half recorded": lambda n: after(1, sundae_ns.training.report, "write_text", half_recorded),
@@ -182,7 +182,7 @@ def run_folder(config: TrainerConfig) -> Path:
 def outcome(folder: Path) -> dict[str, Any]:
     """Result of a finished run: tensors of the final checkpoint, the record of its prune, and names of its files."""
     models = folder / "nerfstudio_models"
-    state = sundae_ns.storage.runs.checkpoint.load(models / f"step-{STEPS - 1:09d}.ckpt")
+    state = sundae_ns.storage.runs.checkpoint.read(models / f"step-{STEPS - 1:09d}.ckpt")
     prunes = json.loads((folder / "prune.json").read_text())
     return {
         "tensors": {name: value for name, value in state["pipeline"].items() if isinstance(value, torch.Tensor)},

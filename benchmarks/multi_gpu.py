@@ -92,7 +92,7 @@ class Clock:
             self.look(step)
         if self.save is not None and self.ranks == 1 and step == self.trainer.pipeline.model.config.pruning.prune_at:
             self.pause()
-            checkpoint.save({"step": step, "pipeline": self.trainer.pipeline.state_dict()}, self.save)
+            checkpoint.write({"step": step, "pipeline": self.trainer.pipeline.state_dict()}, self.save)
         if self.started is None and step * self.ranks >= self.warm:
             self.started = self._now()
         if self.started is not None:
@@ -193,7 +193,7 @@ def main() -> None:
         if known.field is not None:
             field = tile(checkpoint.read_field(known.field)[0], known.primitives)
             state = {"step": 0, "pipeline": {f"_model.gauss_params.{name}": value for name, value in field.items()}}
-            checkpoint.save(state, Path(folder) / "tiled.ckpt")
+            checkpoint.write(state, Path(folder) / "tiled.ckpt")
             del field, state
         for ranks in known.gpus:
             meeting = str(Path(folder) / f"meeting-{ranks}")

@@ -21,7 +21,7 @@ from torch import Tensor
 from sundae_ns.data.capture import check_image, check_transforms, no_transforms, undecodable
 from sundae_ns.data.colmap import check_colmap
 from sundae_ns.errors import ConfigError, DataError, SundaeError, one_line
-from sundae_ns.storage.point_cloud import read_point_cloud
+from sundae_ns.storage import read_point_cloud
 from sundae_ns.training.warning import warn
 
 DATASET_FRAME = "sundae_dataset_frame"

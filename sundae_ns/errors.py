@@ -79,11 +79,7 @@ class RankError(SundaeError, RuntimeError):
 def writing(failure: str) -> Iterator[None]:
     """Turn file-system errors that a user can correct into ``StorageError``; others pass.
 
-    Args:
-        failure: start of the message, without a full stop: ``"cannot make runs/a"``.
-
-    Raises:
-        StorageError: the disk is full or not writable.
+    ``failure`` is the start of the message, without a full stop: ``"cannot make runs/a"``.
     """
     try:
         yield
@@ -94,6 +90,24 @@ def writing(failure: str) -> Iterator[None]:
         if reason is None:
             raise
         raise StorageError(f"{failure}: {reason}") from error
+
+
+@contextmanager
+def reading(
+    path: Path, kind: str, failure: type[SundaeError] = DataError, *, mend: str = "export it again"
+) -> Iterator[None]:
+    """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
+
+    ``kind`` names what the file should be, ``"a complete .spz"``, and ``mend`` what to do if it is damaged.
+    """
+    try:
+        yield
+    except SundaeError:
+        raise
+    except OSError as error:
+        raise failure(f"{path} cannot be read ({error.strerror or one_line(error)}); check the path") from error
+    except Exception as error:
+        raise failure(f"{path} is not {kind} ({one_line(error)}); {mend}") from error
 
 
 def _reason(error: Exception) -> str | None:
@@ -115,22 +129,14 @@ def one_line(error: BaseException) -> str:
 
 
 def regular(path: Path) -> Path:
-    """The path, unless reading it may never end.
-
-    Raises:
-        OSError: it is a pipe, a socket or a device.
-    """
+    """The path; ``OSError`` for a pipe, a socket or a device, whose reading may never end."""
     if path.exists() and not path.is_file() and not path.is_dir():
         raise OSError(errno.EINVAL, "it is a pipe or a device, not a file", str(path))
     return path
 
 
 def rank_ended(error: BaseException) -> RankError:
-    """The error for a rank that ended and stopped the others: which rank, why, and how to resume.
-
-    Args:
-        error: ``ProcessExitedException`` or ``ProcessRaisedException`` of ``torch.multiprocessing``.
-    """
+    """The error for a rank that ended and stopped the others, from an exception of ``torch.multiprocessing``."""
     rank, signal = getattr(error, "error_index", 0), getattr(error, "signal_name", None)
     last = (str(error).strip().splitlines() or [""])[-1]
     kind, _, message = last.partition(": ")
@@ -144,12 +150,7 @@ def rank_ended(error: BaseException) -> RankError:
 
 
 def out_of_memory(error: BaseException, primitives: int) -> MemoryExhaustedError:
-    """The error for a full CUDA device: the number of primitives, the allocation that failed, what to try.
-
-    Args:
-        error: ``torch.cuda.OutOfMemoryError``; its message states the size of the allocation.
-        primitives: number of primitives in the field.
-    """
+    """The error for a full CUDA device: the number of primitives, the allocation that failed, what to try."""
     found = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", str(error))
     asked = f"cannot allocate {found[1]} more" if found else "cannot allocate more"
     return MemoryExhaustedError(

@@ -107,7 +107,7 @@ class SundaeTrainerConfig(TrainerConfig):
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StorageError(f"cannot make {path.parent} ({error.strerror}); choose another --output-dir") from error
-        folder.hold(path.parent)
+        folder.reserve(path.parent)
         CONSOLE.log(f"Saving config to: {path}")
         write_text(path, yaml.dump(self))
 
@@ -330,7 +330,7 @@ class SundaeTrainer(Trainer):
         if state is None:  # another rank writes
             return
         path = self.checkpoint_dir / f"step-{state['step']:09d}.ckpt"
-        checkpoint.save(state, path)
+        checkpoint.write(state, path)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("*.ckpt"):
                 if other != path:
@@ -341,7 +341,7 @@ class SundaeTrainer(Trainer):
         if path is None:
             CONSOLE.print("No checkpoint to load: training from scratch.")
             return
-        loaded = checkpoint.load(path)
+        loaded = checkpoint.read(path)
         try:
             loaded = self.team.part(loaded, list(self.model.state.field))
             self._restore(loaded)

@@ -42,12 +42,12 @@ def name(step: int) -> str:
 
 def saved(folder: Path, *steps: int) -> None:
     for step in steps:
-        checkpoint.save(state(step), folder / name(step))
+        checkpoint.write(state(step), folder / name(step))
 
 
 def test_what_is_saved_is_loaded(tmp_path: Path) -> None:
     saved(tmp_path / "models", 7)
-    loaded = checkpoint.load(tmp_path / "models" / name(7))
+    loaded = checkpoint.read(tmp_path / "models" / name(7))
     assert loaded["step"] == 7
     assert torch.equal(loaded["pipeline"]["_model.gauss_params.means"], torch.full((50, 3), 7.0))
 
@@ -94,7 +94,7 @@ def test_what_is_not_whole_is_passed_over(tmp_path: Path, harm: Any) -> None:
     (line,) = passed_over
     assert name(30) in line
     with pytest.raises(CheckpointError, match="cannot be read"):
-        checkpoint.load(tmp_path / name(30))
+        checkpoint.read(tmp_path / name(30))
     for step in (10, 20):
         harm(tmp_path / name(step))
     with pytest.raises(CheckpointError, match="no whole checkpoint.*give the folder of a run") as caught:
@@ -139,10 +139,10 @@ def test_random_numbers_go_on_where_they_were_left(tmp_path: Path) -> None:
         return [random.random(), random.gauss(0, 1), np.random.rand(), np.random.randn(), torch.randn(3).tolist()]
 
     draw()
-    checkpoint.save({**state(1), "random": checkpoint.random_state()}, tmp_path / name(1))
+    checkpoint.write({**state(1), "random": checkpoint.random_state()}, tmp_path / name(1))
     expected = draw()
     assert draw() != expected
-    checkpoint.set_random_state(checkpoint.load(tmp_path / name(1))["random"])
+    checkpoint.set_random_state(checkpoint.read(tmp_path / name(1))["random"])
     assert draw() == expected
 
 
@@ -150,7 +150,7 @@ def test_a_tensor_that_claims_more_than_it_has(tmp_path: Path) -> None:
     bomb = {"step": 1, "pipeline": {"_model.gauss_params.means": torch.zeros(1).expand(10**12, 3)}}
     torch.save(bomb, tmp_path / name(1))
     with pytest.raises(CheckpointError, match="claims more than it has"):
-        checkpoint.load(tmp_path / name(1))
+        checkpoint.read(tmp_path / name(1))
 
 
 def test_an_archive_that_unpacks_to_more_than_its_size(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_an_archive_that_unpacks_to_more_than_its_size(tmp_path: Path) -> None:
         for entry, content in entries.items():
             archive.writestr(entry, content)
     with pytest.raises(CheckpointError, match="unpack to more"):
-        checkpoint.load(tmp_path / name(2))
+        checkpoint.read(tmp_path / name(2))
 
 
 def test_a_second_training_in_a_folder_changes_nothing_there(tmp_path: Path) -> None:

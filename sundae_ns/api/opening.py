@@ -81,7 +81,7 @@ def _of_run(path: Path) -> Scene:
         raise CheckpointError(f"{path} {reason}; give a run, its config.yml, or a .sundae, .ply, .spz or .sog file")
     options = model_options(config)
     source = path if path.suffix == ".ckpt" else checkpoint.newest_whole(config.parent)[0]
-    loaded = checkpoint.load(source)
+    loaded = checkpoint.read(source)
     field, state = checkpoint.field_of(loaded, source), checkpoint.model_state(loaded)
     extra = state.get(checkpoint.EXTRA_STATE)
     extra = extra if isinstance(extra, Mapping) else {}

@@ -70,7 +70,7 @@ def _packed(scene: Scene) -> bytes:
     from sundae_ns.api.packing import contents_of  # its encoder needs a compiler, which other files do not
     from sundae_ns.storage.packing import fit_scene, pack_bytes
 
-    return pack_bytes(*fit_scene(contents_of(scene)))
+    return pack_bytes(*fit_scene(contents_of(scene)))[0]
 
 
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:

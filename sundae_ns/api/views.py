@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from sundae_ns.api.scene import Scene
-from sundae_ns.data.capture import matrix, number, read_json, side
+from sundae_ns.data.capture import finite, matrix, read_json, side
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.rendering import View
@@ -103,7 +103,7 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
     path = path / "transforms.json" if path.is_dir() else path
     content = read_json(path)
     if "camera_path" in content:
-        views, speed = _camera_path(content, path.name), number(content.get("fps", 24), "fps", path.name, positive=True)
+        views, speed = _camera_path(content, path.name), finite(content.get("fps", 24), "fps", path.name, positive=True)
         return CameraFile(views, speed)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
@@ -114,7 +114,7 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
         where = f"{path.name}, frame {i}"
         stated = {**content, **entry} if isinstance(entry, dict) else {}
         pose = matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where)
-        intrinsics = [number(stated.get(name), name, where, positive=name.startswith("fl")) for name in _INTRINSICS]
+        intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in _INTRINSICS]
         size = [side(stated.get(name), name, where) for name in ("w", "h")]
         moved = transform[:3, :3] @ pose[:3]
         moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
@@ -134,7 +134,7 @@ def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple
     transform[:3] = np.asarray(frame["transform"], np.float64)[:3]
     if "applied_transform" in content:
         applied[:3] = matrix(content["applied_transform"], (3,), "applied_transform", where)
-    scale = float(frame["scale"]) / number(content.get("applied_scale", 1.0), "applied_scale", where, positive=True)
+    scale = float(frame["scale"]) / finite(content.get("applied_scale", 1.0), "applied_scale", where, positive=True)
     return transform @ np.linalg.inv(applied), scale
 
 
@@ -152,7 +152,7 @@ def _camera_path(content: dict[str, Any], where: str) -> list[View]:
         flat = entry.get("camera_to_world") if isinstance(entry, dict) else None
         rows = [flat[k : k + 4] for k in range(0, 16, 4)] if isinstance(flat, list) and len(flat) == 16 else flat
         pose = matrix(rows, (4,), "camera_to_world", place)
-        fov = number(entry.get("fov", _FOV), "fov", place, positive=True)
+        fov = finite(entry.get("fov", _FOV), "fov", place, positive=True)
         if not fov < 180:
             raise DataError(f"{place}: fov is {fov:g}; it must be below 180 degrees")
         focal = height / 2 / math.tan(math.radians(fov) / 2)

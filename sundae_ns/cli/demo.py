@@ -41,7 +41,7 @@ def demo(
         from rich.progress import Progress
 
         from sundae_ns.data import write_demo_capture
-        from sundae_ns.evaluation import report_text, save_comparison
+        from sundae_ns.evaluation import comparison_sheet, report_text
 
     console = Console()
     scene, run = out / "scene", out / "runs" / "demo" / METHOD / "run"
@@ -84,7 +84,7 @@ def demo(
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
             chosen = range(0, len(cameras), max(len(cameras) // SHOWN, 1))[:SHOWN]
             rows = [comparison_of(model, cameras[i], opened.truths[i], f"test view {i}") for i in chosen]
-            save_comparison(out / "comparison.png", rows)
+            comparison_sheet(rows).save(out / "comparison.png")
             finished, packed = packed_run(run)
             with replacing(out / "scene.sundae") as partial:
                 partial.write_bytes(packed)

@@ -73,7 +73,7 @@ def report(
         from sundae_ns.evaluation import Lpips, csv_text, flip_available, lpips_weights_available
         from sundae_ns.evaluation.curves import read_curves
         from sundae_ns.evaluation.document import document
-        from sundae_ns.evaluation.flip import INSTALL
+        from sundae_ns.evaluation.metrics import INSTALL_FLIP
         from sundae_ns.scenes.measure import measure_scene
         from sundae_ns.scenes.opening import open_scene
         from sundae_ns.storage.atomic import write_text
@@ -84,7 +84,7 @@ def report(
     lpips = Lpips(lpips_net, download=False) if lpips_weights_available(lpips_net) else None
     notes = []
     if not flip_available():
-        notes.append(f"FLIP: the package is not installed; run {INSTALL}.")
+        notes.append(f"FLIP: the package is not installed; run {INSTALL_FLIP}.")
     if lpips is None:
         notes.append(f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them.")
     done: list[Measured] = []
@@ -179,7 +179,7 @@ def _label(opened: Opened, taken: Collection[str]) -> str:
 
 def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
     """Write a comparison image of the views with the lowest and the median PSNR."""
-    from sundae_ns.evaluation import save_comparison
+    from sundae_ns.evaluation import comparison_sheet
     from sundae_ns.scenes.measure import comparison_of
 
     values = [view.psnr for view in measured.full.views]
@@ -189,7 +189,7 @@ def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
         comparison_of(opened.model, opened.cameras[index], opened.truths[index], f"{name}: test view {index}")
         for name, index in chosen.items()
     ]
-    save_comparison(path, rows)
+    comparison_sheet(rows).save(path)
 
 
 def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> None:

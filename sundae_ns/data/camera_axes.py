@@ -16,28 +16,14 @@ OPENGL_TO_OPENCV = (1.0, -1.0, -1.0)
 
 
 def world_to_camera(pose: Tensor) -> Tensor:
-    """World-to-camera matrix ``[4, 4]``, OpenCV axes; differentiable.
-
-    Args:
-        pose: camera-to-world, OpenGL axes, ``[3, 4]``: a rotation and a translation.
-
-    Returns:
-        The matrix, with dtype and device of ``pose``.
-    """
+    """World-to-camera matrix ``[4, 4]``, OpenCV axes, of camera-to-world ``[3, 4]``, OpenGL axes; differentiable."""
     rotation = pose[:, :3] * pose.new_tensor(OPENGL_TO_OPENCV)
     top = torch.cat([rotation.T, -rotation.T @ pose[:, 3:]], dim=1)
     return torch.cat([top, pose.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
 
 def world_to_camera_floats(pose: Sequence[float]) -> list[float]:
-    """Compute :func:`world_to_camera` on Python floats, without a tensor or a GPU kernel.
-
-    Args:
-        pose: the 12 entries of camera-to-world ``[3, 4]``, OpenGL axes, row by row.
-
-    Returns:
-        The 16 entries of world-to-camera ``[4, 4]``, OpenCV axes, row by row.
-    """
+    """The 16 entries of :func:`world_to_camera` row by row, from the 12 of ``pose``, without a tensor or a kernel."""
     x, y, z = pose[3::4]
     matrix: list[float] = []
     for axis, sign in enumerate(OPENGL_TO_OPENCV):

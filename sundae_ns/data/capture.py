@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from sundae_ns.errors import DataError, one_line, regular
+from sundae_ns.errors import DataError, one_line, reading, regular
 
-MAX_SIDE = 65535
+_MAX_SIDE = 65535
 """Longest side of an image, in pixels: JPEG's limit."""
 _LARGEST = 1e12
 """Largest coordinate or focal length; its square must stay in the range of float32."""
@@ -32,12 +32,8 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 
-def number(value: Any, name: str, where: str, *, positive: bool = False) -> float:
-    """Return ``value`` as a finite float.
-
-    Raises:
-        DataError: it is not a number, not finite, too large, or not positive although ``positive`` is set.
-    """
+def finite(value: Any, name: str, where: str, *, positive: bool = False) -> float:
+    """``value`` as a float; ``DataError`` if it is no number, not finite, too large, or not positive if asked."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise DataError(f"{where}: {name} is {_short(value)}; it must be a number")
     if not abs(value) <= _LARGEST:
@@ -48,19 +44,17 @@ def number(value: Any, name: str, where: str, *, positive: bool = False) -> floa
 
 
 def side(value: Any, name: str, where: str) -> int:
-    """Return ``value`` as the side of an image in pixels.
-
-    Raises:
-        DataError: it is not a whole number from 1 to 65,535.
-    """
-    length = number(value, name, where)
-    if length != int(length) or not 1 <= length <= MAX_SIDE:
-        raise DataError(f"{where}: {name} is {_short(value)}; it must be a whole number of pixels from 1 to {MAX_SIDE}")
+    """``value`` as the side of an image in pixels; ``DataError`` unless it is a whole number from 1 to 65,535."""
+    length = finite(value, name, where)
+    if length != int(length) or not 1 <= length <= _MAX_SIDE:
+        raise DataError(
+            f"{where}: {name} is {_short(value)}; it must be a whole number of pixels from 1 to {_MAX_SIDE}"
+        )
     return int(length)
 
 
 def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray:
-    """Return ``value`` as a float64 matrix ``[R, 4]``, with R one of ``rows`` and an invertible 3 x 3 part.
+    """``value`` as a float64 matrix ``[R, 4]``, with R one of ``rows``.
 
     Raises:
         DataError: it has another shape, an entry that is not finite, or is singular.
@@ -69,7 +63,7 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
     if not whole or not all(isinstance(row, list) and len(row) == 4 for row in value):
         raise DataError(f"{where}: {name} must have {' or '.join(map(str, rows))} rows of 4 numbers")
     for entry in chain(*value):
-        number(entry, name, where)
+        finite(entry, name, where)
     array = np.array(value, dtype=np.float64)
     if abs(np.linalg.det(array[:3, :3])) < 1e-9:
         raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
@@ -77,28 +71,15 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
 
 
 def read_bytes(path: Path) -> bytes:
-    """Contents of a file.
-
-    Raises:
-        DataError: it cannot be read.
-    """
-    try:
+    """Contents of a file; ``DataError`` if it cannot be read."""
+    with reading(path, "a file"):
         return regular(path).read_bytes()
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Parse a file with one JSON object.
-
-    Raises:
-        DataError: the file cannot be read or does not hold a JSON object.
-    """
-    text = read_bytes(path)
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:  # invalid UTF-8, endless digits, endless nesting
-        raise DataError(f"{path} is not JSON ({one_line(error)}); write it again") from error
+    """The JSON object of a file; ``DataError`` if it cannot be read or holds none."""
+    with reading(path, "JSON", mend="write it again"):
+        content = json.loads(read_bytes(path))
     if not isinstance(content, dict):
         raise DataError(f"{path} does not hold a JSON object; give the transforms.json of a capture")
     return content
@@ -177,16 +158,16 @@ def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -
         if key in ("w", "h"):
             side(entry[key], key, where)
         else:
-            number(entry[key], key, where, positive=key.startswith("fl"))
+            finite(entry[key], key, where, positive=key.startswith("fl"))
     for key in _DISTORTION:
         if key in entry:
-            number(entry[key], key, where)
+            finite(entry[key], key, where)
     if "distortion_params" in entry:
         values = entry["distortion_params"]
         if not isinstance(values, list) or len(values) not in (4, 6, 12):
             raise DataError(f"{where}: distortion_params must be a list of 4, 6 or 12 numbers")
         for value in values:
-            number(value, "distortion_params", where)
+            finite(value, "distortion_params", where)
 
 
 def _check_round_lens(meta: Mapping[str, Any], masked: bool, where: str) -> None:
@@ -222,7 +203,7 @@ def _check_frame_of_capture(meta: Mapping[str, Any], where: str) -> None:
     if "applied_transform" in meta:
         matrix(meta["applied_transform"], (3,), "applied_transform", where)
     if "applied_scale" in meta:
-        number(meta["applied_scale"], "applied_scale", where, positive=True)
+        finite(meta["applied_scale"], "applied_scale", where, positive=True)
     if meta.get("orientation_override", "up") not in _ORIENTATIONS:
         raise DataError(
             f"{where}: orientation_override is {_short(meta['orientation_override'])}; "
@@ -239,14 +220,9 @@ def _path(value: Any, name: str, where: str) -> str:
 
 
 def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
-    """Check by its header that an image can be used for training.
+    """Width and height in pixels of an image, after a check by its header that training can use it.
 
-    Args:
-        path: the file.
-        mask: expect a mask of one channel instead of a photograph of 8 bits per channel.
-
-    Returns:
-        Width and height in pixels.
+    A ``mask`` has one channel, a photograph 8 bits per channel.
 
     Raises:
         DataError: the file is missing, not an image, of another pixel type, or too short for its size in pixels.

@@ -14,8 +14,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from sundae_ns.data.capture import number, read_bytes, side
-from sundae_ns.errors import DataError, one_line
+from sundae_ns.data.capture import finite, read_bytes, side
+from sundae_ns.errors import DataError, one_line, reading
 
 # Identifier: name, number of parameters, number of focal lengths; only models that nerfstudio supports.
 _MODELS = {
@@ -30,6 +30,7 @@ _CONVERT = "undistort the capture (colmap image_undistorter), or calibrate it wi
 _SHELL = set('"$`\\\n')
 """Characters that end a quoted word: nerfstudio passes image names to a shell when it scales images down."""
 _CAMERA, _IMAGE, _POINT, _COUNT = map(struct.Struct, ("<iiQQ", "<i7di", "<Q3d3Bd", "<Q"))
+_IMAGE_BYTES = _IMAGE.size + 1 + _COUNT.size  # at least, with an empty name and no observations
 _OBSERVATION, _TRACK = 24, 8
 _MAX_NAME = 4096
 
@@ -86,11 +87,9 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
             f"{model} is not a folder; give the folder of the model with colmap --colmap-path (usually sparse/0)"
         )
     if (model / "cameras.txt").exists():
-        cameras = _cameras_text(model / "cameras.txt")
-        names = _images_text(_existing(model / "images.txt"), cameras)
+        names = _images_text(model / "images.txt", _cameras_text(model / "cameras.txt"))
     elif (model / "cameras.bin").exists():
-        cameras = _cameras_binary(model / "cameras.bin")
-        names = _images_binary(_existing(model / "images.bin"), cameras)
+        names = _images_binary(model / "images.bin", _cameras_binary(model / "cameras.bin"))
     else:
         raise DataError(
             f"{model} holds neither cameras.bin nor cameras.txt; give the folder of the model with --colmap-path"
@@ -114,18 +113,8 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
 
 
 def num_images(model: Path) -> int:
-    """Number of images that a binary COLMAP model states.
-
-    Raises:
-        DataError: its ``images.bin`` cannot be read, or is cut short.
-    """
-    return _BinaryFile(model / "images.bin").count(_IMAGE.size + 1 + _COUNT.size, "images")
-
-
-def _existing(path: Path) -> Path:
-    if not path.is_file():
-        raise DataError(f"{path} does not exist; copy or export the model again")
-    return path
+    """Number of images that a binary COLMAP model states; ``DataError`` if its ``images.bin`` cannot be read."""
+    return _BinaryFile(model / "images.bin").count(_IMAGE_BYTES, "images")
 
 
 def _check_camera(
@@ -136,12 +125,12 @@ def _check_camera(
     if len(params) != model[1]:
         raise DataError(f"{where}: {model[0]} has {model[1]} parameters, not {len(params)}; export it again")
     for index, value in enumerate(params):
-        number(value, f"parameter {index}", where, positive=index < model[2])
+        finite(value, f"parameter {index}", where, positive=index < model[2])
 
 
 def _check_pose(pose: Sequence[float], camera: int, cameras: set[int], where: str) -> None:
     for value in pose:
-        number(value, "the pose", where)
+        finite(value, "the pose", where)
     if not abs(math.hypot(*pose[:4]) - 1) < 0.01:
         raise DataError(f"{where}: its quaternion is not of length 1, so it is not a rotation; remove the image")
     if camera not in cameras:
@@ -165,7 +154,7 @@ def _cameras_binary(path: Path) -> set[int]:
 
 def _images_binary(path: Path, cameras: set[int]) -> list[str]:
     file, names = _BinaryFile(path), []
-    for _ in range(file.count(_IMAGE.size + 1 + _COUNT.size, "images")):
+    for _ in range(file.count(_IMAGE_BYTES, "images")):
         identifier, *pose, camera = file.take(_IMAGE)
         _check_pose(pose, int(camera), cameras, f"{path.name}, image {identifier}")
         names.append(file.text())
@@ -199,11 +188,9 @@ def _lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _all_lines(path: Path) -> list[str]:
-    content = read_bytes(path)
-    try:
-        return io.StringIO(content.decode("utf-8"), newline=None).read().split("\n")  # any kind of line end
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path} is not UTF-8 text; export it again") from error
+    with reading(path, "UTF-8 text"):
+        text = read_bytes(path).decode("utf-8")
+    return io.StringIO(text, newline=None).read().split("\n")  # any kind of line end
 
 
 def _check_count(path: Path, found: int) -> None:

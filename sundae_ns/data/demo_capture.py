@@ -17,15 +17,9 @@ MARKER = ".sundae_scene.json"
 
 
 def write_demo_capture(out: Path) -> Path:
-    """Write the demo's capture as a nerfstudio data set.
+    """Write the demo's capture as a nerfstudio data set to a folder; returns that folder, the value for ``--data``.
 
-    ``transforms.json`` comes last, so an interrupted copy has none.
-
-    Args:
-        out: folder; new, empty, or with an earlier copy, which is replaced.
-
-    Returns:
-        ``out``, the value for ``--data``.
+    An earlier copy is replaced. ``transforms.json`` comes last, so an interrupted copy has none.
 
     Raises:
         DataError: ``out`` is a file, or holds other files.

@@ -1,15 +1,12 @@
 """Image metrics in named variants, synchronised timing, comparison images, plots and tables."""
 
 from sundae_ns.evaluation import display
-from sundae_ns.evaluation.comparison_image import ComparisonRow, comparison_sheet, save_comparison
-from sundae_ns.evaluation.flip import flip, flip_available
+from sundae_ns.evaluation.comparison_image import ComparisonRow, comparison_sheet
+from sundae_ns.evaluation.document import COLUMNS, csv_text, report_text
 from sundae_ns.evaluation.lpips import Lpips, lpips_weights_available, lpips_weights_path, lpips_weights_url
 from sundae_ns.evaluation.measured import HEAD_OFF, HEAD_ON, Configuration, Measured, ViewQuality, without_nan
-from sundae_ns.evaluation.memory import peak_memory
-from sundae_ns.evaluation.metrics import psnr, ssim
-from sundae_ns.evaluation.records import COLUMNS, csv_text
-from sundae_ns.evaluation.report import report_text
-from sundae_ns.evaluation.timing import median_ms
+from sundae_ns.evaluation.metrics import flip, flip_available, psnr, ssim
+from sundae_ns.evaluation.timing import median_ms, peak_memory
 
 __all__ = [
     "COLUMNS",
@@ -32,7 +29,6 @@ __all__ = [
     "peak_memory",
     "psnr",
     "report_text",
-    "save_comparison",
     "ssim",
     "without_nan",
 ]

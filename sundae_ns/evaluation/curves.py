@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 
-@dataclass(frozen=True)
-class Curve:
+class Curve(NamedTuple):
     """One quantity over training, by ascending step."""
 
     steps: tuple[int, ...] = ()
     values: tuple[float, ...] = ()
-
-    def __bool__(self) -> bool:
-        return bool(self.steps)
 
 
 @dataclass(frozen=True)
@@ -35,11 +31,8 @@ class Curves:
     memory: Curve = Curve()
     """Peak device memory so far, MiB."""
 
-    def __bool__(self) -> bool:
-        return any(getattr(self, field.name) for field in fields(self))
 
-
-TAGS = {
+_TAGS = {
     "loss": "Train Loss",
     "primitives": "Train Metrics Dict/gaussian_count",
     "psnr": "Train Metrics Dict/psnr",
@@ -50,13 +43,9 @@ TAGS = {
 
 
 def read_curves(folder: Path) -> Curves | None:
-    """Read the curves of a run.
+    """Read the curves of a run from its folder; None if it holds no readable event file.
 
-    Args:
-        folder: the run's folder. A resumed run has several event files in it.
-
-    Returns:
-        The curves, with the parts of a resumed run joined; None if the folder holds no readable event file.
+    A resumed run has several event files; its parts are joined.
     """
     if not any(folder.glob("events.out.tfevents.*")):
         return None
@@ -71,8 +60,8 @@ def read_curves(folder: Path) -> Curves | None:
     except Exception:  # a damaged file raises many types; a report works without curves
         return None
     known = set(events.Tags()["scalars"])
-    curves = Curves(**{name: _curve(events.Scalars(tag)) for name, tag in TAGS.items() if tag in known})
-    return curves if curves else None
+    curves = {name: _curve(events.Scalars(tag)) for name, tag in _TAGS.items() if tag in known}
+    return Curves(**curves) if curves else None
 
 
 def _curve(events: Sequence[Any]) -> Curve:

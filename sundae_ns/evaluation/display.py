@@ -14,9 +14,9 @@ def fill_depth(depth: Tensor, alpha: Tensor) -> Tensor:
 
 
 def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean ``[F]``, first three principal directions ``[F, 3]`` and standard deviations ``[3]`` of ``features`` ``[N, F]``.
+    """Mean ``[F]``, first three principal directions ``[F, 3]`` and standard deviations ``[3]`` of features ``[N, F]``.
 
-    With fewer than three channels, the missing directions are zero. Signs are fixed, so the displayed colours are stable.
+    With fewer than three channels, the missing directions are zero. Signs are fixed, so displayed colours are stable.
     """
     mean = features.mean(dim=0)
     centred = features - mean
@@ -33,15 +33,12 @@ def principal_components(features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Tensor, alpha: Tensor) -> Tensor:
-    """Rendered features as colours; [0, 1] spans three standard deviations to each side of the mean.
+    """Rendered features as colours ``[H, W, 3]``; [0, 1] spans three standard deviations to each side of the mean.
 
     Args:
         features: rendered features ``[H, W, F]``, already weighted by ``alpha``.
         mean, basis, deviations: from :func:`principal_components` of the primitives' features.
-        alpha: accumulation ``[H, W, 1]``.
-
-    Returns:
-        ``[H, W, 3]`` in [0, 1]; black where ``alpha`` is 0.
+        alpha: accumulation ``[H, W, 1]``; colours are black where it is 0.
     """
     components = (features - alpha * mean) @ basis
     scaled = components / (6 * deviations.clamp_min(1e-8)) + 0.5 * alpha
@@ -49,10 +46,7 @@ def feature_colors(features: Tensor, mean: Tensor, basis: Tensor, deviations: Te
 
 
 def response_values(response: Tensor) -> Tensor:
-    """Rank of each response magnitude ``[N]``, scaled to (0, 1], float32; 0 where the response is not finite.
-
-    Ranks show fields of any scale.
-    """
+    """Rank of each response magnitude ``[N]``, scaled to (0, 1], float32; 0 where the response is not finite."""
     known = torch.isfinite(response)
     order = response[known].argsort().argsort()
     values = torch.zeros_like(response, dtype=torch.float32)

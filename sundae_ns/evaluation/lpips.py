@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
+from sundae_ns.errors import one_line
 from sundae_ns.evaluation.metrics import check_pair
 
 if TYPE_CHECKING:
@@ -18,13 +19,10 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 Net = Literal["alex", "vgg", "squeeze"]
-
-MIN_SIDE = 32
+_MIN_SIDE = 32
 """Shortest image side in pixels; below it, a backbone pools its input to nothing."""
-
-PROBE_SECONDS = 5.0
+_PROBE_SECONDS = 5.0
 """Seconds to wait for the server of the weights."""
-
 _BACKBONES = {"alex": "AlexNet_Weights", "vgg": "VGG16_Weights", "squeeze": "SqueezeNet1_1_Weights"}
 
 
@@ -48,8 +46,8 @@ def lpips_weights_available(net: Net = "alex") -> bool:
 class Lpips:
     """Learned perceptual image patch similarity (Zhang et al. 2018), built at its first use.
 
-    torchmetrics' variant with ``normalize=True``, for images in [0, 1]. Values of different nets do not compare: most papers
-    report VGG, splatfacto and gsplat report AlexNet. The class is no ``nn.Module``, which keeps the net out of checkpoints.
+    torchmetrics' variant with ``normalize=True``, for images in [0, 1]. Values of different nets do not compare: most
+    papers report VGG, splatfacto and gsplat report AlexNet. It is no ``nn.Module``, so checkpoints do not hold the net.
 
     Args:
         net: the backbone, ``alex``, ``vgg`` or ``squeeze``.
@@ -64,11 +62,7 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, pred: Tensor, target: Tensor) -> Tensor | None:
-        """Distance of two images; lower is better.
-
-        Args:
-            pred: ``[H, W, 3]``; clamped to [0, 1].
-            target: ``[H, W, 3]``; clamped to [0, 1].
+        """Distance of two images ``[H, W, 3]``, clamped to [0, 1]; lower is better.
 
         Returns:
             A float32 scalar on the inputs' device. None if a side is shorter than 32 pixels, or if the weights are
@@ -78,37 +72,30 @@ class Lpips:
             DataError: the shapes differ, or are not ``[H, W, 3]``.
         """
         check_pair(pred, target)
-        if min(pred.shape[:2]) < MIN_SIDE:
+        if min(pred.shape[:2]) < _MIN_SIDE:
             return None
-        metric = self._built()
-        if metric is None:
+        if self._metric is None and not self._failed:
+            self._build()
+        if self._metric is None:
             return None
-        metric.to(pred.device)
+        self._metric.to(pred.device)
         # Calling the metric returns the value of this pair alone; earlier calls do not count.
-        return metric(*(image.float().clamp(0, 1).permute(2, 0, 1)[None] for image in (pred, target)))
+        return self._metric(*(image.float().clamp(0, 1).permute(2, 0, 1)[None] for image in (pred, target)))
 
-    def _built(self) -> LearnedPerceptualImagePatchSimilarity | None:
-        if self._metric is not None or self._failed:
-            return self._metric
+    def _build(self) -> None:
         try:
             if not lpips_weights_available(self.net):
                 if not self.download:
                     raise FileNotFoundError("downloads are off")
                 # torch.hub downloads without a timeout, so check first that the server answers.
                 probe = urllib.request.Request(lpips_weights_url(self.net), method="HEAD")
-                urllib.request.urlopen(probe, timeout=PROBE_SECONDS).close()
+                urllib.request.urlopen(probe, timeout=_PROBE_SECONDS).close()
             from torchmetrics.image import LearnedPerceptualImagePatchSimilarity
 
             self._metric = LearnedPerceptualImagePatchSimilarity(net_type=self.net, normalize=True)
         except Exception as error:
             # Network, disk or a damaged file: a missing metric must not end a run.
             self._failed = True
-            cause = " ".join(str(error).split()) or type(error).__name__
-            logger.warning(
-                "LPIPS is left out because its %s weights are missing (%s); put %s into %s.",
-                self.net,
-                cause,
-                lpips_weights_url(self.net),
-                lpips_weights_path(self.net).parent,
-            )
-        return self._metric
+            url, folder = lpips_weights_url(self.net), lpips_weights_path(self.net).parent
+            cause = f"its {self.net} weights are missing ({one_line(error)})"
+            logger.warning("LPIPS is left out because %s; put %s into %s.", cause, url, folder)

@@ -33,8 +33,8 @@ class Configuration:
     ms: float | None
     """Synchronised milliseconds per frame, median over the test views; None if not timed."""
     bytes: int
-    """Bytes on disk in fp32 that this configuration needs: without the head, neither network nor features. For a packed scene,
-    the size of the file."""
+    """Bytes on disk in fp32 that this configuration needs: without the head, neither network nor features. For a packed
+    scene, the size of the file."""
     views: tuple[ViewQuality, ...]
     """Metrics by test view, in the order of the views."""
 
@@ -103,7 +103,7 @@ class Measured:
         return len(self.configurations) > 1
 
     def as_json(self) -> dict[str, Any]:
-        """All measurements, including those of each view, as plain values for JSON; numbers that are not finite become None."""
+        """All measurements, including those of each view, as plain values for JSON."""
         plain = asdict(self)
         plain["bytes_total"] = self.bytes_total
         for configuration, entry in zip(self.configurations, plain["configurations"], strict=True):

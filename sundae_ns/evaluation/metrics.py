@@ -1,18 +1,25 @@
 """Image metrics, each in one named variant; ``lpips.py`` has the learned one.
 
 PSNR is over all pixels and channels, with a peak of 1. SSIM is pytorch_msssim's, as in splatfacto: an 11 x 11 Gaussian
-window with sigma 1.5, no padding ("valid"), averaged over pixels and colour channels. Other libraries pad or normalise the
-variance differently; their values differ in the fourth digit.
+window with sigma 1.5, no padding ("valid"), averaged over pixels and colour channels. Other libraries pad or normalise
+the variance differently; their values differ in the fourth digit. FLIP needs the optional package of its authors.
 """
 
 from __future__ import annotations
 
+import importlib.util
+
+import numpy as np
 import torch
 from pytorch_msssim import ssim as _windowed_ssim
 from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.gpu.fused_loss import SSIM_WINDOW
+
+FLIP_VARIANT = "LDR-FLIP, 67 pixels per degree"
+"""Variant of FLIP: low dynamic range, at the default viewing distance of the authors' tools."""
+INSTALL_FLIP = "pip install flip-evaluator"
 
 
 def check_pair(pred: Tensor, target: Tensor) -> None:
@@ -41,20 +48,38 @@ def psnr(pred: Tensor, target: Tensor) -> Tensor:
 
 
 def ssim(pred: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity (Wang et al. 2004), pytorch_msssim's variant with the valid window and a data range of 1.
+    """Structural similarity (Wang et al. 2004); takes, returns and raises the same as :func:`psnr`.
 
-    Args:
-        pred: ``[H, W, 3]``, nominally in [0, 1].
-        target: ``[H, W, 3]`` in [0, 1].
-
-    Returns:
-        A scalar of the inputs' dtype and device; differentiable. NaN if a side is shorter than the window, 11 pixels:
-        pytorch_msssim would not smooth along that side and return another quantity.
-
-    Raises:
-        DataError: the shapes differ, or are not ``[H, W, 3]``.
+    NaN if a side is shorter than the window: pytorch_msssim would not smooth along it and return another quantity.
     """
     check_pair(pred, target)
     if min(pred.shape[:2]) < SSIM_WINDOW:
         return pred.new_full((), float("nan"))
     return _windowed_ssim(pred.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None], data_range=1.0)
+
+
+def flip_available() -> bool:
+    """Whether the package that computes FLIP is installed."""
+    return importlib.util.find_spec("flip_evaluator") is not None
+
+
+@torch.no_grad()
+def flip(pred: Tensor, target: Tensor) -> Tensor | None:
+    """Mean FLIP error (Andersson et al. 2020) of two sRGB images ``[H, W, 3]``, in [0, 1]; lower is better.
+
+    Images are clamped to [0, 1]. The authors' package computes the error on the CPU.
+
+    Returns:
+        A float32 scalar on the inputs' device; None if the package is not installed.
+
+    Raises:
+        DataError: the shapes differ, or are not ``[H, W, 3]``.
+    """
+    check_pair(pred, target)
+    if not flip_available():
+        return None
+    from flip_evaluator import evaluate
+
+    reference, test = (np.ascontiguousarray(image.float().clamp(0, 1).cpu().numpy()) for image in (target, pred))
+    _, mean, _ = evaluate(reference, test, "LDR", applyMagma=False)
+    return torch.tensor(mean, dtype=torch.float32, device=pred.device)

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 Cost = Literal["size", "time", "primitives"]
 
-DPI = 110
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Six colours that people with colour-vision deficiency can tell apart (Okabe and Ito, "Color Universal Design")."""
 MOST_SERIES = len(PALETTE)
@@ -32,7 +31,6 @@ _SMOOTHING = 30
 """The window of a running median reaches 1/30 of the run to both sides."""
 _FAINT_RUNS = 2
 """Most runs whose values at single steps are drawn behind their medians; more would hide each other."""
-
 _MARKERS = "os^DvP"
 """Markers of the first, second ... six runs: colours repeat after them."""
 _COSTS: Mapping[Cost, tuple[Callable[[Measured, Configuration], float | None], str]] = {
@@ -49,16 +47,9 @@ def colors_of(labels: Sequence[str]) -> dict[str, str]:
 
 
 def plot_quality(path: Path, runs: Sequence[Measured], cost: Cost, colors: Mapping[str, str]) -> bool:
-    """PSNR and SSIM against a cost; a line connects a field with its head and without.
+    """PSNR and SSIM of the runs of a scene against a cost; a line connects a field with its head and without.
 
-    Args:
-        path: the file to write.
-        runs: all of one scene; those without this cost are left out.
-        cost: the horizontal axis: size in MB, time in ms per frame, or number of primitives.
-        colors: from :func:`colors_of`.
-
-    Returns:
-        Whether there was a point to plot; otherwise no file is written.
+    Runs without this cost are left out. Returns whether there was a point to plot; otherwise no file is written.
     """
     value, cost_label = _COSTS[cost]
     places = [(run, way, x) for run in runs for way in run.configurations if (x := value(run, way)) is not None]
@@ -78,65 +69,37 @@ def plot_quality(path: Path, runs: Sequence[Measured], cost: Cost, colors: Mappi
         _cost_axis(panel, [x for _, _, x in places])
         panel.set_xlabel(cost_label)
         panel.set_ylabel(metric_label)
-    handles = [
-        Line2D([], [], color=colors[label], marker=marker, linestyle="none", label=label)
-        for label, marker in markers.items()
-    ]
+    handles = [_key(label, color=colors[label], marker=marker, linestyle="none") for label, marker in markers.items()]
     if any(run.has_head for run in runs):
-        keys = (("filled: with the head", _GRAY), ("open: without the head", "white"))
-        handles += [
-            Line2D([], [], color=_GRAY, marker="o", markerfacecolor=face, linestyle="none", label=text)
-            for text, face in keys
-        ]
-    _legend(figure, handles)
-    figure.suptitle(f"{runs[0].scene}: means over the test views", fontsize=11)
-    figure.savefig(path)
+        for text, face in (("filled: with the head", _GRAY), ("open: without the head", "white")):
+            handles.append(_key(text, color=_GRAY, marker="o", markerfacecolor=face, linestyle="none"))
+    _save(figure, path, handles, f"{runs[0].scene}: means over the test views")
     return True
 
 
 def plot_views(path: Path, runs: Sequence[Measured], colors: Mapping[str, str]) -> None:
-    """PSNR of every test view; solid lines with the head, dashed lines without it.
-
-    Args:
-        path: the file to write.
-        runs: of one scene, at most :data:`MOST_SERIES`.
-        colors: from :func:`colors_of`.
-    """
+    """PSNR of every test view of at most :data:`MOST_SERIES` runs of a scene; dashed lines are without the head."""
     count = max(len(run.full.views) for run in runs)
     figure, panels = _figure(1, 1, width=min(7 + 0.12 * count, 16), height=3.8)
     panel = panels[0, 0]
     for run in runs:
         for configuration in run.configurations:
-            full = configuration is run.full
-            panel.plot(
-                range(len(configuration.views)),
-                [view.psnr for view in configuration.views],
-                color=colors[run.label],
-                linestyle="-" if full else "--",
-                marker="o" if full else None,
-                markersize=4,
-                linewidth=1.3 if full else 1,
-                alpha=1 if full else 0.6,
-            )
+            solid = {"linestyle": "-", "marker": "o", "markersize": 4, "linewidth": 1.3}
+            look = solid if configuration is run.full else {"linestyle": "--", "linewidth": 1, "alpha": 0.6}
+            panel.plot([view.psnr for view in configuration.views], color=colors[run.label], **look)
     panel.xaxis.set_major_locator(MaxNLocator(integer=True))
     panel.set_xlabel("test view, in the order of the capture")
     panel.set_ylabel("PSNR, dB (higher is better)")
-    handles = [Line2D([], [], color=colors[run.label], marker="o", markersize=4, label=run.label) for run in runs]
+    handles = [_key(run.label, color=colors[run.label], marker="o", markersize=4) for run in runs]
     if any(run.has_head for run in runs):
-        handles.append(Line2D([], [], color="0.4", linestyle="--", label="same field, head off"))
-    _legend(figure, handles)
-    figure.suptitle(f"{runs[0].scene}: PSNR of each test view", fontsize=11)
-    figure.savefig(path)
+        handles.append(_key("same field, head off", color=_GRAY, linestyle="--"))
+    _save(figure, path, handles, f"{runs[0].scene}: PSNR of each test view")
 
 
 def plot_curves(path: Path, curves: Mapping[str, Curves], colors: Mapping[str, str], *, title: str) -> None:
-    """Loss, number of primitives, PSNR of training views, and peak memory over training.
+    """Loss, number of primitives, PSNR of training views, and peak memory over training, by label.
 
-    Args:
-        path: the file to write.
-        curves: by label; at least one and at most :data:`MOST_SERIES`.
-        colors: from :func:`colors_of`.
-        title: of the figure.
+    There are at least one and at most :data:`MOST_SERIES` runs in ``curves``.
     """
     figure, panels = _figure(2, 2, width=5.6, height=3.2)
     titles = (
@@ -153,17 +116,16 @@ def plot_curves(path: Path, curves: Mapping[str, Curves], colors: Mapping[str, s
     faint = len(curves) <= _FAINT_RUNS
     without_head = False
     for label, run in curves.items():
+        line = {"color": colors[label], "linewidth": 1.3}
         _noisy(loss, run.loss, colors[label], faint)
         # Steps, not slopes: a prune is instantaneous.
-        count.plot(
-            run.primitives.steps, run.primitives.values, color=colors[label], linewidth=1.3, drawstyle="steps-post"
-        )
+        count.plot(run.primitives.steps, run.primitives.values, drawstyle="steps-post", **line)
         _noisy(psnr, run.psnr, colors[label], faint)
         if run.psnr_base.values != run.psnr.values:
             without_head = True
             _noisy(psnr, run.psnr_base, colors[label], False, linestyle="--")
         if any(run.memory.values):
-            memory.plot(run.memory.steps, run.memory.values, color=colors[label], linewidth=1.3)
+            memory.plot(run.memory.steps, run.memory.values, **line)
     loss.set_yscale("log")
     loss.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     loss.yaxis.set_major_formatter(FuncFormatter(_number))
@@ -175,16 +137,14 @@ def plot_curves(path: Path, curves: Mapping[str, Curves], colors: Mapping[str, s
     else:
         memory.text(0.5, 0.5, "not recorded (no CUDA device)", transform=memory.transAxes, ha="center", color="0.5")
         memory.set(xticks=[], yticks=[])
-    handles = [Line2D([], [], color=colors[label], label=label) for label in curves]
+    handles = [_key(label, color=colors[label]) for label in curves]
     if without_head:
-        handles.append(Line2D([], [], color="0.4", linestyle="--", label="PSNR without the head"))
-    _legend(figure, handles)
-    figure.suptitle(f"{title} (loss and PSNR are running medians; each step has another view)", fontsize=11)
-    figure.savefig(path)
+        handles.append(_key("PSNR without the head", color=_GRAY, linestyle="--"))
+    _save(figure, path, handles, f"{title} (loss and PSNR are running medians; each step has another view)")
 
 
 def _figure(rows: int, columns: int, *, width: float, height: float) -> tuple[Figure, np.ndarray]:
-    figure = Figure(figsize=(width * columns, height * rows + 0.6), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(width * columns, height * rows + 0.6), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False)
     for panel in panels.flat:
@@ -193,9 +153,15 @@ def _figure(rows: int, columns: int, *, width: float, height: float) -> tuple[Fi
     return figure, panels
 
 
-def _legend(figure: Figure, handles: Sequence[Any]) -> None:
-    # Below the panels, where it hides no data.
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 3), fontsize=8, frameon=False)
+def _key(label: str, **look: Any) -> Line2D:
+    return Line2D([], [], label=label, **look)
+
+
+def _save(figure: Figure, path: Path, keys: Sequence[Line2D], title: str) -> None:
+    # The legend is below the panels, where it hides no data.
+    figure.legend(handles=keys, loc="outside lower center", ncols=min(len(keys), 3), fontsize=8, frameon=False)
+    figure.suptitle(title, fontsize=11)
+    figure.savefig(path)
 
 
 def _number(value: float, _: object = None) -> str:
@@ -209,20 +175,19 @@ def _number(value: float, _: object = None) -> str:
 def _cost_axis(panel: Axes, values: Sequence[float]) -> None:
     """Choose a linear axis for values within a factor of 4, else a logarithmic one, with readable ticks."""
     panel.margins(0.2)
-    panel.xaxis.set_major_formatter(FuncFormatter(_number))
-    if min(values) <= 0 or max(values) / min(values) < 4:
+    span = max(values) / min(values) if min(values) > 0 else 0
+    if span < 4:
         panel.xaxis.set_major_locator(MaxNLocator(6))
-        return
-    panel.set_xscale("log")
-    span = max(values) / min(values)
-    panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if span < 100 else (1, 3) if span < 10_000 else (1,)))
+    else:
+        panel.set_xscale("log")
+        panel.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if span < 100 else (1, 3) if span < 10_000 else (1,)))
+        panel.xaxis.set_minor_formatter(NullFormatter())
     panel.xaxis.set_major_formatter(FuncFormatter(_number))
-    panel.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _noisy(panel: Axes, curve: Curve, color: str, faint: bool, linestyle: str = "-") -> None:
     """The running median of a curve whose steps have different views, and the curve itself, faintly, if wanted."""
-    if not curve:
+    if not curve.steps:
         return
     steps, values = np.asarray(curve.steps), np.asarray(curve.values)
     reach = max(len(values) // _SMOOTHING, 1)

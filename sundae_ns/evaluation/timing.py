@@ -1,7 +1,8 @@
-"""Wall-clock times that include the device's work."""
+"""Wall-clock times that include the device's work, and peak memory."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from statistics import median
@@ -12,7 +13,7 @@ from sundae_ns.errors import ConfigError
 
 
 def now(device: torch.device | str) -> float:
-    """Seconds on the host's wall clock, from an arbitrary start, after waiting for the device to finish its queued work."""
+    """Seconds on the host's wall clock, from an arbitrary start, after the device has finished its queued work."""
     device = torch.device(device)
     if device.type == "cuda":
         torch.cuda.synchronize(device)
@@ -22,15 +23,9 @@ def now(device: torch.device | str) -> float:
 
 
 def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: int = 5, repeats: int = 20) -> float:
-    """Median milliseconds of a function, from its call until the device is idle again.
+    """Median milliseconds of a function on a device, from its call until the device is idle again.
 
-    The host's clock is read after a synchronisation on both sides of the call, so the time includes launching the work.
-
-    Args:
-        fn: called without arguments; its result is discarded.
-        device: the device that ``fn`` uses.
-        warmup: number of untimed calls first.
-        repeats: number of timed calls.
+    ``warmup`` untimed calls come before the ``repeats`` timed ones.
 
     Raises:
         ConfigError: ``warmup`` is negative, or ``repeats`` less than 1.
@@ -45,3 +40,15 @@ def median_ms(fn: Callable[[], object], *, device: torch.device | str, warmup: i
         fn()
         times.append(1e3 * (now(device) - start))
     return median(times)
+
+
+def peak_memory(device: torch.device) -> int:
+    """Peak memory so far in bytes: allocated by torch on a CUDA device, else resident on the host; 0 if unknown."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device)
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return 0
+    # Linux reports kibibytes, macOS bytes.
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

@@ -12,7 +12,6 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from sundae_ns.evaluation.comparison_image import ComparisonRow
 from sundae_ns.evaluation.metrics import psnr
 
-FRAMES_PER_SECOND = 6
 WIDEST = 1920
 """Largest width of a frame in pixels, which every player decodes."""
 _NARROWEST = 240
@@ -21,20 +20,19 @@ _CAPTION = 24
 _FONT_SIZE = 14
 _TEXT = (255, 255, 255)
 _BT709 = 1
-"""Number of the colour space in a video's header, which players otherwise guess from the size."""
+"""Number of the colour space in a video's header; without it, players guess from the size."""
 
 
 def side_by_side(row: ComparisonRow, tile: tuple[int, int], *, head: bool) -> Image.Image:
-    """A frame: base colours, the compensated image and the truth of one view, with PSNR and the row's title below.
+    """A frame of a view: base colours, compensated image and truth, with PSNR and the row's title below.
+
+    It is an RGB image with even sides, at most ``WIDEST`` pixels wide.
 
     Args:
         row: the view.
-        tile: width and height in pixels that each image gets; one of another shape gets black borders. Narrow tiles are
+        tile: width and height in pixels for each image; one of another shape gets black borders. Narrow tiles are
             enlarged, and wide ones reduced.
         head: whether the field has a head; without one, the compensated image is left out.
-
-    Returns:
-        RGB image with even sides, at most ``WIDEST`` pixels wide.
     """
     truth = torch.as_tensor(row.truth)
     base = float(psnr(torch.as_tensor(row.base), truth))
@@ -58,15 +56,10 @@ def side_by_side(row: ComparisonRow, tile: tuple[int, int], *, head: bool) -> Im
     return frame
 
 
-def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second: float = FRAMES_PER_SECOND) -> int:
-    """Write frames of one size as an MP4 (H.264), which browsers play; returns their number.
+def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second: float = 6) -> int:
+    """Write RGB frames of one size with even sides as an MP4 (H.264), which browsers play; returns their number.
 
-    PyAV brings its own encoder, so no ffmpeg is needed.
-
-    Args:
-        path: file to write, of any suffix.
-        frames: RGB images of one size with even sides, rendered one at a time.
-        frames_per_second: speed.
+    PyAV brings its own encoder, so no ffmpeg is needed. The path may have any suffix.
     """
     import av
 

@@ -179,7 +179,7 @@ def open_pipeline(
     pipeline_config.datamanager.data = capture
 
     pipeline: Any = pipeline_config.setup(device=_device(), test_mode=test_mode)
-    loaded = checkpoint.load(newest)
+    loaded = checkpoint.read(newest)
     if foreign:
         put_scene(pipeline.model, load(newest))
         pipeline.model.step = int(loaded["step"])

@@ -84,7 +84,7 @@ def contents_of_run(run: Path, *, max_cameras: int = 100, data: Path | None = No
 def packed_run(run: Path, *, data: Path | None = None) -> tuple[Scene, bytes]:
     """The scene of a finished run with its training cameras, and its packed file; errors as :func:`contents_of_run`."""
     contents = contents_of_run(run, data=data)
-    return scene_of(contents), pack_bytes(*fit_scene(contents))
+    return scene_of(contents), pack_bytes(*fit_scene(contents))[0]
 
 
 def _cameras(manager: SundaeDatamanagerConfig, most: int) -> dict[str, Tensor]:
@@ -161,7 +161,7 @@ def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | 
         if is_frame(frame := packed.meta.get("frame")):
             write_text(folder / FRAME_FILE, json.dumps(frame, indent=4))
     state = {f"_model.{name}": value for name, value in model.state_dict().items()}
-    checkpoint.save(
+    checkpoint.write(
         {"step": model.step, "pipeline": state}, config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"
     )
     write_text(folder / "config.yml", yaml.dump(config))

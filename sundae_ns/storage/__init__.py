@@ -1,16 +1,8 @@
-"""Files: .ply, .spz, .sog and packed scenes; runs; atomic writes, sizes in bytes, similarity transforms. Floor 3."""
+"""Files: .ply, .spz, .sog and packed scenes; runs; atomic writes, sizes in bytes, similarity transforms."""
 
 from sundae_ns.storage.accounting import Sizes, bytes_of, bytes_of_module, megabytes, stored_bytes
 from sundae_ns.storage.atomic import replacing, write_text
-from sundae_ns.storage.ply import read_ply, write_ply
-from sundae_ns.storage.point_cloud import (
-    MODEL_FRAME,
-    is_nerfstudio_ply,
-    ply_comments,
-    read_point_cloud,
-)
-from sundae_ns.storage.sog import write_sog
-from sundae_ns.storage.spz import write_spz
+from sundae_ns.storage.ply import MODEL_FRAME, is_nerfstudio_ply, ply_comments, read_ply, read_point_cloud, write_ply
 from sundae_ns.storage.transform import similarity
 
 __all__ = [
@@ -27,7 +19,5 @@ __all__ = [
     "similarity",
     "stored_bytes",
     "write_ply",
-    "write_sog",
-    "write_spz",
     "write_text",
 ]

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from itertools import chain
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.evaluation.measured import MEGABYTE
 
 BYTES_PER_FLOAT = 4
-MEGABYTE = 1_000_000
 
 
 def bytes_of(params: Mapping[str, Tensor]) -> int:
@@ -39,21 +40,15 @@ def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
 
 
 def rows_within(params: Mapping[str, Tensor], limit: int, count_bytes: Callable[[Mapping[str, Tensor]], int]) -> int:
-    """Largest n for which the first n primitives of a field take at most ``limit`` bytes; may be 0.
+    """Largest n, maybe 0, for which the first n primitives of a field take at most ``limit`` bytes.
 
-    Args:
-        params: the field, each parameter ``[N, ...]``.
-        limit: bytes.
-        count_bytes: bytes of a field; must not decrease with the number of primitives.
+    ``count_bytes`` gives the bytes of a field; they must not decrease with the number of primitives.
     """
-    low, high = 0, len(params["means"])
-    while low < high:
-        middle = (low + high + 1) // 2
-        if count_bytes({name: value[:middle] for name, value in params.items()}) <= limit:
-            low = middle
-        else:
-            high = middle - 1
-    return low
+
+    def taken(n: int) -> int:
+        return count_bytes({name: value[:n] for name, value in params.items()})
+
+    return bisect_right(range(1, len(params["means"]) + 1), limit, key=taken)
 
 
 def megabytes(count: int) -> str:
@@ -61,21 +56,13 @@ def megabytes(count: int) -> str:
     return f"{count / MEGABYTE:.2f} MB"
 
 
-@dataclass(frozen=True)
-class Sizes:
+class Sizes(NamedTuple):
     """Stored bytes of a compensated field."""
 
     primitives: int
-    """Bytes of the primitives."""
     head: int = 0
-    """Bytes of the head."""
 
     @property
     def total(self) -> int:
         """Bytes of both."""
         return self.primitives + self.head
-
-    def __str__(self) -> str:
-        """``23.60 MB primitives + 7.80 MB head = 31.40 MB``."""
-        parts = f"{megabytes(self.primitives)} primitives + {megabytes(self.head)} head"
-        return f"{parts} = {megabytes(self.total)}"

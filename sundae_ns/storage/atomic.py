@@ -37,11 +37,7 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a small text file atomically.
-
-    Raises:
-        StorageError: the disk is full or not writable.
-    """
+    """Write a small text file atomically; ``StorageError`` if the disk is full or not writable."""
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
 

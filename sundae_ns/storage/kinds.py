@@ -8,7 +8,6 @@ from typing import Literal
 from sundae_ns.errors import CheckpointError, regular
 
 Kind = Literal["packed", "ply", "spz", "sog"]
-
 PACKED = b"\x89SUNDAE\n"
 """First bytes of a packed scene."""
 _FIRST_BYTES: dict[bytes, Kind] = {
@@ -19,7 +18,6 @@ _FIRST_BYTES: dict[bytes, Kind] = {
     b"NGSP": "spz",
     b"PK\x03\x04": "sog",
 }
-_NAMES: dict[Kind, str] = {"packed": "a packed scene", "ply": "a .ply file"}
 
 
 def kind_of(path: Path) -> Kind | None:
@@ -35,17 +33,9 @@ def kind_of(path: Path) -> Kind | None:
 
 
 def refuse(path: Path, *, packed: str | None = None, ply: str | None = None) -> None:
-    """Raise an error for a file of a refused kind.
-
-    Args:
-        path: given by the user.
-        packed: advice on what to give instead of a packed scene; None accepts packed scenes.
-        ply: advice on what to give instead of a .ply; None accepts .ply files.
-
-    Raises:
-        CheckpointError: the file is of a refused kind.
-    """
-    advice: dict[Kind, str | None] = {"packed": packed, "ply": ply}
+    """Raise ``CheckpointError`` for a packed scene or a .ply, with the advice for it; None accepts the kind."""
     kind = kind_of(path)
-    if kind is not None and (instead := advice.get(kind)) is not None:
-        raise CheckpointError(f"{path} is {_NAMES[kind]}; {instead}")
+    if kind == "packed" and packed is not None:
+        raise CheckpointError(f"{path} is a packed scene; {packed}")
+    if kind == "ply" and ply is not None:
+        raise CheckpointError(f"{path} is a .ply file; {ply}")

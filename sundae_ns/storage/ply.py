@@ -1,4 +1,4 @@
-"""The .ply of 3D Gaussian splatting, which viewers and converters read.
+"""The .ply of 3D Gaussian splatting, which viewers and converters read, and the .ply of points.
 
 One binary vertex per primitive, all properties float32, values before activation as in
 :mod:`sundae_ns.gaussians.parameters`: ``x y z  nx ny nz  f_dc_0..2  f_rest_*  opacity  scale_0..2  rot_0..3``. Normals
@@ -10,18 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from sundae_ns.errors import DataError, regular
+from sundae_ns.errors import DataError, SundaeError, reading, regular
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, sh_degree_of
 from sundae_ns.storage.atomic import replacing
 
+MODEL_FRAME = "Coordinates: nerfstudio model"
+"""Header comment of files in the coordinates of nerfstudio's model, not of the capture."""
 _COLUMNS = {
     "means": ("x", "y", "z"),
     "features_dc": ("f_dc_0", "f_dc_1", "f_dc_2"),
@@ -32,24 +33,21 @@ _COLUMNS = {
 _NORMALS = ("nx", "ny", "nz")
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
-MAX_HEADER = 1 << 16
-"""The header must end within this many bytes."""
+_MAX_HEADER = 1 << 16  # bytes
+_GREY = 128
 
 
 def _rest_columns(count: int) -> tuple[str, ...]:
-    """Names of the ``count`` properties with SH coefficients of degrees 1 and up."""
     return tuple(f"f_rest_{i}" for i in range(count))
 
 
-def check_field(params: Mapping[str, Tensor]) -> None:
-    """Raise ``DataError`` unless a field has all of ``SPLAT_NAMES``, in their shapes."""
+def check_field(params: Mapping[str, Tensor], failure: type[SundaeError] = DataError) -> None:
+    """Raise a ``failure`` unless a field has all of ``SPLAT_NAMES``, in their shapes."""
     missing = [name for name in SPLAT_NAMES if name not in params]
     if missing:
-        raise DataError(
-            f"The field has no {', '.join(missing)}; a file of primitives needs all of {', '.join(SPLAT_NAMES)}."
-        )
+        raise failure(f"the field has no {', '.join(missing)}; it needs all of {', '.join(SPLAT_NAMES)}")
     for odd in odd_shapes(params):
-        raise DataError(f"{odd}.")
+        raise failure(odd)
 
 
 def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[str] = ()) -> None:
@@ -59,14 +57,13 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
         path: the file; its folder must exist.
         params: a field; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not written. Values that are not
             finite are written unchanged: drop such primitives first (``finite_mask``), because viewers do not.
-        comments: lines for the header: ``storage.MODEL_FRAME`` for the field of a nerfstudio model, ``SplatRenderMode:
+        comments: lines for the header: :data:`MODEL_FRAME` for the field of a nerfstudio model, ``SplatRenderMode:
             mip`` for an antialiased scene.
 
     Raises:
         DataError: a parameter is missing or has the wrong shape.
         StorageError: the disk is full or not writable.
     """
-    path = Path(path)
     check_field(params)
     n = num_primitives(params)
     means, *others = _table(params)
@@ -81,105 +78,70 @@ def write_ply(path: Path, params: Mapping[str, Tensor], *, comments: Sequence[st
 
 def _table(params: Mapping[str, Tensor]) -> list[tuple[tuple[str, ...], NDArray[np.float32]]]:
     """Properties of a field and their values ``[N, C]``, in the order of the format."""
-
-    def columns(name: str) -> NDArray[np.float32]:
-        return params[name].detach().to(device="cpu", dtype=torch.float32).numpy()
-
+    values = {name: params[name].detach().to("cpu", torch.float32).numpy() for name in SPLAT_NAMES}
     rest = (
-        columns("features_rest")
-        .transpose(0, 2, 1)
-        .reshape(num_primitives(params), 3 * params["features_rest"].shape[1])
+        values["features_rest"].transpose(0, 2, 1).reshape(num_primitives(params), 3 * params["features_rest"].shape[1])
     )
-    colors = [(_COLUMNS["features_dc"], columns("features_dc")), (_rest_columns(rest.shape[1]), rest)]
-    shapes = [(_COLUMNS[name], columns(name)) for name in ("opacities", "scales", "quats")]
-    return [(_COLUMNS["means"], columns("means")), *colors, *shapes]
+    blocks = [(_COLUMNS[name], values[name]) for name in ("means", "features_dc", "opacities", "scales", "quats")]
+    return [*blocks[:2], (_rest_columns(rest.shape[1]), rest), *blocks[2:]]
 
 
-class Header(NamedTuple):
-    """What the header of a .ply states."""
-
-    text: bool
-    lists: dict[str, list[str]]
-    """Names of the list properties of each element."""
-    stated: int
-    """Smallest number of bytes that its elements take."""
-    available: int
-    """Bytes behind the header."""
-
-
-def read_header(path: Path) -> Header:
-    """Read the header alone: plyfile allocates by it, and reads lists and text row by row, in minutes.
-
-    Raises:
-        DataError: the file has no header of a .ply, or an element without properties.
-        OSError: the file cannot be read.
-    """
+def _check_header(path: Path, primitives: bool) -> None:
+    """Check the header alone: plyfile allocates by it, and reads lists and text row by row, in minutes."""
     with regular(path).open("rb") as file:
-        header, end, _ = file.read(MAX_HEADER).partition(b"end_header")
+        header, end, _ = file.read(_MAX_HEADER).partition(b"end_header")
     lines = [line.split() for line in header.splitlines()]
     if not end or lines[:1] != [[b"ply"]]:
         raise _incomplete(path, "it has no .ply header")
     text = [b"format", b"ascii", b"1.0"] in lines
     # In ascii, each value takes at least a digit and a space.
     elements: list[tuple[int, int]] = []
-    lists: dict[str, list[str]] = {}
+    lists: dict[str, str] = {}
+    name = ""
     for words in lines:
         if words[:1] == [b"element"] and len(words) == 3 and words[2].isdigit():
             elements.append((int(words[2]), 0))
-            lists[words[1].decode("latin-1")] = []
+            name = words[1].decode("latin-1")
         elif words[:1] == [b"property"] and elements and len(words) >= 3:
             is_list = words[1] == b"list"
             kind = words[2] if is_list else words[1]
             count, size = elements[-1]
             elements[-1] = (count, size + (2 if text else _SIZES.get(kind.decode("latin-1"), 1)))
             if is_list:
-                lists[list(lists)[-1]].append(words[-1].decode("latin-1"))
+                lists.setdefault(name, words[-1].decode("latin-1"))
     if any(count > 0 and size == 0 for count, size in elements):
         raise _incomplete(path, "an element has no properties")
-    stated = sum(count * size for count, size in elements)
-    return Header(text, lists, stated, path.stat().st_size - len(header))
+    stated, available = sum(count * size for count, size in elements), path.stat().st_size - len(header)
+    if stated > available:
+        raise _incomplete(path, f"its header states at least {stated:,} bytes, it has {available:,}")
+    if primitives and text:
+        raise DataError(f"{path} is an ascii .ply; export it as binary.")
+    for element, listed in lists.items():
+        if primitives or element == "vertex":
+            raise DataError(
+                f"property {listed} of each {element} in {path} is a list, not a number; export the .ply again."
+            )
 
 
 def _incomplete(path: Path, reason: str) -> DataError:
     return DataError(f"{path} is not a complete .ply file ({reason}); export it again.")
 
 
-def load_ply(path: Path, *, primitives: bool = False) -> PlyData:
-    """Parse any .ply file, allocating no more than a few times its size.
+def _load(path: Path, *, primitives: bool = False) -> PlyData:
+    """Parse any .ply with vertices, allocating no more than a few times its size.
 
-    Args:
-        path: the file.
-        primitives: refuse, by the header, what no binary .ply of Gaussian primitives has: text and lists.
-
-    Raises:
-        DataError: the file is missing, not a .ply, truncated, has no vertices, or vertices with lists.
+    ``primitives`` refuses what no binary .ply of Gaussian primitives has: text and lists.
     """
-    try:
-        header = read_header(path)
-        if header.stated > header.available:
-            raise _incomplete(path, f"its header states at least {header.stated:,} bytes, it has {header.available:,}")
-        if primitives and header.text:
-            raise DataError(f"{path} is an ascii .ply; export it as binary.")
-        for element, names in header.lists.items():
-            if names and (primitives or element == "vertex"):
-                raise DataError(
-                    f"property {names[0]} of each {element} in {path} is a list, not a number; export the .ply again."
-                )
+    with reading(path, "a complete .ply file"):
+        _check_header(path, primitives)
         # plyfile maps the file given a path; from a stream it reads single vertices (90 s per million instead of 1 s).
         data = PlyData.read(str(path))
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path.") from error
-    except (PlyParseError, ValueError) as error:
-        if isinstance(error, DataError):
-            raise
-        # A header that is not text raises ValueError.
-        raise _incomplete(path, " ".join(str(error).split())[:200]) from error
     if "vertex" not in data:
         raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussian primitives.")
     return data
 
 
-def stack_columns(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
+def _stacked(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
     """Properties of all vertices as columns: ``[N, len(columns)]`` float32."""
     table = np.empty((vertex.count, len(columns)), np.float32)
     for i, name in enumerate(columns):
@@ -189,10 +151,7 @@ def stack_columns(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
 
 
 def read_ply(path: Path) -> dict[str, Tensor]:
-    """Read a 3DGS .ply.
-
-    Args:
-        path: a binary .ply; further properties and elements are ignored.
+    """Read a binary 3DGS .ply; further properties and elements are ignored.
 
     Returns:
         A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU. The SH degree
@@ -201,7 +160,7 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     Raises:
         DataError: the file is missing, not a binary .ply, truncated, or does not hold Gaussian primitives.
     """
-    vertex = load_ply(path, primitives=True)["vertex"]
+    vertex = _load(path, primitives=True)["vertex"]
     present = {prop.name for prop in vertex.properties}
     missing = [name for columns in _COLUMNS.values() for name in columns if name not in present]
     if missing:
@@ -211,10 +170,34 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     if degree is None or not present.issuperset(_rest_columns(rest)):
         raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
 
-    params = {name: stack_columns(vertex, columns) for name, columns in _COLUMNS.items()}
-    by_channel = stack_columns(vertex, _rest_columns(rest)).reshape(vertex.count, 3, rest // 3)
+    params = {name: _stacked(vertex, columns) for name, columns in _COLUMNS.items()}
+    by_channel = _stacked(vertex, _rest_columns(rest)).reshape(vertex.count, 3, rest // 3)
     params["features_rest"] = by_channel.transpose(1, 2).contiguous()
     return {name: params[name] for name in SPLAT_NAMES}
+
+
+def read_point_cloud(path: Path) -> tuple[Tensor, Tensor]:
+    """Read the points and colours of a .ply, binary or ascii.
+
+    Args:
+        path: vertices with ``x y z`` and, optionally, ``red green blue``: integers to 255 or floats to 1.
+
+    Returns:
+        Positions ``[N, 3]`` float32 and colours ``[N, 3]`` uint8, on the CPU; points without a colour are mid-grey.
+
+    Raises:
+        DataError: the file is missing, not a .ply, truncated, or its vertices have no position.
+    """
+    vertex = _load(path)["vertex"]
+    kinds = {prop.name: vertex[prop.name].dtype.kind for prop in vertex.properties}
+    if not kinds.keys() >= {"x", "y", "z"}:
+        raise DataError(f"{path} has vertices without x, y and z; give a .ply of points.")
+    points = _stacked(vertex, ("x", "y", "z"))
+    channels = ("red", "green", "blue")
+    if not kinds.keys() >= set(channels):
+        return points, torch.full_like(points, _GREY, dtype=torch.uint8)
+    scale = 255 if kinds["red"] == "f" else 1
+    return points, (_stacked(vertex, channels) * scale).round().clamp(0, 255).to(torch.uint8)
 
 
 def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Tensor] | None = None) -> None:
@@ -230,7 +213,7 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
         DataError: the file cannot be read, or has another number of vertices.
         StorageError: the disk is full or not writable.
     """
-    data = load_ply(source)
+    data = _load(source)
     vertex = data["vertex"]
     if vertex.count != len(mask):
         raise DataError(f"{source} has {vertex.count} vertices, not {len(mask)}: it was changed meanwhile; run again.")
@@ -241,5 +224,28 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
     kept = PlyElement.describe(rows, "vertex", comments=vertex.comments)
     elements = [kept if element.name == "vertex" else element for element in data.elements]
     copy = PlyData(elements, text=data.text, byte_order=data.byte_order, comments=data.comments, obj_info=data.obj_info)
-    with replacing(Path(out)) as partial:
+    with replacing(out) as partial:
         copy.write(str(partial))
+
+
+def ply_comments(path: Path) -> list[str]:
+    """Comments in the header of a .ply; an empty list for any other file or an unreadable one."""
+    try:
+        with regular(path).open("rb") as file:
+            header = file.read(_MAX_HEADER).partition(b"end_header")[0]
+    except OSError:
+        return []
+    mark = b"comment "
+    comments = [line[len(mark) :].strip() for line in header.splitlines() if line.startswith(mark)]
+    return [comment.decode("latin-1") for comment in comments] if header.startswith(b"ply") else []
+
+
+def is_nerfstudio_ply(path: Path) -> bool:
+    """Whether a .ply is in the coordinates of nerfstudio's model, by its header; False for unreadable files.
+
+    True for files of ``ns-export gaussian-splat`` and files with :data:`MODEL_FRAME`. Files of other programs are in
+    the coordinates of the capture.
+    """
+    # nerfstudio 1.1.5 writes the misspelt first one.
+    marks = ("Generated by Nerstudio", "Generated by Nerfstudio", MODEL_FRAME)
+    return any(comment.startswith(marks) for comment in ply_comments(path))

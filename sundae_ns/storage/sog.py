@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.errors import DataError, regular
+from sundae_ns.errors import DataError, reading, regular
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.morton import scene_order
 from sundae_ns.storage.spz import MAX_SH_DEGREE, checked
@@ -105,7 +105,7 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
             "codebook": values.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-    with replacing(Path(path)) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as bundle:
+    with replacing(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as bundle:
         # ZipInfo has a fixed date, so that equal fields give equal bytes.
         bundle.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
         for name, pixels in images.items():
@@ -122,19 +122,11 @@ def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
     Raises:
         DataError: the file is missing, damaged, no bundled .sog, or of another version.
     """
-    try:
-        with zipfile.ZipFile(regular(path)) as bundle:
-            meta = json.loads(_entry(bundle, "meta.json"))
-            if meta["version"] != 2:
-                raise DataError(f"{path} has version {meta['version']} of the format; this program reads 2")
-            arrays = _decoded(bundle, meta)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
-    except DataError:
-        raise
-    except Exception as error:  # zip, JSON and Pillow raise errors of many kinds on damaged files
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DataError(f"{path} is no complete .sog ({reason}); export it again") from error
+    with reading(path, "a complete .sog"), zipfile.ZipFile(regular(path)) as bundle:
+        meta = json.loads(_entry(bundle, "meta.json"))
+        if meta["version"] != 2:
+            raise DataError(f"{path} has version {meta['version']} of the format; this program reads 2")
+        arrays = _decoded(bundle, meta)
     field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
     return field, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
 
@@ -204,13 +196,9 @@ def _from_smallest_three(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def codebook(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Fit 256 numbers to values, minimising the squared error by one-dimensional k-means (Lloyd, 1957).
+    """Numbers in ascending order ``[256]``, by k-means (Lloyd, 1957), and the index of the nearest for each value.
 
-    Args:
-        values: of any shape, not empty, finite.
-
-    Returns:
-        The numbers in ascending order ``[256]``, and the index of the nearest one, in the shape of ``values``.
+    ``values`` are finite, not empty, of any shape.
     """
     ordered = np.sort(values, axis=None).astype(np.float64)
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
@@ -230,40 +218,26 @@ def _middles(centres: NDArray[np.float64]) -> NDArray[np.float64]:
     return (centres[1:] + centres[:-1]) / 2
 
 
-def palette(
-    rows: NDArray[np.float32], max_rows: int = MAX_PALETTE, *, seed: int = 0
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Fit at most ``max_rows`` palette rows to the given rows.
+def palette(rows: NDArray[np.float32], max_rows: int = MAX_PALETTE) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """A palette ``[P, D]`` of at most ``max_rows`` rows, fitted to rows ``[N, D]``, and the index of each row ``[N]``.
 
     A k-means of 65,536 centres over a million rows would take hours. So it has two levels: 256 coarse cells, and in
     each cell centres in proportion to its rows.
-
-    Args:
-        rows: ``[N, D]``.
-        max_rows: maximum number of palette rows, at least 512; if N is not larger, the rows are the palette.
-        seed: seed of the initial centres.
-
-    Returns:
-        Palette ``[P, D]`` and the palette index of each row ``[N]``.
     """
     n = len(rows)
     if n <= max_rows:
         return rows, np.arange(n)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     vectors = torch.from_numpy(np.ascontiguousarray(rows)).double()
     cell_of = _nearest_centre(vectors, kmeans(vectors, _COARSE, generator))
     centres: list[Tensor] = []
     labels = torch.empty(n, dtype=torch.int64)
-    count_before = 0
-    for cell in range(_COARSE):
+    for cell in cell_of.unique():
         (members,) = torch.nonzero(cell_of == cell, as_tuple=True)
-        if not len(members):
-            continue
         count = min(1 + (max_rows - _COARSE) * len(members) // n, len(members))
         fine = kmeans(vectors[members], count, generator)
-        labels[members] = count_before + _nearest_centre(vectors[members], fine)
+        labels[members] = sum(map(len, centres)) + _nearest_centre(vectors[members], fine)
         centres.append(fine)
-        count_before += count
     return torch.cat(centres).float().numpy(), labels.numpy()
 
 

@@ -24,14 +24,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import DataError, regular
+from sundae_ns.errors import DataError, reading, regular
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.ply import check_field
 
 MAX_SH_DEGREE = 3
 """Highest SH degree that .spz and .sog can store."""
-HARMONICS_STEP = 1 / 64
-"""Costs 0.03 dB; the finest step costs 0.01 dB, twice this step 0.12 dB (docs/formats.md)."""
+_HARMONICS_STEP = 1 / 64
+"""Step of SH coefficients of degrees 1 and up. Costs 0.03 dB; twice this step costs 0.12 dB (docs/formats.md)."""
 _VERSION = 3  # one gzip stream; more programs read it than version 4
 _HEADER_FLAGS = 14  # offset of the flags in the header
 _ANTIALIASED = 0x1  # flag
@@ -45,18 +45,10 @@ _SCALES = (-10.0, 5.9375)  # log-scales that fit
 _COLOR, _HARMONIC = 0.5 / 0.15, 1.0  # largest SH coefficients of degree 0, and of higher degrees
 
 
-def most_unpacked(size: int) -> int:
-    """Most bytes that a file of ``size`` bytes may unpack to; readers refuse others before they allocate."""
-    return (8 << 20) + 64 * size
-
-
 def fractional_bits(means: Tensor) -> int:
-    """Fractional bits of the positions: the largest number, at most 24, with which the farthest primitive fits.
+    """Most fractional bits, at most 24, of positions ``[N, 3]`` with which the farthest primitive fits.
 
     The error of a coordinate is at most ``2^-(bits + 1)``, plus the rounding of float32.
-
-    Args:
-        means: centres ``[N, 3]``, finite, N at least 1.
 
     Raises:
         DataError: a primitive is so far away that fewer than 8 bits are left.
@@ -70,9 +62,7 @@ def fractional_bits(means: Tensor) -> int:
     )
 
 
-def write_spz(
-    path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False, harmonics_step: float = HARMONICS_STEP
-) -> None:
+def write_spz(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = False) -> None:
     """Write the base colours of a field as a .spz, atomically.
 
     Args:
@@ -80,8 +70,6 @@ def write_spz(
         params: a finite field of SH degree at most 3; see :mod:`sundae_ns.gaussians.parameters`. ``features`` are not
             written.
         antialiased: mark the scene as trained with antialiasing.
-        harmonics_step: SH coefficients of degrees 1 and up are rounded to multiples of this power of two, at least
-            1/128; coarser steps compress better.
 
     Raises:
         DataError: the field has no primitives, an SH degree above 3, a primitive too far away, or wrong shapes.
@@ -92,18 +80,12 @@ def write_spz(
 
     field = checked(path, params)
     bits = fractional_bits(field["means"])
-    field["features_rest"] = (field["features_rest"] / harmonics_step).round() * harmonics_step
-    arrays = {name: value.numpy() for name, value in field.items()}
-    data = GSData.from_arrays(
-        means=arrays["means"],
-        scales=arrays["scales"],
-        quats=arrays["quats"],
-        opacities=arrays["opacities"][:, 0],
-        sh0=arrays["features_dc"],
-        shN=arrays["features_rest"] if arrays["features_rest"].size else None,
-        format="ply",
-    )
-    with replacing(Path(path)) as partial:
+    field["features_rest"] = (field["features_rest"] / _HARMONICS_STEP).round() * _HARMONICS_STEP
+    opacities, colors, rest = (field[name].numpy() for name in ("opacities", "features_dc", "features_rest"))
+    means, scales, quats = (field[name].numpy() for name in ("means", "scales", "quats"))
+    harmonics = rest if rest.size else None
+    data = GSData.from_arrays(means, scales, quats, opacities[:, 0], colors, harmonics, format="ply")
+    with replacing(path) as partial:
         write(partial, data, version=_VERSION, fractional_bits=bits)
         # gsply 0.4 has no option for the flag.
         raw = bytearray(gzip.decompress(partial.read_bytes()))
@@ -123,16 +105,9 @@ def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
     """
     from gsply.spz import read_spz as read
 
-    try:
+    with reading(path, "a complete .spz"):
         flags = _checked_flags(path)
         data = read(path)
-    except OSError as error:
-        raise DataError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
-    except DataError:
-        raise
-    except Exception as error:  # gsply and its codecs raise errors of many kinds on damaged files
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise DataError(f"{path} is no complete .spz ({reason}); export it again") from error
     n = len(data.means)
     rest = data.shN if data.shN is not None and data.shN.size else np.zeros((n, 0, 3))
     columns = {
@@ -148,18 +123,15 @@ def read_spz(path: Path) -> tuple[dict[str, Tensor], bool]:
 
 
 def _checked_flags(path: Path) -> int:
-    """Flags of a .spz. gsply unpacks without a limit, so the size is checked before.
-
-    Raises:
-        DataError: the file is no .spz, or its header contradicts its size.
-    """
+    """Flags of a .spz. gsply unpacks without a limit, so this checks the size before."""
     raw = regular(path).read_bytes()
+    most = (8 << 20) + 64 * len(raw)
     packed = raw[:2] == b"\x1f\x8b"
     header = zlib.decompressobj(wbits=31).decompress(raw, _HEADER.size) if packed else raw[: _HEADER.size]
     if len(header) < _HEADER.size or header[:4] != b"NGSP":
         raise DataError(f"{path} is no .spz; give a .ply, .spz, .sog, .sundae, or a run")
     _, _, count, _, _, flags, _ = _HEADER.unpack(header)
-    if count == 0 or count * _LEAST_BYTES > most_unpacked(len(raw)):
+    if count == 0 or count * _LEAST_BYTES > most:
         raise DataError(
             f"{path} states {count:,} primitives, which its {len(raw):,} bytes cannot hold; export it again"
         )
@@ -168,7 +140,7 @@ def _checked_flags(path: Path) -> int:
         while rest and not stream.eof:
             size += len(stream.decompress(rest, _CHUNK))
             rest = stream.unconsumed_tail
-            if size > most_unpacked(len(raw)):
+            if size > most:
                 raise DataError(f"{path} unpacks to far more than its {len(raw):,} bytes; export it again")
     return int(flags)
 
@@ -192,13 +164,11 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     names = ("means", "scales", "quats", "opacities", "features_dc", "features_rest")
     field = {name: params[name].detach().to(device="cpu", dtype=torch.float32).contiguous() for name in names}
     if not len(field["means"]):
-        raise DataError(f"the field has no primitives, which a {Path(path).suffix} cannot store; check the run")
+        raise DataError(f"the field has no primitives, which a {path.suffix} cannot store; check the run")
     if not all(bool(value.isfinite().all()) for value in field.values()):
         raise DataError("some values are NaN or infinite; drop those primitives first (finite_mask)")
     if field["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
-        raise DataError(
-            f"a {Path(path).suffix} stores SH degrees up to {MAX_SH_DEGREE}; cut features_rest, or write a .ply"
-        )
+        raise DataError(f"a {path.suffix} stores SH degrees up to {MAX_SH_DEGREE}; cut features_rest, or write a .ply")
     # Normalise in float64: the square of 1e-30 is 0 in float32.
     quats = field["quats"].double()
     norms = quats.norm(dim=1, keepdim=True)

@@ -8,22 +8,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from sundae_ns.gaussians.covariance import quaternions
 from sundae_ns.gaussians.parameters import sh_degree
 from sundae_ns.rasterization.harmonics import harmonic_basis
-
-
-def rotation_to_quaternion(rotation: Tensor) -> Tensor:
-    """Unit quaternion wxyz ``[4]`` of a rotation matrix ``[3, 3]``.
-
-    It is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Bar-Itzhack, 2000); no rotation is a
-    special case.
-    """
-    m = rotation.double()
-    k = torch.zeros(4, 4, dtype=torch.float64, device=m.device)
-    k[0, 0] = m.trace()
-    k[0, 1:] = k[1:, 0] = torch.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    k[1:, 1:] = m + m.T - m.trace() * torch.eye(3, dtype=torch.float64, device=m.device)
-    return torch.linalg.eigh(k).eigenvectors[:, -1].to(rotation)
 
 
 def multiply_quaternions(a: Tensor, b: Tensor) -> Tensor:
@@ -58,20 +45,15 @@ def rotate_spherical_harmonics(features_rest: Tensor, rotation: Tensor) -> Tenso
 
 
 def similarity(params: Mapping[str, Tensor], transform: Tensor, scale: float) -> dict[str, Tensor]:
-    """Transform a field by ``x -> scale * (R x + t)``.
+    """A field moved by ``x -> scale * (R x + t)``; ``transform`` ``[3, 4]`` holds rotation R and translation t.
 
-    Args:
-        params: a field; see :mod:`sundae_ns.gaussians.parameters`.
-        transform: rotation R and translation t ``[3, 4]``.
-        scale: factor.
-
-    Returns:
-        New parameters; opacities, SH coefficients of degree 0 and features are the tensors of ``params``.
+    Opacities, SH coefficients of degree 0 and features are the tensors of ``params``.
     """
     rotation, translation = transform[:, :3].to(params["means"]), transform[:, 3].to(params["means"])
     moved = dict(params)
     moved["means"] = scale * (params["means"] @ rotation.T + translation)
+    turn = quaternions(rotation.double()[None])[0].to(rotation)
     moved["scales"] = params["scales"] + math.log(scale)
-    moved["quats"] = multiply_quaternions(rotation_to_quaternion(rotation), params["quats"])
+    moved["quats"] = multiply_quaternions(turn, params["quats"])
     moved["features_rest"] = rotate_spherical_harmonics(params["features_rest"], rotation)
     return moved

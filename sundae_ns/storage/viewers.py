@@ -12,8 +12,7 @@ from torch import Tensor
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import finite_mask, rgb_to_sh
 from sundae_ns.gaussians.parameters import sh_degree_of
-from sundae_ns.storage.ply import write_ply
-from sundae_ns.storage.point_cloud import MODEL_FRAME
+from sundae_ns.storage.ply import MODEL_FRAME, write_ply
 from sundae_ns.storage.sog import write_sog
 from sundae_ns.storage.spz import MAX_SH_DEGREE, clamped, write_spz
 from sundae_ns.storage.transform import similarity
@@ -61,7 +60,7 @@ def write_for_viewers(
     Drops primitives that are not finite, and SH coefficients above the format's degree.
 
     Args:
-        path: a .ply, .spz or .sog; its folder must exist.
+        path: its folder must exist.
         params: the field; see :mod:`sundae_ns.gaussians.parameters`.
         antialiased: mark the scene as trained with antialiasing.
         sigmoid_colors: ``features_dc`` are logits of colours, as in a model of SH degree 0, not SH coefficients.

@@ -83,7 +83,7 @@ def test_frames_of_files(tmp_path: Path) -> None:
         ("a.txt", b"a text", CheckpointError, "is no run"),
         ("a.spz", b"\x1f\x8b\x08\x00", DataError, "is no"),
         ("a.spz", b"NGSP" + bytes(40), DataError, "states 0 primitives"),
-        ("a.sog", b"PK\x03\x04", DataError, "is no complete .sog"),
+        ("a.sog", b"PK\x03\x04", DataError, "is not a complete .sog"),
         ("a.ply", b"ply\nformat ascii 1.0\nend_header\n", DataError, "a.ply"),
     ],
 )

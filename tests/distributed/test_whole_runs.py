@@ -268,7 +268,7 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
     assert report["after"] == round(KEEP * report["before"])
     assert report["before"] > 150, "densification added nothing"
     before, after = (
-        checkpoint.load(models(folder, "train") / f"step-{step:09d}.ckpt") for step in (SAVED_AT, STEPS - 1)
+        checkpoint.read(models(folder, "train") / f"step-{step:09d}.ckpt") for step in (SAVED_AT, STEPS - 1)
     )
     assert len(after["pipeline"]["_model.gauss_params.means"]) == report["after"]
     n = len(before["pipeline"]["_model.gauss_params.means"])
@@ -293,7 +293,7 @@ def test_checkpoint_of_two_ranks_is_one_of_one_gpu(folder: Path) -> None:
 def test_the_prune_is_that_of_one_process(folder: Path) -> None:
     """The same primitives of the same field stay, with the same values."""
     one = train(frozen(folder, "one"), 0, 1)
-    two = checkpoint.load(models(folder, "two") / "step-000000001.ckpt")["pipeline"]
+    two = checkpoint.read(models(folder, "two") / "step-000000001.ckpt")["pipeline"]
     for name, value in one.pipeline.model.gauss_params.items():
         # Weights of a view are sums over fewer rows here, so merged values differ by rounding.
         torch.testing.assert_close(value.detach(), two[f"_model.gauss_params.{name}"], rtol=1e-5, atol=1e-6)
@@ -301,7 +301,7 @@ def test_the_prune_is_that_of_one_process(folder: Path) -> None:
 
 @pytest.mark.parametrize("ranks", [1, 3])
 def test_a_checkpoint_loads_on_another_number_of_ranks(folder: Path, ranks: int) -> None:
-    loaded = checkpoint.load(models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt")
+    loaded = checkpoint.read(models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt")
     parts = [state_of_rank(loaded, rank, ranks, NAMES) for rank in range(ranks)]
     for key, value in loaded["pipeline"].items():
         if key.startswith("_model.gauss_params."):
@@ -354,7 +354,7 @@ def test_ranks_stop_together_and_save_when_one_gets_a_signal(folder: Path) -> No
     assert result.returncode == 130, result.stderr
     assert result.stdout.count("--load-dir") == 1, "the first rank says how to resume"
     # They agree after the seventeenth batch.
-    saved = checkpoint.load(models(folder, "stops") / f"step-{17 * RANKS - 1:09d}.ckpt")
+    saved = checkpoint.read(models(folder, "stops") / f"step-{17 * RANKS - 1:09d}.ckpt")
     assert checkpoint.checkpoints(models(folder, "stops"))[-1].name == f"step-{saved['step']:09d}.ckpt"
 
 

@@ -4,7 +4,7 @@ import torch
 from PIL import Image
 
 from sundae_ns.errors import DataError
-from sundae_ns.evaluation import ComparisonRow, comparison_sheet, save_comparison
+from sundae_ns.evaluation import ComparisonRow, comparison_sheet
 from sundae_ns.evaluation.comparison_image import _CAPTION, _GAP
 
 
@@ -13,16 +13,16 @@ def _images(height=6, width=8):
     return truth, truth + 0.2, truth - 0.08
 
 
-def _tiles(row, **options):
+def _tiles(row):
     """The four enlarged tiles of a sheet with one row."""
-    sheet = np.asarray(comparison_sheet([row], **options))
+    sheet = np.asarray(comparison_sheet([row]))
     width = (sheet.shape[1] - 5 * _GAP) // 4
     tiles = sheet[_CAPTION : -_CAPTION - _GAP]
     return [tiles[:, _GAP + i * (width + _GAP) :][:, :width] for i in range(4)]
 
 
 def test_tiles_and_amplified_error():
-    tiles = _tiles(ComparisonRow(*_images()), error_gain=5)
+    tiles = _tiles(ComparisonRow(*_images()))
     assert {(tile.dtype.name, tile.shape) for tile in tiles} == {("uint8", (6 * 30, 8 * 30, 3))}
     assert [np.unique(tile).tolist() for tile in tiles] == [[102], [153], [82], [102]]
 
@@ -54,7 +54,7 @@ def test_captions_change_with_the_quality():
 
 def test_rows_of_different_sizes_fit(tmp_path):
     rows = [ComparisonRow(*_images(6, 8), "small"), ComparisonRow(*_images(30, 300), "wide")]
-    save_comparison(tmp_path / "a.png", rows)
+    comparison_sheet(rows).save(tmp_path / "a.png")
     saved = Image.open(tmp_path / "a.png")
     np.testing.assert_array_equal(np.asarray(saved), np.asarray(comparison_sheet(rows)))
     assert saved.width > 4 * 300

@@ -26,7 +26,7 @@ def test_all_points_of_all_curves(tmp_path: Path) -> None:
     assert set(curves.psnr.values) == {20.0}
     assert set(curves.psnr_base.values) == {19.0}
     assert set(curves.primitives.values) == {300.0}
-    assert not curves.memory
+    assert not curves.memory.steps
 
 
 def test_the_later_record_of_a_resumed_run_counts(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from sundae_ns.evaluation.memory import peak_memory
+from sundae_ns.evaluation.timing import peak_memory
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="compares with Linux's own number")

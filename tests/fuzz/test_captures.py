@@ -318,7 +318,7 @@ MODELS: dict[str, tuple[Callable[[Path], None], str]] = {
     "an endless name": (_patch("images.bin", 8 + 64, b"a" * 10**4), "without an end"),
     "no images": (lambda model: (model / "images.bin").write_bytes(struct.pack("<Q", 0)), "has no images"),
     "no points": (lambda model: (model / "points3D.bin").write_bytes(struct.pack("<Q", 0)), "has no points"),
-    "no file of images": (lambda model: (model / "images.bin").unlink(), "images.bin does not exist"),
+    "no file of images": (lambda model: (model / "images.bin").unlink(), "images.bin cannot be read"),
     "no files": (shutil.rmtree, "is not a folder"),
     "no file of cameras": (lambda model: (model / "cameras.bin").unlink(), "holds neither cameras.bin nor cameras.txt"),
     "a camera twice": (_twice, "camera 1: it is listed twice"),

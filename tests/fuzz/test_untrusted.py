@@ -102,7 +102,7 @@ def a_pack(path: Path, place: str) -> None:
     header = container.read_header(path)
     meta = {name: value for name, value in header.meta.items() if name != "sections"}
     arrays = container.read_sections(path, header)
-    container.write(path, meta, {**arrays, place: arrays["means/low"]})
+    path.write_bytes(container.encode(meta, {**arrays, place: arrays["means/low"]})[0])
 
 
 def a_ply(path: Path, place: str) -> None:
@@ -111,7 +111,7 @@ def a_ply(path: Path, place: str) -> None:
 
 
 CASES: dict[str, tuple[Callable[[Path, str], None], Callable[[Path], Any]]] = {
-    "a.ckpt": (a_checkpoint, checkpoint.load),
+    "a.ckpt": (a_checkpoint, checkpoint.read),
     "b.ckpt": (a_checkpoint, checkpoint.read_field),
     "a.sundae": (a_pack, read_scene),
     "a.ply": (a_ply, read_ply),

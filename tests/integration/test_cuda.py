@@ -71,7 +71,7 @@ def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkp
 
     saved, passed_over = checkpoint.newest_whole(trainer.checkpoint_dir)
     assert passed_over == []
-    step = checkpoint.load(saved)["step"]
+    step = checkpoint.read(saved)["step"]
     assert step >= 10
     little_memory(torch.cuda.get_device_properties(0).total_memory)
 

@@ -179,7 +179,7 @@ def test_a_run_of_splatfacto(tiny: Any, tmp_path: Path) -> None:
     rest[::2] = 0  # these colours stay view-independent
     state = {f"_model.gauss_params.{name}": value for name, value in field.items() if name != "features"}
     state |= {"_model.gauss_params.features_rest": rest, "_model.device_indicator_param": torch.zeros(0)}
-    checkpoint.save({"step": 29999, "pipeline": state}, tmp_path / "nerfstudio_models" / "step-000029999.ckpt")
+    checkpoint.write({"step": 29999, "pipeline": state}, tmp_path / "nerfstudio_models" / "step-000029999.ckpt")
     (tmp_path / "config.yml").write_text(yaml.dump(config))
     scene = contents_of_run(tmp_path, max_cameras=0)
     trained, codecs = finetune(tmp_path, scene, PackConfig(), 3)

@@ -77,7 +77,7 @@ def test_a_run_by_recorded_steps_is_the_same(trainer_of: MakeTrainer) -> None:
     usual, recorded = alike(trainer_of, RecordedStep)
     assert recorded._recorded is not None
     for path in sorted(recorded.checkpoint_dir.glob("*.ckpt")):
-        loaded = checkpoint.load(path)
+        loaded = checkpoint.read(path)
         means = loaded["pipeline"]["_model.gauss_params.means"]
         assert means.untyped_storage().nbytes() == means.numel() * 4  # and not the memory beyond the field
         assert loaded["optimizers"].keys() == usual.optimizers.optimizers.keys()

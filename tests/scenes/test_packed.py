@@ -172,7 +172,7 @@ def test_an_interrupted_unpack_leaves_no_run(tmp_path: Path, monkeypatch: pytest
         raise StorageError("the disk is full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint, "save", full)
+        patch.setattr(checkpoint, "write", full)
         with pytest.raises(StorageError):
             write_run(scene(), tmp_path, "a")
     assert not list(tmp_path.rglob("config.yml"))
@@ -308,7 +308,7 @@ def run_folder(folder: Path, method: str, step: int, **model: Any) -> tuple[Path
     (folder / "config.yml").write_text(yaml.dump(config))
     (folder / "nerfstudio_models").mkdir()
     saved = {"step": step, "pipeline": {f"_model.{name}": value for name, value in state.items()}}
-    checkpoint.save(saved, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
+    checkpoint.write(saved, folder / "nerfstudio_models" / f"step-{step:09d}.ckpt")
     return folder, truth
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sundae_ns.errors import StorageError, regular, writing
+from sundae_ns.errors import DataError, PackError, StorageError, reading, regular, writing
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import replacing, write_ply, write_text
 
@@ -123,3 +123,17 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     for path in (tmp_path / "file", tmp_path, tmp_path / "missing"):
         assert regular(path) == path
+
+
+@pytest.mark.parametrize(
+    ("raised", "kind", "message"),
+    [
+        (FileNotFoundError(2, "No such file"), PackError, r"a\.x cannot be read \(No such file\); check the path"),
+        (KeyError("means\n twice"), PackError, r"a\.x is not a whole x \('means\\n twice'\); get it again"),
+        (ValueError(), PackError, r"a\.x is not a whole x \(ValueError\); get it again"),
+        (DataError("one of ours; mend it"), DataError, "one of ours; mend it"),
+    ],
+)
+def test_errors_of_reading_name_the_file(raised: Exception, kind: type[Exception], message: str) -> None:
+    with pytest.raises(kind, match=f"^{message}$"), reading(Path("a.x"), "a whole x", PackError, mend="get it again"):
+        raise raised

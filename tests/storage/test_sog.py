@@ -19,9 +19,8 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage import write_sog
 from sundae_ns.storage.morton import scene_order
-from sundae_ns.storage.sog import codebook, kmeans, palette
+from sundae_ns.storage.sog import codebook, kmeans, palette, write_sog
 
 
 def field(n: int = 150, degree: int = 3) -> dict[str, Tensor]:

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians import from_points
-from sundae_ns.storage import write_spz
-from sundae_ns.storage.spz import HARMONICS_STEP, fractional_bits
+from sundae_ns.storage.spz import _HARMONICS_STEP, fractional_bits, write_spz
 
 HEADER = struct.Struct("<IIIBBBB")
 
@@ -52,7 +51,7 @@ def test_values_come_back_within_the_steps_of_the_format(tmp_path: Path, degree:
     assert cosines.min() >= 1 - 6 * (0.5 / 511) ** 2
     if degree:
         rest = found["shN"].reshape(truth["features_rest"].shape)
-        assert np.abs(rest - truth["features_rest"].numpy()).max() <= HARMONICS_STEP / 2 + 1e-6
+        assert np.abs(rest - truth["features_rest"].numpy()).max() <= _HARMONICS_STEP / 2 + 1e-6
 
 
 @pytest.mark.parametrize("antialiased", [False, True])

@@ -8,10 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from sundae_ns.gaussians.rotations import rotation_matrices
 from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
 from sundae_ns.rasterization.harmonics import evaluate_harmonics
 from sundae_ns.storage import similarity
-from sundae_ns.storage.transform import multiply_quaternions, rotate_spherical_harmonics, rotation_to_quaternion
+from sundae_ns.storage.transform import rotate_spherical_harmonics
 
 SCALE = 1.7
 SIZE = 24
@@ -112,14 +113,6 @@ def test_rotated_harmonics_are_the_rotated_function(degree: int) -> None:
     torch.testing.assert_close(after, before, atol=1e-12, rtol=0)
 
 
-def matrix_of(quat: Tensor) -> Tensor:
-    axes = torch.eye(3, dtype=quat.dtype)
-    pure = torch.cat([torch.zeros(3, 1, dtype=quat.dtype), axes], dim=1)
-    conjugate = quat * quat.new_tensor([1.0, -1.0, -1.0, -1.0])
-    turned = multiply_quaternions(multiply_quaternions(quat.expand(3, 4), pure), conjugate.expand(3, 4))
-    return turned[:, 1:].T
-
-
 @pytest.mark.parametrize(
     "matrix",
     [
@@ -131,10 +124,11 @@ def matrix_of(quat: Tensor) -> Tensor:
     ],
     ids=["identity", "half turn x", "half turn z", "COLMAP to nerfstudio", "any"],
 )
-def test_quaternion_of_a_rotation(matrix: Tensor) -> None:
-    quat = rotation_to_quaternion(matrix)
-    assert quat.norm().item() == pytest.approx(1)
-    torch.testing.assert_close(matrix_of(quat), matrix, atol=1e-12, rtol=0)
+def test_rotations_follow(matrix: Tensor) -> None:
+    params = field()
+    moved = similarity(params, torch.cat([matrix, torch.zeros(3, 1, dtype=torch.float64)], dim=1), 1.0)
+    expected = matrix @ rotation_matrices(params["quats"])
+    torch.testing.assert_close(rotation_matrices(moved["quats"]), expected, atol=1e-12, rtol=0)
 
 
 def test_other_parameters_are_shared_and_the_input_is_unchanged() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,12 +17,12 @@ from sundae_ns.storage.packing import quantize, transform
 from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array, Coded, Floats
 from sundae_ns.storage.packing.quantize import Blocks, Rotations
+from sundae_ns.storage.packing.transform import Transform
 
-LOGITS = (-6.0, 8.0)
+_LOGITS = (-6.0, 8.0)
 """Opacities outside of these logits look the same as at them: below 1/255 nothing is drawn."""
 _LARGEST_SHARE = 0.5
 """Step of an output channel of the head, at most, as a share of its largest weight."""
-_NONE = np.zeros((0, 0), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,19 +33,6 @@ class Sensitivity:
     """Positive definite forms ``[C, C]``, float64, for changes of the rows ``[N, C]`` of attributes."""
     head: dict[str, Tensor]
     """For the weights of each pair of channels, float64 ``[O, I]``, of each tensor with more than one dimension."""
-
-
-class Codec(Protocol):
-    """Codec of one attribute ``[N, C]``."""
-
-    def encode(self, values: Floats) -> Coded:
-        """Return the stored form."""
-
-    def rounded(self, values: Tensor) -> Tensor:
-        """Return the values that a reader decodes, on the device of ``values``; on a CPU bit for bit."""
-
-    def coefficients(self, values: Tensor) -> Tensor:
-        """Return what is rounded to levels, float64 ``[N, C]``; gradients flow through it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,23 +51,21 @@ class HeadCodec:
             PackError: weights are not finite.
         """
         names = sorted(head)
-        values = {name: torch.from_numpy(as_array(head[name])) for name in names}
+        values = {name: head[name].detach().to("cpu", torch.float32) for name in names}
         if not all(torch.isfinite(value).all() for value in values.values()):
             raise PackError("the head has weights that are not finite; go back to an earlier checkpoint")
         weights = [name for name in names if values[name].ndim > 1]
-        none = np.zeros(0, np.float32)
+        plain = [values[name].flatten() for name in names if name not in weights]
         levels = [quantize.weight_levels(values[name], self.steps(name)).flatten() for name in weights]
-        arrays: dict[str, Array] = {
-            "plain": np.concatenate(
-                [*(values[name].numpy().reshape(-1) for name in names if name not in weights), none]
-            ),
-            "steps": np.concatenate([*(self.rows[name].numpy() for name in weights), none]),
-            "columns": np.concatenate([*(self.columns[name].numpy() for name in weights), none]),
-        }
-        column = torch.cat([*levels, torch.zeros(0, dtype=torch.float64)])[:, None]
+
+        def joined(parts: list[Tensor]) -> Array:
+            return torch.cat([*parts, torch.zeros(0)]).numpy()
+
+        column = joined(levels)[:, None].astype(np.int32)
         shapes = [[name, list(values[name].shape)] for name in names]
         about = {"codec": "channels", "weights": len(column), "tensors": shapes}
-        return about, column.numpy().astype(np.int32), arrays
+        steps, columns = ([side[name] for name in weights] for side in (self.rows, self.columns))
+        return about, column, {"plain": joined(plain), "steps": joined(steps), "columns": joined(columns)}
 
     def rounded(self, name: str, values: Tensor) -> Tensor:
         """Return the values that a reader decodes for the tensor ``name``."""
@@ -90,37 +75,32 @@ class HeadCodec:
         return quantize.weights_at(quantize.weight_levels(values, step), step)
 
     def steps(self, name: str) -> Tensor:
-        """Return the steps of a tensor ``[O, I]``, float32."""
+        """Steps of a tensor ``[O, I]``, float32."""
         return self.rows[name][:, None] * self.columns[name]
 
     def coefficients(self, name: str, values: Tensor) -> Tensor:
-        """Return the weights of a tensor in steps ``[O, ...]``, flattened to ``[O, I]``; gradients flow through them."""
+        """Weights of a tensor in steps, flattened to ``[O, I]``; gradients flow through them."""
         return quantize.in_steps(values, self.steps(name)).flatten(1)
 
 
 @dataclass(frozen=True, eq=False)
 class Codecs:
-    """Codecs of a whole scene; see :func:`fit`."""
+    """Codecs of a whole scene; see :func:`fit_codecs`."""
 
     config: PackConfig
     blocks: Blocks
     """The positions in their stored form."""
-    field: dict[str, Codec]
+    field: dict[str, Rotations | Transform]
     """Codecs of all other attributes."""
     head: HeadCodec | None
 
     def to(self, device: torch.device) -> Codecs:
         """Return a copy on another device."""
-        moved: Codecs = _moved(self, device)
-        return moved
+        return _moved(self, device)  # type: ignore[no-any-return]
 
     @torch.no_grad()
     def rounded(self, field: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the field that a reader decodes; positions are unchanged.
-
-        Args:
-            field: primitives in the order of these codecs.
-        """
+        """The field that a reader decodes, for primitives in the order of these codecs; positions are unchanged."""
         result = dict(field)
         for name, codec in self.field.items():
             values = field[name]
@@ -144,13 +124,13 @@ def _moved(value: Any, device: torch.device) -> Any:
     return value
 
 
-def fit(
+def fit_codecs(
     field: Mapping[str, Tensor],
     head: Mapping[str, Tensor],
     config: PackConfig,
     sensitivity: Sensitivity | None = None,
 ) -> tuple[dict[str, Tensor], Codecs]:
-    """Fit codecs to a field and a head, which may be empty; see :func:`sundae_ns.storage.packing.fit_scene`."""
+    """The field in the stored order, with rounded positions, and codecs fitted to it and to a head; {} for none."""
     names = [name for name in (*SPLAT_NAMES, FEATURES) if name in field]
     values = {name: as_matrix(field[name]) for name in names}
     order = scene_order(values["means"])
@@ -159,7 +139,7 @@ def fit(
     values = {name: value[order] for name, value in values.items()}
     values["means"] = quantize.dequantize_positions(blocks, config.position_bits, config.block)
     values["quats"], values["scales"] = quantize.aligned(values["quats"], values["scales"])
-    values["opacities"] = values["opacities"].clip(*LOGITS)
+    values["opacities"] = values["opacities"].clip(*_LOGITS)
     steps = {
         "scales": config.scale_step,
         "opacities": config.opacity_step,
@@ -168,9 +148,9 @@ def fit(
         FEATURES: config.feature_step,
     }
     forms = {} if sensitivity is None else sensitivity.rows
-    codecs: dict[str, Codec] = {"quats": Rotations(config.rotation_step)}
+    codecs: dict[str, Rotations | Transform] = {"quats": Rotations(config.rotation_step)}
     for name, step in steps.items():
-        if values.get(name, _NONE).size:
+        if name in values and values[name].size:
             codecs[name] = transform.fit(values[name], step, centred=name != "features_rest", form=forms.get(name))
     ordered = {name: torch.from_numpy(values[name]).reshape(field[name].shape) for name in names}
     of_head = {} if sensitivity is None else sensitivity.head
@@ -178,14 +158,14 @@ def fit(
 
 
 def _fit_head(head: Mapping[str, Tensor], share: float, sensitivity: Mapping[str, Tensor]) -> HeadCodec | None:
-    """Steps of ``share`` of each output channel's largest weight, or, with a sensitivity, steps of the same total error.
+    """Steps of a share of each output channel's largest weight, or, with a sensitivity, steps of the same total error.
 
-    Steps in inverse proportion to the root of the sensitivity take the fewest bits for an error. Levels of a head differ
-    most: four times as many pixels depend on a weight of the finer one.
+    Steps in inverse proportion to the root of the sensitivity take the fewest bits for an error. The levels of a head
+    differ most: each weight of a finer level acts on four times as many pixels.
     """
     if not head:
         return None
-    weights = {name: torch.from_numpy(as_array(value)) for name, value in head.items() if value.ndim > 1}
+    weights = {name: value.detach().to("cpu", torch.float32) for name, value in head.items() if value.ndim > 1}
     rows = {name: quantize.weight_steps(value, share) for name, value in weights.items()}
     columns = {name: torch.ones(value.shape[1]) for name, value in weights.items()}
     mean = max((float(value.mean()) for value in sensitivity.values()), default=0.0)
@@ -212,12 +192,6 @@ def _quarters(values: Tensor) -> Tensor:
     return torch.exp2((4 * values.double().clamp_min(1e-30).log2()).round() / 4).float()
 
 
-def as_array(values: Tensor) -> Floats:
-    """Return a tensor as float32 on the CPU."""
-    array: Floats = values.detach().to("cpu", torch.float32).numpy()
-    return array
-
-
 def as_matrix(values: Tensor) -> Floats:
     """Return a tensor ``[N, ...]`` as contiguous float32 ``[N, C]`` on the CPU."""
-    return np.ascontiguousarray(as_array(values).reshape(len(values), -1))
+    return np.ascontiguousarray(values.detach().to("cpu", torch.float32).numpy().reshape(len(values), -1))

@@ -36,14 +36,11 @@ class PackConfig:
         Raises:
             ConfigError: names the first invalid option and its valid values.
         """
-        for name, (minimum, maximum) in {"position_bits": (4, 16), "block": (16, 1 << 20)}.items():
+        limits = {"position_bits": (4, 16), "block": (16, 1 << 20), **dict.fromkeys(STEPS, (0.0001, 1))}
+        for name, (minimum, maximum) in limits.items():
             value = getattr(self, name)
             if not minimum <= value <= maximum:
                 raise ConfigError(f"{name.replace('_', '-')} is {value}; give {minimum} to {maximum}")
-        for name in STEPS:
-            value = getattr(self, name)
-            if not 1e-4 <= value <= 1:
-                raise ConfigError(f"{name.replace('_', '-')} is {value}; give 0.0001 to 1")
 
 
 STEPS = ("scale_step", "rotation_step", "color_step", "opacity_step", "harmonics_step", "feature_step", "head_step")

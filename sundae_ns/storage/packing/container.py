@@ -11,8 +11,9 @@ import hashlib
 import json
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +22,6 @@ import zstandard
 from numpy.typing import NDArray
 
 from sundae_ns.errors import PackError, regular
-from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.kinds import PACKED
 
 VERSION = 2
@@ -38,6 +38,21 @@ Floats = NDArray[np.float32]
 Levels = NDArray[np.int32]
 Coded = tuple[dict[str, Any], Levels, dict[str, Array]]
 """The stored form of an attribute: its entry in the header, its levels ``[N, C]``, and its other sections by name."""
+
+
+class DamagedError(PackError):
+    """What is wrong with a packed scene, in words that do not name the file."""
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Turn a ``DamagedError`` or ``OSError`` into a ``PackError`` that names the file."""
+    try:
+        yield
+    except DamagedError as error:
+        raise PackError(f"{path} is not a whole packed scene ({error}); get it again, or pack it again") from error
+    except OSError as error:
+        raise PackError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
 
 
 class Section(NamedTuple):
@@ -93,9 +108,10 @@ def _join(planes: list[bytes], section: Section) -> Array:
     """Join planes that :func:`_split` returned."""
     if not planes:
         return np.zeros(section.shape, section.dtype)
-    rows, size = _rows(section.shape), section.dtype.itemsize
+    size = section.dtype.itemsize
     if len(planes) == 1:
         return np.frombuffer(planes[0], section.dtype).reshape(section.shape)
+    rows = _rows(section.shape)
     table = np.empty((rows, math.prod(section.shape) // rows, size), np.uint8)
     for i, plane in enumerate(planes):
         table[i // size, :, i % size] = np.frombuffer(plane, np.uint8)
@@ -113,10 +129,10 @@ def _decompress(part: memoryview, size: int) -> bytes:
         return bytes(part)
     try:
         if zstandard.frame_content_size(part) != size:
-            raise PackError("a section does not unpack to the size that the header states")
+            raise DamagedError("a section does not unpack to the size that the header states")
         return zstandard.ZstdDecompressor().decompress(part, max_output_size=size)
     except zstandard.ZstdError as error:
-        raise PackError("a section cannot be decompressed") from error
+        raise DamagedError("a section cannot be decompressed") from error
 
 
 def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0) -> tuple[bytes, dict[str, int]]:
@@ -138,48 +154,30 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
 
     with ThreadPoolExecutor(_THREADS) as pool:
         parts = dict(zip(named, pool.map(compressed, named.values()), strict=True))
-    sections = [_entry(name, named[name], parts[name]) for name in named]
     body = sum(len(part) for planes in parts.values() for part in planes)
     size = max(unpacked, sum(array.nbytes for array in named.values()))
     lacking = (size - SPARE) // MAX_RATIO + 1 - body
     if lacking > 0:
-        padding = np.zeros(lacking, np.uint8)
-        parts[PADDING] = [padding.tobytes()]
-        sections.append(_entry(PADDING, padding, parts[PADDING]))
+        named[PADDING] = np.zeros(lacking, np.uint8)
+        parts[PADDING] = [named[PADDING].tobytes()]
+    sections = [_entry(name, array, parts[name]) for name, array in named.items()]
     header = json.dumps({**meta, "sections": sections}, allow_nan=False, separators=(",", ":")).encode()
     if len(header) > MAX_HEADER:
         raise PackError(
             f"the header takes {len(header):,} bytes, but readers accept {MAX_HEADER:,}; give fewer cameras"
         )
     preamble = _PREAMBLE.pack(PACKED, VERSION, len(header), hashlib.sha256(header).digest())
-    return b"".join([preamble, header, *(part for planes in parts.values() for part in planes)]), {
-        name: sum(len(part) for part in planes) for name, planes in parts.items()
-    }
-
-
-def write(path: Path, meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: int = 0) -> int:
-    """Write the bytes of :func:`encode`, atomically, and return their number.
-
-    Raises:
-        PackError: the header is too long for a reader.
-        StorageError: the disk is full or not writable.
-    """
-    content, _ = encode(meta, arrays, unpacked=unpacked)
-    with replacing(path) as partial:
-        partial.write_bytes(content)
-    return len(content)
+    content = b"".join([preamble, header, *(part for planes in parts.values() for part in planes)])
+    return content, {name: sum(map(len, planes)) for name, planes in parts.items()}
 
 
 def _entry(name: str, array: Array, parts: list[bytes]) -> dict[str, Any]:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part)
     return {
         "name": name,
         "dtype": array.dtype.newbyteorder("<").str,
         "shape": list(array.shape),
         "parts": [len(part) for part in parts],
-        "sha256": digest.hexdigest(),
+        "sha256": hashlib.sha256(b"".join(parts)).hexdigest(),
     }
 
 
@@ -189,33 +187,26 @@ def read_header(path: Path) -> Header:
     Raises:
         PackError: the file is not a packed scene, of another version, truncated, altered, or states impossible sizes.
     """
-    try:
-        with regular(path).open("rb") as file:
-            size = path.stat().st_size
-            preamble = file.read(_PREAMBLE.size)
-            if preamble[: len(PACKED)] != PACKED:
-                raise PackError(f"{path} is not a packed scene; give a file that sundae pack wrote")
-            if len(preamble) < _PREAMBLE.size:
-                raise _damaged(path, "it ends before its header")
-            _, version, length, digest = _PREAMBLE.unpack(preamble)
-            if version != VERSION:
-                raise PackError(f"{path} has version {version} of the format, this program reads {VERSION}; update it")
-            if length > min(MAX_HEADER, size - _PREAMBLE.size):
-                raise _damaged(path, "it ends in its header")
-            text = file.read(length)
-    except OSError as error:
-        raise PackError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
-    if hashlib.sha256(text).digest() != digest:
-        raise _damaged(path, "the checksum of its header is wrong")
-    try:
-        meta = json.loads(text, parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        raise _damaged(path, "its header is not JSON") from error
-    return Header(meta, _sections(path, meta, _PREAMBLE.size + length, size), size)
-
-
-def _damaged(path: Path, reason: str) -> PackError:
-    return PackError(f"{path} is not a whole packed scene ({reason}); get it again, or pack it again")
+    with naming(path), regular(path).open("rb") as file:
+        size = path.stat().st_size
+        preamble = file.read(_PREAMBLE.size)
+        if preamble[: len(PACKED)] != PACKED:
+            raise PackError(f"{path} is not a packed scene; give a file that sundae pack wrote")
+        if len(preamble) < _PREAMBLE.size:
+            raise DamagedError("it ends before its header")
+        _, version, length, digest = _PREAMBLE.unpack(preamble)
+        if version != VERSION:
+            raise PackError(f"{path} has version {version} of the format, this program reads {VERSION}; update it")
+        if length > min(MAX_HEADER, size - _PREAMBLE.size):
+            raise DamagedError("it ends in its header")
+        text = file.read(length)
+        if hashlib.sha256(text).digest() != digest:
+            raise DamagedError("the checksum of its header is wrong")
+        try:
+            meta = json.loads(text, parse_constant=_no_constant)
+        except (ValueError, RecursionError) as error:
+            raise DamagedError("its header is not JSON") from error
+        return Header(meta, _sections(meta, _PREAMBLE.size + length, size), size)
 
 
 def _no_constant(name: str) -> None:
@@ -226,33 +217,27 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 28
 
 
-def _sections(path: Path, meta: Any, offset: int, size: int) -> dict[str, Section]:
+def _sections(meta: Any, offset: int, size: int) -> dict[str, Section]:
     entries = meta.get("sections") if isinstance(meta, dict) else None
     if not isinstance(entries, list):
-        raise _damaged(path, "its header lists no sections")
+        raise DamagedError("its header lists no sections")
     sections: dict[str, Section] = {}
-    total = 0
     for entry in entries:
         section = _section(entry, offset)
         if section is None or section.name in sections:
-            raise _damaged(path, "its header describes an invalid section")
+            raise DamagedError("its header describes an invalid section")
         sections[section.name] = section
         offset += section.length
-        total += section.size
     if offset != size:
-        raise _damaged(path, f"its header states {offset:,} bytes, it has {size:,}")
-    check_ratio(path, total, size)
+        raise DamagedError(f"its header states {offset:,} bytes, it has {size:,}")
+    check_ratio(sum(section.size for section in sections.values()), size)
     return sections
 
 
-def check_ratio(path: Path, unpacked: int, size: int) -> None:
-    """Refuse a file that unpacks to far more bytes than it has.
-
-    Raises:
-        PackError: a file of ``size`` bytes may not unpack to ``unpacked`` bytes.
-    """
+def check_ratio(unpacked: int, size: int) -> None:
+    """Raise ``DamagedError`` if a file of ``size`` bytes may not unpack to ``unpacked`` bytes."""
     if unpacked > SPARE + MAX_RATIO * size:
-        raise _damaged(path, f"{size:,} bytes would unpack to {unpacked:,}")
+        raise DamagedError(f"{size:,} bytes would unpack to {unpacked:,}")
 
 
 def _section(entry: Any, offset: int) -> Section | None:
@@ -266,37 +251,28 @@ def _section(entry: Any, offset: int) -> Section | None:
     if entry["dtype"] not in _DTYPES or not 1 <= len(shape) <= 3 or not all(map(_is_count, [*shape, *parts])):
         return None
     section = Section(entry["name"], np.dtype(entry["dtype"]), tuple(shape), tuple(parts), entry["sha256"], offset)
-    empty = section.size == 0
-    if len(parts) != (0 if empty else section.planes):
-        return None
-    return None if not empty and any(part > section.size // section.planes for part in parts) else section
+    if section.size == 0:
+        return None if parts else section
+    fits = len(parts) == section.planes and max(parts) <= section.size // section.planes
+    return section if fits else None
 
 
 def read_sections(path: Path, header: Header) -> dict[str, Array]:
-    """Read all sections except padding.
-
-    Raises:
-        PackError: a section is altered or truncated.
-    """
-    wanted = [section for section in header.sections.values() if section.name != PADDING]
-    try:
+    """Read all sections except padding; ``PackError`` if one is altered or truncated."""
+    with naming(path):
         content = memoryview(path.read_bytes())
-    except OSError as error:
-        raise PackError(f"{path} cannot be read ({error.strerror or error}); check the path") from error
-    for section in header.sections.values():
-        stored = content[section.offset : section.offset + section.length]
-        if hashlib.sha256(stored).hexdigest() != section.sha256:
-            raise _damaged(path, f"the checksum of {section.name} is wrong")
+        for section in header.sections.values():
+            stored = content[section.offset : section.offset + section.length]
+            if hashlib.sha256(stored).hexdigest() != section.sha256:
+                raise DamagedError(f"the checksum of {section.name} is wrong")
 
-    def decode(section: Section) -> Array:
-        planes, start = [], section.offset
-        for part in section.parts:
-            planes.append(_decompress(content[start : start + part], section.size // section.planes))
-            start += part
-        return _join(planes, section)
+        def decode(section: Section) -> Array:
+            planes, start = [], section.offset
+            for part in section.parts:
+                planes.append(_decompress(content[start : start + part], section.size // section.planes))
+                start += part
+            return _join(planes, section)
 
-    try:
+        wanted = [section for section in header.sections.values() if section.name != PADDING]
         with ThreadPoolExecutor(_THREADS) as pool:
             return dict(zip([section.name for section in wanted], pool.map(decode, wanted), strict=True))
-    except PackError as error:
-        raise _damaged(path, str(error)) from error

@@ -11,11 +11,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from sundae_ns.errors import PackError
-from sundae_ns.storage.packing.container import Array, Levels
+from sundae_ns.rasterization.cpu.parallel import compiled
+from sundae_ns.storage.packing.container import Array, DamagedError, Levels
 
 LARGEST = (1 << 24) - 1
 """Largest magnitude of a number."""
@@ -36,21 +35,11 @@ Near = NDArray[np.int32]
 """Rows ``[N, NEIGHBOURS]`` before each row, the nearest first; -1 for none."""
 
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile at the first call; later processes load the machine code from numba's cache."""
-    try:
-        return njit(cache=True, nogil=True)(function)  # type: ignore[no-any-return]
-    except RuntimeError:  # neither the package's folder nor the user's is writable
-        return njit(nogil=True)(function)  # type: ignore[no-any-return]
+_SQUASH = np.rint(4096 / (1 + np.exp(-np.arange(-2047, 2048) / 256))).clip(1, 4095).astype(np.int32)
+"""Probabilities of 12 bits ``[4095]`` for -2047 to 2047 in 256ths of their logits.
 
-
-def _logistic() -> NDArray[np.int32]:
-    """Probabilities of 12 bits ``[4095]`` for -2047 to 2047 in 256ths of their logits."""
-    return np.rint(4096 / (1 + np.exp(-np.arange(-2047, 2048) / 256))).clip(1, 4095).astype(np.int32)
-
-
-_SQUASH = _logistic()
-"""The format fixes these numbers: other machines' exponentials must round to them (a test holds their hash)."""
+The format fixes these numbers: other machines' exponentials must round to them (a test holds their hash).
+"""
 _STRETCH = np.searchsorted(_SQUASH, np.arange(4096), side="left").clip(0, 4094).astype(np.int32) - 2047
 _RATES = (65536 * 5 // (5 * np.arange(256) + 8)).astype(np.int32)
 
@@ -85,8 +74,18 @@ def _coded(coder, stream, chance, bit):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _decided(coder, stream, model, counts, weights, places, row, node, bit, scores):  # type: ignore[no-untyped-def]
+def _chances(contexts, decisions):  # type: ignore[no-untyped-def]
+    """Chances in all contexts, counts of their decisions, weights of the mix, places of contexts, and scratch."""
+    model = np.full(contexts * _NODES, _EVEN, np.int32)
+    counts = np.zeros(contexts * _NODES, np.uint8)
+    weights = np.full((decisions * _NODES, CONTEXTS), 0x5000, np.int32)
+    return model, counts, weights, np.zeros(CONTEXTS, np.int64), np.zeros(CONTEXTS, np.int64)
+
+
+@compiled
+def _decided(coder, stream, chances, row, node, bit):  # type: ignore[no-untyped-def]
     """Code the decision ``node`` with the mix of its chances in the contexts at ``places``, and adapt them."""
+    model, counts, weights, places, scores = chances
     total = 0
     for c in range(CONTEXTS):
         scores[c] = _STRETCH[model[places[c] + node] >> 4]
@@ -106,20 +105,20 @@ def _decided(coder, stream, model, counts, weights, places, row, node, bit, scor
 
 
 @compiled
-def _number(coder, stream, model, counts, weights, places, first, value, reading, scores):  # type: ignore[no-untyped-def]
+def _number(coder, stream, chances, first, value, reading):  # type: ignore[no-untyped-def]
     """Code a number: is it 0, its sign, how many binary digits it has, and these; return it."""
     bit = -1 if reading else (1 if value == 0 else 0)
-    if _decided(coder, stream, model, counts, weights, places, first, 0, bit, scores) == 1:
+    if _decided(coder, stream, chances, first, 0, bit) == 1:
         return 0
     bit = -1 if reading else (1 if value < 0 else 0)
-    negative = _decided(coder, stream, model, counts, weights, places, first + 1, 1, bit, scores)
+    negative = _decided(coder, stream, chances, first + 1, 1, bit)
     size = abs(value)
     side = _SIDE * negative
     digits = 0
     while digits < _LAST - 1:
         node = side + min(2 + digits, 17)
         bit = -1 if reading else (1 if size >> (digits + 1) > 0 else 0)
-        if _decided(coder, stream, model, counts, weights, places, first + node, node, bit, scores) == 0:
+        if _decided(coder, stream, chances, first + node, node, bit) == 0:
             break
         digits += 1
     found = 1
@@ -127,7 +126,7 @@ def _number(coder, stream, model, counts, weights, places, first, value, reading
         bit = -1 if reading else (size >> (digits - 1 - k)) & 1
         if k < 2 and digits < 15:
             node = side + 18 + 3 * digits + (k + (found & 1) if k else 0)
-            bit = _decided(coder, stream, model, counts, weights, places, first + node, node, bit, scores)
+            bit = _decided(coder, stream, chances, first + node, node, bit)
         else:
             bit = _coded(coder, stream, _EVEN, bit)
         found = 2 * found + bit
@@ -157,13 +156,9 @@ def _signed(value):  # type: ignore[no-untyped-def]
 def _run(levels, near, stream, coder, reading):  # type: ignore[no-untyped-def]
     """Code levels ``[N, C]`` row after row."""
     n, width = levels.shape
-    sizes = (1, 31, 31, _CLASSES * _CLASSES)
-    each = sum(sizes)
-    model = np.full(width * each * _NODES, _EVEN, np.int32)
-    counts = np.zeros(width * each * _NODES, np.uint8)
-    weights = np.full((width * _NODES, CONTEXTS), 0x5000, np.int32)
-    scores = np.zeros(CONTEXTS, np.int64)
-    places = np.zeros(CONTEXTS, np.int64)
+    each = 63 + _CLASSES * _CLASSES
+    chances = _chances(width * each, width)
+    places = chances[3]
     for i in range(n):
         total = 0
         for k in range(width):
@@ -181,9 +176,7 @@ def _run(levels, near, stream, coder, reading):  # type: ignore[no-untyped-def]
             places[1] = (start + 1 + _signed(nearest)) * _NODES
             places[2] = (start + 32 + _signed(around >> 2)) * _NODES
             places[3] = (start + 63 + _magnitude(amount >> 1) * _CLASSES + _magnitude(total)) * _NODES
-            levels[i, k] = _number(
-                coder, stream, model, counts, weights, places, k * _NODES, levels[i, k], reading, scores
-            )
+            levels[i, k] = _number(coder, stream, chances, k * _NODES, levels[i, k], reading)
             total += abs(levels[i, k])
 
 
@@ -209,12 +202,9 @@ def _search(cells, block, near):  # type: ignore[no-untyped-def]
 
 @compiled
 def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-untyped-def]
-    """Code Morton codes ``[N]``, which ascend in each block: the number of digits of each difference, and its digits."""
-    model = np.full((1 + 3 * 64) * _NODES, _EVEN, np.int32)
-    counts = np.zeros((1 + 3 * 64) * _NODES, np.uint8)
-    weights = np.full((_NODES, CONTEXTS), 0x5000, np.int32)
-    scores = np.zeros(CONTEXTS, np.int64)
-    places = np.zeros(CONTEXTS, np.int64)
+    """Code ascending Morton codes ``[N]``: the number of digits of each difference, and its digits."""
+    chances = _chances(1 + 3 * 64, 1)
+    places = chances[3]
     last, before, average = 0, 0, 0
     for i in range(len(codes)):
         gap, digits = 0, 0
@@ -229,7 +219,7 @@ def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-un
         node = 1
         for k in range(6):
             bit = -1 if reading else (digits >> (5 - k)) & 1
-            node = 2 * node + _decided(coder, stream, model, counts, weights, places, node, node, bit, scores)
+            node = 2 * node + _decided(coder, stream, chances, node, node, bit)
         digits = min(node - 64, 3 * bits)
         found = min(digits, 1)
         for k in range(digits - 2, -1, -1):
@@ -237,7 +227,7 @@ def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-un
             kind = digits - 2 - k
             if kind < 2:
                 node = 64 + (1 if kind == 0 else found & 3)
-                bit = _decided(coder, stream, model, counts, weights, places, node, node, bit, scores)
+                bit = _decided(coder, stream, chances, node, node, bit)
             else:
                 bit = _coded(coder, stream, _EVEN, bit)
             found = 2 * found + bit
@@ -249,32 +239,18 @@ def _run_gaps(codes, block, bits, stream, coder, reading):  # type: ignore[no-un
 
 def encode_gaps(codes: NDArray[np.uint64], block: int, bits: int) -> Stream:
     """Code Morton codes of cells, which ascend in each block."""
-    stream = np.zeros(len(codes) * 12 + 16, np.uint8)
-    coder = np.array([0, _MASK, 0, 0], np.int64)
-    _run_gaps(codes.astype(np.int64), block, bits, stream, coder, False)
-    return _ended(stream, coder)
+    return _written(_run_gaps, len(codes) * 12 + 16, codes.astype(np.int64), block, bits)
 
 
 def decode_gaps(stream: Stream, count: int, block: int, bits: int) -> NDArray[np.uint64]:
-    """Morton codes ``[N]`` from :func:`encode_gaps`.
-
-    Raises:
-        PackError: the stream does not end with its last number.
-    """
+    """Morton codes ``[N]`` from :func:`encode_gaps`; ``PackError`` if the stream does not end with its last number."""
     codes = np.zeros(count, np.int64)
-    coder = _started(stream)
-    _run_gaps(codes, block, bits, stream.copy(), coder, True)  # the loop takes no read-only arrays
-    _check_end(stream, coder)
+    _read(_run_gaps, stream, codes, block, bits)
     return codes.astype(np.uint64)
 
 
 def neighbours_of(cells: Array, block: int) -> Near:
-    """Nearest earlier rows ``[N, NEIGHBOURS]`` in the same block, nearest first; -1 for none.
-
-    Args:
-        cells: whole coordinates ``[N, 3]`` below 2^21.
-        block: rows in a block.
-    """
+    """Nearest earlier rows ``[N, NEIGHBOURS]`` in the same block of cells ``[N, 3]`` below 2^21; -1 for none."""
     near = np.full((len(cells), NEIGHBOURS), -1, np.int32)
     _search(np.ascontiguousarray(cells, np.int64), block, near)
     return near
@@ -286,41 +262,33 @@ def predecessors(count: int) -> Near:
     return np.maximum(rows, -1)
 
 
-def encode(levels: Array, near: Near) -> Stream:
+def encode_levels(levels: Array, near: Near) -> Stream:
     """Code numbers ``[N, C]`` of at most :data:`LARGEST`, given the neighbours of each row."""
     values = np.ascontiguousarray(levels, np.int32).copy()
-    stream = np.zeros(values.size * 5 + 16, np.uint8)
-    coder = np.array([0, _MASK, 0, 0], np.int64)
-    _run(values, near, stream, coder, False)
-    return _ended(stream, coder)
+    return _written(_run, values.size * 5 + 16, values, near)
 
 
-def decode(stream: Stream, width: int, near: Near) -> Levels:
-    """Numbers ``[N, C]`` from :func:`encode`.
-
-    Raises:
-        PackError: the stream does not end with its last number.
-    """
+def decode_levels(stream: Stream, width: int, near: Near) -> Levels:
+    """Numbers ``[N, C]`` from :func:`encode_levels`; ``PackError`` if the stream does not end with its last number."""
     levels = np.zeros((len(near), width), np.int32)
-    coder = _started(stream)
-    _run(levels, near, stream.copy(), coder, True)
-    _check_end(stream, coder)
+    _read(_run, stream, levels, near)
     return levels
 
 
-def _started(stream: Stream) -> NDArray[np.int64]:
-    """State of a decoder at the start of a stream."""
-    return np.array([0, _MASK, int.from_bytes(bytes(stream[:4]).ljust(4, b"\0"), "big"), 4], np.int64)
-
-
-def _ended(stream: Stream, coder: NDArray[np.int64]) -> Stream:
-    """The bytes that an encoder wrote, and one more: it and the zeros that a decoder adds are between the two ends."""
+def _written(run: Callable[..., None], size: int, *arguments: Any) -> Stream:
+    """The bytes that a loop writes, at most ``size``."""
+    stream, coder = np.zeros(size, np.uint8), np.array([0, _MASK, 0, 0], np.int64)
+    run(*arguments, stream, coder, False)
+    # One more byte: it and the zeros that a decoder adds are between the two ends.
     end = int(coder[3])
     stream[end] = int(coder[1]) >> 24
     return stream[: end + 1]
 
 
-def _check_end(stream: Stream, coder: NDArray[np.int64]) -> None:
-    """Refuse a stream of more or fewer numbers: a decoder has read four bytes where the encoder wrote the last one."""
+def _read(run: Callable[..., None], stream: Stream, *arguments: Any) -> None:
+    """Fill the arguments of a loop from a stream; refuse a stream of more or fewer numbers."""
+    coder = np.array([0, _MASK, int.from_bytes(bytes(stream[:4]).ljust(4, b"\0"), "big"), 4], np.int64)
+    run(*arguments, stream.copy(), coder, True)  # the loop takes no read-only arrays
+    # A decoder has read four bytes where the encoder wrote the last one.
     if int(coder[3]) - 3 != len(stream):
-        raise PackError("a stream does not end with its last number")
+        raise DamagedError("a stream does not end with its last number")

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sundae_ns.gaussians.rotations import rotation_matrices
 from sundae_ns.storage.morton import interleave, separate
 from sundae_ns.storage.packing.container import Coded, Floats
 from sundae_ns.storage.packing.entropy import LARGEST
@@ -94,19 +95,8 @@ def aligned(quats: Floats, scales: Floats) -> tuple[Floats, Floats]:
     turned = np.einsum("rcn,nc->nr", products, turns[best])
     turned = _normalized(torch.from_numpy(turned)).numpy()
     # A turn puts the axis in which it has a column's 1 into that column's place.
-    places = np.abs(_matrices(turns)).argmax(axis=1)
+    places = rotation_matrices(torch.from_numpy(turns)).abs().numpy().argmax(axis=1)
     return turned.astype(np.float32), np.take_along_axis(scales, places[best], axis=1)
-
-
-def _matrices(quats: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation matrices ``[N, 3, 3]`` of unit quaternions wxyz ``[N, 4]``."""
-    w, x, y, z = quats.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,9 +135,9 @@ def rotations_at(levels: Tensor, step: float) -> Tensor:
 def rotation_bound(step: float) -> float:
     """Maximum error of the angle of an aligned rotation, radians.
 
-    The vector v of x, y and z has an error of at most sqrt(3) / 2 steps, and w is sqrt(1 - |v|^2). On the sphere of unit
-    quaternions, a step of v is stretched by at most 1 / w. Aligned rotations turn by at most 62.8 degrees, so |v| is at
-    most 0.522 before rounding. The angle of a rotation is twice the angle on that sphere.
+    The vector v of x, y and z has an error of at most sqrt(3) / 2 steps. On the sphere of unit quaternions, a step of v
+    is stretched by at most 1 / w, and w is sqrt(1 - |v|^2). Aligned rotations turn by at most 62.8 degrees, so |v| is
+    at most 0.522 before rounding. The angle of a rotation is twice the angle on that sphere.
     """
     off = 3**0.5 * step / 2
     return 2 * off / (1 - min(0.522 + off, 0.999) ** 2) ** 0.5

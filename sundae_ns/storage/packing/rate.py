@@ -19,12 +19,9 @@ _RUN = 16
 
 
 def estimated_bits(codecs: Codecs, field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Bits of each attribute of a field and of a head, without positions.
+    """Bits of each attribute of a field, without positions, and of a head, which may be empty.
 
-    Args:
-        codecs: fitted to the scene, on its device.
-        field: primitives in the order of the codecs.
-        head: weights; empty without a head.
+    The codecs are on the device of the field, whose primitives are in their order.
     """
     bits = {}
     for name, codec in codecs.field.items():
@@ -45,9 +42,8 @@ def _of_rows(levels: Tensor) -> Tensor:
     for run in runs:
         if run.numel():
             means = run.mean(dim=1, keepdim=True)
-            total = (
-                total + _of_magnitudes((run - means).abs().mean(dim=1), run.shape[1]) + _of_magnitudes(means.abs(), 1)
-            )
+            deviations = (run - means).abs().mean(dim=1)
+            total = total + _of_magnitudes(deviations, run.shape[1]) + _of_magnitudes(means.abs(), 1)
     return total
 
 

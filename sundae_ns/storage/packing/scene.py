@@ -19,19 +19,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import PackError
-from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, odd_shapes, sh_degree_of
+from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, sh_degree_of
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.packing import container, entropy, quantize, transform
-from sundae_ns.storage.packing.codecs import Codecs, Sensitivity, as_matrix, fit
+from sundae_ns.storage.packing.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
 from sundae_ns.storage.packing.config import PackConfig
-from sundae_ns.storage.packing.container import Array, Levels
+from sundae_ns.storage.packing.container import Array, DamagedError, Levels
 from sundae_ns.storage.packing.entropy import Near
 from sundae_ns.storage.packing.quantize import Blocks
+from sundae_ns.storage.ply import check_field
 
 CAMERAS = {"poses": ("<f4", (3, 4)), "intrinsics": ("<f8", (4,)), "sizes": ("<u4", (2,))}
 """dtype and shape, after ``[M, ...]``, of the arrays of M cameras: camera-to-world with OpenGL axes in the model's
 coordinates; fx, fy, cx, cy in pixels; width and height in pixels."""
 _MAX_WIDTH = 256
+_LARGEST_STEP = float(np.finfo(np.float32).max) / 2**34
+"""Levels are below 2^24 and a transform adds up to 2^8 products; the sums must stay finite in float32."""
 Decoded = TypeVar("Decoded")
 
 
@@ -71,23 +74,16 @@ class PackReport(NamedTuple):
 
     def summary(self) -> dict[str, Any]:
         """JSON values: primitives, bytes, and the bits per primitive of each attribute and of all."""
-        bits = {name: round(value, 2) for name, value in self.bits.items()}
-        return {
-            "primitives": self.primitives,
-            "bytes": self.bytes,
-            "bits": {**bits, "all": round(8 * self.bytes / self.primitives, 2)},
-        }
+        bits = {**self.bits, "all": 8 * self.bytes / self.primitives}
+        rounded = {name: round(value, 2) for name, value in bits.items()}
+        return {"primitives": self.primitives, "bytes": self.bytes, "bits": rounded}
 
 
 def _check(params: Mapping[str, Tensor]) -> None:
-    missing = [name for name in SPLAT_NAMES if name not in params]
-    if missing:
-        raise PackError(f"the field has no {', '.join(missing)}; it needs all of {', '.join(SPLAT_NAMES)}")
+    check_field(params, PackError)
     n = num_primitives(params)
     if n == 0:
         raise PackError("the field has no primitives; there is nothing to pack")
-    for odd in odd_shapes(params):
-        raise PackError(odd)
     features = params.get(FEATURES)
     if features is not None and not (
         features.ndim == 2 and len(features) == n and 1 <= features.shape[1] <= _MAX_WIDTH
@@ -115,7 +111,7 @@ def fit_scene(scene: PackedScene, config: PackConfig | None = None) -> tuple[Pac
     config = config or PackConfig()
     config.validate()
     _check(scene.field)
-    field, codecs = fit(scene.field, scene.head, config, scene.sensitivity)
+    field, codecs = fit_codecs(scene.field, scene.head, config, scene.sensitivity)
     return replace(scene, field=field), codecs
 
 
@@ -127,26 +123,21 @@ def write_scene(path: Path, scene: PackedScene, config: PackConfig | None = None
 def write_fitted(path: Path, scene: PackedScene, codecs: Codecs) -> PackReport:
     """Pack a scene, atomically, with codecs that were fitted to it before or after training with rounding.
 
-    Args:
-        scene: primitives in the order of :func:`fit_scene`. Its positions are ignored; the codecs hold them.
+    Primitives are in the order of :func:`fit_scene`. Their positions are ignored; the codecs hold them.
 
     Raises:
         PackError: values are not finite, or the codecs do not fit the scene.
         StorageError: the disk is full or not writable.
     """
-    packed, sections = _encoded(scene, codecs)
+    packed, sections = pack_bytes(scene, codecs)
     with replacing(path) as partial:
         partial.write_bytes(packed)
     sections["header"] = len(packed) - sum(sections.values())
     return PackReport(num_primitives(scene.field), len(packed), sections)
 
 
-def pack_bytes(scene: PackedScene, codecs: Codecs) -> bytes:
-    """The bytes of the file that :func:`write_fitted` writes."""
-    return _encoded(scene, codecs)[0]
-
-
-def _encoded(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int]]:
+def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int]]:
+    """The bytes of the file that :func:`write_fitted` writes, and the number of bytes of each section."""
     _check(scene.field)
     config, blocks = codecs.config, codecs.blocks
     n = num_primitives(scene.field)
@@ -162,7 +153,7 @@ def _encoded(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int]]
         head = codecs.head.encode(scene.head)
         coded["head"] = head, entropy.predecessors(len(head[1]))
     with ThreadPoolExecutor(2) as pool:
-        streams = pool.map(lambda one: entropy.encode(one[0][1], one[1]), coded.values())
+        streams = pool.map(lambda one: entropy.encode_levels(one[0][1], one[1]), coded.values())
         for (name, ((entry, _, parts), _)), stream in zip(coded.items(), streams, strict=True):
             about[name] = entry
             arrays |= {f"{name}/levels": stream, **{f"{name}/{part}": array for part, array in parts.items()}}
@@ -179,137 +170,114 @@ def _encoded(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int]]
 
 
 class _Reader:
-    """Sections of a file; each is checked before use."""
+    """Header and sections of a file; each entry is checked before use. All methods raise ``DamagedError``."""
 
-    def __init__(self, path: Path, header: container.Header, arrays: Mapping[str, Array]) -> None:
-        self.path = path
+    def __init__(self, header: container.Header, arrays: Mapping[str, Array]) -> None:
         self.size = header.size
         self.meta = header.meta
         self.arrays = arrays
 
-    def refuse(self, reason: str) -> PackError:
-        return PackError(f"{self.path} is not a valid scene ({reason}); pack it again")
-
-    def section(self, name: str, dtypes: tuple[str, ...], shape: tuple[int | None, ...]) -> Array:
-        """A finite array with one of the dtypes and the shape, in which None matches any length."""
+    def section(self, name: str, dtype: str, shape: tuple[int | None, ...]) -> Array:
+        """A finite array of the dtype and the shape, in which None matches any length."""
         array = self.arrays.get(name)
-        fits = array is not None and array.dtype.str in dtypes and len(array.shape) == len(shape)
+        fits = array is not None and array.dtype.str == dtype and len(array.shape) == len(shape)
         if array is None or not fits or any(w is not None and w != s for w, s in zip(shape, array.shape)):
-            raise self.refuse(f"{name} is missing or has another shape")
+            raise DamagedError(f"{name} is missing or has another shape")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise self.refuse(f"{name} has values that are not finite")
+            raise DamagedError(f"{name} has values that are not finite")
         return array
 
-    def about(self, name: str, codecs: tuple[str, ...]) -> dict[str, Any]:
-        """The header's entry of an attribute, with one of the codecs."""
-        attributes = self.meta.get("attributes")
-        entry = attributes.get(name) if isinstance(attributes, dict) else None
-        if not isinstance(entry, dict) or entry.get("codec") not in codecs:
-            raise self.refuse(f"its header has no valid codec for {name}")
+    def about(self, name: str, codec: str) -> dict[str, Any]:
+        """The header's entry of an attribute with this codec."""
+        entry = self.meta["attributes"].get(name)
+        if not isinstance(entry, dict) or entry.get("codec") != codec:
+            raise DamagedError(f"its header has no valid codec for {name}")
         return entry
-
-    def number(self, about: Mapping[str, Any], key: str, minimum: int, maximum: int) -> int:
-        """A whole number from ``minimum`` to ``maximum``."""
-        value = about.get(key)
-        if not isinstance(value, int) or isinstance(value, bool) or not minimum <= value <= maximum:
-            raise self.refuse(f"{key} is not one of {minimum} to {maximum}")
-        return value
-
-    def numbers(self, about: Mapping[str, Any], key: str, count: int) -> NDArray[np.float64]:
-        """A list of ``count`` numbers within the range of float32."""
-        value = about.get(key)
-        if not isinstance(value, list) or len(value) != count or not all(type(v) in (int, float) for v in value):
-            raise self.refuse(f"{key} is not a list of {count} numbers")
-        try:
-            array = np.array(value, np.float64)
-        except OverflowError:
-            array = np.array([np.inf])
-        # Levels are below 2^24 and a transform adds up to 2^8 products; the sums must stay finite in float32.
-        if not (np.abs(array) < np.finfo(np.float32).max / 2**34).all():
-            raise self.refuse(f"{key} has values beyond float32")
-        return array
 
     def decoded(self, name: str, decode: Callable[..., Decoded], *arguments: Any) -> Decoded:
         """What the entropy coder decodes from a section."""
-        stream = self.section(name, ("|u1",), (None,))
+        stream = self.section(name, "|u1", (None,))
         try:
             return decode(stream, *arguments)
-        except PackError as error:
-            raise self.refuse(f"{name}: {error}") from error
+        except DamagedError as error:
+            raise DamagedError(f"{name}: {error}") from error
+
+    def levels(self, name: str, codec: str, near: Near, width: int) -> tuple[Levels, float]:
+        """Levels ``[N, C]`` of an attribute, and their step."""
+        step = self.about(name, codec).get("step")
+        if not isinstance(step, (int, float)) or isinstance(step, bool) or not abs(step) < _LARGEST_STEP:
+            raise DamagedError(f"the step of {name} is not a number within float32")
+        return self.decoded(f"{name}/levels", entropy.decode_levels, width, near), float(step)
+
+
+def _whole(about: Mapping[str, Any], key: str, minimum: int, maximum: int) -> int:
+    """A whole number of the header from ``minimum`` to ``maximum``."""
+    value = about.get(key)
+    if type(value) is not int or not minimum <= value <= maximum:
+        raise DamagedError(f"{key} is not one of {minimum} to {maximum}")
+    return value
 
 
 def _decode_means(reader: _Reader, n: int) -> tuple[Blocks, int, int]:
-    about = reader.about("means", ("blocks",))
-    bits, size = reader.number(about, "bits", 4, 16), reader.number(about, "block", 16, 1 << 20)
-    low, high = (reader.section(f"means/{end}", ("<f4",), (-(-n // size), 3)) for end in ("low", "high"))
+    about = reader.about("means", "blocks")
+    bits, size = _whole(about, "bits", 4, 16), _whole(about, "block", 16, 1 << 20)
+    low, high = (reader.section(f"means/{end}", "<f4", (-(-n // size), 3)) for end in ("low", "high"))
     return Blocks(reader.decoded("means/gaps", entropy.decode_gaps, n, size, bits), low, high), bits, size
 
 
-def _decode_levels(reader: _Reader, name: str, codec: str, near: Near, width: int) -> tuple[Levels, float]:
-    """Levels ``[N, C]`` of an attribute, and their step."""
-    about = reader.about(name, (codec,))
-    (step,) = reader.numbers({"step": [about.get("step")]}, "step", 1)
-    return reader.decoded(f"{name}/levels", entropy.decode, width, near), float(step)
-
-
 def _decode_quats(reader: _Reader, near: Near) -> NDArray[np.float32]:
-    levels, step = _decode_levels(reader, "quats", "xyz", near, 3)
+    levels, step = reader.levels("quats", "xyz", near, 3)
     found: NDArray[np.float32] = quantize.rotations_at(torch.from_numpy(levels), step).numpy()
     return found
 
 
 def _decode_rows(reader: _Reader, name: str, near: Near, width: int) -> NDArray[np.float32]:
-    levels, step = _decode_levels(reader, name, "transform", near, width)
-    mean = reader.section(f"{name}/mean", ("<f4",), (width,))
-    basis = reader.section(f"{name}/basis", ("|i1",), (width * width,)).reshape(width, width)
-    return transform.restore(levels, mean, basis, step)
+    levels, step = reader.levels(name, "transform", near, width)
+    mean = reader.section(f"{name}/mean", "<f4", (width,))
+    basis = reader.section(f"{name}/basis", "|i1", (width * width,)).reshape(width, width)
+    return transform.rows_at(levels, mean, basis, step)
 
 
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:
     if "head/levels" not in reader.arrays:
         return {}
-    about = reader.about("head", ("channels",))
-    plain, steps, columns = (
-        reader.section(f"head/{part}", ("<f4",), (None,)) for part in ("plain", "steps", "columns")
-    )
-    tensors = _tensors(reader, about.get("tensors"))
+    about = reader.about("head", "channels")
+    sources = {part: reader.section(f"head/{part}", "<f4", (None,)) for part in ("plain", "steps", "columns")}
+    tensors = _head_tensors(about.get("tensors"))
     sizes = {name: int(np.prod(shape, dtype=object)) for name, shape in tensors}
     count = sum(sizes[name] for name, shape in tensors if len(shape) > 1)
-    if reader.number(about, "weights", 0, 1 << 28) != count:
-        raise reader.refuse("the head has another number of weights than it states")
-    container.check_ratio(reader.path, 4 * count, reader.size)
-    levels = reader.decoded("head/levels", entropy.decode, 1, entropy.predecessors(count)).reshape(-1)
-    taken = {"plain": 0, "levels": 0, "steps": 0, "columns": 0}
+    if _whole(about, "weights", 0, 1 << 28) != count:
+        raise DamagedError("the head has another number of weights than it states")
+    container.check_ratio(4 * count, reader.size)
+    sources["levels"] = reader.decoded("head/levels", entropy.decode_levels, 1, entropy.predecessors(count)).reshape(-1)
 
-    def take(name: str, source: Array, count: int) -> Tensor:
-        start = taken[name]
-        taken[name] += count
-        if taken[name] > len(source):
-            raise reader.refuse("the head has fewer weights than it states")
-        return torch.from_numpy(source[start : taken[name]].astype(np.float32))
+    def take(part: str, count: int) -> Tensor:
+        if count > len(sources[part]):
+            raise DamagedError("the head has fewer weights than it states")
+        taken, sources[part] = np.split(sources[part], [count])
+        return torch.from_numpy(taken.astype(np.float32))
 
     head: dict[str, Tensor] = {}
     for name, shape in tensors:
         if len(shape) <= 1:
-            head[name] = take("plain", plain, sizes[name]).reshape(shape)
+            head[name] = take("plain", sizes[name]).reshape(shape)
         else:
-            found = take("levels", levels, sizes[name]).reshape(shape)
-            each = take("steps", steps, shape[0])[:, None] * take("columns", columns, shape[1])
-            head[name] = quantize.weights_at(found, each)
+            steps = take("steps", shape[0])[:, None] * take("columns", shape[1])
+            head[name] = quantize.weights_at(take("levels", sizes[name]).reshape(shape), steps)
             if not torch.isfinite(head[name]).all():
-                raise reader.refuse("the head has weights beyond float32")
+                raise DamagedError("the head has weights beyond float32")
     return head
 
 
-def _tensors(reader: _Reader, listed: Any) -> list[tuple[str, tuple[int, ...]]]:
+def _head_tensors(listed: Any) -> list[tuple[str, tuple[int, ...]]]:
     """Names and shapes of the head's tensors, as listed in the header."""
     if not isinstance(listed, list) or len(listed) > 10_000:
-        raise reader.refuse("its header does not list the tensors of the head")
+        raise DamagedError("its header does not list the tensors of the head")
     tensors = []
     for entry in listed:
         valid = isinstance(entry, list) and len(entry) == 2 and isinstance(entry[0], str) and isinstance(entry[1], list)
         if not valid or len(entry[1]) > 5 or not all(type(side) is int and 0 < side < 1 << 28 for side in entry[1]):
-            raise reader.refuse("a tensor of the head has an invalid shape")
+            raise DamagedError("a tensor of the head has an invalid shape")
         tensors.append((entry[0], tuple(entry[1])))
     return tensors
 
@@ -319,10 +287,10 @@ def _decode_cameras(reader: _Reader) -> dict[str, Tensor] | None:
         return None
     count = len(reader.arrays["cameras/poses"])
     arrays = {
-        name: reader.section(f"cameras/{name}", (dtype,), (count, *shape)) for name, (dtype, shape) in CAMERAS.items()
+        name: reader.section(f"cameras/{name}", dtype, (count, *shape)) for name, (dtype, shape) in CAMERAS.items()
     }
     if count and (int(arrays["sizes"].min()) < 1 or int(arrays["sizes"].max()) > 1 << 16):
-        raise reader.refuse("a camera has an invalid image size")
+        raise DamagedError("a camera has an invalid image size")
     arrays["sizes"] = arrays["sizes"].astype(np.int64)
     return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
@@ -333,12 +301,14 @@ def read_scene(path: Path) -> PackedScene:
     Raises:
         PackError: the file is missing, of another version, truncated, altered, or not a valid scene.
     """
-    path = Path(path)
     header = container.read_header(path)
-    n, width, features = _shape(path, header)
-    container.check_ratio(path, 4 * n * (14 + width + features), header.size)
-    reader = _Reader(path, header, container.read_sections(path, header))
+    with container.naming(path):
+        n, width, features = _shape(header.meta)
+        container.check_ratio(4 * n * (14 + width + features), header.size)
+        return _decoded(_Reader(header, container.read_sections(path, header)), n, width, features)
 
+
+def _decoded(reader: _Reader, n: int, width: int, features: int) -> PackedScene:
     blocks, bits, block = _decode_means(reader, n)
     near = entropy.neighbours_of(blocks.cells, block)
     # Start with the largest jobs, so that the threads end together.
@@ -358,18 +328,14 @@ def read_scene(path: Path) -> PackedScene:
     rest = field.get("features_rest")
     field["features_rest"] = torch.zeros(n, 0, 3) if rest is None else rest.reshape(n, width // 3, 3)
     ordered = {name: field[name] for name in (*SPLAT_NAMES, FEATURES) if name in field}
-    meta = {name: value for name, value in header.meta.items() if name not in ("sections", "attributes", "primitives")}
+    meta = {name: value for name, value in reader.meta.items() if name not in ("sections", "attributes", "primitives")}
     return PackedScene(ordered, head, _decode_cameras(reader), meta)
 
 
-def _shape(path: Path, header: container.Header) -> tuple[int, int, int]:
-    """Numbers of primitives, of SH values of degrees 1 and up, and of features, from the header alone.
-
-    Raises:
-        PackError: the header contradicts itself, or names a codec that is not supported.
-    """
-    refusal = PackError(f"{path} is not a valid scene (its header contradicts itself); pack it again")
-    attributes, n = header.meta.get("attributes"), header.meta.get("primitives")
+def _shape(meta: Mapping[str, Any]) -> tuple[int, int, int]:
+    """Numbers of primitives, of SH values of degrees 1 and up, and of features, from the header alone."""
+    refusal = DamagedError("its header contradicts itself")
+    attributes, n = meta.get("attributes"), meta.get("primitives")
     if not isinstance(attributes, dict) or type(n) is not int or not 1 <= n < 1 << 28:
         raise refusal
     widths = []

@@ -95,11 +95,10 @@ def _roots(size: int, form: Tensor | None) -> tuple[NDArray[np.float64], NDArray
     return vectors * roots @ vectors.T, vectors / roots @ vectors.T
 
 
-def restore(levels: Levels, mean: Floats, basis: NDArray[np.int8], step: float) -> Floats:
+def rows_at(levels: Levels, mean: Floats, basis: NDArray[np.int8], step: float) -> Floats:
     """Rows ``[N, D]`` from levels ``[N, D]`` and the arrays of :meth:`Transform.encode`, with a basis ``[D, D]``."""
     # Copies, because arrays of a file are read-only.
-    out: Floats = _expand(torch.tensor(levels), torch.tensor(mean), torch.tensor(basis), step).numpy()
-    return out
+    return _expand(torch.tensor(levels), torch.tensor(mean), torch.tensor(basis), step).numpy()
 
 
 def _expand(levels: Tensor, mean: Tensor, basis: Tensor, step: float) -> Tensor:

@@ -10,8 +10,7 @@ import pickle
 import random
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from numbers import Integral
 from pathlib import Path
 from typing import Any, get_args
@@ -20,20 +19,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import CheckpointError, StorageError, regular
+from sundae_ns.errors import CheckpointError, StorageError, one_line, regular
 from sundae_ns.gaussians.field import Encoding, Field
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, odd_shapes
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.kinds import kind_of, refuse
-from sundae_ns.storage.ply import read_ply
-from sundae_ns.storage.point_cloud import is_nerfstudio_ply
+from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply
 
 EXTRA_STATE = "_extra_state"
 FORMAT = 2
 _PREFIX = "gauss_params."
 _NAME = re.compile(r"step-(\d+)\.ckpt")
 _PARTIAL = "partial--1.{}.tmp"
-"""Name of an unfinished checkpoint of a process. nerfstudio parses a step from every file name; this one gives -1."""
+"""Name of an unfinished checkpoint of a process; nerfstudio, which parses a step from every name, reads -1."""
 
 
 def random_state() -> dict[str, Any]:
@@ -70,22 +68,14 @@ def folder_of(place: Path) -> Path:
 
 
 def newest_step(place: Path) -> int | None:
-    """Step of the newest checkpoint by its name; None if there is none.
-
-    Args:
-        place: a checkpoint, the folder of checkpoints, or the folder of a run.
-    """
+    """Step of the newest checkpoint by its name, given it, its folder, or the run's; None if there is none."""
     found = [place] if place.is_file() else checkpoints(folder_of(place))
     match = _NAME.fullmatch(found[-1].name) if found else None
     return None if match is None else int(match[1])
 
 
-def save(state: Mapping[str, Any], path: Path) -> None:
-    """Write a checkpoint atomically: an older file of that name stays until the new one is on the disk.
-
-    Raises:
-        StorageError: no space or no right to write; names the newest older checkpoint that is whole.
-    """
+def write(state: Mapping[str, Any], path: Path) -> None:
+    """Write a checkpoint atomically; a ``StorageError`` names the newest older checkpoint that is whole."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Through a Python file, because torch's own writer hides the reason of a failed write.
@@ -111,10 +101,7 @@ def _compact(value: Any) -> Any:
 
 
 def _damage(path: Path) -> str | None:
-    """Reason why a file is no whole checkpoint; None if its checksums are right.
-
-    torch neither verifies checksums nor refuses a file that unpacks to more than its size.
-    """
+    """Reason why a file is no whole checkpoint; None if its checksums are right, which torch does not verify."""
     try:
         with zipfile.ZipFile(regular(path)) as archive:
             entries = archive.infolist()
@@ -124,28 +111,22 @@ def _damage(path: Path) -> str | None:
             broken = archive.testzip()
             return None if broken is None else f"{broken} in it is damaged"
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        return " ".join(reason.split()) or type(error).__name__
+        return getattr(error, "strerror", None) or one_line(error)
 
 
-def _check_extent(value: Any, path: Path) -> None:
-    """Refuse sparse or quantized tensors, and tensors with more elements than their storage, whose copy would fill memory."""
+def _check_tensors(value: Any) -> None:
+    """Refuse sparse or quantized tensors, and tensors larger than their storage, whose copy would fill memory."""
     if isinstance(value, Tensor):
         if value.layout is not torch.strided or value.is_quantized or value.is_meta:
-            raise CheckpointError(
-                f"{path} holds a tensor that is sparse, quantized or without values; give another file"
-            )
+            raise ValueError("it holds a tensor that is sparse, quantized or without values")
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
-            raise CheckpointError(f"{path} holds a tensor that claims more than it has; give another file")
-    elif isinstance(value, Mapping):
-        for inner in value.values():
-            _check_extent(inner, path)
-    elif isinstance(value, (list, tuple)):
-        for inner in value:
-            _check_extent(inner, path)
+            raise ValueError("it holds a tensor that claims more than it has")
+    elif isinstance(value, (Mapping, list, tuple)):
+        for inner in value.values() if isinstance(value, Mapping) else value:
+            _check_tensors(inner)
 
 
-def load(path: Path) -> dict[str, Any]:
+def read(path: Path) -> dict[str, Any]:
     """Read a checkpoint of nerfstudio's trainer on the CPU, without running code from it.
 
     Raises:
@@ -153,32 +134,29 @@ def load(path: Path) -> dict[str, Any]:
     """
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist; give a .ckpt file, or the folder of them")
-    reason = _damage(path)
-    if reason is None:
-        try:
-            with _numpy_numbers_allowed():
-                loaded = torch.load(path, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError:
+    try:
+        if (damage := _damage(path)) is not None:
+            raise ValueError(damage)
+        with _numpy_numbers_allowed():
+            loaded = torch.load(path, map_location="cpu", weights_only=True)
+        state = loaded.get("pipeline") if isinstance(loaded, dict) else None
+        if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
+            raise ValueError("it holds no model")
+        if not isinstance(loaded.get("step"), Integral):
+            raise ValueError("it does not say after which step it was saved")
+        _check_tensors(loaded)
+    except Exception as error:  # torch.load raises many kinds with one meaning for the user
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        if isinstance(error, pickle.UnpicklingError):
             reason = "it holds more than tensors and plain values, or nothing that can be read"
-        except Exception as error:  # torch.load raises many kinds with one meaning for the user
-            reason = str(error).partition("\n")[0] or type(error).__name__
-        else:
-            state = loaded.get("pipeline") if isinstance(loaded, dict) else None
-            if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
-                reason = "it holds no model"
-            elif not isinstance(loaded.get("step"), Integral):
-                reason = "it does not say after which step it was saved"
-            else:
-                _check_extent(loaded, path)
-                return loaded
-    raise CheckpointError(f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file")
+        raise CheckpointError(
+            f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file"
+        ) from error
+    return loaded
 
 
 def newest_whole(folder: Path) -> tuple[Path, list[str]]:
-    """The newest whole checkpoint of a folder, and a line for each newer damaged one.
-
-    Args:
-        folder: of checkpoints, or of a run.
+    """The newest whole checkpoint of a folder or a run, and a line for each newer damaged one.
 
     Raises:
         CheckpointError: there is none.
@@ -228,12 +206,7 @@ def extra_state(
 
 
 def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Encoding) -> Mapping[str, Any]:
-    """The state beside the tensors, checked against the model.
-
-    Args:
-        state: state of the checkpoint's model, without the pipeline's prefix.
-        num_features: configured length of the model's feature vectors; 0 without a head.
-        encoding: how the model's field stores colours.
+    """The state beside the tensors in a model's ``state``, checked against the model's features and encoding.
 
     Raises:
         CheckpointError: a checkpoint of another method, format, feature width or encoding of colours.
@@ -265,41 +238,36 @@ def check_extra_state(state: Mapping[str, Any], num_features: int, encoding: Enc
 def _check_format(extra: Mapping[str, Any]) -> None:
     if extra.get("format") != FORMAT:
         raise CheckpointError(
-            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; use the version that wrote it"
+            f"the checkpoint has format {extra.get('format')}, this version reads {FORMAT}; "
+            "use the version that wrote it"
         )
 
 
 def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], *, may_be_empty: bool = False) -> None:
-    """Check that the tensors of a checkpoint fit the model.
+    """Check that a ``state``, whose extra state was checked, fits the ``state_dict`` that a model has.
 
-    Args:
-        state: state of the checkpoint's model, whose extra state was checked.
-        expected: ``state_dict`` of the model.
-        may_be_empty: whether there may be no primitive, as in a shard.
+    A shard ``may_be_empty``, without a primitive.
 
     Raises:
         CheckpointError: a tensor is missing or has another shape, or the running states do not fit.
     """
+    mend = "load it with the options that it was trained with"
     for name, value in expected.items():
         if not isinstance(value, Tensor) or name == EXTRA_STATE:
             continue
         if not isinstance(state.get(name), Tensor):
-            raise CheckpointError(f"the checkpoint has no {name}; load it with the options that it was trained with")
+            raise CheckpointError(f"the checkpoint has no {name}; {mend}")
         per_primitive = name.startswith(_PREFIX)
         theirs, ours = state[name].shape, value.shape
         if (len(theirs) == 0 or theirs[1:] != ours[1:]) if per_primitive else (theirs != ours):
-            mend = "load it with the options that it was trained with"
-            if name.startswith("networks.head."):
-                mend += ", such as its --pipeline.model.head.size"
-            raise CheckpointError(f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {mend}")
+            hint = ", such as its --pipeline.model.head.size" if name.startswith("networks.head.") else ""
+            raise CheckpointError(
+                f"{name} is {list(theirs)} in the checkpoint and {list(ours)} in the model; {mend}{hint}"
+            )
     rows = sorted({state[name].shape[0] for name in expected if name.startswith(_PREFIX)})
     if len(rows) != 1 or (rows[0] == 0 and not may_be_empty):
         raise CheckpointError(f"the checkpoint has parameters of {rows} primitives; give another")
-    _check_running_state(state[EXTRA_STATE], rows[0])
-
-
-def _check_running_state(extra: Mapping[str, Any], n: int) -> None:
-    """Check the running states of densification and pruning for ``n`` primitives."""
+    extra, n = state[EXTRA_STATE], rows[0]
     pruning, strategy = extra["running"].get("pruning"), extra["running"].get("densification")
     numbers = [extra.get("step"), *(pruning.values() if isinstance(pruning, Mapping) else [None])]
     if not all(isinstance(value, int) for value in numbers) or not isinstance(strategy, Mapping):
@@ -309,20 +277,12 @@ def _check_running_state(extra: Mapping[str, Any], n: int) -> None:
             raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} primitives; give another")
 
 
-@contextmanager
-def _numpy_numbers_allowed() -> Iterator[None]:
-    """Allow the numpy floats that stock nerfstudio leaves in a scheduler's state."""
-    scalar = np.float64(0.0).__reduce__()[0]
-    allowed: list[Any] = [
-        scalar,
-        (scalar, "numpy.core.multiarray.scalar"),
-        (scalar, "numpy._core.multiarray.scalar"),
-        np.dtype,
-        type(np.dtype(np.float64)),
-        type(np.dtype(np.float32)),
-    ]
-    with torch.serialization.safe_globals(allowed):
-        yield
+def _numpy_numbers_allowed() -> Any:
+    """A context in which torch reads the numpy floats that stock nerfstudio leaves in a scheduler's state."""
+    scalar: Any = np.float64(0.0).__reduce__()[0]
+    names = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
+    types: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
+    return torch.serialization.safe_globals([scalar, *names, *types])
 
 
 def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
@@ -332,13 +292,12 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         path: ``.ckpt`` file, a folder of them (the newest counts), or ``.ply`` file.
 
     Returns:
-        Parameters without features, float32 on the CPU, colours as harmonics; and True if they are in the coordinates of
-        nerfstudio's model (checkpoints, ``ns-export``), False if in those of the capture (other ``.ply``).
+        Parameters without features, float32 on the CPU, colours as harmonics; and whether they are in the coordinates
+        of nerfstudio's model (checkpoints, ``ns-export``), not in those of the capture (other ``.ply``).
 
     Raises:
-        CheckpointError: there is no such file, it holds no Gaussian field, or it is a SUNDAE checkpoint of another format.
+        CheckpointError: there is no such file, it holds no Gaussian field, or has another format.
     """
-    path = Path(path)
     if path.is_dir():
         if not checkpoints(folder_of(path)):
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
@@ -348,35 +307,31 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
         field = read_ply(path)
         _check_field(field, path)
         return field, is_nerfstudio_ply(path)
-    return dict(field_of(load(path), path).as_harmonics()), True
+    return dict(field_of(read(path), path).as_harmonics()), True
 
 
 def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
-    """The field of a checkpoint of splatfacto or sundae as it is stored, without features, float32 on the CPU.
-
-    Args:
-        loaded: from :func:`load`.
-        path: for error messages.
+    """The stored field of a checkpoint from :func:`read`, without features, float32 on the CPU.
 
     Raises:
         CheckpointError: it holds no Gaussian field, or is a SUNDAE checkpoint of another format.
     """
     state = model_state(loaded)
-    keys = {name: _PREFIX + name for name in SPLAT_NAMES}
-    if not all(isinstance(state.get(key), Tensor) for key in keys.values()):
+    stored = {name: state.get(_PREFIX + name) for name in SPLAT_NAMES}
+    field = {name: value.float() for name, value in stored.items() if isinstance(value, Tensor)}
+    if len(field) < len(stored):
         raise CheckpointError(f"{path} holds no Gaussian field; give a checkpoint of splatfacto or sundae")
-    field = {name: state[key].float() for name, key in keys.items()}
     _check_field(field, path)
     return Field(field, _encoding(field, state.get(EXTRA_STATE)))
 
 
 def model_state(loaded: Mapping[str, Any]) -> dict[str, Any]:
     """State of the model in a checkpoint, by its own names."""
-    found = {}
-    for name, value in loaded["pipeline"].items():
-        if name.startswith("_model."):
-            found[name.removeprefix("_model.").removeprefix("module.")] = value
-    return found
+    return {
+        name.removeprefix("_model.").removeprefix("module."): value
+        for name, value in loaded["pipeline"].items()
+        if name.startswith("_model.")
+    }
 
 
 def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:

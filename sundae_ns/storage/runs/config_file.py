@@ -1,11 +1,12 @@
-"""A run's ``config.yml`` as objects of nerfstudio, without running it; nerfstudio's own reader calls whatever it names."""
+"""A run's ``config.yml`` as objects of nerfstudio, without running it. nerfstudio's own reader calls what it names."""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import suppress
 from enum import Enum
 from functools import cache
 from importlib.metadata import entry_points
@@ -16,7 +17,7 @@ from typing import Any
 import yaml
 from yaml.constructor import ConstructorError
 
-from sundae_ns.errors import CheckpointError, regular
+from sundae_ns.errors import CheckpointError, reading, regular
 from sundae_ns.storage.kinds import refuse
 from sundae_ns.storage.runs.folder import config_of
 
@@ -25,35 +26,27 @@ _GROUPS = ("nerfstudio.method_configs", "nerfstudio.dataparser_configs")
 
 
 class _ConfigLoader(yaml.SafeLoader):
-    """Makes configurations again, and nothing else: no constructor is called, nor any function that a file names."""
+    """Makes configurations only; calls no constructor and no function that a file names."""
 
 
 @cache
 def _trusted_packages() -> frozenset[str]:
-    """Packages whose classes a configuration may name: nerfstudio's, ours, torch, and plug-ins, which nerfstudio imports."""
+    """Packages whose classes a configuration may name; nerfstudio imports plug-ins anyway."""
     plugins = {point.value.partition(":")[0] for group in _GROUPS for point in entry_points(group=group)}
     return frozenset({"nerfstudio", "sundae_ns", "gsplat", "torch"} | {name.partition(".")[0] for name in plugins})
 
 
 def _named(name: str, node: yaml.Node) -> Any:
-    """The class or function of a dotted name; it has to be at home in a package that is trusted."""
+    """The class or function of a dotted name, which a trusted package must define."""
     module, _, attribute = name.rpartition(".")
     found = None
     if module.partition(".")[0] in _trusted_packages():
-        try:
+        with suppress(ImportError):
             found = getattr(importlib.import_module(module), attribute, None)
-        except ImportError:
-            found = None
-        home = str(getattr(found, "__module__", "")).partition(".")[0]
-        if home not in _trusted_packages() or not isinstance(found, (type, FunctionType)):
-            found = None
-    if found is None:
+    home = str(getattr(found, "__module__", "")).partition(".")[0]
+    if home not in _trusted_packages() or not isinstance(found, (type, FunctionType)):
         raise ConstructorError(None, None, f"it names {name}", node.start_mark)
     return found
-
-
-def _make_name(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
-    return _named(suffix, node)
 
 
 def _make_object(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Iterator[Any]:
@@ -66,14 +59,14 @@ def _make_object(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Iterato
     # Setting a configuration up calls its target.
     if not isinstance(state.get("_target", type), type):
         raise ConstructorError(None, None, f"the target of {suffix} is no class", node.start_mark)
-    for field in dataclasses.fields(kind):  # options that came after the run was saved
+    for field in dataclasses.fields(kind):  # options newer than the run
         if field.name not in state and field.default_factory is not dataclasses.MISSING:
             state[field.name] = field.default_factory()
     vars(made).update(state)
 
 
 def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
-    """A path, or a member of an enumeration: what else is made by a call is refused."""
+    """A path, or a member of an enumeration; other calls are refused."""
     arguments = loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else []
     module, _, name = suffix.rpartition(".")
     if module.partition(".")[0] == "pathlib" and name in _PATHS and all(isinstance(a, str) for a in arguments):
@@ -86,18 +79,13 @@ def _make_value(loader: _ConfigLoader, suffix: str, node: yaml.Node) -> Any:
 
 _PYTHON = "tag:yaml.org,2002:python/"
 _ConfigLoader.add_constructor(_PYTHON + "tuple", lambda loader, node: tuple(loader.construct_sequence(node, deep=True)))
-_ConfigLoader.add_multi_constructor(_PYTHON + "name:", _make_name)
+_ConfigLoader.add_multi_constructor(_PYTHON + "name:", lambda loader, suffix, node: _named(suffix, node))
 _ConfigLoader.add_multi_constructor(_PYTHON + "object:", _make_object)
 _ConfigLoader.add_multi_constructor(_PYTHON + "object/apply:", _make_value)
 
 
 def _find_capture(config: Any, folder: Path) -> None:
-    """If the capture of a run is not where it was, look for it where it was as seen from the run, which may have moved too.
-
-    Args:
-        config: of the run.
-        folder: of the run.
-    """
+    """If a run's capture is gone, look for it at the same place relative to the run, which may have moved too."""
     datamanager: Any = getattr(getattr(config, "pipeline", None), "datamanager", None)
     data = getattr(datamanager, "data", None)
     if not isinstance(data, Path) or data.exists():
@@ -110,7 +98,7 @@ def _find_capture(config: Any, folder: Path) -> None:
 
 
 class _ValueLoader(yaml.SafeLoader):
-    """Makes plain values alone: mappings for configurations, text for names, lists for tuples and calls."""
+    """Makes plain values only: mappings for configurations, text for names, lists for tuples and calls."""
 
 
 def _make_plain(loader: _ValueLoader, suffix: str, node: yaml.Node) -> Any:
@@ -123,15 +111,14 @@ _ValueLoader.add_multi_constructor(_PYTHON, _make_plain)
 
 
 def load_config(path: Path) -> Any:
-    """What a run's ``config.yml`` describes, as objects of nerfstudio, without running anything that it asks for.
+    """A run's ``config.yml`` as objects of nerfstudio, with the options that were saved.
 
-    nerfstudio's own commands call whatever the file names. Here configurations are made again as they were saved, and only
-    classes of nerfstudio, of this package, of torch, and of installed plug-ins are known.
+    Only classes of nerfstudio, of this package, of torch, and of installed plug-ins are known; nothing is called.
 
     Raises:
         CheckpointError: it cannot be read, is no configuration, or asks for something else.
     """
-    config = _load(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
+    config = _load(path, _ConfigLoader)
     _find_capture(config, path.absolute().parent)
     return config
 
@@ -142,7 +129,7 @@ def model_options(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: it cannot be read, or is no configuration of a run.
     """
-    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
+    found = _load(path, _ValueLoader)
     for part in ("pipeline", "model"):
         found = found.get(part) if isinstance(found, dict) else None
     if not isinstance(found, dict):
@@ -151,10 +138,7 @@ def model_options(path: Path) -> dict[str, Any]:
 
 
 def check_run(run: Path) -> None:
-    """Refuse what is no run before nerfstudio is imported, which takes seconds.
-
-    Args:
-        run: a folder or ``config.yml``, given by the user.
+    """Refuse a path that is no run, nor its ``config.yml``, before the slow import of nerfstudio.
 
     Raises:
         CheckpointError: it is a file of another kind, or has no ``config.yml`` of a run.
@@ -173,24 +157,14 @@ def schedule_length(path: Path) -> int:
     Raises:
         CheckpointError: it cannot be read, or is no configuration of a run of ours.
     """
-    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
+    found = _load(path, _ValueLoader)
     length = found.get("schedule_length") if isinstance(found, dict) else None
     if not isinstance(length, int):
         raise CheckpointError(f"{path} states no length of its schedule; give a run of sundae")
     return length
 
 
-def _load(path: Path, parse: Callable[[str], Any]) -> Any:
-    try:
-        return parse(regular(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise CheckpointError(
-            f"{path} cannot be read ({error.strerror}); give the folder of a finished run, or its config.yml"
-        ) from error
-    except Exception as error:  # PyYAML, enumerations and modules that are gone raise of many kinds
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        if isinstance(error, UnicodeDecodeError):
-            reason = "it is no text"
-        raise CheckpointError(
-            f"{path} is not a run's config.yml, or of another version ({reason}); give the folder of a run"
-        ) from error
+def _load(path: Path, loader: type[yaml.SafeLoader]) -> Any:
+    mend = "give the folder of a finished run, or its config.yml"
+    with reading(path, "a run's config.yml, or of another version", CheckpointError, mend=mend):
+        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)

@@ -11,28 +11,22 @@ from pathlib import Path
 from typing import Any
 
 LEFT_OUT = frozenset(
-    {
-        # Names, places and seeds.
-        *("method_name", "experiment_name", "project_name", "timestamp", "output_dir", "relative_model_dir", "data"),
-        *(
-            "pipeline.datamanager.data",
-            "pipeline.datamanager.train_cameras_sampling_seed",
-            "pipeline.model.pruning.seed",
-        ),
-        # How the capture is read belongs to the capture.
-        *("pipeline.datamanager.dataparser", "pipeline.datamanager.images"),
-        # The machine, and where it keeps images.
-        *("machine", "pipeline.datamanager.cache_images", "pipeline.datamanager.max_thread_workers"),
-        *("pipeline.datamanager.masks_on_gpu", "pipeline.datamanager.images_on_gpu"),
-        # Logs, saves, evaluations, and resuming.
-        *("logging", "log_gradients", "viewer", "vis", "start_paused", "prompt", "save_only_latest_checkpoint"),
-        *("steps_per_save", "steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images"),
-        *("load_dir", "load_step", "load_config", "load_checkpoint", "load_scheduler"),
-        *(f"pipeline.datamanager.eval_{name}" for name in ("image_indices", "num_images_to_sample_from")),
-        *("pipeline.datamanager.eval_num_times_to_repeat_images", "pipeline.model.evaluate_prune"),
-        # A count that comparisons take from the capture; it stands beside the row as its number of primitives.
-        "pipeline.model.mcmc_cap",
-    }
+    # Names, places and seeds.
+    "method_name experiment_name project_name timestamp output_dir relative_model_dir data pipeline.datamanager.data "
+    "pipeline.datamanager.train_cameras_sampling_seed pipeline.model.pruning.seed "
+    # How the capture is read belongs to the capture.
+    "pipeline.datamanager.dataparser pipeline.datamanager.images "
+    # The machine, and where it keeps images.
+    "machine pipeline.datamanager.cache_images pipeline.datamanager.max_thread_workers "
+    "pipeline.datamanager.masks_on_gpu pipeline.datamanager.images_on_gpu "
+    # Logs, saves, evaluations, and resuming.
+    "logging log_gradients viewer vis start_paused prompt save_only_latest_checkpoint "
+    "steps_per_save steps_per_eval_batch steps_per_eval_image steps_per_eval_all_images "
+    "load_dir load_step load_config load_checkpoint load_scheduler pipeline.datamanager.eval_image_indices "
+    "pipeline.datamanager.eval_num_images_to_sample_from pipeline.datamanager.eval_num_times_to_repeat_images "
+    "pipeline.model.evaluate_prune "
+    # A count that comparisons take from the capture; it stands beside the row as its number of primitives.
+    "pipeline.model.mcmc_cap".split()
 )
 """Options of a trainer that decide neither quality nor time of what is trained, by their dotted names."""
 LENGTH = 8
@@ -40,13 +34,10 @@ _LETTERS = str.maketrans("0123456789abcdef", "abcdefghijklmnop")
 
 
 def fingerprint(config: Any) -> str:
-    """Eight letters that stand for the options of a run which decide its results; letters, so that no table reads a number.
+    """Eight letters that stand for the options which decide a run's results; a table cannot read them as a number.
 
     Options that are off (None or False) count as absent, so that a new option that is off by default changes nothing.
     Classes count by their bare names, so that a class may move.
-
-    Args:
-        config: nerfstudio's configuration of a trainer, made by ``ns-train`` or read from a ``config.yml``.
     """
     text = json.dumps(_plain(config, ""), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:LENGTH].translate(_LETTERS)

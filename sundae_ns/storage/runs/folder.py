@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 from sundae_ns.errors import PackError, StorageError, regular, writing
 
-LOCK = "training.lock"
+_LOCK = "training.lock"
 """Names the process that trains in a folder. The file stays; the system drops its lock when the process ends."""
 UNPACKED = "unpacked"
 """Timestamp of runs that were unpacked; they cannot be trained on."""
@@ -22,16 +22,12 @@ _held: dict[Path, TextIO] = {}
 
 
 def new_name() -> str:
-    """A name for a run: the local time to the microsecond, so that runs of one second differ."""
+    """A name for a run: the local time to the microsecond."""
     return datetime.now().strftime("%Y-%m-%d_%H%M%S_%f")
 
 
 def unpacked_folder(output_dir: Path, name: str) -> Path:
-    """Folder of the run that a packed scene is unpacked to.
-
-    Args:
-        output_dir: folder of runs.
-        name: of the experiment; characters beside letters, digits, ``_``, ``.`` and ``-`` are replaced.
+    """Folder below ``output_dir`` of the run that a packed scene is unpacked to; odd characters of its name change.
 
     Raises:
         PackError: there is a run already.
@@ -43,11 +39,8 @@ def unpacked_folder(output_dir: Path, name: str) -> Path:
     return folder
 
 
-def hold(run: Path) -> None:
-    """Reserve a run's folder for this process until it ends, and remove files that killed processes left unfinished.
-
-    Args:
-        run: folder of the run; created if missing.
+def reserve(run: Path) -> None:
+    """Make a run's folder, reserve it for this process, and remove files that killed processes left unfinished.
 
     Raises:
         StorageError: another process trains in it, or the folder cannot be written.
@@ -59,7 +52,7 @@ def hold(run: Path) -> None:
 
     with writing(f"cannot write to the run's folder {run}"):
         run.mkdir(parents=True, exist_ok=True)
-        file = (run / LOCK).open("a+", encoding="utf-8")
+        file = (run / _LOCK).open("a+", encoding="utf-8")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
@@ -83,27 +76,27 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
     A file that cannot be read is renamed to ``*.damaged.json``, because it should not end a training.
     """
     try:
-        records = json.loads(regular(path).read_text(encoding="utf-8"))
-        return [record for record in records if record["step"] < step]
+        return [record for record in _records(path) if record["step"] < step]
     except FileNotFoundError:
-        return []
+        pass
     except (ValueError, TypeError, KeyError):
         path.replace(path.with_suffix(".damaged.json"))
-        return []
+    return []
 
 
 def prunes_of(run: Path) -> list[dict[str, Any]]:
-    """Records of the prunes of a finished run; empty if there are none that can be read.
-
-    Args:
-        run: folder of the run.
-    """
+    """Records of the prunes of a finished run, given its folder; empty if they cannot be read."""
     try:
-        records = json.loads(regular(run / "prune.json").read_text(encoding="utf-8"))
+        return _records(run / "prune.json")
     except (OSError, ValueError):
         return []
-    known = isinstance(records, list) and all(isinstance(record, dict) for record in records)
-    return records if known else []
+
+
+def _records(path: Path) -> list[dict[str, Any]]:
+    records = json.loads(regular(path).read_text(encoding="utf-8"))
+    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
+        raise ValueError(f"{path} is no list of objects")
+    return records
 
 
 def config_of(run: Path) -> Path:
@@ -112,7 +105,7 @@ def config_of(run: Path) -> Path:
 
 
 def files_of(run: Path) -> list[Path]:
-    """Files and folders of a run that commands read, given its folder or its ``config.yml``; a file alone for others."""
+    """Files and folders of a run that commands read, given its folder or its ``config.yml``; another file itself."""
     if run.is_file() and run.name != "config.yml":
         return [run]
     folder = config_of(run).parent
@@ -120,9 +113,7 @@ def files_of(run: Path) -> list[Path]:
 
 
 def find_config(path: Path) -> Path | None:
-    """The ``config.yml`` of the run that a path belongs to: the file, the run's folder, its checkpoints or one of them."""
-    if path.name == "config.yml" and path.is_file():
-        return path
+    """The ``config.yml`` of a run, given it, the run's folder, the folder of its checkpoints, or one of these."""
     folder = path if path.is_dir() else path.parent
     places = [folder, folder.parent] if folder.name == "nerfstudio_models" else [folder]
     return next((place / "config.yml" for place in places if (place / "config.yml").is_file()), None)

@@ -72,7 +72,7 @@ def test_transform(kind: str, n: int, seed: int) -> None:
     for y in (x, drifted(x, seed)):
         _, levels, arrays = codec.encode(y)
         arrays["basis"] = arrays["basis"].reshape(9, 9)
-        found = transform.restore(levels, step=codec.step, **arrays)
+        found = transform.rows_at(levels, step=codec.step, **arrays)
         assert np.array_equal(codec.rounded(torch.from_numpy(y)).numpy(), found)
         assert np.abs(levels).max() <= entropy.LARGEST
 
@@ -174,7 +174,7 @@ def test_weights_that_show_less_are_coarser_at_the_same_total_error() -> None:
         moved = {name: codecs.head.rounded(name, value) - value for name, value in head.items()}
         errors.append(sum(float((shown[name] * moved[name].square().sum((2, 3))).sum()) for name in head))
         levels = codecs.head.encode(head)[1]
-        sizes.append(len(entropy.encode(levels, entropy.predecessors(len(levels)))))
+        sizes.append(len(entropy.encode_levels(levels, entropy.predecessors(len(levels)))))
     assert errors[1] == pytest.approx(errors[0], rel=0.25)
     assert sizes[1] < 0.9 * sizes[0]
     share = [float(codecs.head.steps(name).mean()) for name in head]

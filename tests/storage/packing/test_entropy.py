@@ -37,7 +37,7 @@ def cells_of(n: int, bits: int, block: int, seed: int) -> NDArray[np.uint64]:
 @pytest.fixture(scope="module", autouse=True)
 def compiled() -> None:
     """Compile first, because hypothesis watches the time."""
-    entropy.encode(np.zeros((1, 1), np.int32), entropy.neighbours_of(np.zeros((1, 3)), 1))
+    entropy.encode_levels(np.zeros((1, 1), np.int32), entropy.neighbours_of(np.zeros((1, 3)), 1))
     entropy.encode_gaps(np.zeros(1, np.uint64), 1, 4)
 
 
@@ -45,7 +45,7 @@ def compiled() -> None:
 def test_numbers_come_back(n: int, width: int, seed: int) -> None:
     levels = levels_of(n, width, seed)
     near = entropy.neighbours_of(np.random.default_rng(seed).integers(0, 99, (n, 3)), 1 + seed % 50)
-    assert np.array_equal(entropy.decode(entropy.encode(levels, near), width, near), levels)
+    assert np.array_equal(entropy.decode_levels(entropy.encode_levels(levels, near), width, near), levels)
 
 
 @given(st.integers(1, 300), st.integers(4, 16), st.integers(0, 2**16))
@@ -60,7 +60,7 @@ def test_codes_of_cells_come_back(n: int, bits: int, seed: int) -> None:
 
 def test_no_rows() -> None:
     near = entropy.predecessors(0)
-    assert entropy.decode(entropy.encode(np.zeros((0, 1), np.int32), near), 1, near).shape == (0, 1)
+    assert entropy.decode_levels(entropy.encode_levels(np.zeros((0, 1), np.int32), near), 1, near).shape == (0, 1)
 
 
 @pytest.mark.parametrize("scale", [0.02, 0.3, 4.0, 300.0])
@@ -68,7 +68,7 @@ def test_sizes_are_near_the_entropy(scale: float) -> None:
     levels = np.rint(np.random.default_rng(0).laplace(size=(20_000, 2)) * scale).astype(np.int32)
     _, counts = np.unique(levels, return_counts=True)
     entropy_of = -np.sum(counts / counts.sum() * np.log2(counts / counts.sum()))
-    stream = entropy.encode(levels, entropy.predecessors(len(levels)))
+    stream = entropy.encode_levels(levels, entropy.predecessors(len(levels)))
     assert 8 * len(stream) < (1.03 * entropy_of + 0.02) * levels.size
 
 
@@ -79,8 +79,8 @@ def test_contexts_use_neighbours() -> None:
     cells = cells[np.argsort(interleave(cells))]
     near = entropy.neighbours_of(cells, 4000)
     levels = np.rint(cells[:, :1].astype(np.int64) - 32 + rng.normal(size=(4000, 1))).astype(np.int32)
-    alone = entropy.encode(levels, np.full_like(near, -1))
-    assert len(entropy.encode(levels, near)) < 0.7 * len(alone)
+    alone = entropy.encode_levels(levels, np.full_like(near, -1))
+    assert len(entropy.encode_levels(levels, near)) < 0.7 * len(alone)
 
 
 def test_neighbours_are_the_nearest_of_the_window() -> None:
@@ -104,7 +104,7 @@ def test_the_numbers_of_the_format() -> None:
     assert np.abs(exact % 1 - 0.5).min() > 1e-6
     assert digest.hexdigest()[:16] == "15160911aa9b93af"
     levels = np.arange(-40, 40, dtype=np.int32).reshape(20, 4)
-    stream = entropy.encode(levels, entropy.predecessors(20))
+    stream = entropy.encode_levels(levels, entropy.predecessors(20))
     assert hashlib.sha256(stream.tobytes()).hexdigest()[:16] == "af8f24b70648e1b2"
 
 
@@ -112,7 +112,7 @@ def test_the_numbers_of_the_format() -> None:
 def test_other_streams_are_refused_or_within_the_limits(content: bytes, n: int) -> None:
     stream = np.frombuffer(content, np.uint8)
     with suppress(PackError):
-        assert np.abs(entropy.decode(stream, 3, entropy.predecessors(n))).max() <= LARGEST
+        assert np.abs(entropy.decode_levels(stream, 3, entropy.predecessors(n))).max() <= LARGEST
     with suppress(PackError):
         codes = entropy.decode_gaps(stream, n, 16, 5)
         assert codes.max() < 1 << 15
@@ -122,7 +122,7 @@ def test_other_streams_are_refused_or_within_the_limits(content: bytes, n: int) 
 
 def test_a_stream_of_more_or_fewer_numbers_is_refused() -> None:
     levels = np.random.default_rng(0).integers(-1000, 1000, (100, 2)).astype(np.int32)
-    stream = entropy.encode(levels, entropy.predecessors(100))
+    stream = entropy.encode_levels(levels, entropy.predecessors(100))
     for other, count in ((np.append(stream, np.uint8(0)), 100), (stream, 80), (stream, 120)):
         with pytest.raises(PackError, match="does not end with its last number"):
-            entropy.decode(other, 2, entropy.predecessors(count))
+            entropy.decode_levels(other, 2, entropy.predecessors(count))

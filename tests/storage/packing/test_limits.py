@@ -75,7 +75,7 @@ def resectioned(path: Path, name: str, array: Any) -> None:
     """Replace a section of a file and keep all checksums valid."""
     header = container.read_header(path)
     meta = {key: value for key, value in header.meta.items() if key != "sections"}
-    container.write(path, meta, {**container.read_sections(path, header), name: array})
+    path.write_bytes(container.encode(meta, {**container.read_sections(path, header), name: array})[0])
 
 
 STATED: dict[str, tuple[str, str, tuple[Any, ...]]] = {

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from sundae_ns.gaussians.rotations import rotation_matrices
 from sundae_ns.storage import morton
 from sundae_ns.storage.packing import quantize, transform
 from sundae_ns.storage.packing.container import Floats
@@ -91,7 +92,7 @@ def hard_quaternions(n: int, seed: int, length: float) -> Floats:
 def covariances(q: Floats, scales: Floats) -> NDArray[np.float64]:
     """Covariances ``[N, 3, 3]`` of ellipsoids with these rotations and log-scales."""
     unit = q.astype(np.float64) / np.linalg.norm(q.astype(np.float64), axis=1, keepdims=True)
-    root = quantize._matrices(unit) * np.exp(scales.astype(np.float64))[:, None]
+    root = rotation_matrices(torch.from_numpy(unit)).numpy() * np.exp(scales.astype(np.float64))[:, None]
     return root @ root.transpose(0, 2, 1)
 
 
@@ -142,7 +143,7 @@ def test_transform(kind: str, n: int, seed: int) -> None:
     codec = transform.fit(x, 0.03)
     _, levels, arrays = codec.encode(x)
     arrays["basis"] = arrays["basis"].reshape(9, 9)
-    found = transform.restore(levels, step=codec.step, **arrays).astype(np.float64)
+    found = transform.rows_at(levels, step=codec.step, **arrays).astype(np.float64)
     # Sums of nine products in float32.
     slack = 20 * ulp(np.linalg.norm(x.astype(np.float64), axis=1, keepdims=True))
     assert (np.abs(found - x) <= codec.bound + slack).all()
@@ -170,7 +171,7 @@ def test_rows_of_zeros_stay_exact() -> None:
 
 
 def test_a_form_makes_errors_that_show_smaller() -> None:
-    """At as many bits: the sum of the errors by the form is less than half, and errors of its least direction are larger."""
+    """At as many bits: less than half of the errors by the form, and larger errors in its least direction."""
     rng = np.random.default_rng(0)
     x = rng.normal(size=(4000, 6)).astype(np.float32)
     axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]

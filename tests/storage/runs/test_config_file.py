@@ -57,7 +57,7 @@ HOSTILE = {
     "a call": "!!python/object/apply:os.mkdir ['{}']",
     "a new object": "!!python/object/new:os.mkdir\nargs: ['{}']",
     "a call of nerfstudio's": "!!python/object/apply:nerfstudio.utils.scripts.run_command ['mkdir {}']",
-    "a call of what nerfstudio imports": "!!python/object/apply:nerfstudio.utils.scripts.subprocess.run [[mkdir, '{}']]",
+    "a call of an import": "!!python/object/apply:nerfstudio.utils.scripts.subprocess.run [[mkdir, '{}']]",
     "a call of ours": "!!python/object/apply:sundae_ns.storage.atomic.write_text ['{}', a]",
     "a name from elsewhere": "!!python/name:os.mkdir ''",
     "a name that ours imports": "!!python/name:sundae_ns.storage.atomic.os.mkdir ''",
@@ -117,7 +117,7 @@ def test_a_file_that_is_no_run_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(CheckpointError, match=r"cannot be read \(No such file"):
         load_config(tmp_path / "gone.yml")
     path.write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(CheckpointError, match="is no text"):
+    with pytest.raises(CheckpointError, match="codec"):
         load_config(path)
     with pytest.raises(CheckpointError, match="cannot be read"):
         load_config(tmp_path)

@@ -1,4 +1,4 @@
-"""Fingerprints of runs: equal wherever and however a method is trained, different for every option that decides a result."""
+"""Fingerprints of runs: equal wherever a method is trained, different for every option that decides a result."""
 
 from __future__ import annotations
 
@@ -89,7 +89,8 @@ def test_every_value_counts(other: Options) -> None:
     [
         "--machine.seed 7 --pipeline.model.pruning.seed 7 --pipeline.datamanager.train-cameras-sampling-seed 7",
         "--output-dir elsewhere --experiment-name other --timestamp now --vis tensorboard --viewer.websocket-port 9",
-        "--steps-per-save 7 --steps-per-eval-all-images 7 --pipeline.model.evaluate-prune False --logging.steps-per-log 7",
+        "--steps-per-save 7 --steps-per-eval-all-images 7 --logging.steps-per-log 7 "
+        "--pipeline.model.evaluate-prune False",
         "--pipeline.datamanager.cache-images cpu --max-num-iterations 30000 --pipeline.model.pruning.keep-ratio 0.1",
     ],
 )

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from sundae_ns.errors import StorageError
-from sundae_ns.storage.runs.folder import files_of, find_config, hold, new_name, prunes_before, prunes_of
+from sundae_ns.storage.runs.folder import files_of, find_config, new_name, prunes_before, prunes_of, reserve
 
-HOLDER = "import sys, time; from pathlib import Path; from sundae_ns.storage.runs.folder import hold; "
-HOLDER += "hold(Path(sys.argv[1])); print(flush=True); time.sleep(600)"
+HOLDER = "import sys, time; from pathlib import Path; from sundae_ns.storage.runs.folder import reserve; "
+HOLDER += "reserve(Path(sys.argv[1])); print(flush=True); time.sleep(600)"
 
 
 def test_the_configuration_is_found_from_any_path_of_its_run(tmp_path: Path) -> None:
@@ -60,15 +60,15 @@ def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path: Path) -> None:
         other.stdout.readline()
         for path in (run, tmp_path / "runs" / ".." / "runs" / "a"):
             with pytest.raises(StorageError, match=f"^process {other.pid} on .* trains in .*; .*--timestamp$"):
-                hold(path)
+                reserve(path)
         (run / "models").mkdir()
         for name in ("config.yml.17.partial", "models/partial--1.17.tmp", "config.yml", "models/step-000000001.ckpt"):
             (run / name).touch()
     finally:
         other.kill()
         other.wait()
-    hold(run)
-    hold(run)  # its own folder
+    reserve(run)
+    reserve(run)  # its own folder
     assert (run / "training.lock").read_text().startswith(f"process {os.getpid()} on ")
     assert sorted(path.name for path in run.rglob("*") if path.is_file()) == [
         "config.yml",
