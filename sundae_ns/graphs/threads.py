@@ -23,11 +23,6 @@ def for_each(work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
         return list(pool.map(work, parts))
 
 
-def slices(count: int, size: int) -> list[slice]:
-    """``range(count)`` in slices of at most ``size``."""
-    return [slice(start, min(start + size, count)) for start in range(0, count, size)]
-
-
 def cores() -> int:
     """Number of cores that this process may use; follows ``taskset``, not ``OMP_NUM_THREADS``."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -48,7 +48,7 @@ def test_nearest_of_all_is_ordered_by_squared_distance_and_index(cluster: Callab
     coordinates = with_floaters(cluster(100)).numpy()
     positions = host_search._distinct(coordinates)
     rows = np.arange(len(positions.coordinates))
-    points, lengths = host_search._nearest_of_all(positions, rows, width)
+    _, points, lengths = map(np.concatenate, zip(*host_search._nearest_of_all(positions, rows, width), strict=True))
     assert points.shape == lengths.shape == (len(rows), min(width, len(coordinates)))
     for row in rows:
         x, y, z = (coordinates - positions.coordinates[row]).T
