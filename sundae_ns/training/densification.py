@@ -232,7 +232,7 @@ class Densification(Extension):
         """Keep the gradients that densification reads."""
         if state.densifying:
             self.strategy.step_pre_backward(
-                state.field.params, state.optimizers, state.densification, state.schedule_step, state.info
+                state.field.data, state.optimizers, state.densification, state.schedule_step, state.info
             )
 
     def after_step(self, run: TrainingRun) -> None:
@@ -244,7 +244,7 @@ class Densification(Extension):
     def densify(self, state: FieldState) -> None:
         """Let the strategy add, move and remove primitives."""
         self.strategy.step_post_backward(
-            params=state.field.params,
+            params=state.field.data,
             optimizers=state.optimizers,
             state=state.densification,
             step=state.schedule_step,

@@ -10,7 +10,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import Parameter
 
-from sundae_ns.gaussians.sh_folding import fold, view_dependence
+from sundae_ns.gaussians.sh_folding import fold_harmonics, view_dependence
 from sundae_ns.gaussians.snapshot import narrow
 from sundae_ns.training.budget.search import NO_IMAGE
 from sundae_ns.training.budget.searched_field import SearchedField
@@ -71,7 +71,7 @@ def lower_degree(searched: SearchedField, degree: int) -> None:
     field = searched.field
     dc, rest = field["features_dc"], field["features_rest"]
     mean, _ = searched.mean_basis(field.sh_degree)
-    dc.data.copy_(fold(dc.data, rest.data, mean, degree)[0])
+    dc.data.copy_(fold_harmonics(dc.data, rest.data, mean, degree)[0])
     narrow(field, searched.state.optimizers, "features_rest", (degree + 1) ** 2 - 1)
 
 
@@ -89,7 +89,7 @@ def flatten(searched: SearchedField, least: float) -> Tensor:
     weight = searched.contribution()
     mean, square = searched.mean_basis(field.sh_degree)
     order = view_dependence(rest.data, mean, square, weight).cpu().argsort(stable=True).to(rest.device)
-    folded, _ = fold(dc.data, rest.data, mean, 0)
+    folded, _ = fold_harmonics(dc.data, rest.data, mean, 0)
 
     def flattened(count: int) -> tuple[Tensor, Tensor, Tensor]:
         flat = torch.zeros(len(order), dtype=torch.bool, device=rest.device)
