@@ -14,8 +14,7 @@ from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import virtual_views
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import finite_mask
-from sundae_ns.pruning import PruneRule, kept_count
-from sundae_ns.pruning import prune as prune_field
+from sundae_ns.pruning import PruneRule, kept_count, prune_field
 from sundae_ns.rendering import LocalField, TrainingView, View, contribution
 
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.gaussians.surgery import change_parameter, moments_of
 
 MAX_COPIES = 51

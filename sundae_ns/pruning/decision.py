@@ -51,7 +51,7 @@ class Pruned(NamedTuple):
 
 
 @torch.no_grad()
-def prune(
+def prune_field(
     field: Mapping[str, Tensor],
     rule: PruneRule,
     count: int,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.covariance import rotation_matrices
 
 BLUR = 0.3
 """Variance in square pixels added to each footprint."""

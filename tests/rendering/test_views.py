@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.cameras.cameras import Cameras
 
-from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rendering.views import view_of
 
 
