@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from rich.console import Console
 from torch import Tensor
 
 from sundae_ns.api.scene import Scene
@@ -84,11 +83,16 @@ def prune_with_mask(
     rule = rule or PruneRule()
     finite = finite_mask(scene.field)
     field = scene.field if bool(finite.all()) else scene.field.rows(finite)
-    if count is None:
-        count = kept_count(keep or 1.0, len(field["means"]))
+    if keep is not None:
+        count = kept_count(keep, field.num_primitives)
+    assert count is not None
 
-    weights = None
-    if rule.uses_contribution and count < len(field["means"]):
+    weights = console = None
+    if progress:
+        from rich.console import Console
+
+        console = Console(stderr=True)
+    if rule.uses_contribution and count < field.num_primitives:
         usable = dataclasses.replace(scene, field=field)
         seen = views if views is not None else scene.views or virtual_views(usable)
         weights = contribution(
@@ -97,7 +101,7 @@ def prune_with_mask(
             scene.background,
             scene.settings(head=False),
             count=count if rule.uses_detail else None,
-            console=Console(stderr=True) if progress else None,
+            console=console,
         )
     pruned = prune_field(field, rule, count, weights)
     mask = finite.clone()

@@ -1,9 +1,9 @@
-"""What errors of a pack do to images, so that bits go where they are seen.
+"""Effect of quantisation errors on images, which decides where a pack spends its bits.
 
 A camera sees a primitive from few directions, so some combinations of harmonics hardly show. Weights of the head differ
 more: those of its finest level act on 64 times as many pixels as those of its coarsest. Derivatives of all pixels are
-too many; with random signs r of the pixels, the mean square of the derivative of sum(r * image) is the sum of the squared
-derivatives (Hutchinson, 1990). Views and signs are fixed, so that a run packs alike each time.
+too many. With random signs r of the pixels, the mean square of the derivative of sum(r * image) is the sum of the
+squared derivatives (Hutchinson, 1990). Views and signs are fixed, so that a run packs alike each time.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def sensitivity_of(scene: Scene, views: Sequence[View]) -> Sensitivity:
 
 
 def _of_harmonics(means: Tensor, views: Sequence[View], degree: int) -> Tensor:
-    """Mean product of each pair of basis functions of degrees 1 and up, over the views that see a primitive ``[K, K]``."""
+    """Sum of the products of basis functions of degrees 1 and up, over views and the primitives they see ``[K, K]``."""
     chosen = means[:: -(-len(means) // _PRIMITIVES)]
     total = torch.zeros((degree + 1) ** 2 - 1, (degree + 1) ** 2 - 1, dtype=torch.float64)
     for view in views:

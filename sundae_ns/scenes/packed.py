@@ -27,7 +27,7 @@ from nerfstudio.models.splatfacto import SplatfactoModelConfig
 from torch import Tensor
 
 from sundae_ns.api.opening import FRAME_FILE, load
-from sundae_ns.api.packing import cameras_of, contents_of, refusal, scene_of
+from sundae_ns.api.packing import contents_of, refusal, scene_of, stored_cameras
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import is_frame, is_number
 from sundae_ns.compensation import HeadConfig
@@ -287,7 +287,7 @@ def _capture(stated: Any) -> tuple[DataParserConfig, float]:
 
 def _transforms(packed: PackedScene) -> dict[str, Any]:
     """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
-    cameras = cameras_of(packed)
+    cameras = stored_cameras(packed)
     frames = []
     for i, pose in enumerate(cameras["poses"].double().tolist()):
         fx, fy, cx, cy = cameras["intrinsics"][i].tolist()
