@@ -18,7 +18,7 @@ from sundae_ns.api.scene import Scene
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering import LocalField, View
-from sundae_ns.rendering.render import render
+from sundae_ns.rendering.render import render_view
 from sundae_ns.storage.packing import Sensitivity
 
 _VIEWS = 8
@@ -75,7 +75,7 @@ def _of_head(scene: Scene, views: Sequence[View]) -> tuple[Tensor, dict[str, Ten
         view = views[i]
         if view.width * view.height > _PIXELS:
             view = view.zoomed((_PIXELS / (view.width * view.height)) ** 0.5)
-        image = render(source, view, scene.background, settings, depth=False)[0]["rgb"]
+        image = render_view(source, view, scene.background, settings, depth=False)[0]["rgb"]
         random = torch.randint(0, 2, image.shape, generator=signs) * 2.0 - 1
         of_features, *grads = torch.autograd.grad((image * random).sum(), [features, *weights.values()])
         form += of_features.double().T @ of_features.double()

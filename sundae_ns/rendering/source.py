@@ -1,6 +1,6 @@
 """Where a view gets its primitives from: the field of this process, or shards on several GPUs.
 
-:func:`sundae_ns.rendering.render.render` takes a :class:`FieldSource`. Only the place that makes the source knows how
+:func:`sundae_ns.rendering.render_view` takes a :class:`FieldSource`. Only the place that makes the source knows how
 many processes hold the field.
 """
 

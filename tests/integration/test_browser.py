@@ -24,7 +24,7 @@ from torch import Tensor
 from viser import transforms
 
 from sundae_ns.pruning import kept_count, prune_field
-from sundae_ns.rendering import LocalField, render
+from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.viewer import previewed_rule
 
 pytestmark = [pytest.mark.browser, needs_chromium]
@@ -141,7 +141,7 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
     assert pruned.decision.values is not None
     settings = model.render_settings(training=False).without_head()
     with torch.no_grad():
-        preview, _ = render(
+        preview, _ = render_view(
             LocalField(pruned.field), model.view_of(camera_of(page)), expected["background"][0, 0], settings
         )
     previewed = scene(page)

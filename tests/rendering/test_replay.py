@@ -21,7 +21,7 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.cuda_graphs import RECORD_AT
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization import Capacity, RecordableGsplat
-from sundae_ns.rendering import FieldSource, FrameReplay, LocalField, RenderSettings, View, render, replay
+from sundae_ns.rendering import FieldSource, FrameReplay, LocalField, RenderSettings, View, render_view, replay
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -51,7 +51,7 @@ class Recorder:
         shown = {}
 
         def show(view: View, background: Tensor) -> dict[str, Tensor]:
-            shown.update(render(source, view, background, settings, depth=False)[0])
+            shown.update(render_view(source, view, background, settings, depth=False)[0])
             return {name: shown[name] for name in replay.REPLAYED}
 
         return SimpleNamespace(show=show, capacity=capacity or 120)
@@ -292,9 +292,9 @@ def test_shorter_lists_make_the_same_picture(build: Build, camera: MakeCamera, s
     model.gauss_params["scales"] += 2 * torch.randn_like(model.gauss_params["scales"])
     view, background = model.view_of(camera(width=size[0], height=size[1])), torch.zeros(3, device="cuda")
     settings = model.render_settings(training=False)
-    theirs = render(model.source, view, background, settings)[0]
+    theirs = render_view(model.source, view, background, settings)[0]
     capacity = Capacity()
-    ours = render(model.source, view, background, replace(settings, backend=RecordableGsplat(capacity)))[0]
+    ours = render_view(model.source, view, background, replace(settings, backend=RecordableGsplat(capacity)))[0]
     assert int(capacity.needed[0]) > 0
     for name in ("depth", "accumulation"):
         assert torch.equal(ours[name], theirs[name])
