@@ -60,17 +60,17 @@ def prune(
     >>> sn.prune(scene, keep=0.1, views=sn.virtual_views(scene, 4, size=32)).num_primitives
     20
     """
-    return prune_with_mask(scene, keep=keep, count=count, views=views, rule=rule, progress=progress).scene
+    return prune_with_mask(scene, keep, count, views, rule, progress=progress).scene
 
 
 @torch.no_grad()
 def prune_with_mask(
     scene: Scene,
-    *,
     keep: float | None,
     count: int | None,
     views: Sequence[View] | None,
     rule: PruneRule | None,
+    *,
     progress: bool,
 ) -> PrunedScene:
     """As :func:`prune`, with the mask of the kept primitives."""

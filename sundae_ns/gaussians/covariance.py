@@ -47,15 +47,8 @@ def quaternions(matrices: Tensor) -> Tensor:
     xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
     w, x, y, z = squares.unbind(dim=1)
     # Row i is 4 q_i q.
-    products = torch.stack(
-        [
-            torch.stack([w, wx, wy, wz], dim=1),
-            torch.stack([wx, x, xy, xz], dim=1),
-            torch.stack([wy, xy, y, yz], dim=1),
-            torch.stack([wz, xz, yz, z], dim=1),
-        ],
-        dim=1,
-    )
+    rows = (w, wx, wy, wz), (wx, x, xy, xz), (wy, xy, y, yz), (wz, xz, yz, z)
+    products = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
     largest = squares.argmax(dim=1)
     chosen = products[torch.arange(len(m), device=m.device), largest]
     return chosen / torch.linalg.vector_norm(chosen, dim=1, keepdim=True)

@@ -6,13 +6,13 @@ are grouped first, the tree is built and searched once per position, and groups 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-
-from sundae_ns.graphs.threads import for_each
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -80,8 +80,20 @@ def nearest(coordinates: Floats, k: int, dtype: DTypeLike) -> tuple[Ints, Floats
             _write(indices, distances, positions, *settled)
 
     # In the order of the tree, consecutive queries find their part of it in the cache; in the order of a field rarely.
-    for_each(search, _parts(tree.indices, k + 2))
+    parts, threads = _parts(tree.indices, k + 2), cores()
+    if threads > 1 and len(parts) > 1:
+        # numpy and scipy release the interpreter's lock while they compute.
+        with ThreadPoolExecutor(min(threads, len(parts))) as pool:
+            list(pool.map(search, parts))
+    else:
+        for part in parts:
+            search(part)
     return indices, distances
+
+
+def cores() -> int:
+    """Number of cores that this process may use; follows ``taskset``, not ``OMP_NUM_THREADS``."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _distinct(coordinates: Floats) -> _Positions:

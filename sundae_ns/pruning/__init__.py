@@ -1,7 +1,7 @@
 """Pruning: signals, scores, exact selection and merging. Knows no schedule.
 
-:func:`prune_field` takes a field, a :class:`PruneRule` and a count, and returns a new field; :func:`decide` returns the mask
-alone. :class:`sundae_ns.pruning.cutting.FieldPruner` applies the same decision to a field in training.
+:func:`prune_field` takes a field, a :class:`PruneRule` and a count, and returns a new field; :func:`decide` returns the
+mask alone. :class:`sundae_ns.pruning.cutting.FieldPruner` applies the same decision to a field in training.
 """
 
 from sundae_ns.pruning.decision import Decision, Pruned, decide, prune_field

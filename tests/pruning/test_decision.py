@@ -14,8 +14,7 @@ from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.parameters import rgb_to_sh
 from sundae_ns.pruning import PruneRule, decide, prune_field, response
-from sundae_ns.pruning.scores import score
-from sundae_ns.pruning.scores import attribute_signal
+from sundae_ns.pruning.scores import attribute_signal, score
 
 PLAIN = PruneRule(selection="sampled", score="response-contribution", edges="centres", redistribution="none")
 """Response times contribution and independent draws, without the additions of the default rule."""
