@@ -28,8 +28,7 @@ from sundae_ns.evaluation import Lpips, psnr, ssim
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.rasterization import Backend, select_backend
 from sundae_ns.rendering.contribution import contribution
-from sundae_ns.rendering.lazy import Later, LazyOutputs
-from sundae_ns.rendering.outputs import ShownResponse, empty_outputs, late_outputs
+from sundae_ns.rendering.outputs import Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
 from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings
 from sundae_ns.rendering.replay import FrameReplay
 from sundae_ns.rendering.source import FieldSource, LocalField, StepResolution

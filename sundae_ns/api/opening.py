@@ -88,7 +88,11 @@ def _of_run(path: Path) -> Scene:
     head = _head_of(state, options, source) if enabled else None
     if head is not None:
         field[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
-    field["features_rest"] = field["features_rest"][:, : (_trained_degree(field, options, loaded) + 1) ** 2 - 1]
+    degree, interval = field.sh_degree, options.get("sh_degree_interval")
+    if options.get("warm_start") is None and isinstance(interval, int):
+        # Coefficients of degrees that training has not reached are not in use.
+        degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))
+    field["features_rest"] = field["features_rest"][:, : (degree + 1) ** 2 - 1]
     frame = _frame_of(config.parent)
     return Scene(
         field,
@@ -99,14 +103,6 @@ def _of_run(path: Path) -> Scene:
         in_model_frame=True,
         meta={"source": {"step": int(loaded["step"])}, **({} if frame is None else {"frame": frame})},
     )
-
-
-def _trained_degree(field: Field, options: Mapping[str, Any], loaded: Mapping[str, Any]) -> int:
-    """Highest SH degree that training has reached."""
-    interval = options.get("sh_degree_interval")
-    if options.get("warm_start") is not None or not isinstance(interval, int):
-        return field.sh_degree
-    return degree_in_use(field.sh_degree, int(loaded["step"]) // max(interval, 1))
 
 
 def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path) -> CompensationHead | None:

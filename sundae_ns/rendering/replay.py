@@ -46,7 +46,7 @@ class _Frame:
 
 
 class FrameReplay:
-    """Recorded frames of one field. They are made when first needed and dropped when the field changes."""
+    """Replays recorded frames of one field, which are recorded on demand and dropped when the field changes."""
 
     def __init__(self) -> None:
         self._frames: GraphCache[_Frame] = GraphCache()

@@ -248,7 +248,8 @@ class FullBackend:
 
     def rasterize(self, *_: Any, **__: Any) -> Any:
         raise torch.cuda.OutOfMemoryError(
-            "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 79.10 GiB of which 1 MiB is free."
+            "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 79.10 GiB of which 1 MiB is "
+            "free."
         )
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Cameras as the rasteriser takes them: what a view is, against nerfstudio's own matrices, and against a pose that learns."""
+"""Views against nerfstudio's own matrices, and with a pose that learns."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from sundae_ns.compensation import HeadConfig
 from sundae_ns.compensation.head import SIZES
 from sundae_ns.gaussians import FEATURES
-from sundae_ns.gaussians.snapshot import narrow
+from sundae_ns.gaussians.surgery import narrow
 from sundae_ns.storage import accounting
 from sundae_ns.training.budget.search import SearchProgress
 from sundae_ns.training.budget.searched_field import SearchedField

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.gaussians.sh_folding import fold_harmonics, view_dependence
-from sundae_ns.gaussians.snapshot import narrow
+from sundae_ns.gaussians.surgery import narrow
 from sundae_ns.training.budget.search import NO_IMAGE
 from sundae_ns.training.budget.searched_field import SearchedField
 
