@@ -42,7 +42,7 @@ def prune(
         scene: to prune; it does not change.
         keep: share of the finite primitives to keep, in (0, 1].
         count: number of primitives to keep, in place of a share; at least 1.
-        views: cameras that say what is seen; by default those stored with the scene, else
+        views: cameras whose images the prune preserves; by default those stored with the scene, else
             :func:`sundae_ns.virtual_views`.
         rule: score, selection and merge; by default those of ``ns-train sundae``.
         progress: show a progress bar on stderr.

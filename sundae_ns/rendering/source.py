@@ -172,3 +172,6 @@ class LocalField(FieldSource):
         if colors:
             primitives["colors"] = colors_from(self.field, self.field, view.center, settings)
         return primitives
+
+    def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
+        """Nothing to prepare."""

@@ -10,8 +10,8 @@ import torch
 
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.graphs import bandwidth as bandwidth_module
-from sundae_ns.graphs.bandwidth import bandwidth, kth_smallest
+from sundae_ns.graphs import graph as graph_module
+from sundae_ns.graphs.graph import bandwidth, kth_smallest
 
 
 def cloud(n: int = 120, seed: int = 0) -> torch.Tensor:
@@ -78,7 +78,7 @@ def test_overrides_replace_the_rule() -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("sampled", [2**16, 256, 1], ids=["all in order", "near a sample", "near a sample of one"])
 def test_kth_smallest_matches_sorting(dtype: torch.dtype, sampled: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bandwidth_module, "SAMPLED", sampled)
+    monkeypatch.setattr(graph_module, "SAMPLED", sampled)
     values = torch.cat([cloud(300).abs().flatten(), torch.zeros(40), torch.tensor([1e-40, 1e-30, 1e30, torch.inf])])
     values = values[torch.randperm(len(values))].to(dtype)
     ordered = values.sort().values.tolist()
@@ -88,7 +88,7 @@ def test_kth_smallest_matches_sorting(dtype: torch.dtype, sampled: int, monkeypa
 
 def test_a_misleading_sample_does_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """All sampled values are 1 and no other value is."""
-    monkeypatch.setattr(bandwidth_module, "SAMPLED", 64)
+    monkeypatch.setattr(graph_module, "SAMPLED", 64)
     values = torch.arange(10_000.0)
     values[torch.randint(10_000, (64,), generator=torch.Generator().manual_seed(0))] = 1.0
     ordered = values.sort().values.tolist()
