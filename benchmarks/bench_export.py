@@ -27,7 +27,7 @@ from torch.nn.functional import avg_pool2d
 
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.field import Field
-from sundae_ns.rendering import LocalField, render
+from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.scenes.opening import Opened, open_scene
 from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage import read_ply
@@ -57,7 +57,7 @@ def images_of(run: Opened, field: Mapping[str, Tensor], views: list[int], downsc
     made = []
     for i in track(views, description=text, transient=True):
         view = model.view_of(run.cameras[i], downscale)
-        made.append(render(LocalField(Field(dict(field))), view, background, settings, depth=False)[0]["base_rgb"])
+        made.append(render_view(LocalField(Field(dict(field))), view, background, settings, depth=False)[0]["base_rgb"])
     return made
 
 

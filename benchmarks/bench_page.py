@@ -30,7 +30,7 @@ from browser import WEBGPU, Browser, find_chromium, wait_for
 from nerfstudio.cameras.cameras import Cameras
 from numpy.typing import NDArray
 
-from sundae_ns.api.packing import cameras_of, scene_of
+from sundae_ns.api.packing import scene_of, stored_cameras
 from sundae_ns.api.page import write_page
 from sundae_ns.scenes.packed import model_of
 from sundae_ns.storage.packing import PackedScene, container, read_scene
@@ -46,7 +46,7 @@ WEB = Path(__file__).parents[1] / "web"
 
 def scaled(scene: PackedScene, side: int) -> PackedScene:
     """The scene with six of its cameras, no larger than ``side``, as if the head had been trained at that size."""
-    cameras = cameras_of(scene)
+    cameras = stored_cameras(scene)
     picks = torch.linspace(0, len(cameras["poses"]) - 1, CAMERAS).round().long().unique()
     cameras = {name: value[picks].clone() for name, value in cameras.items()}
     sizes = (cameras["sizes"] * min(side / int(cameras["sizes"].max()), 1.0)).round().clamp_min(1)
@@ -75,7 +75,7 @@ def write_scaled(out: Path, scene: Path, side: int) -> PackedScene:
 
 def truths(scene: PackedScene) -> list[dict[str, NDArray[np.float32]]]:
     """``rgb`` and ``base_rgb`` of each camera, by Python."""
-    model, cameras = model_of(scene_of(scene)), cameras_of(scene)
+    model, cameras = model_of(scene_of(scene)), stored_cameras(scene)
     images = []
     for pose, lens, size in zip(*(cameras[name] for name in ("poses", "intrinsics", "sizes")), strict=True):
         fx, fy, cx, cy = lens.float().reshape(4, 1, 1)
@@ -114,7 +114,7 @@ def compared(scene: Path, side: int = SIDE, *, half: bool = False) -> dict[str, 
         small = write_scaled(packed, scene, side)
         write_page(html, scene_of(small), packed.read_bytes(), title=scene.stem)
         images = truths(small)
-        width, height = (int(length) for length in cameras_of(small)["sizes"][0])
+        width, height = (int(length) for length in stored_cameras(small)["sizes"][0])
         row: dict[str, Any] = {"scene": scene.name, "bytes": scene.stat().st_size, "size": f"{width}x{height}"}
         row |= {"primitives": len(small.field["means"]), "head": bool(small.head)}
         with Browser(chromium, width, height, WEBGPU) as page:
@@ -168,7 +168,7 @@ def half_images(packed: Path) -> tuple[str, list[NDArray[np.float64]]] | None:
         adapter = json.loads(found.stdout.splitlines()[-1])
         if adapter is None:
             return None
-        sizes = cameras_of(read_scene(packed))["sizes"].tolist()
+        sizes = stored_cameras(read_scene(packed))["sizes"].tolist()
         files = [np.fromfile(f"{copy}.{i}", np.uint8) for i in range(len(sizes))]
         pixels = [file.reshape(height, width, 4) for file, (width, height) in zip(files, sizes, strict=True)]
         return adapter, [each[..., :3] / 255 for each in pixels]

@@ -32,7 +32,7 @@ from bench_page import SECONDS, SIDE, bundled, has_packages, psnr, scaled, truth
 from browser import Browser, find_chromium, wait_for
 from numpy.typing import NDArray
 
-from sundae_ns.api.packing import cameras_of
+from sundae_ns.api.packing import stored_cameras
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.storage.packing import PackedScene, read_scene
 from sundae_ns.storage.viewers import write_for_viewers
@@ -82,7 +82,7 @@ def base_colors(scene: PackedScene) -> PackedScene:
 def central(scene: PackedScene) -> PackedScene:
     """The scene with the primitives whose centres lie in the images of all cameras."""
     keep = torch.ones(len(scene.field["means"]), dtype=torch.bool)
-    cameras = cameras_of(scene)
+    cameras = stored_cameras(scene)
     for pose, lens, size in zip(*(cameras[name].float() for name in ("poses", "intrinsics", "sizes")), strict=True):
         x, y, z = ((scene.field["means"] - pose[:, 3]) @ pose[:, :3]).T
         u, v = lens[0] * x / -z + lens[2], lens[3] - lens[1] * y / -z
@@ -100,7 +100,7 @@ class Viewers:
 
     def __init__(self, page: Browser, scene: PackedScene, file: str) -> None:
         self._page, self._file = page, file
-        cameras = cameras_of(scene)
+        cameras = stored_cameras(scene)
         names = ("fx", "fy", "cx", "cy", "width", "height")
         self._sizes = cameras["sizes"].tolist()
         self._cameras = [
@@ -131,7 +131,7 @@ def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
     if chromium is None or not has_packages():
         sys.exit("no Chromium or no viewers here: apt-get install chromium, then make browser")
     model = scene.meta["model"]
-    width, height = (int(side) for side in cameras_of(scene)["sizes"][0])
+    width, height = (int(side) for side in stored_cameras(scene)["sizes"][0])
     with TemporaryDirectory() as folder:
         site = Path(folder)
         (site / "index.html").write_text(PAGE)

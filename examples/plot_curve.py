@@ -24,8 +24,8 @@ SHARES = (0.05, 0.1, 0.2, 0.4, 0.7)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help=".ply, .spz, .sog, .sundae, or a run of ns-train")
-    parser.add_argument("out", type=Path, help="picture to write")
-    parser.add_argument("--views", type=int, default=64, help="virtual cameras that say what is seen")
+    parser.add_argument("out", type=Path, help="image to write")
+    parser.add_argument("--views", type=int, default=64, help="number of virtual cameras")
     options = parser.parse_args()
 
     scene = sn.load(options.scene, device="cuda" if torch.cuda.is_available() else "cpu")

@@ -20,7 +20,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path, help=".ply, .spz, .sog, .sundae, or a run of ns-train")
     parser.add_argument("out", type=Path, help="file to write")
     parser.add_argument("--keep", type=float, default=0.25, help="share of the primitives to keep")
-    parser.add_argument("--views", type=int, default=128, help="virtual cameras that say what is seen")
+    parser.add_argument("--views", type=int, default=128, help="number of virtual cameras")
     options = parser.parse_args()
 
     scene = sn.load(options.scene, device="cuda" if torch.cuda.is_available() else "cpu")

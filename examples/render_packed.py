@@ -1,6 +1,6 @@
-"""Render a packed scene to a picture: with its head, without it, and what the head changes.
+"""Render a packed scene with its head, without it, and the difference of both, side by side.
 
-python examples/render_packed.py scene.sundae picture.png --view 0
+python examples/render_packed.py scene.sundae image.png --view 0
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import sundae_ns as sn
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="file of sundae pack")
-    parser.add_argument("out", type=Path, help="picture to write")
+    parser.add_argument("out", type=Path, help="image to write")
     parser.add_argument("--view", type=int, default=0, help="index of a camera stored with the scene")
     options = parser.parse_args()
 

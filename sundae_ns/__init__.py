@@ -19,16 +19,19 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sundae_ns.api.measuring import Quality, measure
-    from sundae_ns.api.opening import load
-    from sundae_ns.api.pruning import prune
-    from sundae_ns.api.rendering import Rendering, render
-    from sundae_ns.api.saving import save
-    from sundae_ns.api.scene import Scene
-    from sundae_ns.api.views import views_of, virtual_views
-    from sundae_ns.errors import SundaeError
-    from sundae_ns.pruning import PruneRule
-    from sundae_ns.rendering.views import View
+    from sundae_ns.api.measuring import Quality as Quality
+    from sundae_ns.api.measuring import measure as measure
+    from sundae_ns.api.opening import load as load
+    from sundae_ns.api.pruning import prune as prune
+    from sundae_ns.api.rendering import Rendering as Rendering
+    from sundae_ns.api.rendering import render as render
+    from sundae_ns.api.saving import save as save
+    from sundae_ns.api.scene import Scene as Scene
+    from sundae_ns.api.views import views_of as views_of
+    from sundae_ns.api.views import virtual_views as virtual_views
+    from sundae_ns.errors import SundaeError as SundaeError
+    from sundae_ns.pruning import PruneRule as PruneRule
+    from sundae_ns.rendering.views import View as View
 
 __version__ = "0.1.0"
 
@@ -49,21 +52,7 @@ _HOMES = {
 }
 """Public names and the modules that hold them."""
 
-__all__ = [
-    "PruneRule",
-    "Quality",
-    "Rendering",
-    "Scene",
-    "SundaeError",
-    "View",
-    "load",
-    "measure",
-    "prune",
-    "render",
-    "save",
-    "views_of",
-    "virtual_views",
-]
+__all__ = [*_HOMES]  # noqa: PLE0604
 
 
 def __getattr__(name: str) -> Any:

@@ -28,8 +28,7 @@ from sundae_ns.evaluation import Lpips, psnr, ssim
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.rasterization import Backend, select_backend
 from sundae_ns.rendering.contribution import contribution
-from sundae_ns.rendering.lazy import Later, LazyOutputs
-from sundae_ns.rendering.outputs import ShownResponse, empty_outputs, late_outputs
+from sundae_ns.rendering.outputs import Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
 from sundae_ns.rendering.render import SHOWN_BACKGROUNDS, RenderSettings
 from sundae_ns.rendering.replay import FrameReplay
 from sundae_ns.rendering.source import FieldSource, LocalField, StepResolution
@@ -105,7 +104,7 @@ class SundaeModel(SplatfactoModel):
         config = self.config
         frame = (self.kwargs.get("metadata") or {}).get(DATASET_FRAME)
         self.state, self.extensions, self._start = build(config, self.num_train_data, self.seed_points, frame)
-        self.gauss_params, self.networks = cast(Any, self.state.field.params), self.state.networks
+        self.gauss_params, self.networks = cast(Any, self.state.field.data), self.state.networks
         self.source = LocalField(self.state.field)
         self.camera_optimizer = config.camera_optimizer.setup(num_cameras=self.num_train_data, device="cpu")
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)

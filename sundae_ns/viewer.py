@@ -23,7 +23,7 @@ from sundae_ns.compensation import PHASES
 from sundae_ns.errors import ConfigError, SundaeError, one_line
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning import Pruned, PruneRule, band_rule, field_graph, kept_count, prune
+from sundae_ns.pruning import Pruned, PruneRule, band_rule, field_graph, kept_count, prune_field
 from sundae_ns.rendering.outputs import FieldKey
 from sundae_ns.rendering.source import FieldSource, LocalField
 from sundae_ns.training.field_state import FieldState
@@ -192,7 +192,7 @@ class ViewerControls(torch.nn.Module):
             self._graphs[rule.edges] = field_graph(field.rows(finite), rule)
         needed = rule.uses_contribution and count < n
         weights = self._contribution_of(count if rule.uses_detail else None) if needed else None
-        return prune(field, rule, count, weights, self._graphs.get(rule.edges))
+        return prune_field(field, rule, count, weights, self._graphs.get(rule.edges))
 
     def _contribution_of(self, count: int | None) -> Tensor:
         if self._contribution is None or self._contribution[0] != count:

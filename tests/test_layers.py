@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
@@ -14,31 +15,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "sundae_ns"
-FLOORS = (
-    "errors",
-    "gpu",
-    "data",
-    "graphs",
-    "filters",
-    "gaussians",
-    "rasterization",
-    "compensation",
-    "evaluation",
-    "pruning",
-    "storage",
-    "rendering",
-    "api",
-    "training",
-    "distributed",
-    "datamanager",
-    "viewer",
-    "callbacks",
-    "model",
-    "trainer",
-    "scenes",
-    "method_configs",
-    "cli",
-)
+TABLE = re.findall(r"^\| *([\d to]+) \| (`[^|]+) \|", (ROOT / "docs" / "architecture.md").read_text(), re.MULTILINE)
+"""Floors and rooms of the table in docs/architecture.md, which alone states them."""
+FLOORS = tuple(room for _, rooms in TABLE for room in re.findall(r"`(\w+)`", rooms))
 """Rooms from the lowest floor up; each has a floor of its own."""
 SHELL = ("model", "trainer")
 """Only rooms above may know these."""
@@ -123,6 +102,17 @@ def circles(edges: dict[str, set[str]]) -> list[str]:
 def test_every_room_has_a_floor() -> None:
     rooms = {room for room, _ in sources()}
     assert rooms == set(FLOORS)
+
+
+def test_the_table_counts_its_floors() -> None:
+    """A row of several rooms states its first and its last floor."""
+    counted: list[int] = []
+    for stated, rooms in TABLE:
+        first, *last = map(int, stated.split(" to "))
+        assert first == len(counted)
+        counted += [first] * rooms.count("`,") + [last[-1] if last else first]
+        assert counted[-1] == len(counted) - 1
+    assert len(counted) == len(FLOORS) == len(set(FLOORS))
 
 
 def test_few_modules_stand_beside_the_folders() -> None:

@@ -24,7 +24,7 @@ from sundae_ns.compensation import HeadConfig
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.pruning import PruneRule, response
 from sundae_ns.pruning.cutting import FieldPruner
-from sundae_ns.rendering import LocalField, render
+from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import PruningSchedule
@@ -162,7 +162,7 @@ def test_what_is_shown_is_what_the_prune_leaves(options: dict[str, Any]) -> None
     assert all(torch.equal(value, preview.field[name]) for name, value in model.state.field.items())
     # A merge and growth show in the picture too.
     settings = model.render_settings(training=False).without_head()
-    left, _ = render(model.source, model.view_of(camera()), seen["background"][0, 0], settings)
+    left, _ = render_view(model.source, model.view_of(camera()), seen["background"][0, 0], settings)
     assert torch.equal(seen["rgb"], left["rgb"])
 
 
@@ -199,7 +199,7 @@ def test_a_crop_box_cuts_the_preview_too() -> None:
     rows = half.within(model.means).squeeze(-1)[preview.decision.mask]
     assert 0 < int(rows.sum()) < len(rows)
     settings = model.render_settings(training=False).without_head()
-    expected, _ = render(
+    expected, _ = render_view(
         LocalField(preview.field.rows(rows)), model.view_of(camera()), seen["background"][0, 0], settings
     )
     assert torch.equal(seen["rgb"], expected["rgb"])

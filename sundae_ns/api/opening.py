@@ -36,8 +36,8 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     """Open a finished scene. Nothing in its files is executed, and nerfstudio is not needed.
 
     Args:
-        path: a ``.ply``, ``.spz`` or ``.sog`` of any program, a packed ``.sundae``, or a run of ``ns-train`` with sundae
-            or splatfacto: its folder, its ``config.yml`` or one of its checkpoints.
+        path: a ``.ply``, ``.spz`` or ``.sog`` of any program, a packed ``.sundae``, or a run of ``ns-train`` with
+            sundae or splatfacto: its folder, its ``config.yml`` or one of its checkpoints.
         device: of the scene.
 
     Raises:
@@ -58,20 +58,17 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
         from sundae_ns.storage.packing import read_scene
 
         return scene_of(read_scene(path)).to(device)
+    in_model_frame = False
     if kind == "ply" or suffix == ".ply":
-        params = read_ply(path)
-        antialiased, in_model_frame = ANTIALIASED in ply_comments(path), is_nerfstudio_ply(path)
-        return _of_file(path, params, antialiased, in_model_frame).to(device)
-    if kind in ("spz", "sog") or suffix in (".spz", ".sog"):
+        params, antialiased = read_ply(path), ANTIALIASED in ply_comments(path)
+        in_model_frame = is_nerfstudio_ply(path)
+    elif kind in ("spz", "sog") or suffix in (".spz", ".sog"):
         params, antialiased = (read_spz if kind == "spz" or suffix == ".spz" else read_sog)(path)
-        return _of_file(path, params, antialiased).to(device)
-    return _of_run(path).to(device)
-
-
-def _of_file(path: Path, params: dict[str, Tensor], antialiased: bool, in_model_frame: bool = False) -> Scene:
+    else:
+        return _of_run(path).to(device)
     if not finite_mask(params).any():
         raise DataError(f"{path} has {len(params['means']):,} primitives, and none is finite; export it again")
-    return Scene(Field(params), antialiased=antialiased, in_model_frame=in_model_frame)
+    return Scene(Field(params), antialiased=antialiased, in_model_frame=in_model_frame).to(device)
 
 
 def _of_run(path: Path) -> Scene:
@@ -85,11 +82,17 @@ def _of_run(path: Path) -> Scene:
     field, state = checkpoint.field_of(loaded, source), checkpoint.model_state(loaded)
     extra = state.get(checkpoint.EXTRA_STATE)
     extra = extra if isinstance(extra, Mapping) else {}
-    head = _head_of(state, options, source) if _uses_head(extra) else None
+    focal = extra.get("trained_focal")
+    # Earlier versions did not state whether the head is enabled, but only what it was trained on.
+    enabled = extra.get("head_enabled", focal is not None)
+    head = _head_of(state, options, source) if enabled else None
     if head is not None:
         field[FEATURES] = state[f"gauss_params.{FEATURES}"].float()
-    field["features_rest"] = field["features_rest"][:, : (_trained_degree(field, options, loaded) + 1) ** 2 - 1]
-    focal = extra.get("trained_focal")
+    degree, interval = field.sh_degree, options.get("sh_degree_interval")
+    if options.get("warm_start") is None and isinstance(interval, int):
+        # Coefficients of degrees that training has not reached are not in use.
+        degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))
+    field["features_rest"] = field["features_rest"][:, : (degree + 1) ** 2 - 1]
     frame = _frame_of(config.parent)
     return Scene(
         field,
@@ -102,21 +105,8 @@ def _of_run(path: Path) -> Scene:
     )
 
 
-def _uses_head(extra: Mapping[str, Any]) -> bool:
-    """Whether images of a checkpoint get a correction; earlier versions did not say, but noted what it trained on."""
-    return bool(extra.get("head_enabled", extra.get("trained_focal") is not None))
-
-
-def _trained_degree(field: Field, options: Mapping[str, Any], loaded: Mapping[str, Any]) -> int:
-    """Highest SH degree that training has reached."""
-    interval = options.get("sh_degree_interval")
-    if options.get("warm_start") is not None or not isinstance(interval, int):
-        return field.sh_degree
-    return degree_in_use(field.sh_degree, int(loaded["step"]) // max(interval, 1))
-
-
 def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path) -> CompensationHead | None:
-    """The head of a checkpoint. Its size is that of its weights, because training may choose another than it was given.
+    """The head of a checkpoint. Its size is that of its weights, because training may choose another than configured.
 
     Raises:
         CheckpointError: its weights fit no known size.
@@ -125,8 +115,7 @@ def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path)
     features = state.get(f"gauss_params.{FEATURES}")
     if not weights or not isinstance(features, Tensor):
         return None
-    known = options.get("head")
-    known = known if isinstance(known, dict) else {}
+    known = options["head"] if isinstance(options.get("head"), dict) else {}
     fields = {name: known[name] for name in ("pixel_unshuffle", "precision", "phases", "fused") if name in known}
     mode = "features" if known.get("mode") == "features" else "residual"
     shapes = {name: value.shape for name, value in weights.items()}

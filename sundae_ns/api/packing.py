@@ -15,13 +15,26 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import PackError, SundaeError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians.parameters import MAX_SH_DEGREE
 from sundae_ns.rendering.views import View
 from sundae_ns.storage.packing import PackedScene
 
-HEAD_OPTIONS = ("mode", "size", "pixel_unshuffle", "num_features", "precision")
-"""Options of a head that a packed scene states."""
-_MOST_UNSHUFFLE = 8
+_KINDS = get_type_hints(HeadConfig)
+_HEAD_VALUES: dict[str, Sequence[Any]] = {
+    "mode": get_args(_KINDS["mode"]),
+    "size": get_args(_KINDS["size"]),
+    "pixel_unshuffle": range(1, 9),
+    "num_features": range(1, 257),
+    "precision": get_args(_KINDS["precision"]),
+}
+"""Options of a head that a packed scene states, and their values."""
 _RASTERIZE_MODES = ("classic", "antialiased")
+_MODEL_VALUES: dict[str, Sequence[Any]] = {
+    "sh_degree": range(MAX_SH_DEGREE + 1),
+    "background_color": get_args(Background),
+    "rasterize_mode": _RASTERIZE_MODES,
+}
+"""Options of a model that a packed scene states, and their values."""
 _CARRIED = ("source", "frame", "capture")
 """Entries of the header that a scene carries along."""
 
@@ -35,7 +48,7 @@ def scene_of(packed: PackedScene) -> Scene:
     stated = packed.meta.get("model")
     if not isinstance(stated, dict):
         raise refusal("no model")
-    degree = whole(stated, "sh_degree", 0, 4)
+    degree, background, rasterize_mode = _checked(stated, _MODEL_VALUES)
     if packed.field["features_rest"].shape[1] > (degree + 1) ** 2 - 1:
         raise refusal("a lower SH degree than it has")
     meta = {name: packed.meta[name] for name in _CARRIED if packed.meta.get(name) is not None}
@@ -44,9 +57,9 @@ def scene_of(packed: PackedScene) -> Scene:
     source = meta.get("source")
     return Scene(
         Field(dict(packed.field), "logits" if degree == 0 else "harmonics"),
-        _head_of(packed, _head_config(stated.get("head"))),
-        background_color=one_of(stated, "background_color", get_args(Background)),
-        antialiased=one_of(stated, "rasterize_mode", _RASTERIZE_MODES) == "antialiased",
+        _head_of(packed, stated.get("head")),
+        background_color=background,
+        antialiased=rasterize_mode == "antialiased",
         trained_focal=_focal(stated.get("trained_focal")),
         views=views_of_arrays(packed.cameras),
         in_model_frame=not isinstance(source, dict) or source.get("model_frame") is not False,
@@ -67,7 +80,7 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
     field = {name: value.detach() for name, value in scene.field.items() if name != FEATURES or head}
     if cameras is None and scene.views:
         cameras = arrays_of_views(scene.views)
-    options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in HEAD_OPTIONS}
+    options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in _HEAD_VALUES}
     # Degree 0 stands for logits.
     degree = 0 if scene.field.encoding == "logits" else max(scene.field.sh_degree, 1)
     model = {
@@ -85,7 +98,7 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
     )
 
 
-def cameras_of(packed: PackedScene) -> dict[str, Tensor]:
+def stored_cameras(packed: PackedScene) -> dict[str, Tensor]:
     """The stored cameras, as arrays; one in front of the scene if there are none."""
     if packed.cameras is not None and len(packed.cameras["poses"]):
         return packed.cameras
@@ -109,8 +122,13 @@ def arrays_of_views(views: Sequence[View]) -> dict[str, Tensor]:
     }
 
 
-def _head_of(packed: PackedScene, config: HeadConfig) -> CompensationHead | None:
+def _head_of(packed: PackedScene, stated: Any) -> CompensationHead | None:
     features = packed.field[FEATURES].shape[1] if FEATURES in packed.field else 0
+    config = HeadConfig(mode="off")
+    if stated is not None:
+        if not isinstance(stated, dict) or set(stated) != set(_HEAD_VALUES):
+            raise refusal("a head of an unknown kind")
+        config = HeadConfig(**dict(zip(_HEAD_VALUES, _checked(stated, _HEAD_VALUES), strict=True)), start_at=0)
     if config.mode == "off" and not packed.head and features == 0:
         return None
     if features != config.num_features:
@@ -128,37 +146,19 @@ def refusal(reason: str) -> PackError:
     return PackError(f"the packed scene states {reason}; update this program, or pack it again")
 
 
-def one_of(stated: Mapping[str, Any], name: str, known: Sequence[Any]) -> Any:
-    """A stated value that is one of the known ones."""
-    value = stated.get(name)
-    if value not in known:
-        raise refusal(f"a {name} that is none of {', '.join(map(str, known))}")
-    return value
+def _checked(stated: Mapping[str, Any], values: Mapping[str, Sequence[Any]]) -> list[Any]:
+    """The stated options, in the order of ``values``.
 
-
-def whole(stated: Mapping[str, Any], name: str, least: int, most: int) -> int:
-    """A stated whole number from ``least`` to ``most``."""
-    value = stated.get(name)
-    if type(value) is not int or not least <= value <= most:
-        raise refusal(f"a {name} outside of {least} to {most}")
-    return value
-
-
-def _head_config(stated: Any) -> HeadConfig:
-    if stated is None:
-        return HeadConfig(mode="off")
-    if not isinstance(stated, dict) or set(stated) != set(HEAD_OPTIONS):
-        raise refusal("a head of an unknown kind")
-    kinds = get_type_hints(HeadConfig)
-    mode, size, precision = (one_of(stated, name, get_args(kinds[name])) for name in ("mode", "size", "precision"))
-    return HeadConfig(
-        mode=mode,
-        size=size,
-        precision=precision,
-        pixel_unshuffle=whole(stated, "pixel_unshuffle", 1, _MOST_UNSHUFFLE),
-        num_features=whole(stated, "num_features", 1, 256),
-        start_at=0,
-    )
+    Raises:
+        PackError: an option is none of its values.
+    """
+    for name, known in values.items():
+        value = stated.get(name)
+        # By type too: True is 1 and 1.0 is 1 in Python.
+        if type(value) is not type(known[0]) or value not in known:
+            allowed = f"{known[0]} to {known[-1]}" if isinstance(known, range) else ", ".join(known)
+            raise refusal(f"a {name} that is none of {allowed}")
+    return [stated[name] for name in values]
 
 
 def _focal(stated: Any) -> tuple[float, float] | None:

@@ -1,7 +1,7 @@
 """A packed scene as a web page that decodes and renders it, head included.
 
-``page.html`` is built from the TypeScript in ``web/`` by ``make web``. It asks no host for anything: a scene is either in
-the page itself or in a file beside it.
+``page.html`` is built from the TypeScript in ``web/`` by ``make web``. It asks no host for anything: a scene is either
+in the page itself or in a file beside it.
 """
 
 from __future__ import annotations
@@ -28,13 +28,7 @@ _POSTER_QUALITY = 80
 
 
 def page_of(scene: Scene, packed: bytes, *, title: str) -> str:
-    """The page of a scene, as one document without any address.
-
-    Args:
-        scene: for the first image; rendered on its device.
-        packed: the scene as a packed file.
-        title: title of the page.
-    """
+    """The HTML of a page that contains its scene; arguments as for :func:`write_page`."""
     return _filled(scene, title, inline=base64.b64encode(packed).decode())
 
 
@@ -43,7 +37,7 @@ def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
 
     Args:
         path: file with a suffix, or folder without one.
-        scene: for the first image.
+        scene: for the first image; rendered on its device.
         packed: the scene as a packed file.
         title: title of the page.
 

@@ -7,15 +7,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from rich.console import Console
 from torch import Tensor
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import virtual_views
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import finite_mask
-from sundae_ns.pruning import PruneRule, kept_count
-from sundae_ns.pruning import prune as prune_field
+from sundae_ns.pruning import PruneRule, kept_count, prune_field
 from sundae_ns.rendering import LocalField, TrainingView, View, contribution
 
 
@@ -44,7 +42,7 @@ def prune(
         scene: to prune; it does not change.
         keep: share of the finite primitives to keep, in (0, 1].
         count: number of primitives to keep, in place of a share; at least 1.
-        views: cameras that say what is seen; by default those stored with the scene, else
+        views: cameras whose images the prune preserves; by default those stored with the scene, else
             :func:`sundae_ns.virtual_views`.
         rule: score, selection and merge; by default those of ``ns-train sundae``.
         progress: show a progress bar on stderr.
@@ -62,17 +60,17 @@ def prune(
     >>> sn.prune(scene, keep=0.1, views=sn.virtual_views(scene, 4, size=32)).num_primitives
     20
     """
-    return prune_with_mask(scene, keep=keep, count=count, views=views, rule=rule, progress=progress).scene
+    return prune_with_mask(scene, keep, count, views, rule, progress=progress).scene
 
 
 @torch.no_grad()
 def prune_with_mask(
     scene: Scene,
-    *,
     keep: float | None,
     count: int | None,
     views: Sequence[View] | None,
     rule: PruneRule | None,
+    *,
     progress: bool,
 ) -> PrunedScene:
     """As :func:`prune`, with the mask of the kept primitives."""
@@ -85,11 +83,16 @@ def prune_with_mask(
     rule = rule or PruneRule()
     finite = finite_mask(scene.field)
     field = scene.field if bool(finite.all()) else scene.field.rows(finite)
-    if count is None:
-        count = kept_count(keep or 1.0, len(field["means"]))
+    if keep is not None:
+        count = kept_count(keep, field.num_primitives)
+    assert count is not None
 
-    weights = None
-    if rule.uses_contribution and count < len(field["means"]):
+    weights = console = None
+    if progress:
+        from rich.console import Console
+
+        console = Console(stderr=True)
+    if rule.uses_contribution and count < field.num_primitives:
         usable = dataclasses.replace(scene, field=field)
         seen = views if views is not None else scene.views or virtual_views(usable)
         weights = contribution(
@@ -98,7 +101,7 @@ def prune_with_mask(
             scene.background,
             scene.settings(head=False),
             count=count if rule.uses_detail else None,
-            console=Console(stderr=True) if progress else None,
+            console=console,
         )
     pruned = prune_field(field, rule, count, weights)
     mask = finite.clone()

@@ -10,8 +10,7 @@ from torch import Tensor
 from sundae_ns.api.scene import Scene
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.rasterization import BackendName
-from sundae_ns.rendering import LocalField, View
-from sundae_ns.rendering import render as render_source
+from sundae_ns.rendering import LocalField, View, render_view
 
 
 class Rendering(NamedTuple):
@@ -49,5 +48,5 @@ def render(scene: Scene, view: View, *, head: bool = True, backend: BackendName 
     """
     with naming_full_memory(lambda: scene.num_primitives):
         settings = scene.settings(backend, head=head)
-        images, _ = render_source(LocalField(scene.field), view.to(scene.device), scene.background, settings)
+        images, _ = render_view(LocalField(scene.field), view.to(scene.device), scene.background, settings)
     return Rendering(*(images[name] for name in Rendering._fields))

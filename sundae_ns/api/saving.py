@@ -19,8 +19,8 @@ SUFFIXES = (*FORMATS, ".sundae", ".html")
 def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
     """Write a scene in the format of the file's suffix, atomically; an existing file is replaced.
 
-    ``.sundae`` holds everything that a render needs, quantised. ``.html`` is a web page that renders it. ``.ply`` (exact),
-    ``.spz`` and ``.sog`` (quantised) hold base colours only, for other viewers.
+    ``.sundae`` holds everything that a render needs, quantised. ``.html`` is a web page that renders it. ``.ply``
+    (exact), ``.spz`` and ``.sog`` (quantised) hold base colours only, for other viewers.
 
     Args:
         scene: any device.
@@ -59,7 +59,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
 
 
 def packed_file(path: Path) -> tuple[Scene, bytes]:
-    """A scene, and the packed file that holds it: a packed scene as it is, a file of primitives packed by the defaults."""
+    """A scene and the bytes of its packed file; a file that is not packed is packed with default settings."""
     scene = load(path)
     if kind_of(path) == "packed":
         return scene, path.read_bytes()
@@ -74,7 +74,7 @@ def _packed(scene: Scene) -> bytes:
 
 
 def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> ViewerFile:
-    """Write base colours as ``.ply``, ``.spz`` or ``.sog``, and return what was left out or clamped; see :func:`save`."""
+    """Write base colours as ``.ply``, ``.spz`` or ``.sog``; returns what was left out or clamped. See :func:`save`."""
     return write_for_viewers(
         path,
         scene.field,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -89,7 +88,13 @@ class Scene:
         if torch.device(device) == self.device:
             return self
         field = self.field.replaced({name: value.to(device) for name, value in self.field.items()})
-        head = None if self.head is None else copy.deepcopy(self.head).to(device)
+        head = None
+        if self.head is not None:
+            # No deep copy: on a GPU the head keeps recorded CUDA graphs, which cannot be copied.
+            with torch.random.fork_rng(devices=[]):
+                head = CompensationHead(dataclasses.replace(self.head.config))
+            head.load_state_dict(self.head.state_dict())
+            head = head.train(self.head.training).to(device)
         return dataclasses.replace(self, field=field, head=head)
 
     def settings(self, backend: BackendName = "auto", *, head: bool = True) -> RenderSettings:

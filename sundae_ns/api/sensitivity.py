@@ -1,9 +1,9 @@
-"""What errors of a pack do to images, so that bits go where they are seen.
+"""Effect of quantisation errors on images, which decides where a pack spends its bits.
 
 A camera sees a primitive from few directions, so some combinations of harmonics hardly show. Weights of the head differ
 more: those of its finest level act on 64 times as many pixels as those of its coarsest. Derivatives of all pixels are
-too many; with random signs r of the pixels, the mean square of the derivative of sum(r * image) is the sum of the squared
-derivatives (Hutchinson, 1990). Views and signs are fixed, so that a run packs alike each time.
+too many. With random signs r of the pixels, the mean square of the derivative of sum(r * image) is the sum of the
+squared derivatives (Hutchinson, 1990). Views and signs are fixed, so that a run packs alike each time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sundae_ns.api.scene import Scene
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering import LocalField, View
-from sundae_ns.rendering.render import render
+from sundae_ns.rendering.render import render_view
 from sundae_ns.storage.packing import Sensitivity
 
 _VIEWS = 8
@@ -47,7 +47,7 @@ def sensitivity_of(scene: Scene, views: Sequence[View]) -> Sensitivity:
 
 
 def _of_harmonics(means: Tensor, views: Sequence[View], degree: int) -> Tensor:
-    """Mean product of each pair of basis functions of degrees 1 and up, over the views that see a primitive ``[K, K]``."""
+    """Sum of the products of basis functions of degrees 1 and up, over views and the primitives they see ``[K, K]``."""
     chosen = means[:: -(-len(means) // _PRIMITIVES)]
     total = torch.zeros((degree + 1) ** 2 - 1, (degree + 1) ** 2 - 1, dtype=torch.float64)
     for view in views:
@@ -75,7 +75,7 @@ def _of_head(scene: Scene, views: Sequence[View]) -> tuple[Tensor, dict[str, Ten
         view = views[i]
         if view.width * view.height > _PIXELS:
             view = view.zoomed((_PIXELS / (view.width * view.height)) ** 0.5)
-        image = render(source, view, scene.background, settings, depth=False)[0]["rgb"]
+        image = render_view(source, view, scene.background, settings, depth=False)[0]["rgb"]
         random = torch.randint(0, 2, image.shape, generator=signs) * 2.0 - 1
         of_features, *grads = torch.autograd.grad((image * random).sum(), [features, *weights.values()])
         form += of_features.double().T @ of_features.double()

@@ -68,12 +68,12 @@ def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128)
     return [View.look_at(eye, target, fov=_FOV, width=size, height=size) for eye, target in pairs]
 
 
-def view_in_front(scene: Scene, *, width: int = 640, height: int = 480) -> View:
-    """A camera in front of a scene without cameras: it looks along y, with z upwards."""
+def view_in_front(scene: Scene) -> View:
+    """A camera of 640 x 480 pixels for a scene without cameras: it looks along y, with z upwards."""
     means = scene.field["means"].detach().cpu()
     center = means.median(dim=0).values
     away = 3 * float((means - center).norm(dim=1).median().clamp_min(1e-6))
-    return View.look_at(center - torch.tensor([0.0, away, 0.0]), center, fov=_FRONT_FOV, width=width, height=height)
+    return View.look_at(center - torch.tensor([0.0, away, 0.0]), center, fov=_FRONT_FOV)
 
 
 def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:

@@ -27,7 +27,7 @@ class ShardedDensification(Densification):
         shards, running, params = self.shards, state.densification, state.field
         peak, running["peak"] = running["peak"], 0
         self.strategy.step_post_backward(
-            params=state.field.params,
+            params=state.field.data,
             optimizers=state.optimizers,
             state=running,
             step=state.schedule_step,

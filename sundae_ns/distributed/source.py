@@ -136,7 +136,7 @@ def send_statistics(info: Mapping[str, Any], *, absgrad: bool) -> None:
     """Let the statistics for densification travel back with the gradients of a training image.
 
     Args:
-        info: of :func:`sundae_ns.rendering.render`.
+        info: of :func:`sundae_ns.rendering.render_view`.
         absgrad: whether gradients of the projected centres are summed absolutely.
     """
 

@@ -1,7 +1,7 @@
 """The high-pass filter I - A, the low-pass filter I + A, and the magnitude of their response.
 
-The graph shift is the random-walk matrix ``A = D^-1 W``. Its largest eigenvalue is 1, as the paper requires. Its rows sum to
-1, so the high-pass response does not depend on the origin of the signal.
+The graph shift is the random-walk matrix ``A = D^-1 W``. Its largest eigenvalue is 1, as the paper requires. Its rows
+sum to 1, so the high-pass response does not depend on the origin of the signal.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ def high_pass(graph: NeighborGraph, signal: Tensor) -> Tensor:
     Differences are taken before the sum: the form ``x_i - sum_j A_ij x_j`` loses digits in float32 if the signal has a
     large offset, as in a scene far from the origin.
 
-    The response of a node without neighbours is undefined (row i of A is 0 / 0), so it is NaN. With 0, floaters would look
-    like the smoothest part of the field and fill the low end of a band selection.
+    The response of a node without neighbours is undefined (row i of A is 0 / 0), so it is NaN. With 0, floaters would
+    look like the smoothest part of the field and fill the low end of a band selection.
 
     Args:
         graph: the graph, N nodes.

@@ -1,11 +1,10 @@
-"""Covariances of primitives, their decomposition into scales and rotations, and their overlap and projected area."""
+"""Rotations and covariances of primitives, their overlap and their projected area."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
-
-from sundae_ns.gaussians.rotations import rotation_matrices
+from torch.nn.functional import normalize
 
 SURFACE_EXPONENT = 1.6075
 """Exponent of Thomsen's formula for the surface area of an ellipsoid, which is exact to 1.1% for any axes."""
@@ -17,6 +16,17 @@ _LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
 """Rows and columns of the six entries of a symmetric matrix, diagonal first."""
 
 _DIAGONAL = (1.0, 1.0, 1.0, 0.0, 0.0, 0.0)
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotation matrices ``[N, 3, 3]`` of wxyz quaternions ``[N, 4]`` of any length; all-zero ones give the identity."""
+    w, x, y, z = normalize(quats, dim=-1).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([entry for row in rows for entry in row], dim=-1).reshape(-1, 3, 3)
 
 
 def covariances(scales: Tensor, quats: Tensor) -> Tensor:
@@ -31,22 +41,14 @@ def quaternions(matrices: Tensor) -> Tensor:
     The diagonal gives the largest of the four components, which is at least one half; the others are divided by it.
     """
     m = matrices
-    trace = m.diagonal(dim1=1, dim2=2)
-    xx, yy, zz = trace.unbind(dim=1)
+    xx, yy, zz = m.diagonal(dim1=1, dim2=2).unbind(dim=1)
     squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], dim=1)
     wx, wy, wz = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]
     xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
     w, x, y, z = squares.unbind(dim=1)
     # Row i is 4 q_i q.
-    products = torch.stack(
-        [
-            torch.stack([w, wx, wy, wz], dim=1),
-            torch.stack([wx, x, xy, xz], dim=1),
-            torch.stack([wy, xy, y, yz], dim=1),
-            torch.stack([wz, xz, yz, z], dim=1),
-        ],
-        dim=1,
-    )
+    rows = (w, wx, wy, wz), (wx, x, xy, xz), (wy, xy, y, yz), (wz, xz, yz, z)
+    products = torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
     largest = squares.argmax(dim=1)
     chosen = products[torch.arange(len(m), device=m.device), largest]
     return chosen / torch.linalg.vector_norm(chosen, dim=1, keepdim=True)

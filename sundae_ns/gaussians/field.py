@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections import UserDict
+from collections.abc import Mapping, MutableMapping
 from typing import Any, Literal
 
 from torch import Tensor
@@ -10,14 +11,15 @@ from torch import Tensor
 from sundae_ns.gaussians.parameters import num_primitives, rgb_to_sh, sh_degree
 
 Encoding = Literal["harmonics", "logits"]
-"""How a field stores colours. ``harmonics``: ``features_dc`` and ``features_rest`` are coefficients of spherical harmonics.
-``logits``: ``features_dc`` holds logits of view-independent colours, as splatfacto does at SH degree 0."""
+"""How a field stores colours. ``harmonics``: ``features_dc`` and ``features_rest`` are coefficients of spherical
+harmonics. ``logits``: ``features_dc`` holds logits of view-independent colours, as splatfacto does at SH degree 0."""
 
 
-class Field(MutableMapping[str, Any]):
+class Field(UserDict[str, Any]):
     """Named parameters ``[N, ...]`` (see :mod:`sundae_ns.gaussians.parameters`) and the encoding of their colours.
 
-    A view of the mapping that it is given: surgery that replaces a parameter here replaces it there too.
+    A view of the mapping that it is given: surgery that replaces a parameter here replaces it there too. ``len`` counts
+    parameters, :attr:`num_primitives` counts primitives.
 
     Args:
         params: tensors, or ``Parameter``s of a field in training.
@@ -25,34 +27,19 @@ class Field(MutableMapping[str, Any]):
     """
 
     def __init__(self, params: MutableMapping[str, Any], encoding: Encoding = "harmonics") -> None:
-        self.params = params
+        # Not by UserDict, which would copy the mapping.
+        self.data = params  # type: ignore[assignment]
         self.encoding: Encoding = encoding
-
-    def __getitem__(self, name: str) -> Any:
-        return self.params[name]
-
-    def __setitem__(self, name: str, value: Any) -> None:
-        self.params[name] = value
-
-    def __delitem__(self, name: str) -> None:
-        del self.params[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.params)
-
-    def __len__(self) -> int:
-        """Number of parameters; :attr:`num_primitives` counts primitives."""
-        return len(self.params)
 
     @property
     def num_primitives(self) -> int:
         """Number of primitives N."""
-        return num_primitives(self.params)
+        return num_primitives(self)
 
     @property
     def sh_degree(self) -> int:
         """SH degree of the stored colours."""
-        return sh_degree(self.params["features_rest"])
+        return sh_degree(self["features_rest"])
 
     def rows(self, mask: Tensor) -> Field:
         """The primitives under a mask, bool ``[N]``, as a field of its own."""

@@ -70,7 +70,7 @@ def from_points(
 
 
 def initial_features(features_dc: Tensor, num_features: int, generator: torch.Generator | None = None) -> Tensor:
-    """Initial feature vectors ``[N, F]``: ``features_dc`` ``[N, 3]`` in the first three channels, small noise in all."""
+    """Initial feature vectors ``[N, F]``: small noise, plus ``features_dc`` ``[N, 3]`` in the first three channels."""
     noise = 0.05 * torch.randn(features_dc.shape[0], num_features, generator=generator)
     features = noise.to(features_dc)
     color_channels = min(3, num_features)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.gaussians.surgery import change_parameter, moments_of
 
 MAX_COPIES = 51
@@ -102,15 +102,10 @@ def grow(
         return
     sources = draw_sources(params["opacities"].sigmoid().flatten(), count)
     _split_sources(params, sources, min_opacity)
-
-    def longer(value: Tensor) -> Tensor:
-        return torch.cat([value, value[sources]])
-
-    def with_zeros(moment: Tensor) -> Tensor:
-        return torch.cat([moment, torch.zeros_like(moment[sources])])
-
     for name in list(params):
-        change_parameter(params, optimizers, name, longer, with_zeros)
+        change_parameter(params, optimizers, name, lambda value: torch.cat([value, value[sources]]))
+        for moment in moments_of(optimizers, name, params[name]).values():
+            moment[-count:] = 0
 
 
 @torch.no_grad()

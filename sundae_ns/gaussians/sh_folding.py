@@ -1,8 +1,8 @@
 """Folding of spherical harmonics into a lower SH degree, and the view dependence of each primitive.
 
-A colour is linear in its coefficients, so its mean over the views that see a primitive follows from the means of the basis.
-Folding moves the mean of the removed degrees into degree 0: no other constant is nearer to the colours seen, in the mean
-square (``E[(c - m)^2]`` is least at ``m = E[c]``).
+A colour is linear in its coefficients, so its mean over the views that see a primitive follows from the means of the
+basis. Folding moves the mean of the removed degrees into degree 0: no other constant is nearer to the colours seen, in
+the mean square (``E[(c - m)^2]`` is least at ``m = E[c]``).
 """
 
 from __future__ import annotations
@@ -24,21 +24,16 @@ def mean_basis(weighted: Iterable[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tenso
     Returns:
         Mean and mean square ``[N, K]``; 0 for primitives that no view sees.
     """
-    total = mean = square = None
+    total = mean = square = torch.zeros(())
     for weight, basis in weighted:
-        first, second = weight[:, None] * basis, weight[:, None] * basis.square()
-        if total is None or mean is None or square is None:
-            total, mean, square = weight.clone(), first, second
-        else:
-            total, mean, square = total + weight, mean + first, square + second
-    assert total is not None
-    assert mean is not None
-    assert square is not None
+        total = total + weight
+        mean = mean + weight[:, None] * basis
+        square = square + weight[:, None] * basis.square()
     scale = torch.where(total > 0, 1 / total, 0.0)[:, None]
     return mean * scale, square * scale
 
 
-def fold(features_dc: Tensor, features_rest: Tensor, mean: Tensor, degree: int) -> tuple[Tensor, Tensor]:
+def fold_harmonics(features_dc: Tensor, features_rest: Tensor, mean: Tensor, degree: int) -> tuple[Tensor, Tensor]:
     """Remove the coefficients above SH degree ``degree``, and add their mean colour to degree 0.
 
     Args:

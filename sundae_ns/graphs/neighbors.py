@@ -1,8 +1,8 @@
 """Exact neighbour search: one interface to scipy's k-d tree on the CPU and to our own kernel on a GPU.
 
-Both order neighbours by squared distance in float64 and then by index, so the same points have the same neighbours on every
-device. Coordinates are subtracted in float64. For float32 positions of similar size this is exact, so a scene far from the
-origin loses no further digits.
+Both order neighbours by squared distance in float64 and then by index, so the same points have the same neighbours on
+every device. Coordinates are subtracted in float64. For float32 positions of similar size this is exact, so a scene far
+from the origin loses no further digits.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class Neighbors(NamedTuple):
 def knn(points: Tensor, k: int) -> Neighbors:
     """Exact ``k`` nearest neighbours of every point, without the point itself.
 
-    Coincident points are neighbours of each other at distance 0. Among equally distant points the lower index comes first,
-    also at the end of the list. The search runs on the points' device. It runs on the CPU if the GPU kernel cannot be
-    compiled, or for more than :data:`sundae_ns.graphs.traversal.MAX_NEIGHBORS` neighbours.
+    Coincident points are neighbours of each other at distance 0. Among equally distant points the lower index comes
+    first, also at the end of the list. The search runs on the points' device. It runs on the CPU if the GPU kernel
+    cannot be compiled, or for more than :data:`sundae_ns.graphs.traversal.MAX_NEIGHBORS` neighbours.
 
     Args:
         points: positions in scene units, any floating dtype and device ``[N, 3]``.
@@ -62,21 +62,16 @@ def knn(points: Tensor, k: int) -> Neighbors:
             f"{n} primitives cannot have {k} neighbours each: use at most {max(n - 1, 0)} neighbours, "
             "or a field with more primitives"
         )
-    kernel = _kernel(points.device, _tree_dtype(points), k) if points.is_cuda else None
+    # Supported by the kernel, and exact for the points.
+    dtype = torch.float64 if points.dtype == torch.float64 else torch.float32
+    kernel = _kernel(points.device, dtype, k) if points.is_cuda else None
     if kernel is None:
         coordinates = points.detach().to(device="cpu", dtype=torch.float64).numpy()
-        dtype = np.float64 if points.dtype == torch.float64 else np.float32
-        indices, distances = host_search.nearest(np.ascontiguousarray(coordinates), k, dtype)
-        found = torch.from_numpy(indices), torch.from_numpy(distances)
-        return Neighbors(found[0].to(points.device), found[1].to(points.device, points.dtype))
-    tree = build_tree(points.detach().to(_tree_dtype(points)))
-    on_device, lengths = traversal.search_tree(tree, k, kernel)
-    return Neighbors(on_device, lengths.to(points.dtype))
-
-
-def _tree_dtype(points: Tensor) -> torch.dtype:
-    """The dtype of the tree: supported by the kernel, and exact for the points."""
-    return torch.float64 if points.dtype == torch.float64 else torch.float32
+        found = host_search.nearest(np.ascontiguousarray(coordinates), k, str(dtype).removeprefix("torch."))
+        indices, distances = (torch.from_numpy(values).to(points.device) for values in found)
+    else:
+        indices, distances = traversal.search_tree(build_tree(points.detach().to(dtype)), k, kernel)
+    return Neighbors(indices, distances.to(points.dtype))
 
 
 @functools.cache

@@ -21,7 +21,7 @@ BLOCK = 128
 """Threads per block."""
 
 OPTIONS = ("--fmad=false",)
-"""Compiler options. Fused multiply-adds round differently, and distances would differ from the CPU's in the last bit."""
+"""Compiler options. Fused multiply-adds round differently: distances would differ from the CPU's in the last bit."""
 
 SOURCE = r"""
 // Whether neighbour (d, i) comes before (e, j): nearer, or as near with a lower index.
@@ -57,8 +57,8 @@ extern "C" __global__ void nearest(const REAL* __restrict__ points, const int* _
         which[s] = -1;
     }
 
-    // The stack holds the sibling of every node from the root to the own leaf, the nearest relatives on top. The search starts
-    // in the own leaf, which fills the list with close points; most of the rest of the tree is skipped.
+    // The stack holds the sibling of every node from the root to the own leaf, the nearest relatives on top. The search
+    // starts in the own leaf, which fills the list with close points; most of the rest of the tree is skipped.
     const int leaves = 1 << depth;
     const int home = leaves + (int)(((self + 1LL) * leaves - 1) / n);
     int waiting[32];

@@ -1,8 +1,8 @@
 """A balanced tree of boxes over points, built with torch on the points' device, for the search on a GPU.
 
-Points are split at the median of the widest axis of their box, level by level, until at most 16 are left. Medians adapt to
-any spread: clusters of 1e-5 beside a background of 1e3, or a floater at 1e20, cost no resolution. A uniform grid or a
-Morton code would lose it.
+Points are split at the median of the widest axis of their box, level by level, until at most 16 are left. Medians adapt
+to any spread: clusters of 1e-5 beside a background of 1e3, or a floater at 1e20, cost no resolution. A uniform grid or
+a Morton code would lose it.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class BoxTree:
 def build_tree(points: Tensor) -> BoxTree:
     """Build the tree.
 
-    Each level sorts all points at once, by segment and by rank along the segment's widest axis. Equal coordinates are ranked
-    by index, so the result is the same in every run and on every device.
+    Each level sorts all points at once, by segment and by rank along the segment's widest axis. Equal coordinates are
+    ranked by index, so the result is the same in every run and on every device.
 
     Args:
         points: finite positions, float32 or float64, at least one ``[N, 3]``.
@@ -62,13 +62,9 @@ def build_tree(points: Tensor) -> BoxTree:
         sorting = torch.sort(segment.mul_(n).add_(rank)).indices
         coordinates, ranks, order = coordinates[:, sorting], ranks[:, sorting], order[sorting]
     low, high = _bounds(coordinates, depth)
-    lowest = _segments(order[None], depth).amin(dim=2)
-    return _with_upper_levels(coordinates.T.contiguous(), order, low, high, lowest.squeeze(0), depth)
-
-
-def _with_upper_levels(points: Tensor, order: Tensor, low: Tensor, high: Tensor, lowest: Tensor, depth: int) -> BoxTree:
-    """The whole tree, from the boxes ``[3, L]`` and the lowest indices ``[L]`` of its leaves."""
-    boxes = points.new_empty(2 ** (depth + 1), 6)
+    lowest = _segments(order[None], depth).amin(dim=2).squeeze(0)
+    # From the leaves to the root.
+    boxes = coordinates.new_empty(2 ** (depth + 1), 6)
     all_lowest = order.new_empty(2 ** (depth + 1))
     boxes[0], all_lowest[0] = 0, 0
     for level in range(depth, -1, -1):
@@ -79,7 +75,7 @@ def _with_upper_levels(points: Tensor, order: Tensor, low: Tensor, high: Tensor,
             low = torch.minimum(low[:, 0::2], low[:, 1::2])
             high = torch.maximum(high[:, 0::2], high[:, 1::2])
             lowest = torch.minimum(lowest[0::2], lowest[1::2])
-    return BoxTree(points, order, boxes, all_lowest, depth)
+    return BoxTree(coordinates.T.contiguous(), order, boxes, all_lowest, depth)
 
 
 def _ranks(values: Tensor) -> Tensor:

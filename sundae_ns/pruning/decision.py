@@ -13,12 +13,11 @@ from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.field import Field, as_field
 from sundae_ns.gaussians.parameters import finite_mask
 from sundae_ns.graphs import NeighborGraph
-from sundae_ns.pruning.coverage import neighbor_order, select_systematic
 from sundae_ns.pruning.edges import field_graph
 from sundae_ns.pruning.redistribution import merged
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response, score
-from sundae_ns.pruning.selection import select_band, select_sampled, select_top
+from sundae_ns.pruning.selection import neighbor_order, select_band, select_sampled, select_systematic, select_top
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ class Pruned(NamedTuple):
 
 
 @torch.no_grad()
-def prune(
+def prune_field(
     field: Mapping[str, Tensor],
     rule: PruneRule,
     count: int,

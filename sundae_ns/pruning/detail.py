@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from sundae_ns.errors import DataError
-
 FLOOR = 0.25
 """Weight of a flat pixel, as a share of the image's root mean square: flat areas need some primitives too."""
 
@@ -26,12 +24,7 @@ def pixel_detail(image: Tensor, cells: float) -> Tensor:
 
     Returns:
         Weights of the pixels, positive with mean 1 ``[H, W]``; all 1 for a flat image.
-
-    Raises:
-        DataError: the image is empty or does not have three dimensions.
     """
-    if image.ndim != 3 or 0 in image.shape:
-        raise DataError(f"the image has shape {list(image.shape)}: pass [H, W, C]")
     height, width = image.shape[:2]
     side = round((height * width / max(cells, 1.0)) ** 0.5)
     # An odd window of at least 3 pixels; its half is the padding, and must not exceed the image.

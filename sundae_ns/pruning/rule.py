@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Literal, get_args, get_origin, get_type_hints
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.graphs.neighbors import MOST_EXTENT
@@ -98,10 +98,7 @@ class PruneRule:
                 raise ConfigError(f"{name} is {value}: use at least {least}")
 
 
-_Rule = TypeVar("_Rule", bound=PruneRule)
-
-
-def band_rule(rule: _Rule, gamma: float) -> _Rule:
+def band_rule(rule: PruneRule, gamma: float) -> PruneRule:
     """The paper's rule: both ends of the response, a share ``gamma`` of the high end, and no merge.
 
     Signal, number of neighbours and bandwidth are those of ``rule``.

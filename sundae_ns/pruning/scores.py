@@ -1,4 +1,4 @@
-"""Scores: the importance of each primitive as one non-negative number."""
+"""Graph signals, their response, and scores: the importance of each primitive as one non-negative number."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.filters import high_pass, response_magnitude
-from sundae_ns.gaussians.parameters import num_primitives
+from sundae_ns.gaussians.parameters import num_primitives, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning.edges import field_graph, graph_inputs
 from sundae_ns.pruning.rule import PruneRule
-from sundae_ns.pruning.signals import attribute_signal, position_signal
-
-SIGNALS = {"attributes": attribute_signal, "positions": position_signal}
 
 
 @torch.no_grad()
@@ -33,7 +30,8 @@ def response(params: Mapping[str, Tensor], rule: PruneRule, graph: NeighborGraph
         DataError: only one primitive, or positions that are not finite.
     """
     graph = field_graph(params, rule) if graph is None else graph
-    signal = SIGNALS[rule.signal](graph_inputs(params, rule))
+    inputs = graph_inputs(params, rule)
+    signal = attribute_signal(inputs) if rule.signal == "attributes" else inputs["means"].detach()
     return response_magnitude(high_pass(graph, signal)).to(params["means"].device)
 
 
@@ -81,3 +79,32 @@ def score(
     # On a graph without edges no response is known: one value for all leaves the choice to the contribution.
     filling = known.median() if known.numel() else norm.new_tensor(1.0)
     return weights * torch.where(norm.isnan(), filling, norm)
+
+
+def attribute_signal(params: Mapping[str, Tensor]) -> Tensor:
+    """Position, colour, opacity and log size, each without a unit and of similar spread ``[N, 10]``.
+
+    Each group is divided by its own spread, so that no group dominates the response. The channels of a group share one
+    spread: in a flat field, the flat axis must not be scaled up to the others.
+    """
+    groups = (
+        params["means"],
+        sh_to_rgb(params["features_dc"]),
+        torch.sigmoid(params["opacities"]).reshape(-1, 1),
+        params["scales"],
+    )
+    return torch.cat([_standardise(group.detach()) for group in groups], dim=1)
+
+
+def _standardise(values: Tensor) -> Tensor:
+    """Centre ``[N, C]`` on its medians and divide by the median norm; a constant group becomes 0.
+
+    A few floaters or saturated colours would dominate a mean or a variance, but not a median. If more than half of the
+    rows are equal, the median norm is 0 and the mean of the norms replaces it.
+    """
+    centred = values - values.median(dim=0).values
+    norms = torch.linalg.vector_norm(centred, dim=1, dtype=torch.float64)
+    spread = norms.median()
+    if spread == 0:
+        spread = norms.mean()
+    return centred / spread if spread > 0 else torch.zeros_like(centred)

@@ -4,6 +4,9 @@ All functions take scores ``[N]`` of any floating dtype on any device, and retur
 with exactly ``count`` True entries. Among equal scores the lower index is selected first. NaN means "unknown" and is
 selected last; ``+inf`` is the highest score. All work is done on the CPU in float64, so the same scores give the same
 mask on every device.
+
+Independent draws leave holes and clumps by chance. Systematic sampling draws one primitive in each stretch of an order
+in which neighbours follow each other. It covers a field evenly, and keeps the probability of each primitive.
 """
 
 from __future__ import annotations
@@ -12,6 +15,10 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.graphs.tree import build_tree
+
+LEAST_SHARE = 1e-200
+"""Least score of a systematic sample, as a share of the largest; lower scores are raised to it."""
 
 
 def check_share(share: float) -> None:
@@ -84,6 +91,95 @@ def select_sampled(score: Tensor, count: int, seed: int) -> Tensor:
     keys = torch.log(values[first]) + gumbel[first]
     order = torch.cat([first[_ranked(keys)], last[_ranked(gumbel[last])]])
     return _mask(order[:count], score)
+
+
+def inclusion_probabilities(score: Tensor, count: int) -> Tensor:
+    """Inclusion probabilities ``p_i = min(1, c s_i)`` of positive finite scores ``[N]`` that sum to ``count``, 1 to N.
+
+    Returns:
+        Probabilities, float64 on the CPU ``[N]``; exactly 1 for primitives that are always included.
+    """
+    values = score.detach().to(device="cpu", dtype=torch.float64)
+    # The largest is 1, so that sums do not overflow; none is 0, so that no sum is.
+    values = (values / values.max()).clamp_min(LEAST_SHARE)
+    ordered = torch.sort(values, descending=True, stable=True).values
+    rest = ordered.flip(0).cumsum(0).flip(0)
+    left = count - torch.arange(count, dtype=torch.float64)
+    # The fewest certain primitives such that no other has a probability above 1.
+    certain = int((left * ordered[:count] <= rest[:count]).to(torch.uint8).argmax())
+    probabilities = values * ((count - certain) / rest[certain])
+    return probabilities.masked_fill(values > ordered[certain], 1.0).clamp_max(1.0)
+
+
+def neighbor_order(points: Tensor) -> Tensor:
+    """An order in which neighbours follow each other: the leaves of a balanced tree, int64 on the CPU ``[N]``.
+
+    Similar to a Morton curve, but cells are split at the median of their widest axis. A cluster of any size is
+    resolved, where a Morton code could put it into one cell.
+
+    Args:
+        points: finite positions ``[N, 3]``, N at least 1.
+    """
+    return build_tree(points.detach()).order.cpu().long()
+
+
+def select_systematic(score: Tensor, count: int, order: Tensor, seed: int) -> Tensor:
+    """Draw one primitive in each stretch of an order over which the inclusion probabilities sum to one.
+
+    Systematic sampling with unequal probabilities (Madow, 1949): probabilities are summed along the order, and a
+    primitive is selected whenever the sum passes ``u + j``, with one random u for all j. Each primitive is selected
+    with probability ``min(1, c s_i)``, and any stretch of the order keeps its expected number, rounded up or down.
+
+    Infinite scores are selected first, then positive ones. Scores that are NaN or at most 0 are drawn uniformly, after
+    all others.
+
+    Args:
+        score: scores ``[N]``.
+        count: number of primitives to keep, 1 to N.
+        order: permutation of the primitives, int64 ``[N]``.
+
+    Returns:
+        Mask with ``count`` True entries, bool, on the device of the scores ``[N]``.
+
+    Raises:
+        DataError: ``count`` is not in 1 to N, or shapes do not fit.
+    """
+    if order.shape != score.shape:
+        raise DataError(f"scores have shape {list(score.shape)} and their order {list(order.shape)}: pass [N] and [N]")
+    order = order.cpu()
+    values = as_scores(score, count)[order]
+    start = float(torch.rand((), generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
+    chosen = torch.zeros(len(values), dtype=torch.bool)
+    infinite = values == torch.inf
+    positive = (values > 0) & ~infinite
+    left = count
+    for tier in (infinite, positive, ~infinite & ~positive):
+        members = tier.nonzero().squeeze(1)
+        if len(members) > left:
+            weight = values[members] if tier is positive else torch.ones(len(members), dtype=torch.float64)
+            members = (
+                members[_systematic_sample(inclusion_probabilities(weight, left), left, start)] if left else members[:0]
+            )
+        chosen[order[members]] = True
+        left -= len(members)
+    return chosen.to(score.device)
+
+
+def _systematic_sample(probabilities: Tensor, count: int, start: float) -> Tensor:
+    """Indices ``[count]``, all different, at which the sum of the probabilities passes ``start + j``."""
+    certain = probabilities >= 1
+    places = (~certain).nonzero().squeeze(1)
+    wanted = count - int(certain.sum())
+    sums = probabilities[places].cumsum(0)
+    taken = certain.nonzero().squeeze(1)
+    if wanted:
+        # Rounding must not lose the last draw, nor put two draws on one place.
+        marks = (start + torch.arange(wanted, dtype=torch.float64)) * (sums[-1] / wanted)
+        steps = torch.arange(wanted)
+        drawn = torch.searchsorted(sums, marks, right=True).minimum(steps + len(places) - wanted)
+        drawn = (drawn - steps).cummax(0).values + steps
+        taken = torch.cat([taken, places[drawn]])
+    return taken
 
 
 def select_random(n: int, count: int, seed: int, device: torch.device | str = "cpu") -> Tensor:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import torch
-from rich.console import Console
-from rich.progress import track
 from torch import Tensor
 
 from sundae_ns.errors import DataError
@@ -15,6 +14,9 @@ from sundae_ns.rasterization import blending_weights
 from sundae_ns.rendering.render import RenderSettings, draw, pass_options
 from sundae_ns.rendering.source import FieldSource, Primitives, TrainingView, ViewBatch
 from sundae_ns.rendering.views import View
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 @torch.no_grad()
@@ -64,6 +66,8 @@ def weights_by_batch(
     """
     batches: Iterable[ViewBatch] = source.batches(views)
     if console is not None:
+        from rich.progress import track  # takes 20 ms, which a render without a prune need not spend
+
         batches = track(batches, "Contribution of primitives", transient=True, console=console)
     for batch in batches:
         view, mask = batch.own
@@ -77,7 +81,7 @@ def weights_by_batch(
         if count is not None:
             background = background.to(primitives["means"].device)
             images, splatted = draw(primitives, view, background, settings.without_head(), depth=False)
-            # Of the visible primitives, the same part stays as of all.
+            # A prune keeps the same share of the visible primitives as of all.
             visible = float((splatted.radii > 0).sum())
             detail = pixel_detail(images["base_rgb"], count / source.total * visible)
             pixels = detail if pixels is None else detail * pixels

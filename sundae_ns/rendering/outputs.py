@@ -1,10 +1,13 @@
-"""Outputs beside ``rgb`` and ``base_rgb``, each computed on first access, and the outputs of an empty crop."""
+"""Outputs of a model that are computed on first access, and the outputs of an empty crop."""
 
 from __future__ import annotations
 
+from collections import UserDict
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from sundae_ns.errors import DataError
@@ -12,7 +15,6 @@ from sundae_ns.evaluation import display
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
 from sundae_ns.pruning import PruneRule, response
-from sundae_ns.rendering.lazy import Later, LazyOutputs
 from sundae_ns.rendering.render import RenderSettings, splat
 from sundae_ns.rendering.views import View
 
@@ -21,6 +23,30 @@ OUTPUTS = ("rgb", "base_rgb", "depth", "accumulation", "features", "response")
 
 FieldKey = tuple[int, int]
 """Identifies a state of a field: number of primitives, and number of prunes."""
+
+
+@dataclass(frozen=True)
+class Later:
+    """An output that is not computed yet."""
+
+    make: Callable[[], Any]
+    """Computes it. It may run in another thread after the model has changed, so it must hold what it reads."""
+
+
+class LazyOutputs(UserDict[str, Any]):
+    """Named outputs. One that is :class:`Later` is computed on first access, without gradients, and then kept.
+
+    nerfstudio's commands read one or two outputs of a frame; the others cost nothing. Listing names, counting and
+    ``in`` compute nothing. It is not a ``dict``, because ``dict(outputs)`` and ``{**outputs}`` would then skip the
+    computation.
+    """
+
+    def __getitem__(self, name: str) -> Any:
+        value = self.data[name]
+        if isinstance(value, Later):
+            with torch.no_grad():
+                value = self.data[name] = value.make()
+        return value
 
 
 class ShownResponse:

@@ -120,7 +120,7 @@ def compensate(
     return image
 
 
-def render(
+def render_view(
     source: FieldSource,
     view: View,
     background: Tensor,
@@ -157,7 +157,7 @@ def render(
     if zoom == 1.0:
         images["rgb"] = compensate(head, base, splatted, background, training=settings.training)
     elif weight > 0:
-        at_scale, _ = render(source, view.zoomed(zoom), background, settings, depth=False)
+        at_scale, _ = render_view(source, view.zoomed(zoom), background, settings, depth=False)
         correction = at_scale["rgb"] - at_scale["base_rgb"]
         images["rgb"] = base + weight * resize(correction, view.height, view.width)
     if not settings.training:

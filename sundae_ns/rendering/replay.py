@@ -19,7 +19,7 @@ from torch import Tensor
 from sundae_ns.errors import BackendError
 from sundae_ns.gpu.cuda_graphs import GraphCache, record, warm_up
 from sundae_ns.rasterization import Capacity, RecordableGsplat
-from sundae_ns.rendering.render import RenderSettings, render, scale_plan
+from sundae_ns.rendering.render import RenderSettings, render_view, scale_plan
 from sundae_ns.rendering.source import FieldSource, degree_in_use
 from sundae_ns.rendering.views import View
 
@@ -46,7 +46,7 @@ class _Frame:
 
 
 class FrameReplay:
-    """Recorded frames of one field. They are made when first needed and dropped when the field changes."""
+    """Replays recorded frames of one field, which are recorded on demand and dropped when the field changes."""
 
     def __init__(self) -> None:
         self._frames: GraphCache[_Frame] = GraphCache()
@@ -56,7 +56,7 @@ class FrameReplay:
         self._lock = Lock()
 
     def render(self, source: FieldSource, view: View, background: Tensor, settings: RenderSettings) -> dict[str, Any]:
-        """The images of a view, as :func:`sundae_ns.rendering.render.render` makes them.
+        """The images of a view, as :func:`sundae_ns.rendering.render_view` makes them.
 
         Replays a recorded frame where possible: on CUDA by gsplat, without gradients, of a whole local field. Other
         frames, and the first of a size, are rendered kernel by kernel. Both agree up to the order in which kernels sum.
@@ -83,7 +83,7 @@ class FrameReplay:
                     self._can_record, images = False, None
             if images is not None:
                 return images
-        images = render(source, view, background, settings, depth=source.collective)[0]
+        images = render_view(source, view, background, settings, depth=source.collective)[0]
         return images if source.collective else {name: images[name] for name in REPLAYED}
 
     def _replayed(
@@ -138,7 +138,7 @@ def _record(
 
         def run(pairs: Capacity) -> dict[str, Any]:
             limited = replace(settings, backend=RecordableGsplat(pairs))
-            return render(source, here, inputs[2], limited, depth=False)[0]
+            return render_view(source, here, inputs[2], limited, depth=False)[0]
 
         device = view.viewmat.device
         if capacity is None:

@@ -1,6 +1,6 @@
 """Where a view gets its primitives from: the field of this process, or shards on several GPUs.
 
-:func:`sundae_ns.rendering.render.render` takes a :class:`FieldSource`. Only the place that makes the source knows how
+:func:`sundae_ns.rendering.render_view` takes a :class:`FieldSource`. Only the place that makes the source knows how
 many processes hold the field.
 """
 
@@ -72,23 +72,22 @@ class ColorSettings:
 
 
 class FieldSource(Protocol):
-    """What rendering and training need of a field, whoever holds its primitives."""
+    """What rendering and training need of a field, whoever holds its primitives.
 
-    @property
-    def field(self) -> Field:
-        """The primitives of this process."""
+    Methods with a body are those of a field of one process.
+    """
+
+    field: Field
+    """The primitives of this process."""
+    collective: bool
+    """Whether a render is collective: all ranks must call it together."""
+    replayable: bool
+    """Whether frames of this source may be recorded: its tensors stay where they are."""
 
     @property
     def total(self) -> int:
         """Number of primitives of the whole field."""
-
-    @property
-    def collective(self) -> bool:
-        """Whether a render is collective: all ranks must call it together."""
-
-    @property
-    def replayable(self) -> bool:
-        """Whether frames of this source may be recorded: its tensors stay where they are."""
+        return self.field.num_primitives
 
     def primitives(
         self,
@@ -114,9 +113,11 @@ class FieldSource(Protocol):
 
     def batches(self, views: Sequence[TrainingView]) -> Sequence[ViewBatch]:
         """The views in batches of one for each process, in order."""
+        return [ViewBatch(view, 1) for view in views]
 
     def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
         """Add values of the primitives of a batch ``[M]`` to a sum over the primitives of this process ``[N]``."""
+        total += values
 
 
 def colors_from(params: Mapping[str, Tensor], field: Field, center: Tensor, settings: ColorSettings) -> Tensor:
@@ -143,7 +144,7 @@ def degree_in_use(sh_degree: int, active: int | None) -> int:
     return sh_degree if active is None else min(active, sh_degree)
 
 
-class LocalField:
+class LocalField(FieldSource):
     """The field of one process.
 
     Args:
@@ -156,11 +157,6 @@ class LocalField:
     def __init__(self, field: Field, *, whole: bool = True) -> None:
         self.field = field
         self.replayable = whole
-
-    @property
-    def total(self) -> int:
-        """Number of primitives."""
-        return self.field.num_primitives
 
     def primitives(
         self,
@@ -179,11 +175,3 @@ class LocalField:
 
     def plan_next(self, at: StepResolution, optimizers: Mapping[str, Optimizer]) -> None:
         """Nothing to prepare."""
-
-    def batches(self, views: Sequence[TrainingView]) -> list[ViewBatch]:
-        """One view at a time."""
-        return [ViewBatch(view, 1) for view in views]
-
-    def accumulate(self, total: Tensor, values: Tensor, primitives: Primitives, batch: ViewBatch) -> None:
-        """Add the values, one for each primitive."""
-        total += values

@@ -148,28 +148,20 @@ def view_of(camera: Cameras, device: torch.device | str, *, pose: Tensor | None 
         pose: camera-to-world in place of the camera's own, ``[..., 3, 4]``; differentiable.
         downscale: divisor of the resolution.
     """
-    *flat, fx, fy, cx, cy, width, height = _numbers(camera)
+    # nerfstudio's methods of cameras build tensors and cameras at each call; here one copy from the device does.
+    parts = (camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+    *flat, fx, fy, cx, cy, width, height = torch.cat([part.detach().flatten() for part in parts]).tolist()
     dtype = camera.camera_to_worlds.dtype
     K = [fx / downscale, 0.0, cx / downscale, 0.0, fy / downscale, cy / downscale, 0.0, 0.0, 1.0]
     size = (int(width) // downscale, int(height) // downscale)
     if pose is None:
-        both = torch.tensor([*world_to_camera_floats(flat), *K], dtype=dtype).to(
-            device
-        )  # in one tensor: one copy to a GPU
+        # In one tensor: one copy to a GPU.
+        both = torch.tensor([*world_to_camera_floats(flat), *K], dtype=dtype).to(device)
         viewmat, intrinsics = both[:16].view(4, 4), both[16:].view(3, 3)
     else:
         viewmat = world_to_camera(pose.reshape(-1, 3, 4)[0]).to(device)
         intrinsics = torch.tensor(K, dtype=dtype).to(device).view(3, 3)
     return View(viewmat, intrinsics, *size, (fx + fy) / 2 / downscale)
-
-
-def _numbers(camera: Cameras) -> list[float]:
-    """Camera-to-world row by row, focal lengths, centre and size, as one list.
-
-    nerfstudio's methods of cameras build tensors and cameras at each call; here one copy from the device does.
-    """
-    parts = (camera.camera_to_worlds, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    return torch.cat([part.detach().flatten() for part in parts]).tolist()  # type: ignore[no-any-return]
 
 
 def crop_image(image: Tensor, window: Window | None) -> Tensor:

@@ -26,7 +26,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
 from sundae_ns.api.opening import FRAME_FILE, load
-from sundae_ns.api.packing import cameras_of, contents_of, refusal, scene_of
+from sundae_ns.api.packing import contents_of, refusal, scene_of, stored_cameras
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import is_frame, is_number
 from sundae_ns.compensation import HeadConfig
@@ -269,7 +269,7 @@ def _is_possible(value: Any, default: Any, hint: Any) -> bool:
 
 def _transforms(packed: PackedScene) -> dict[str, Any]:
     """The cameras as a ``transforms.json`` in the model's coordinates, without distortion, as in rendering."""
-    cameras = cameras_of(packed)
+    cameras = stored_cameras(packed)
     frames = [
         {
             "file_path": f"view-{i:05d}",

@@ -231,7 +231,7 @@ class Densification(Extension):
         """Keep the gradients that densification reads."""
         if state.densifying:
             self.strategy.step_pre_backward(
-                state.field.params, state.optimizers, state.densification, state.schedule_step, state.info
+                state.field.data, state.optimizers, state.densification, state.schedule_step, state.info
             )
 
     def after_step(self, run: TrainingRun) -> None:
@@ -242,7 +242,7 @@ class Densification(Extension):
 
     def densify(self, state: FieldState) -> None:
         """The strategy's step; several ranks have their own."""
-        params, running = state.field.params, state.densification
+        params, running = state.field.data, state.densification
         self.strategy.step_post_backward(params, state.optimizers, running, state.schedule_step, state.info)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.evaluation.metrics import SSIM_WINDOW
-from sundae_ns.rendering.render import render
+from sundae_ns.rendering.render import render_view
 from sundae_ns.training.extension import TrainingRun
 
 EXACT = 100.0
@@ -39,7 +39,7 @@ def measure_heldout(run: TrainingRun, *, with_ssim: bool = True) -> list[HeldOut
     """
     qualities = []
     for view, target, mask in run.heldout_views():
-        images, _ = render(run.source, view, run.background, run.settings, depth=False)
+        images, _ = render_view(run.source, view, run.background, run.settings, depth=False)
         quality = view_quality(images["rgb"], target, mask, with_ssim=with_ssim)
         if quality.pixels:
             qualities.append(quality)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from sundae_ns.compensation import Window, training_window
 from sundae_ns.rasterization import Rasterization
-from sundae_ns.rendering.render import RenderSettings, render
+from sundae_ns.rendering.render import RenderSettings, render_view
 from sundae_ns.rendering.source import FieldSource, StepResolution
 from sundae_ns.rendering.views import View
 from sundae_ns.training.field_state import FieldState
@@ -104,8 +104,8 @@ class TrainingStep(NamedTuple):
         at: StepResolution | None = None,
         depth: bool = False,
     ) -> tuple[dict[str, Any], Rasterization]:
-        """The first half: primitives, one splatting pass, and the head; see :func:`sundae_ns.rendering.render`."""
-        return render(self.source, view, background, settings, depth=depth, at=at)
+        """The first half: primitives, one splatting pass, and the head; see :func:`sundae_ns.rendering.render_view`."""
+        return render_view(self.source, view, background, settings, depth=depth, at=at)
 
     def terms(self, images: Mapping[str, Tensor], target: Tensor, mask: Tensor | None) -> dict[str, Tensor]:
         """The second half: the terms of the loss by name, each ``[]``; see :class:`StepInputs` for the arguments."""

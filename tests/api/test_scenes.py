@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import zipfile
 from pathlib import Path
 
@@ -148,6 +149,20 @@ def test_a_head_corrects_images_unless_it_is_left_out(tmp_path: Path) -> None:
     assert (images.rgb - images.base_rgb).abs().max() > 1e-3
     assert torch.equal(without.rgb, images.base_rgb)
     assert [tuple(image.shape) for image in images] == [(37, 50, 3), (37, 50, 3), (37, 50, 1), (37, 50, 1)]
+
+
+def test_a_head_with_recorded_frames_moves_to_another_device(tmp_path: Path) -> None:
+    """A recorded CUDA graph cannot be copied; a lock stands for it."""
+    found = sn.load(write_kind(tmp_path / "a.sundae", KINDS["residual"]))
+    assert found.head is not None
+    found.head._inference._recorded.put("frame", threading.Lock())
+    before = torch.get_rng_state()
+    moved = found.to("meta")
+    assert moved.device.type == "meta"
+    assert moved.head is not None
+    assert {value.device.type for value in moved.head.parameters()} == {"meta"}
+    assert found.device.type == next(found.head.parameters()).device.type == "cpu"
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_scenes_are_values() -> None:

@@ -14,7 +14,7 @@ from sundae_ns.api.scene import Scene
 from sundae_ns.api.sensitivity import sensitivity_of
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.rendering import LocalField, View
-from sundae_ns.rendering.render import render
+from sundae_ns.rendering.render import render_view
 from sundae_ns.storage.packing import PackedScene
 
 
@@ -53,7 +53,7 @@ def scene() -> Scene:
 @torch.no_grad()
 def image(scene: Scene, view: View) -> Tensor:
     settings = dataclasses.replace(scene.settings(), training=True)
-    found: Tensor = render(LocalField(scene.field), view, scene.background, settings, depth=False)[0]["rgb"]
+    found: Tensor = render_view(LocalField(scene.field), view, scene.background, settings, depth=False)[0]["rgb"]
     return found.double()
 
 

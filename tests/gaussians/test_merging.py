@@ -10,9 +10,8 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.covariance import covariances, mean_projected_area, overlap, quaternions
+from sundae_ns.gaussians.covariance import covariances, mean_projected_area, overlap, quaternions, rotation_matrices
 from sundae_ns.gaussians.merging import merge
-from sundae_ns.gaussians.rotations import rotation_matrices
 from sundae_ns.gaussians.surgery import rewrite
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from sundae_ns.gaussians.parameters import SH_C0
-from sundae_ns.gaussians.sh_folding import fold, mean_basis, view_dependence
+from sundae_ns.gaussians.sh_folding import fold_harmonics, mean_basis, view_dependence
 from sundae_ns.rasterization.harmonics import evaluate_harmonics, harmonic_basis
 
 N, VIEWS, DEGREE = 12, 40, 3
@@ -33,7 +33,7 @@ def colours(dc: Tensor, rest: Tensor) -> Tensor:
 def test_the_folded_colour_is_the_nearest_constant() -> None:
     weights, dc, rest = torch.rand(VIEWS, N), torch.randn(N, 3), torch.randn(N, 15, 3)
     mean, _ = mean_basis(views(weights))
-    folded, none = fold(dc, rest, mean, 0)
+    folded, none = fold_harmonics(dc, rest, mean, 0)
     assert none.shape == (N, 0, 3)
     expected = (weights[..., None] * colours(dc, rest)).sum(dim=0) / weights.sum(dim=0)[:, None]
     torch.testing.assert_close(folded * SH_C0, expected)
@@ -43,7 +43,7 @@ def test_mean_colour_is_kept_at_every_degree() -> None:
     weights, dc, rest = torch.ones(VIEWS, N), torch.randn(N, 3), torch.randn(N, 15, 3)
     mean, _ = mean_basis(views(weights))
     for degree, columns in ((0, 0), (1, 3), (2, 8), (3, 15)):
-        folded, kept = fold(dc, rest, mean, degree)
+        folded, kept = fold_harmonics(dc, rest, mean, degree)
         assert kept.shape == (N, columns, 3)
         torch.testing.assert_close(colours(folded, kept).mean(dim=0), colours(dc, rest).mean(dim=0))
 
@@ -53,7 +53,7 @@ def test_unseen_primitives_keep_degree_0() -> None:
     weights[:, 4] = 0
     dc, rest = torch.randn(N, 3), torch.randn(N, 15, 3)
     mean, square = mean_basis(views(weights))
-    assert torch.equal(fold(dc, rest, mean, 0)[0][4], dc[4])
+    assert torch.equal(fold_harmonics(dc, rest, mean, 0)[0][4], dc[4])
     assert view_dependence(rest, mean, square, weights.sum(dim=0))[4] == 0
 
 

@@ -7,8 +7,7 @@ from torch import nn
 from torch.nn import Parameter
 from torch.optim import Adam
 
-from sundae_ns.gaussians.snapshot import module_snapshot, narrow, restore, restore_module, snapshot
-from sundae_ns.gaussians.surgery import keep
+from sundae_ns.gaussians.surgery import keep, module_snapshot, narrow, restore, restore_module, snapshot
 
 
 def field(n: int = 20) -> tuple[dict[str, Parameter], dict[str, Adam]]:

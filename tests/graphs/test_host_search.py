@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.graphs import host_search, knn, threads
+from sundae_ns.graphs import host_search, knn
 
 FAR = (1e18, 1e20, 1e25, 1e30, 1e38)
 
@@ -48,7 +48,7 @@ def test_nearest_of_all_is_ordered_by_squared_distance_and_index(cluster: Callab
     coordinates = with_floaters(cluster(100)).numpy()
     positions = host_search._distinct(coordinates)
     rows = np.arange(len(positions.coordinates))
-    points, lengths = host_search._nearest_of_all(positions, rows, width)
+    _, points, lengths = map(np.concatenate, zip(*host_search._nearest_of_all(positions, rows, width), strict=True))
     assert points.shape == lengths.shape == (len(rows), min(width, len(coordinates)))
     for row in rows:
         x, y, z = (coordinates - positions.coordinates[row]).T
@@ -83,7 +83,7 @@ def test_memory_grows_with_points_and_not_with_their_square(
     monkeypatch: pytest.MonkeyPatch, cluster: Callable[[int], Tensor]
 ) -> None:
     # tracemalloc sees numpy's arrays, not scipy's tree. One thread, so that the sum does not depend on timing.
-    monkeypatch.setattr(threads, "cores", lambda: 1)
+    monkeypatch.setattr(host_search, "cores", lambda: 1)
 
     def peak(n: int) -> int:
         coordinates = with_floaters(cluster(n)).numpy()

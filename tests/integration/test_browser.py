@@ -23,8 +23,8 @@ from PIL import Image
 from torch import Tensor
 from viser import transforms
 
-from sundae_ns.pruning import kept_count, prune
-from sundae_ns.rendering import LocalField, render
+from sundae_ns.pruning import kept_count, prune_field
+from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.viewer import previewed_rule
 
 pytestmark = [pytest.mark.browser, needs_chromium]
@@ -137,11 +137,11 @@ def test_every_control_does_what_it_says(tiny: Any, server: Any, page: Any) -> N
     rule = previewed_rule(model.config.pruning, "as configured")
     count = kept_count(keep_ratio, model.num_points)
     weights = model.contribution(pipeline.datamanager, count if rule.uses_detail else None)
-    pruned = prune(model.state.field, rule, count, weights)
+    pruned = prune_field(model.state.field, rule, count, weights)
     assert pruned.decision.values is not None
     settings = model.render_settings(training=False).without_head()
     with torch.no_grad():
-        preview, _ = render(
+        preview, _ = render_view(
             LocalField(pruned.field), model.view_of(camera_of(page)), expected["background"][0, 0], settings
         )
     previewed = scene(page)

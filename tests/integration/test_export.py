@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.field import Field
-from sundae_ns.rendering import LocalField, render
+from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.storage import read_ply
 
@@ -32,7 +32,7 @@ def test_exported_files_show_the_base_colours(tiny: Any, call: Any, tmp_path: Pa
     def images(field: dict[str, Tensor]) -> list[Tensor]:
         views = [run.model.view_of(camera) for camera in run.cameras]
         with torch.no_grad():
-            return [render(LocalField(Field(field)), view, background, settings)[0]["base_rgb"] for view in views]
+            return [render_view(LocalField(Field(field)), view, background, settings)[0]["base_rgb"] for view in views]
 
     own = images(dict(run.model.gauss_params))
     # The worst seen: 50.2 and 63.0 dB.

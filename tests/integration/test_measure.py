@@ -19,7 +19,7 @@ from sundae_ns.cli import main
 from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import Measured, psnr
-from sundae_ns.rendering import render, zoomed
+from sundae_ns.rendering import render_view, zoomed
 from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, rendered_as, sizes
 from sundae_ns.scenes.opening import Opened, open_scene
 
@@ -78,7 +78,7 @@ def test_frames_show_what_the_resized_truth_shows(tiny: Any, factor: float) -> N
         # The edges of both images agree.
         K = view.K * torch.tensor([[width / view.width], [height / view.height], [1.0]])
         view = view._replace(K=K, width=width, height=height)
-        shown, _ = render(model.source, view, background, settings, depth=False)
+        shown, _ = render_view(model.source, view, background, settings, depth=False)
         expected.append(float(psnr(shown["base_rgb"], resize(truth, height, width))))
     assert found.base.mean("psnr") == pytest.approx(sum(expected) / len(expected), abs=1e-3)
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from sundae_ns.cli import main
 from sundae_ns.evaluation import COLUMNS, flip_available
-from sundae_ns.rendering import render
+from sundae_ns.rendering import render_view
 from sundae_ns.scenes.measure import quality, walk
 from sundae_ns.scenes.opening import open_scene
 from sundae_ns.scenes.packed import contents_of_run
@@ -92,7 +92,9 @@ def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any
     for way, settings in zip(ours["configurations"], (with_head, with_head.without_head()), strict=True):
         assert way["ms"] > 0
         with torch.no_grad():
-            images, _ = render(model.source, model.view_of(opened.cameras[1]), model._get_background_color(), settings)
+            images, _ = render_view(
+                model.source, model.view_of(opened.cameras[1]), model._get_background_color(), settings
+            )
         expected = quality(images["rgb"], opened.truths[1])
         found = way["views"][1]
         assert (found["psnr"], found["ssim"]) == (pytest.approx(expected.psnr), pytest.approx(expected.ssim))

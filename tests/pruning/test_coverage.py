@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from sundae_ns.errors import DataError
-from sundae_ns.pruning.coverage import inclusion_probabilities, neighbor_order, select_systematic
+from sundae_ns.pruning.selection import inclusion_probabilities, neighbor_order, select_systematic
 
 
 def scores(n: int = 500) -> Tensor:

@@ -7,7 +7,7 @@ import torch
 from torch.nn import Parameter
 
 from sundae_ns.errors import DataError
-from sundae_ns.pruning import PruneRule, prune
+from sundae_ns.pruning import PruneRule, prune_field
 from sundae_ns.pruning.cutting import FieldPruner
 
 N = 20
@@ -41,7 +41,7 @@ def test_a_field_without_a_finite_primitive_stays() -> None:
 def test_a_cut_leaves_the_field_that_prune_returns() -> None:
     params, statistics = field(), {"count": torch.arange(N)}
     rule, weights = PruneRule(score="opacity", selection="top", num_neighbors=5), torch.linspace(1, 2, N)
-    expected = prune(field(), rule, N // 2, weights)
+    expected = prune_field(field(), rule, N // 2, weights)
     decision = FieldPruner(params, {}, [statistics]).cut(rule, N // 2, weights)
     assert decision.kept == len(params["means"]) == N // 2
     assert torch.equal(decision.mask, expected.decision.mask)

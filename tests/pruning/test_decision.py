@@ -13,9 +13,8 @@ from torch import Tensor
 from sundae_ns.errors import ConfigError, DataError, SundaeError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.parameters import rgb_to_sh
-from sundae_ns.pruning import PruneRule, decide, prune, response
-from sundae_ns.pruning.scores import score
-from sundae_ns.pruning.signals import attribute_signal, position_signal
+from sundae_ns.pruning import PruneRule, decide, prune_field, response
+from sundae_ns.pruning.scores import attribute_signal, score
 
 PLAIN = PruneRule(selection="sampled", score="response-contribution", edges="centres", redistribution="none")
 """Response times contribution and independent draws, without the additions of the default rule."""
@@ -99,7 +98,6 @@ def test_signals_have_no_unit_and_no_dominating_group() -> None:
     params = field()
     signal = attribute_signal(params)
     assert signal.shape == (60, 10)
-    assert torch.equal(position_signal(params), params["means"])
     for group in (slice(0, 3), slice(3, 6), slice(6, 7), slice(7, 10)):
         assert signal[:, group].norm(dim=1).median().item() == pytest.approx(1.0, rel=1e-5)
     scaled = {**params, "means": 1000 * params["means"] + 5, "scales": params["scales"] + 3}
@@ -155,7 +153,7 @@ def test_prune_leaves_what_the_decision_says_and_the_field_alone(rule: PruneRule
     params = field()
     params["means"][8] = torch.nan
     before = Field({name: value.clone() for name, value in params.items()}, "logits")
-    found = prune(Field(params, "logits"), rule, 12, ones())
+    found = prune_field(Field(params, "logits"), rule, 12, ones())
     decision = decide(before, rule, 12, ones())
     assert torch.equal(found.decision.mask, decision.mask)
     assert found.field.encoding == "logits"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from sundae_ns.errors import DataError
 from sundae_ns.pruning.detail import pixel_detail
 
 
@@ -40,8 +39,3 @@ def test_any_image_and_number_of_cells_has_weights(cells: float, shape: tuple[in
 def test_weights_do_not_depend_on_contrast() -> None:
     image = torch.rand(32, 32, 3)
     torch.testing.assert_close(pixel_detail(0.01 * image + 0.3, 50), pixel_detail(image, 50), rtol=1e-4, atol=1e-4)
-
-
-def test_a_wrong_shape_is_refused() -> None:
-    with pytest.raises(DataError, match=r"\[4, 4\]"):
-        pixel_detail(torch.zeros(4, 4), 1)

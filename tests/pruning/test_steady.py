@@ -14,8 +14,7 @@ from prunes import decide_share
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.gaussians.covariance import covariances, quaternions
-from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.covariance import covariances, quaternions, rotation_matrices
 from sundae_ns.pruning import Decision, PruneRule, field_graph, kept_count, response
 from sundae_ns.pruning.redistribution import voronoi_labels
 from sundae_ns.pruning.selection import select_band, select_sampled, select_top

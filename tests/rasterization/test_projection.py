@@ -7,7 +7,7 @@ import torch
 from splat_inputs import geometry
 from torch import Tensor
 
-from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rasterization.harmonics import evaluate_harmonics
 from sundae_ns.rasterization.projection import project
 

@@ -41,7 +41,7 @@ def test_contribution_is_the_weight_in_the_pictures(build: Build, datamanager: A
 
 @pytest.mark.parametrize("score", ["contribution", "detail-contribution"])
 def test_what_masks_leave_out_of_training_asks_for_no_primitives(build: Build, datamanager: Any, score: str) -> None:
-    """All of a picture is what one half shows and what the other does; many primitives have nothing in one of the two."""
+    """The two halves of an image add up to the whole; many primitives contribute to one half only."""
     model = build(pruning={"score": score})
     model.gauss_params["scales"].data[:] = -4.0
     count = N // 2 if score == "detail-contribution" else None

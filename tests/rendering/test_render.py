@@ -18,7 +18,7 @@ from sundae_ns.errors import MemoryExhaustedError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.method_configs import sundae
 from sundae_ns.model import SundaeModel
-from sundae_ns.rendering import LocalField, render
+from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.rendering.views import crop_image
 
 Build = Callable[..., SundaeModel]
@@ -70,7 +70,7 @@ def test_depth_is_splatted_when_it_is_looked_at(
         assert [p.render_depth for p in passes] == [False]
         inside = slice(None) if crop is None else crop.within(model.means).squeeze(-1)
         part = LocalField(Field({k: v[inside] for k, v in model.state.field.items()}))
-        images, _ = render(part, view, background, model.render_settings(training=False))
+        images, _ = render_view(part, view, background, model.render_settings(training=False))
         seen = images["accumulation"] > 0
         passes.clear()
         found.append(outputs["depth"])
@@ -102,7 +102,7 @@ def test_without_the_head_the_picture_is_the_base_exactly(build: Build, perturb:
     on = model.get_outputs_for_camera(camera())
     assert (on["rgb"] - on["base_rgb"]).abs().max() > 1e-3
     settings = model.render_settings(training=False).without_head()
-    off, _ = render(model.source, model.view_of(camera()), on["background"], settings)
+    off, _ = render_view(model.source, model.view_of(camera()), on["background"], settings)
     assert torch.equal(off["rgb"], off["base_rgb"])
     # With features in the same pass the sums are taken in another order.
     torch.testing.assert_close(off["base_rgb"], on["base_rgb"], atol=1e-6, rtol=0)
@@ -125,7 +125,7 @@ def test_a_mirrored_window_shows_the_mirror_image(
     settings = model.render_settings(training=False).without_head()
     for window in (Window(0, 0, 47, 31), part):
         plain, mirrored = (
-            render(model.source, view.cut(window._replace(mirrored=one)), torch.zeros(3), settings)[0]
+            render_view(model.source, view.cut(window._replace(mirrored=one)), torch.zeros(3), settings)[0]
             for one in (False, True)
         )
         for name in ("rgb", "depth", "accumulation"):
@@ -248,7 +248,8 @@ class FullBackend:
 
     def rasterize(self, *_: Any, **__: Any) -> Any:
         raise torch.cuda.OutOfMemoryError(
-            "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 79.10 GiB of which 1 MiB is free."
+            "CUDA out of memory. Tried to allocate 2.50 GiB. GPU 0 has a total capacity of 79.10 GiB of which 1 MiB is "
+            "free."
         )
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coeffs: Tensor) -> Tensor:
@@ -279,7 +280,7 @@ def test_the_head_runs_as_often_as_the_viewer_asks_and_once_in_training(
     def images() -> list[torch.Tensor]:
         view = model.view_of(camera())
         both = (model.render_settings(training=training) for training in (False, True))
-        return [render(model.source, view, background, settings)[0]["rgb"] for settings in both]
+        return [render_view(model.source, view, background, settings)[0]["rgb"] for settings in both]
 
     shown, trained = images()
     controls = model.viewer_controls

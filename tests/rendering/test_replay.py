@@ -1,4 +1,4 @@
-"""Frames that are played back: when they are recorded, here with a recorder that is none; and on a GPU, what they show."""
+"""Replays of frames: when they are recorded, here by a fake recorder, and on a GPU their images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.cuda_graphs import RECORD_AT
 from sundae_ns.model import SundaeModel
 from sundae_ns.rasterization import Capacity, RecordableGsplat
-from sundae_ns.rendering import FieldSource, FrameReplay, LocalField, RenderSettings, View, render, replay
+from sundae_ns.rendering import FieldSource, LocalField, RenderSettings, View, render_view, replay
+from sundae_ns.rendering.replay import FrameReplay
 
 Build = Callable[..., SundaeModel]
 Perturb = Callable[[SundaeModel], SundaeModel]
@@ -51,7 +52,7 @@ class Recorder:
         shown = {}
 
         def show(view: View, background: Tensor) -> dict[str, Tensor]:
-            shown.update(render(source, view, background, settings, depth=False)[0])
+            shown.update(render_view(source, view, background, settings, depth=False)[0])
             return {name: shown[name] for name in replay.REPLAYED}
 
         return SimpleNamespace(show=show, capacity=capacity or 120)
@@ -198,7 +199,8 @@ def test_nothing_is_recorded_on_a_cpu_or_in_training(
     for _ in range(2 * RECORD_AT):
         model.get_outputs_for_camera(camera())
     source, empty = (LocalField(Field({"means": torch.zeros(n, 3)})) for n in (1, 0))
-    settings = replace(model.render_settings(training=False), backend=SimpleNamespace(name="gsplat"))  # type: ignore[arg-type]
+    settings = model.render_settings(training=False)
+    settings = replace(settings, backend=SimpleNamespace(name="gsplat"))  # type: ignore[arg-type]
     with torch.no_grad():
         assert replay._recordable(source, settings)
         assert not replay._recordable(empty, settings)
@@ -237,7 +239,7 @@ def test_what_is_played_back_is_what_would_be_rendered(
     shown = [model.get_outputs_for_camera(view) for view in views]
     assert len(replayed._frames) == 1
     assert replayed._can_record
-    # The head is a part of the frame's recording, and has none of its own, unless a single frame has run it often enough.
+    # The frame's recording contains the head. The head has one of its own only if single frames ran it often enough.
     if model.head is not None and model.head.config.phases < RECORD_AT:
         assert len(model.head._inference._recorded) == 0
     for found, truth in zip(shown, expected, strict=True):
@@ -292,9 +294,9 @@ def test_shorter_lists_make_the_same_picture(build: Build, camera: MakeCamera, s
     model.gauss_params["scales"] += 2 * torch.randn_like(model.gauss_params["scales"])
     view, background = model.view_of(camera(width=size[0], height=size[1])), torch.zeros(3, device="cuda")
     settings = model.render_settings(training=False)
-    theirs = render(model.source, view, background, settings)[0]
+    theirs = render_view(model.source, view, background, settings)[0]
     capacity = Capacity()
-    ours = render(model.source, view, background, replace(settings, backend=RecordableGsplat(capacity)))[0]
+    ours = render_view(model.source, view, background, replace(settings, backend=RecordableGsplat(capacity)))[0]
     assert int(capacity.needed[0]) > 0
     for name in ("depth", "accumulation"):
         assert torch.equal(ours[name], theirs[name])

@@ -1,4 +1,4 @@
-"""Cameras as the rasteriser takes them: what a view is, against nerfstudio's own matrices, and against a pose that learns."""
+"""Views against nerfstudio's own matrices, and with a pose that learns."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from nerfstudio.cameras.cameras import Cameras
 
-from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rendering.views import view_of
 
 

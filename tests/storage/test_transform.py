@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rasterization import rasterize, select_backend, spherical_harmonics
 from sundae_ns.rasterization.harmonics import evaluate_harmonics
 from sundae_ns.storage import similarity

@@ -11,7 +11,7 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from torch import Tensor
 
-from sundae_ns.gaussians.snapshot import narrow
+from sundae_ns.gaussians.surgery import narrow
 from sundae_ns.model import SundaeModel
 from sundae_ns.training import buffers as buffers_module
 from sundae_ns.training import recordings as recordings_module

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.gaussians.rotations import rotation_matrices
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.storage.morton import interleave, separate
 from sundae_ns.storage.packing.container import Coded, Floats
 from sundae_ns.storage.packing.entropy import LARGEST

@@ -15,8 +15,8 @@ from sundae_ns.compensation import HeadConfig
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians import FEATURES, finite_mask
 from sundae_ns.gaussians.field import Field
-from sundae_ns.gaussians.sh_folding import fold, mean_basis, view_dependence
-from sundae_ns.gaussians.snapshot import narrow
+from sundae_ns.gaussians.sh_folding import fold_harmonics, mean_basis, view_dependence
+from sundae_ns.gaussians.surgery import narrow
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.rendering.contribution import contribution, weights_by_batch
@@ -158,7 +158,7 @@ class SearchedField:
         """Drop the SH coefficients above ``degree``; their mean over the views moves into the constant colour."""
         dc, rest = self.field["features_dc"], self.field["features_rest"]
         mean, _ = self.mean_basis(self.field.sh_degree)
-        dc.data.copy_(fold(dc.data, rest.data, mean, degree)[0])
+        dc.data.copy_(fold_harmonics(dc.data, rest.data, mean, degree)[0])
         narrow(self.field, self.state.optimizers, "features_rest", (degree + 1) ** 2 - 1)
         self.search.degree = degree
 
@@ -176,7 +176,7 @@ class SearchedField:
         mean, square = self.mean_basis(self.field.sh_degree)
         order = view_dependence(rest, mean, square, weight).cpu().argsort(stable=True).to(rest.device)
         colors, coefficients = dc.clone(), rest.clone()
-        folded, _ = fold(colors, coefficients, mean, 0)
+        folded, _ = fold_harmonics(colors, coefficients, mean, 0)
 
         def flattened(count: int) -> Tensor:
             flat = torch.zeros(len(order), dtype=torch.bool, device=rest.device)
