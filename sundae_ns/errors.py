@@ -94,18 +94,24 @@ def writing(failure: str) -> Iterator[None]:
 
 @contextmanager
 def reading(
-    path: Path, kind: str, failure: type[SundaeError] = DataError, *, mend: str = "export it again"
+    path: Path,
+    kind: str,
+    failure: type[SundaeError] = DataError,
+    *,
+    mend: str = "export it again",
+    missing: str = "check the path",
 ) -> Iterator[None]:
     """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
 
-    ``kind`` names what the file should be, ``"a complete .spz"``, and ``mend`` what to do if it is damaged.
+    ``kind`` names what the file should be, ``"a complete .spz"``. ``mend`` says what to do if it is damaged, ``missing``
+    if it cannot be opened.
     """
     try:
         yield
     except SundaeError:
         raise
     except OSError as error:
-        raise failure(f"{path} cannot be read ({error.strerror or one_line(error)}); check the path") from error
+        raise failure(f"{path} cannot be read ({error.strerror or one_line(error)}); {missing}") from error
     except Exception as error:
         raise failure(f"{path} is not {kind} ({one_line(error)}); {mend}") from error
 

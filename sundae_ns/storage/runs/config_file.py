@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from enum import Enum
 from functools import cache
@@ -118,7 +118,7 @@ def load_config(path: Path) -> Any:
     Raises:
         CheckpointError: it cannot be read, is no configuration, or asks for something else.
     """
-    config = _load(path, _ConfigLoader)
+    config = _load(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
     _find_capture(config, path.absolute().parent)
     return config
 
@@ -129,7 +129,7 @@ def model_options(path: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: it cannot be read, or is no configuration of a run.
     """
-    found = _load(path, _ValueLoader)
+    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
     for part in ("pipeline", "model"):
         found = found.get(part) if isinstance(found, dict) else None
     if not isinstance(found, dict):
@@ -157,14 +157,14 @@ def schedule_length(path: Path) -> int:
     Raises:
         CheckpointError: it cannot be read, or is no configuration of a run of ours.
     """
-    found = _load(path, _ValueLoader)
+    found = _load(path, lambda text: yaml.load(text, Loader=_ValueLoader))
     length = found.get("schedule_length") if isinstance(found, dict) else None
     if not isinstance(length, int):
         raise CheckpointError(f"{path} states no length of its schedule; give a run of sundae")
     return length
 
 
-def _load(path: Path, loader: type[yaml.SafeLoader]) -> Any:
+def _load(path: Path, parse: Callable[[str], Any]) -> Any:
     mend = "give the folder of a finished run, or its config.yml"
-    with reading(path, "a run's config.yml, or of another version", CheckpointError, mend=mend):
-        return yaml.load(regular(path).read_text(encoding="utf-8"), Loader=loader)
+    with reading(path, "a run's config.yml, or of another version", CheckpointError, mend=mend, missing=mend):
+        return parse(regular(path).read_text(encoding="utf-8"))
