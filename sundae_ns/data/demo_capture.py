@@ -28,7 +28,8 @@ def write_demo_capture(out: Path) -> Path:
         names = sorted(archive.namelist(), key=lambda name: (name == TRANSFORMS, name))
         _claim(out, names)
         for name in names:
-            archive.extract(name, out)
+            (out / name).parent.mkdir(exist_ok=True)
+            (out / name).write_bytes(archive.read(name))
     return out
 
 

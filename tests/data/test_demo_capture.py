@@ -104,15 +104,15 @@ def test_the_marker_deletes_nothing_outside(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_copy_has_no_transforms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    extract, left = zipfile.ZipFile.extract, [TRAIN + TEST + 1]
+    read, left = zipfile.ZipFile.read, [TRAIN + TEST + 1]
 
-    def until_the_end(self: zipfile.ZipFile, name: str, path: Path) -> str:
+    def until_the_end(self: zipfile.ZipFile, name: str) -> bytes:
         left[0] -= 1
         if left[0] < 0:
             raise KeyboardInterrupt
-        return extract(self, name, path)
+        return read(self, name)
 
-    monkeypatch.setattr(zipfile.ZipFile, "extract", until_the_end)
+    monkeypatch.setattr(zipfile.ZipFile, "read", until_the_end)
     with pytest.raises(KeyboardInterrupt):
         write_demo_capture(tmp_path)
     assert (tmp_path / "images" / "frame_00056.png").exists()
