@@ -31,8 +31,10 @@ from sundae_ns.scenes.packed import packed_run
 from sundae_ns.storage import bytes_of, bytes_of_module
 from sundae_ns.storage.atomic import replacing
 
-COLUMNS = ("capture", "method", "format", "program", "bytes", "psnr", "ssim", "primitives", "seed")
-COLUMNS += ("fingerprint", "command")
+COLUMNS = (
+    *("capture", "method", "format", "program", "bytes", "psnr", "ssim", "primitives"),
+    *("seed", "fingerprint", "command"),
+)
 PLACE = ("capture", "method", "format", "program", "seed")
 """Columns that name a row."""
 OURS = "sundae_ns"
