@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
+import re
 import shutil
 import subprocess
 import sys
@@ -52,7 +53,8 @@ class Packed(NamedTuple):
 def version_of(program: str) -> str:
     """The name of splat-transform with its version: ``splat-transform 3.7.0``."""
     found = subprocess.run([program, "--version"], capture_output=True, text=True, check=True)
-    return f"{OTHER} {found.stdout.split()[-1].lstrip('v')}"
+    number = re.search(r"\d+(\.\d+)+", found.stdout + found.stderr)
+    return f"{OTHER} {number[0]}" if number else OTHER
 
 
 def packed_files(run: Path, scene: sn.Scene, folder: Path, data: Path | None, program: str | None) -> Iterator[Packed]:

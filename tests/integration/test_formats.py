@@ -21,7 +21,7 @@ TRANSFORM = """#!{python}
 import sys
 import sundae_ns as sn
 if sys.argv[1:] == ["--version"]:
-    print("splat-transform v9.8.7")
+    print("splat-transform v9.8.7 (0a1b2c3)", file=sys.stderr)
 else:
     sn.save(sn.load(sys.argv[-2]), sys.argv[-1])
 """
