@@ -120,7 +120,7 @@ def write_rows(file: TextIO, rows: Sequence[dict[str, Any]]) -> None:
     writer.writerows(rows)
 
 
-def main() -> None:
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of a finished run of splatfacto or sundae")
     parser.add_argument("-o", "--out", type=Path, help="CSV file to put the rows into; by default they are printed")
@@ -143,7 +143,8 @@ def main() -> None:
     else:
         merge_rows(options.out, rows)
         print(f"{options.out}: {len(rows)} rows of {opened.scene}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
