@@ -71,7 +71,7 @@ ROOMS = {
     "ranks": Room(
         ("distributed/[!_]*.py",),
         ("distributed/test_blocks.py",),
-        ("bounds", "moves", "scaled_group", "state_of_rank", "_map_state", "_decide"),
+        ("bounds", "moves", "scaled_group", "state_of_rank", "_map_state"),
     ),
 }
 

@@ -49,6 +49,8 @@ METHODS = {
 }
 """Arms of runs.csv in the order of a table, by the names that readers see."""
 HEADLINE = ("splatfacto", "sundae")
+FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
+"""Packed formats in the order of a table, by the heads that readers see."""
 
 
 def lines_of(name: str) -> list[dict[str, Any]]:
@@ -229,6 +231,51 @@ def packing() -> list[str]:
     return table(heads, first_of_each(rows))
 
 
+def format_rows() -> list[dict[str, Any]]:
+    """Rows of formats.csv by capture, method and format, a row for all seeds; numbers are means over the seeds."""
+    methods, kinds = [*METHODS], ["fp32", ".ply", *FORMATS]
+    groups: dict[tuple[str, int, int], list[dict[str, Any]]] = {}
+    for line in lines_of("formats.csv"):
+        theirs = " theirs" if line["program"].startswith("splat-transform") else ""
+        place = methods.index(line["method"]), kinds.index(line["format"] + theirs)
+        groups.setdefault((line["capture"], *place), []).append(line)
+    return [
+        {
+            **{"capture": capture, "kind": kinds[kind], "format": lines[0]["format"], "program": lines[0]["program"]},
+            "method": named(
+                METHODS[methods[method]], all(is_of_today({"variant": methods[method], **line}) for line in lines)
+            ),
+            **{name: fmean(float(line[name]) for line in lines) for name in ("bytes", "psnr", "ssim", "primitives")},
+        }
+        for (capture, method, kind), lines in sorted(groups.items())
+    ]
+
+
+def formats() -> list[str]:
+    """Finished runs in each format: bytes of the whole file, and quality on the test views."""
+    heads = ["capture, method", "format", "program", "primitives", "MB", "PSNR, dB", "SSIM"]
+    rows = [
+        [
+            f"{row['capture']}, {row['method']}",
+            *(row["format"] if row["format"] == "fp32" else f"`{row['format']}`", row["program"]),
+            *(number(row["primitives"], 0), number(row["bytes"] / MB, 2)),
+            *(number(row["psnr"], 2), number(row["ssim"], 4)),
+        ]
+        for row in format_rows()
+    ]
+    return table(heads, first_of_each(rows), words=3)
+
+
+def packed_headline() -> list[str]:
+    """README's table of packed sizes: MB and dB of each packed format, our default beside stock splatfacto."""
+    cells: dict[tuple[str, str], dict[str, str]] = {}
+    for row in (row for row in format_rows() if row["kind"] in FORMATS):
+        cell = f"{number(row['bytes'] / MB, 1)} MB, {number(row['psnr'], 1)} dB"
+        cells.setdefault((row["capture"], row["method"]), {})[row["kind"]] = cell
+    rows = [[*place, *(own.get(kind, "") for kind in FORMATS)] for place, own in cells.items()]
+    return table(["capture", "method", *FORMATS.values()], first_of_each(rows))
+
+
 def multi_gpu() -> list[str]:
     """Training on one and several GPUs."""
     heads = ["field", "GPUs", "primitives", "images a second", "PSNR, dB", "MiB of a GPU, at most"]
@@ -296,6 +343,8 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "flicker": flicker,
     "training-time": training_time,
     "packing": packing,
+    "formats": formats,
+    "packed-headline": packed_headline,
     "multi-gpu": multi_gpu,
     "rules": rules,
     "trials": trials,

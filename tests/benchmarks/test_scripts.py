@@ -232,6 +232,25 @@ def test_a_mean_over_seeds_mixes_no_defaults(monkeypatch: pytest.MonkeyPatch) ->
     assert tables["_merged"]([second, earlier, other], [first], places) == [second, other, first]
 
 
+def test_packed_formats_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    tables = loaded(monkeypatch, "tables.py")
+    monkeypatch.setitem(tables["lines_of"].__globals__, "RESULTS", tmp_path)
+    heads = "capture,method,format,program,bytes,psnr,ssim,primitives,seed,fingerprint,command\n"
+    (ours, *_), (stock, *_) = (sorted(fingerprints(name, 0.1)) for name in ("sundae", "splatfacto"))
+    (tmp_path / "formats.csv").write_text(
+        heads + f"fox,sundae,.sundae,sundae_ns,1000000,30.5,0.9,100,42,{ours},a\n"
+        f"fox,sundae,.sundae,sundae_ns,3000000,31.5,0.8,100,43,{ours},a\n"
+        f"fox,splatfacto,.sog,splat-transform 3.7.0,9000000,29.5,0.7,900,42,{stock},b\n"
+        f"fox,splatfacto,.sog,sundae_ns,8000000,29.4,0.7,900,42,older,c\n"
+    )
+    assert [line.split(" | ") for line in tables["packed_headline"]()[2:]] == [
+        ["| fox", "splatfacto, 30,000 steps, earlier default", "", "8.0 MB, 29.4 dB", "", " |"],
+        ["| ", "splatfacto, 30,000 steps", "", "", "9.0 MB, 29.5 dB", " |"],
+        ["| ", "**sundae**", "", "", "", "2.0 MB, 31.0 dB |"],
+    ]
+    assert tables["formats"]()[-1] == "| fox, **sundae** | `.sundae` | sundae_ns | 100 | 2.00 | 31.00 | 0.8500 |"
+
+
 def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     plots = loaded(monkeypatch, "plot.py")
     monkeypatch.setattr(sys, "argv", ["plot.py", "-o", str(tmp_path)])

@@ -126,10 +126,14 @@ def test_no_recording_outlives_the_strength_of_the_correction_that_it_holds(
 
 @pytest.mark.gpu
 @pytest.mark.parametrize(
-    "options", [GROWTH, {**GROWTH, "use_absgrad": True}, {"sh_degree": 0}], ids=["densify", "absgrad", "logits"]
+    ("options", "alike"),
+    # The prune of the last one enables its head after step 3, so its features drift from step 6 on: by 0.3 to 1.2% of the
+    # loss at step 8 on three H100s.
+    [(GROWTH, 12), ({**GROWTH, "use_absgrad": True}, 12), ({"sh_degree": 0}, 8)],
+    ids=["densify", "absgrad", "logits"],
 )
 def test_replayed_steps_train_the_same_field(
-    both: Callable[..., tuple[Any, Recorded]], options: dict[str, Any]
+    both: Callable[..., tuple[Any, Recorded]], options: dict[str, Any], alike: int
 ) -> None:
     """Gradients are summed in any order, and Adam turns the signs of vanishing ones into steps: fields drift apart."""
     usual, recorded = both("cuda", **options)
@@ -140,7 +144,7 @@ def test_replayed_steps_train_the_same_field(
         torch.manual_seed(step)
         found = {name: value.clone() for name, value in recorded.step(step).items()}
         for name, value in expected.items():
-            if step < 12:
+            if step < alike:
                 torch.testing.assert_close(found[name], value.detach(), rtol=1e-3 * (step + 1), atol=1e-5)
             else:
                 late.setdefault(name, []).append((float(found[name]), float(value)))

@@ -1,0 +1,150 @@
+"""Measure a finished run in every packed format, on its own test views; print one CSV row a format.
+
+    python benchmarks/bench_formats.py RUN                                   # a run of splatfacto or sundae
+    python benchmarks/bench_formats.py RUN -o benchmarks/results/formats.csv
+    python benchmarks/bench_formats.py RUN --ply other.ply other.sog         # files that another program made of the run
+
+The formats are fp32 (the run itself), .ply, .spz and .sog by ``sundae export``, .sundae by ``sundae pack`` with the head
+if there is one, and .sog by PlayCanvas's ``splat-transform`` where it is in PATH (``npm install -g
+@playcanvas/splat-transform``, node 22). Each file is loaded again by ``sundae_ns.load`` and rendered over the background
+of the run. Bytes are those of the whole file; fp32 counts primitives, features and head. With ``-o``, rows take the place
+of those of the same capture, method, format, program and seed. ``benchmarks/tables.py`` shows results/formats.csv.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TextIO
+
+import sundae_ns as sn
+from sundae_ns.rendering.views import view_of
+from sundae_ns.scenes.opening import Opened, open_scene
+from sundae_ns.scenes.packed import packed_run
+from sundae_ns.storage import bytes_of, bytes_of_module
+from sundae_ns.storage.atomic import replacing
+
+COLUMNS = (
+    *("capture", "method", "format", "program", "bytes", "psnr", "ssim", "primitives"),
+    *("seed", "fingerprint", "command"),
+)
+PLACE = ("capture", "method", "format", "program", "seed")
+"""Columns that name a row."""
+OURS = "sundae_ns"
+OTHER = "splat-transform"
+
+
+class Packed(NamedTuple):
+    """A file of the run, and how it was made."""
+
+    file: Path
+    program: str
+    command: str
+
+
+def version_of(program: str) -> str:
+    """The name of splat-transform with its version: ``splat-transform 3.7.0``."""
+    found = subprocess.run([program, "--version"], capture_output=True, text=True, check=True)
+    number = re.search(r"\d+(\.\d+)+", found.stdout + found.stderr)
+    return f"{OTHER} {number[0]}" if number else OTHER
+
+
+def packed_files(run: Path, scene: sn.Scene, folder: Path, data: Path | None, program: str | None) -> Iterator[Packed]:
+    """Write the run in each format into ``folder``, one after the other."""
+    for kind in (".ply", ".spz", ".sog"):
+        sn.save(scene, folder / f"scene{kind}")
+        yield Packed(folder / f"scene{kind}", OURS, f"sundae export RUN -o scene{kind}")
+    packed = folder / "scene.sundae"
+    packed.write_bytes(packed_run(run, data=data)[1])
+    yield Packed(packed, OURS, "sundae pack RUN -o scene.sundae")
+    if program is not None:
+        theirs = folder / "theirs.sog"
+        words = [program, "--quiet", "--overwrite", "--gpu", "cpu", str(folder / "scene.ply"), str(theirs)]
+        subprocess.run(words, check=True)
+        yield Packed(theirs, version_of(program), f"{OTHER} --gpu cpu scene.ply scene.sog")
+
+
+def rows_of(opened: Opened, method: str, files: Iterator[Packed], scene: sn.Scene) -> Iterator[dict[str, Any]]:
+    """A row for the run in fp32, then one for each file."""
+    views = [view_of(camera, scene.device) for camera in opened.cameras]
+
+    def row(measured: sn.Scene, kind: str, program: str, count: int, command: str) -> dict[str, Any]:
+        # Files for viewers state no background.
+        shown = dataclasses.replace(measured, background_color=scene.background_color)
+        quality = sn.measure(shown, opened.truths, views)
+        return {
+            "capture": opened.scene,
+            "method": method,
+            "format": kind,
+            "program": program,
+            "bytes": count,
+            "psnr": round(quality.psnr, 4),
+            "ssim": round(quality.ssim, 4),
+            "primitives": measured.num_primitives,
+            "seed": "" if opened.seed is None else opened.seed,
+            "fingerprint": opened.fingerprint,
+            "command": command,
+        }
+
+    stored = bytes_of(scene.field) + (0 if scene.head is None else bytes_of_module(scene.head))
+    yield row(scene, "fp32", "", stored, f"ns-train {opened.method}")
+    for packed in files:
+        loaded = sn.load(packed.file, device=scene.device)
+        yield row(loaded, packed.file.suffix, packed.program, packed.file.stat().st_size, packed.command)
+
+
+def place_of(row: dict[str, Any]) -> tuple[str, ...]:
+    """What a row is of: another version of a program takes the place of an earlier one."""
+    return tuple(str(row[name]).split(" ")[0] if name == "program" else str(row[name]) for name in PLACE)
+
+
+def merge_rows(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write rows into a file, in place of those that they measure again."""
+    measured = set(map(place_of, rows))
+    old = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines())) if path.exists() else []
+    with replacing(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        write_rows(file, [*(row for row in old if place_of(row) not in measured), *rows])
+
+
+def write_rows(file: TextIO, rows: Sequence[dict[str, Any]]) -> None:
+    writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="folder of a finished run of splatfacto or sundae")
+    parser.add_argument("-o", "--out", type=Path, help="CSV file to put the rows into; by default they are printed")
+    parser.add_argument("--data", type=Path, help="the capture, if it has moved")
+    parser.add_argument("--method", help="name in the rows; by default the run's method")
+    parser.add_argument("--ply", type=Path, nargs="+", default=[], metavar="FILE", help="measure these files instead")
+    parser.add_argument("--program", default="other", help="the program that made the files of --ply")
+    parser.add_argument("--splat-transform", default=shutil.which(OTHER), metavar="PROGRAM")
+    options = parser.parse_args()
+
+    opened = open_scene(options.run, data=options.data)
+    scene = sn.load(options.run, device=opened.model.device)
+    with tempfile.TemporaryDirectory() as name:
+        files = packed_files(options.run, scene, Path(name), options.data, options.splat_transform)
+        if options.ply:
+            files = (Packed(file, options.program, f"{options.program} {file.name}") for file in options.ply)
+        rows = list(rows_of(opened, options.method or opened.method, files, scene))
+    if options.out is None:
+        write_rows(sys.stdout, rows)
+    else:
+        merge_rows(options.out, rows)
+        print(f"{options.out}: {len(rows)} rows of {opened.scene}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
