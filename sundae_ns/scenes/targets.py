@@ -108,7 +108,7 @@ class Search:
 
     def _tried(self, power: float) -> Try:
         scene, codecs = fit_scene(self.scene, scaled(self.config, power))
-        return Try(scene, codecs, len(pack_bytes(scene, codecs)))
+        return Try(scene, codecs, len(pack_bytes(scene, codecs)[0]))
 
 
 @torch.no_grad()
