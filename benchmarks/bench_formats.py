@@ -2,13 +2,14 @@
 
     python benchmarks/bench_formats.py RUN                                   # a run of splatfacto or sundae
     python benchmarks/bench_formats.py RUN -o benchmarks/results/formats.csv
-    python benchmarks/bench_formats.py RUN --ply other.ply other.sog         # files that another program made of the run
+    python benchmarks/bench_formats.py RUN --ply other.ply other.sog         # files of another program
 
-The formats are fp32 (the run itself), .ply, .spz and .sog by ``sundae export``, .sundae by ``sundae pack`` with the head
-if there is one, and .sog by PlayCanvas's ``splat-transform`` where it is in PATH (``npm install -g
-@playcanvas/splat-transform``, node 22). Each file is loaded again by ``sundae_ns.load`` and rendered over the background
-of the run. Bytes are those of the whole file; fp32 counts primitives, features and head. With ``-o``, rows take the place
-of those of the same capture, method, format, program and seed. ``benchmarks/tables.py`` shows results/formats.csv.
+The formats are fp32 (the run itself), .ply, .spz and .sog by ``sundae export``, .sundae by ``sundae pack`` with the
+head if there is one, and .sog by PlayCanvas's ``splat-transform`` where it is in PATH (``npm install -g
+@playcanvas/splat-transform``, node 22). Each file is loaded again by ``sundae_ns.load`` and rendered over the
+background of the run. Bytes are those of the whole file; fp32 counts primitives, features and head. With ``-o``, rows
+take the place of those of the same capture, method, format, program and seed. ``benchmarks/tables.py`` shows
+results/formats.csv.
 """
 
 from __future__ import annotations

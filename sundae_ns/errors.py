@@ -103,8 +103,8 @@ def reading(
 ) -> Iterator[None]:
     """Turn every error of reading an untrusted file into a ``failure``; decoders raise errors of many kinds.
 
-    ``kind`` names what the file should be, ``"a complete .spz"``. ``mend`` says what to do if it is damaged, ``missing``
-    if it cannot be opened.
+    ``kind`` names what the file should be, ``"a complete .spz"``. ``mend`` says what to do if it is damaged,
+    ``missing`` if it cannot be opened.
     """
     try:
         yield

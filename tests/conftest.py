@@ -85,7 +85,8 @@ def _callers() -> list[SimpleNamespace]:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    # nerfstudio calls inspect.stack() 26 times while it is imported, each time for one name; below pytest that takes 10 s.
+    # nerfstudio calls inspect.stack() 26 times while it is imported, each time for one name. Below pytest this takes
+    # 10 s.
     with mock.patch("inspect.stack", _callers):
         return (yield)
 

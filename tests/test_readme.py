@@ -24,7 +24,7 @@ HASH = re.compile(r"(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,40}")
 DOCS_PAGE = re.compile(r"docs/\w+\.md")
 PARSERS = ("colmap", "nerfstudio-data")
 ELSEWHERE = {"data", "help"}
-"""Options of ``ns-train`` that are no place in the configuration: one that nerfstudio spells shorter, and tyro's own."""
+"""Options of ``ns-train`` that are not in the configuration: one that nerfstudio spells shorter, and tyro's own."""
 
 
 def name(path: Path) -> str:

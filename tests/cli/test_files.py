@@ -74,8 +74,8 @@ def test_export_of_a_ply_of_any_program(
     output = " ".join(capsys.readouterr().out.split())
     mode = ", antialiased" if comments else ""
     assert (
-        f"a{kind}: 199 primitives, degree 1{mode}, {out.stat().st_size:,} bytes left out 1 primitives that were not finite"
-        in output
+        f"a{kind}: 199 primitives, degree 1{mode}, {out.stat().st_size:,} bytes "
+        "left out 1 primitives that were not finite" in output
     )
     finite = {name: value[torch.arange(200) != 3] for name, value in given.items()}
     write_for_viewers(same, finite, antialiased=bool(comments))

@@ -1,7 +1,7 @@
 """Ranks over gloo: ``python rank.py FILE RANKS FOLDER SECONDS`` runs the checks of a test file on each rank.
 
-The file's ``checks(FOLDER)`` run in their order; the error of each, or "", is written to FOLDER/rankN.json. Ranks are forked
-off a process that has imported the file, so that they do not import nerfstudio themselves.
+The file's ``checks(FOLDER)`` run in their order; the error of each, or "", is written to FOLDER/rankN.json. Ranks are
+forked off a process that has imported the file, so that they do not import nerfstudio themselves.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ def source_of(shards: Shards, field: Field) -> ShardedField:
 
 
 def render(source: ShardedField, view: View, *, at: StepResolution | None = None) -> tuple[Primitives, Any]:
-    """The primitives that a view receives, and their image; densification finds its statistics after the backward pass."""
+    """The primitives that a view receives, and their image, with densification's statistics after the backward pass."""
     received = source.primitives(view, COLORS, features=True, at=at)
     splat = draw(received, view)
     splat.info["means2d"].retain_grad()

@@ -37,7 +37,8 @@ def test_an_error_of_sundae_in_a_rank_keeps_its_message() -> None:
     class Raised(Exception):
         error_index = 1
 
-    text = "\n\n-- Process 1 terminated with the following error:\nTraceback ...\nsundae_ns.errors.DataError: cause; mend\n"
+    text = "\n\n-- Process 1 terminated with the following error:\n"
+    text += "Traceback ...\nsundae_ns.errors.DataError: cause; mend\n"
     assert str(rank_ended(Raised(text))) == "rank 1: cause; mend"
     assert "rank 1 ended (ValueError: odd)" in str(rank_ended(Raised("Traceback ...\nValueError: odd")))
 

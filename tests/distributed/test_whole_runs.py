@@ -1,7 +1,7 @@
 """Whole runs of two ranks over gloo: they train, prune, save, resume and fail as the documentation says.
 
-``rank.py`` runs the checks of this file on each rank; the tests read their results. Started as a program, the file trains a
-run whose rank is killed. Every program has a time limit.
+``rank.py`` runs the checks of this file on each rank; the tests read their results. Started as a program, the file
+trains a run whose rank is killed. Every program has a time limit.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def train(config: SundaeTrainerConfig, rank: int, ranks: int) -> SundaeTrainer:
 
 
 def check_training(shards: Shards, folder: Path) -> None:
-    """A run of two ranks; it ends with a mean of weights, both have the same head, and no shard is far from the mean."""
+    """A run of two ranks ends with a mean of weights; both have the same head, and no shard is far from the mean."""
     anew, averaged = [], []
     exchange, replace = ShardedField._exchange, RunningMean.replace
 

@@ -1,7 +1,7 @@
 """The viewer in a real browser: ``ns-viewer`` on the tiny run, looked at and operated in a headless Chromium.
 
-Screenshots are compared with pictures of the loaded model by the page's own camera. In between lie JPEG at quality 75 and
-the browser's enlarging to the size of its canvas, done here by the same bilinear filter.
+Screenshots are compared with pictures of the loaded model by the page's own camera. In between lie JPEG at quality 75
+and the browser's enlarging to the size of its canvas, done here by the same bilinear filter.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SIDE = 256
 """Longer side of pictures after "Fast" has been pressed, pixels."""
 FAR = 48
 MEAN, SHARE = 3.0, 0.02
-"""Bounds of the mean difference of screenshot and render, in steps of 255, and of the share of pixels off by ``FAR``."""
+"""Bounds of the mean difference of screenshot and render, in steps of 255, and of the share of pixels off by FAR."""
 
 
 @pytest.fixture

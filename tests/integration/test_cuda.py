@@ -15,7 +15,7 @@ from sundae_ns.storage.runs import checkpoint
 
 pytestmark = pytest.mark.gpu
 SPREAD = 1.0
-"""dB between two runs of one seed: CUDA sums in no fixed order, and five such runs had a standard deviation of 0.2 dB."""
+"""dB between two runs of one seed: CUDA sums in no fixed order; five such runs had a standard deviation of 0.2 dB."""
 ROOM = 256 << 20
 """Bytes that training may take beyond what it has when it starts."""
 
@@ -59,7 +59,8 @@ def test_memory_that_runs_out_is_named_and_training_goes_on_from_the_last_checkp
     line = str(raised.value)
     found = re.fullmatch(
         r"the GPU's memory is full: cannot allocate [\d.]+ [KMG]iB more with ([\d,]+) primitives; try "
-        r"--pipeline\.datamanager\.cache-images cpu \(.*\), --pipeline\.datamanager\.camera-res-scale-factor 0\.5 \(.*\), "
+        r"--pipeline\.datamanager\.cache-images cpu \(.*\), "
+        r"--pipeline\.datamanager\.camera-res-scale-factor 0\.5 \(.*\), "
         r"or --pipeline\.model\.pruning\.mode continuous .*--pipeline\.model\.pruning\.max-primitives (\d+) \(.*\); "
         r"--load-dir resumes from the last checkpoint",
         line,

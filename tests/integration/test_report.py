@@ -35,7 +35,7 @@ def sundae(*arguments: object) -> int:
 
 @pytest.fixture(scope="module")
 def stock(tiny: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder of splatfacto as nerfstudio writes it, its field that of the tiny run: it cannot train without CUDA."""
+    """A run of splatfacto as nerfstudio writes it, with the field of the tiny run: it cannot train without CUDA."""
     config = copy.deepcopy(method_configs["splatfacto"])
     config.data = config.pipeline.datamanager.data = tiny.scene
     config.experiment_name = "stock"

@@ -23,7 +23,7 @@ Run = Callable[..., int]
 
 @pytest.fixture
 def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Run ``sundae run`` with its commands in this process, which has imported nerfstudio; poses are those of the scene."""
+    """Run ``sundae run`` with its commands in this process, which has imported nerfstudio; poses are the scene's."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.scene / "images", "photos")
     monkeypatch.setattr("sundae_ns.cli.run.shutil.which", lambda _: "/bin/true")

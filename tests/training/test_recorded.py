@@ -127,8 +127,8 @@ def test_no_recording_outlives_the_strength_of_the_correction_that_it_holds(
 @pytest.mark.gpu
 @pytest.mark.parametrize(
     ("options", "alike"),
-    # The prune of the last one enables its head after step 3, so its features drift from step 6 on: by 0.3 to 1.2% of the
-    # loss at step 8 on three H100s.
+    # The prune of the last one enables its head after step 3, so its features drift from step 6 on: by 0.3 to 1.2% of
+    # the loss at step 8 on three H100s.
     [(GROWTH, 12), ({**GROWTH, "use_absgrad": True}, 12), ({"sh_degree": 0}, 8)],
     ids=["densify", "absgrad", "logits"],
 )
