@@ -32,7 +32,10 @@ def pixel_detail(image: Tensor, cells: float) -> Tensor:
     planes = image.detach().permute(2, 0, 1).nan_to_num()[None].double()
 
     def local_mean(values: Tensor) -> Tensor:
-        return avg_pool2d(values, 2 * half + 1, stride=1, padding=half, count_include_pad=False)
+        # Rows, then columns: a square window of many pixels would take long.
+        for window, padding in (((2 * half + 1, 1), (half, 0)), ((1, 2 * half + 1), (0, half))):
+            values = avg_pool2d(values, window, stride=1, padding=padding, count_include_pad=False)
+        return values
 
     variance = (local_mean(planes.square()) - local_mean(planes).square()).clamp_min(0).sum(dim=1)[0]
     mean = variance.mean()
