@@ -17,7 +17,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 
 import torch
@@ -25,13 +24,14 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from sundae_ns.api.opening import load
+from sundae_ns.api.saving import save
 from sundae_ns.evaluation import psnr
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.scenes.opening import Opened, open_scene
-from sundae_ns.scenes.packed import contents_of_run
 from sundae_ns.storage import read_ply
-from sundae_ns.storage.viewers import ANTIALIASED, write_for_viewers
+from sundae_ns.storage.viewers import ANTIALIASED
 
 
 def transform(program: str, source: Path, out: Path) -> Path:
@@ -79,9 +79,7 @@ def main() -> None:
 
     run = open_scene(options.run / "config.yml")
     model = run.model
-    scene = contents_of_run(options.run, max_cameras=0)
-    antialiased = model.config.rasterize_mode == "antialiased"
-    logits = model.config.sh_degree == 0
+    scene = load(options.run)
     views = torch.linspace(0, len(run.cameras) - 1, min(options.views, len(run.cameras))).round().long().tolist()
     own = images_of(run, dict(model.gauss_params), views, options.downscale, "The model")
     truths = [
@@ -90,11 +88,10 @@ def main() -> None:
     # From here on the colours are SH coefficients, whatever the model has.
     model.config.sh_degree = max(model.config.sh_degree, 1)
 
-    export = partial(write_for_viewers, params=scene.field, antialiased=antialiased, sigmoid_colors=logits)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for kind in ("ply", "spz", "sog"):
-            export(folder / f"ours.{kind}")
+            save(scene, folder / f"ours.{kind}")
         files = [folder / f"ours.{kind}" for kind in ("ply", "spz", "sog")]
         files += [transform(options.splat_transform, files[0], folder / f"theirs.{kind}") for kind in ("spz", "sog")]
         for file in files:
@@ -107,7 +104,7 @@ def main() -> None:
                 "file": file.name,
                 "bytes": file.stat().st_size,
                 "primitives": len(field["means"]),
-                "antialiased": antialiased,
+                "antialiased": scene.antialiased,
                 "antialiased_back": says_antialiased(back),
                 "views": len(views),
                 "width": own[0].shape[1],

@@ -32,10 +32,10 @@ from bench_page import SECONDS, SIDE, bundled, has_packages, psnr, scaled, truth
 from browser import Browser, find_chromium, wait_for
 from numpy.typing import NDArray
 
-from sundae_ns.api.packing import stored_cameras
+from sundae_ns.api.packing import scene_of, stored_cameras
+from sundae_ns.api.saving import save_for_viewers
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.storage.packing import PackedScene, read_scene
-from sundae_ns.storage.viewers import write_for_viewers
 
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,">
 <script type="module" src="viewers.js"></script>"""
@@ -130,14 +130,12 @@ def opened(scene: PackedScene, kind: str) -> Iterator[Viewers]:
     chromium = find_chromium()
     if chromium is None or not has_packages():
         sys.exit("no Chromium or no viewers here: apt-get install chromium, then make browser")
-    model = scene.meta["model"]
     width, height = (int(side) for side in stored_cameras(scene)["sizes"][0])
     with TemporaryDirectory() as folder:
         site = Path(folder)
         (site / "index.html").write_text(PAGE)
         bundled("viewers.ts", site / "viewers.js", "--minify")
-        antialiased, logits = model["rasterize_mode"] == "antialiased", model["sh_degree"] == 0
-        write_for_viewers(site / f"a.{kind}", scene.field, antialiased=antialiased, sigmoid_colors=logits)
+        save_for_viewers(scene_of(scene), site / f"a.{kind}")
         with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=site)) as server:
             threading.Thread(target=server.serve_forever, daemon=True).start()
             try:

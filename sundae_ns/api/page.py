@@ -14,7 +14,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from sundae_ns.api.rendering import render
+from sundae_ns.api.rendering import image_of, render
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import view_in_front
 from sundae_ns.errors import writing
@@ -79,5 +79,4 @@ def _filled(scene: Scene, title: str, *, inline: str = "", source: str = "") -> 
 def render_first(scene: Scene) -> Image.Image:
     """The image of the scene's first view, head included, at most 640 pixels wide and high."""
     view = scene.views[0] if scene.views else view_in_front(scene)
-    image = render(scene, view.zoomed(min(_POSTER_SIDE / max(view.width, view.height), 1.0))).rgb
-    return Image.fromarray((image * 255).round().byte().cpu().numpy())
+    return image_of(render(scene, view.zoomed(min(_POSTER_SIDE / max(view.width, view.height), 1.0))).rgb)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+from PIL import Image
 from torch import Tensor
 
 from sundae_ns.api.scene import Scene
@@ -24,6 +25,11 @@ class Rendering(NamedTuple):
     """Expected distance along the viewing axis, world units; 0 where nothing is seen ``[H, W, 1]``."""
     accumulation: Tensor
     """Opacity of the image, in [0, 1] ``[H, W, 1]``."""
+
+
+def image_of(rgb: Tensor) -> Image.Image:
+    """Colours in [0, 1] ``[H, W, 3]``, any device, as an image of 8 bits a channel."""
+    return Image.fromarray((rgb * 255).round().byte().cpu().numpy())
 
 
 @torch.no_grad()

@@ -79,7 +79,6 @@ def save_for_viewers(scene: Scene, path: Path, *, upright: bool = False) -> View
         path,
         scene.field,
         antialiased=scene.antialiased,
-        sigmoid_colors=scene.field.encoding == "logits",
         upright=upright,
         in_model_frame=scene.in_model_frame,
     )

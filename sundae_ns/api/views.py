@@ -155,9 +155,7 @@ def _camera_path(content: dict[str, Any], where: str) -> list[View]:
         fov = finite(entry.get("fov", _FOV), "fov", place, positive=True)
         if not fov < 180:
             raise DataError(f"{place}: fov is {fov:g}; it must be below 180 degrees")
-        focal = height / 2 / math.tan(math.radians(fov) / 2)
-        intrinsics = (focal, focal, width / 2, height / 2)
-        views.append(View.from_pose(torch.from_numpy(pose), intrinsics, width, height))
+        views.append(View.from_fov(torch.from_numpy(pose), fov, width, height))
     return views
 
 

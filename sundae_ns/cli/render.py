@@ -10,6 +10,8 @@ import tyro
 from sundae_ns.cli.outputs import Overwrite, check_file
 
 if TYPE_CHECKING:
+    from PIL import Image
+
     from sundae_ns.rendering import View
 
 IMAGES = (".png", ".jpg", ".jpeg", ".webp")
@@ -36,7 +38,6 @@ def render_file(
         width: width of the images in pixels; by default that of the camera.
         overwrite: replace an existing file, once the new one is complete.
     """
-    from PIL import Image
     from rich.console import Console
     from rich.progress import track
 
@@ -59,20 +60,19 @@ def render_file(
         cameras = CameraFile(list(opened.views) or [view_in_front(opened)], None)
     views = [_resized(each, width, even=suffix == ".mp4") for each in cameras.views]
 
-    def image_of(view: View) -> Image.Image:
-        image = rendering.render(opened, view, head=head).rgb
-        return Image.fromarray((image * 255).round().byte().cpu().numpy())
+    def rendered(view: View) -> Image.Image:
+        return rendering.image_of(rendering.render(opened, view, head=head).rgb)
 
     if suffix == ".mp4":
         shown = track(views, "Rendering", transient=True, console=Console(stderr=True))
         speed = cameras.frames_per_second or FRAMES_PER_SECOND
         with writing(f"cannot write {out}"), replacing(out) as partial:
-            count = write_video(partial, (image_of(each) for each in shown), frames_per_second=speed)
+            count = write_video(partial, (rendered(each) for each in shown), frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
     chosen = _chosen(views, view)
     with writing(f"cannot write {out}"), replacing(out) as partial:
-        image_of(chosen).save(partial, format={".jpg": "jpeg"}.get(suffix, suffix[1:]))
+        rendered(chosen).save(partial, format={".jpg": "jpeg"}.get(suffix, suffix[1:]))
     print(f"{out}: {chosen.width} x {chosen.height} px")
     return 0
 

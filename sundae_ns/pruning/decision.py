@@ -139,5 +139,5 @@ def _select(values: Tensor, rule: PruneRule, count: int, points: Tensor) -> Tens
 
 
 def diverged(n: int) -> DataError:
-    """The error of a field of ``n`` primitives of which none is finite."""
+    """The error for a field of ``n`` primitives without a finite one."""
     return DataError(f"none of {n} primitives is finite: the training has diverged, go back to an earlier checkpoint")

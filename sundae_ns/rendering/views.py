@@ -50,6 +50,12 @@ class View(NamedTuple):
         return cls(world_to_camera(pose[:3].float()), K, int(width), int(height), (fx + fy) / 2)
 
     @classmethod
+    def from_fov(cls, pose: Tensor, fov: float, width: int, height: int) -> View:
+        """As :meth:`from_pose`, with the vertical field of view in degrees and the principal point in the middle."""
+        focal = height / 2 / math.tan(math.radians(fov) / 2)
+        return cls.from_pose(pose, (focal, focal, width / 2, height / 2), width, height)
+
+    @classmethod
     def look_at(
         cls,
         eye: Sequence[float] | Tensor,
@@ -81,8 +87,7 @@ class View(NamedTuple):
             right = torch.linalg.cross(torch.roll(back, 1) + torch.tensor([1.0, 0.0, 0.0]), back)
         right = torch.nn.functional.normalize(right, dim=0)
         pose = torch.stack([right, torch.linalg.cross(back, right), back, eye], dim=1)
-        focal = height / 2 / math.tan(math.radians(fov) / 2)
-        return cls.from_pose(pose, (focal, focal, width / 2, height / 2), width, height)
+        return cls.from_fov(pose, fov, width, height)
 
     @property
     def center(self) -> Tensor:

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.gaussians import finite_mask, rgb_to_sh
+from sundae_ns.gaussians import finite_mask
+from sundae_ns.gaussians.field import as_field
 from sundae_ns.gaussians.parameters import sh_degree_of
 from sundae_ns.storage.ply import MODEL_FRAME, write_ply
 from sundae_ns.storage.sog import write_sog
@@ -51,7 +52,6 @@ def write_for_viewers(
     params: Mapping[str, Tensor],
     *,
     antialiased: bool = False,
-    sigmoid_colors: bool = False,
     upright: bool = False,
     in_model_frame: bool = True,
 ) -> ViewerFile:
@@ -61,9 +61,8 @@ def write_for_viewers(
 
     Args:
         path: its folder must exist.
-        params: the field; see :mod:`sundae_ns.gaussians.parameters`.
+        params: the field; see :mod:`sundae_ns.gaussians.parameters`. A :class:`Field` says how it stores colours.
         antialiased: mark the scene as trained with antialiasing.
-        sigmoid_colors: ``features_dc`` are logits of colours, as in a model of SH degree 0, not SH coefficients.
         upright: rotate the scene from nerfstudio's axes to those of a 3DGS .ply, so that viewers show it upright.
         in_model_frame: the field is in the coordinates of nerfstudio's model, as a .ply then says.
 
@@ -74,9 +73,7 @@ def write_for_viewers(
     """
     check_format(path)
     finite = finite_mask(params)
-    field = {name: value.detach()[finite].cpu() for name, value in params.items()}
-    if sigmoid_colors:
-        field["features_dc"] = rgb_to_sh(field["features_dc"].sigmoid())
+    field = {name: value.detach()[finite].cpu() for name, value in as_field(params).as_harmonics().items()}
     if upright:
         field = similarity(field, _UPRIGHT, 1.0)
     coefficients = field["features_rest"].shape[1]

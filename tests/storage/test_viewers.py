@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import from_points
+from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization.harmonics import harmonic_basis
 from sundae_ns.storage import is_nerfstudio_ply, read_ply, write_ply
 from sundae_ns.storage.viewers import ANTIALIASED, FORMATS, write_for_viewers
@@ -90,7 +91,7 @@ def test_sh_degree_4_is_cut_to_the_format(tmp_path: Path, kind: str, degree: int
 
 def test_colours_of_models_of_sh_degree_0(tmp_path: Path) -> None:
     given = field(degree=0)
-    write_for_viewers(tmp_path / "a.ply", given, sigmoid_colors=True)
+    write_for_viewers(tmp_path / "a.ply", Field(given, "logits"))
     colors = 0.5 + 0.28209479 * read_ply(tmp_path / "a.ply")["features_dc"]
     torch.testing.assert_close(colors, given["features_dc"].sigmoid(), rtol=0, atol=1e-6)
 
