@@ -62,8 +62,8 @@ class Room(NamedTuple):
 ROOMS = {
     "pruning": Room(("pruning/[!_]*.py",), ("pruning/test_*.py", "training/test_schedules.py")),
     "schedules": Room(
-        ("training/schedules.py", "training/budget/search.py"),
-        ("training/test_schedules.py", "training/budget/test_*.py"),
+        ("training/schedules.py", "training/trials/curve.py"),
+        ("training/test_schedules.py", "training/trials/test_curve.py"),
     ),
     "surgery": Room(("gaussians/surgery.py", "gaussians/merging.py"), ("gaussians/test_*.py",)),
     "packing": Room(("storage/packing/[!_]*.py",), ("storage/packing/test_*.py", "fuzz/test_packs.py")),

@@ -92,8 +92,6 @@ def method(
             datamanager=SundaeDatamanagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
                 cache_images_type="uint8",
-                # The search decides by views that it does not train on.
-                holdout_every=8 if pruning.mode == "auto" else 0,
             ),
             model=SundaeModelConfig(
                 pruning=pruning,
@@ -139,9 +137,8 @@ sundae_continuous = method(
 
 sundae_auto = method(
     "sundae-auto",
-    "SUNDAE that searches its budget: the smallest field and head within 0.1 dB, or the best in bytes or primitives.",
-    pruning=PruningConfig(mode="auto", stop=28000),
-    head=HeadConfig(mode="residual"),
+    "SUNDAE that keeps as many primitives as the scene needs, by trials of several numbers on held-out training views.",
+    pruning=PruningConfig(keep_ratio=None),
 )
 
 sundae_fast = method(

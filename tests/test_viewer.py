@@ -182,7 +182,10 @@ def test_the_rules_of_the_menu_rank_by_what_they_say() -> None:
     opaque = model.opacities[:, 0]
     assert opaque[top].min() >= opaque[~top].max()
     # The share of the slider counts, whatever budget the run had.
-    for options in ({"mode": "auto", "max_bytes": 900}, {"mode": "continuous", "target_primitives": 7, "start": 20000}):
+    for options in (
+        {"keep_ratio": None, "max_bytes": 900},
+        {"mode": "continuous", "target_primitives": 7, "start": 20000},
+    ):
         busy, _ = build(**{"stop": 20000, **options})
         mask = shown(busy, "as configured", 0.2)
         assert mask is not None

@@ -5,7 +5,7 @@ D = Path(__file__).parent / "data"
 rows = [r for r in json.load(open(D / "oracle.json")) if r["seed"] == 42 and r["share"]]
 real = {}
 for r in rows: real.setdefault(r["capture"], {})[r["share"]] = r
-rec = {json.load(open(f))["scene"]: json.load(open(f)) for f in D.glob("record-*.json")}
+rec = {json.load(open(f))["scene"]: dict(json.load(open(f)), shares=[1.0, .4, .2, .1, .05, .025]) for f in D.glob("whole-*-42.json")}
 mean = lambda w, k: sum(v[k] for v in w) / len(w)
 caps = sorted(real)
 S = [1.0, .4, .2, .1, .05, .025]
@@ -17,7 +17,7 @@ def feats(c, s, k, L):   # value at window L, log slope
 def truth(c, s, key):
     r = real[c].get(s)
     return None if r is None else r[key]
-for L in (2, 3, 4, 5):
+for L in (2,):
     for key, k in (("psnr", 1), ("ssim", 2)):
         X, y, who = [], [], []
         for c in caps:
@@ -39,8 +39,8 @@ for L in (2, 3, 4, 5):
             w = np.linalg.lstsq(X[:, cols], y, rcond=None)[0]
             print(L, key, cols, "w", np.round(w, 3), "LOO rmse %.4f" % np.sqrt(np.mean(np.square(err))), "std y %.4f" % y.std(), len(y))
 print("affine-fitted PSNR as the predictor of PSNR")
-for L in (2, 5):
-    for k in (1, 3):
+for L in (2,):
+    for k in (1,):
         X, y, who = [], [], []
         for c in caps:
             have = [s for s in S if truth(c, s, "psnr") is not None]
@@ -55,12 +55,12 @@ for L in (2, 5):
             if (~tr).sum(): err += list(X[~tr] @ np.linalg.lstsq(X[tr], y[tr], rcond=None)[0] - y[~tr])
         print(L, k, "LOO rmse %.3f" % np.sqrt(np.mean(np.square(err))))
 w = {"psnr": (0.8, 1.5), "ssim": (0.85, 2.0)}
-for L in (2, 5):
+for L in (2,):
   for c in caps:
     P = {s: [w[key][0] * feats(c, s, k, L)[0] + w[key][1] * feats(c, s, k, L)[1] for key, k in (("psnr", 1), ("ssim", 2))] for s in S}
     bp, bs = max(v[0] for v in P.values()), max(v[1] for v in P.values())
     ok = [s for s in S if P[s][0] >= bp - .1 and P[s][1] >= bs - .003]
     print(L, c, "chosen", ok, {s: "%.2f %.4f" % (v[0] - bp, v[1] - bs) for s, v in P.items()})
-    if L == 5:
+    if L == 2:
         T = {s: (real[c][s]["psnr"], real[c][s]["ssim"]) for s in S if s in real[c]}; bp, bs = max(v[0] for v in T.values()), max(v[1] for v in T.values())
         print("      truth", {s: "%.2f %.4f%s" % (v[0] - bp, v[1] - bs, "h" if real[c][s]["bytes_head"] else "") for s, v in T.items()})

@@ -32,8 +32,9 @@ def train(
     Args:
         capture: folder of the capture, as ns-process-data writes it.
         out: folder of runs.
-        method: one of sundae, sundae-fast, -auto, -continuous, -paper; sundae-tiny suits small images and a CPU.
-        keep: share of the primitives to keep, in (0, 1]; by default that of the method.
+        method: one of sundae, sundae-fast, -continuous, -paper; sundae-tiny suits small images and a CPU.
+        keep: share of the primitives to keep, in (0, 1]; by default as many as the scene needs, or
+            that of the method.
         steps: number of training steps; by default that of the method.
     """
     words = command(capture, out, method, keep, steps)
@@ -46,7 +47,7 @@ def command(capture: Path, out: Path, method: str, keep: float | None, steps: in
     """The words of the command; options as in :func:`train`.
 
     Raises:
-        ConfigError: there is no such method, a number is out of range, or the method does not take a share.
+        ConfigError: there is no such method, or a number is out of range.
         DataError: the capture does not exist.
     """
     if not capture.exists():
@@ -55,8 +56,6 @@ def command(capture: Path, out: Path, method: str, keep: float | None, steps: in
         raise ConfigError(f"{method} is no method of sundae; use one of {', '.join(methods())}")
     if keep is not None and not 0 < keep <= 1:
         raise ConfigError(f"keep is {keep}; give a share in (0, 1]")
-    if keep is not None and method == "sundae-auto":
-        raise ConfigError("sundae-auto finds the share by itself; leave --keep out, or choose another method")
     if steps is not None and steps < 1:
         raise ConfigError(f"steps is {steps}; give at least 1")
     words = ["ns-train", method, "--data", str(capture), "--output-dir", str(out)]

@@ -29,7 +29,6 @@ def check_options(config: Any) -> None:
     counted = pruning.max_primitives is not None or pruning.target_primitives is not None
     refused = {
         "--pipeline.model.warmup mcmc": model.warmup == "mcmc",
-        "--pipeline.model.pruning.mode auto": pruning.mode == "auto",
         "continuous pruning to a count or under a cap": pruning.mode == "continuous" and counted,
         "a camera optimizer": model.camera_optimizer.mode != "off",
         "--mixed-precision": config.mixed_precision or config.use_grad_scaler,

@@ -60,7 +60,7 @@ class Buffers:
         n, rows = state.field.num_primitives, list(_rows_of(state, trained))
         shapes = {row.name: row.value.shape[1:] for row in rows}
         fits = n <= self.capacity <= 2 * n if growing else n == self.capacity
-        # A search for a budget narrows harmonics and features.
+        # Trials widen and narrow features.
         renewed = not fits or shapes != {name: held.shape[1:] for name, held in self.tensors.items()}
         if renewed:
             self.capacity = int(SPARE * n) if growing else n

@@ -10,7 +10,6 @@ from sundae_ns.compensation import CompensationHead
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.training.averaging import Averaging
-from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.densification import Densification, make_strategy
 from sundae_ns.training.extension import Extension
 from sundae_ns.training.field_state import FieldState
@@ -18,6 +17,7 @@ from sundae_ns.training.initial_field import Frame, Points, Start, initial_field
 from sundae_ns.training.options import ModelOptions
 from sundae_ns.training.pruning import ScheduledPruning
 from sundae_ns.training.schedules import PruningSchedule
+from sundae_ns.training.trials.count import CountTrials
 from sundae_ns.training.trials.engine import TrialEngine
 from sundae_ns.training.trials.head import HeadTrials
 from sundae_ns.training.trials.stopping import EarlyStopping
@@ -59,8 +59,9 @@ def build(
         frame: transform from the capture's coordinates to the model's, if known.
 
     Returns:
-        State of field and head; extensions in their order (densification, scheduled pruning, and the optional ones:
-        budget search or trials and stopping, averaging); what to announce when training starts.
+        State of field and head; extensions in their order (densification, trials of counts, scheduled pruning, trials
+        of the head and stopping, averaging; all but the pruning and densification optional); what to announce when
+        training starts.
 
     Raises:
         ConfigError: an option cannot work.
@@ -82,13 +83,14 @@ def build(
     densification, schedule = Densification(strategy), PruningSchedule(pruning)
     densification.initialize(state)
     state.pruning = schedule.initialize_state()
-    extensions: list[Extension] = [densification, ScheduledPruning(schedule, evaluate=options.evaluate_prune)]
-    if pruning.mode == "auto":
-        extensions.append(BudgetSearch(pruning, head, densification, state))
-    elif options.head.mode == "auto":
-        begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
-        engine = TrialEngine(begins_at)
-        decision = HeadTrials(begins_at, state, engine)
+    begins_at = int(max(state.head_starts_at, pruning.settled_at, state.densify_until))
+    engine = TrialEngine(begins_at)
+    extensions: list[Extension] = [densification]
+    counts = CountTrials(pruning, densification, engine, alone=options.head.mode != "auto") if pruning.decides else None
+    extensions += [] if counts is None else [counts]
+    extensions.append(ScheduledPruning(schedule, evaluate=options.evaluate_prune))
+    if options.head.mode == "auto":
+        decision = HeadTrials(begins_at, state, engine, None if counts is None else counts.price)
         extensions += [decision, EarlyStopping(decision, options.ssim_lambda, engine)]
     if options.average_share > 0:
         extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))

@@ -1,4 +1,4 @@
-"""The protocol between training and its extensions: densification, pruning, trials, the budget search."""
+"""The protocol between training and its extensions: densification, pruning, trials."""
 
 from __future__ import annotations
 

@@ -26,34 +26,37 @@ class HeldOutQuality(NamedTuple):
     psnr: float
     """PSNR of these pixels, dB, at most :data:`EXACT`."""
     ssim: float
-    """SSIM of these pixels; 0 for an image that is smaller than the window of SSIM, NaN if it was not asked for."""
+    """SSIM of these pixels; 0 for an image that is smaller than the window of SSIM."""
+    fitted: float = math.nan
+    """PSNR of these pixels after the affine map of colours that fits best, dB: what is left if light and exposure of
+    the photo differ from the others'. NaN if it was not asked for."""
 
 
 @torch.no_grad()
-def measure_heldout(run: TrainingRun, *, with_ssim: bool = True) -> list[HeldOutQuality]:
+def measure_heldout(run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
     """Quality of the held-out views as the field is now, with the head if it is enabled; without fully masked views.
 
     Args:
         run: the training.
-        with_ssim: whether to compute SSIM.
+        with_fitted: whether to fit colours, too.
     """
     qualities = []
     for view, target, mask in run.heldout_views():
         images, _ = render_view(run.source, view, run.background, run.settings, depth=False)
-        quality = view_quality(images["rgb"], target, mask, with_ssim=with_ssim)
+        quality = view_quality(images["rgb"], target, mask)
         if quality.pixels:
-            qualities.append(quality)
+            fitted = fitted_psnr(images["rgb"], target, mask) if with_fitted else math.nan
+            qualities.append(quality._replace(fitted=fitted))
     return qualities
 
 
-def view_quality(image: Tensor, target: Tensor, mask: Tensor | None, *, with_ssim: bool = True) -> HeldOutQuality:
+def view_quality(image: Tensor, target: Tensor, mask: Tensor | None) -> HeldOutQuality:
     """Quality of an image under a mask.
 
     Args:
         image: ``[H, W, 3]``.
         target: the truth ``[H, W, 3]``.
         mask: pixels that count, bool ``[H, W]``; None for all.
-        with_ssim: whether to compute SSIM.
     """
     whole = target[..., 0].numel()
     pixels = whole if mask is None else int(mask.sum())
@@ -63,10 +66,32 @@ def view_quality(image: Tensor, target: Tensor, mask: Tensor | None, *, with_ssi
     compared = image if mask is None else torch.where(mask[..., None], image, target)
     share = pixels / whole
     decibels = float(psnr(compared, target)) + 10 * math.log10(share)
-    similarity = 0.0 if with_ssim else math.nan
-    if with_ssim and min(target.shape[:2]) >= SSIM_WINDOW:
+    similarity = 0.0
+    if min(target.shape[:2]) >= SSIM_WINDOW:
         similarity = 1 - (1 - float(ssim(compared, target))) / share
     return HeldOutQuality(pixels, min(decibels, EXACT), similarity)
+
+
+def fitted_psnr(image: Tensor, target: Tensor, mask: Tensor | None) -> float:
+    """PSNR after the affine map of colours (12 numbers) that brings an image nearest to its target, dB.
+
+    Args:
+        image: ``[H, W, 3]``.
+        target: the truth ``[H, W, 3]``.
+        mask: pixels that count, bool ``[H, W]``; None for all.
+
+    Returns:
+        At most :data:`EXACT`; NaN if the image is not finite.
+    """
+    chosen = torch.ones_like(target[..., 0], dtype=torch.bool) if mask is None else mask
+    colors, truth = image[chosen].double(), target[chosen].double()
+    if not bool(torch.isfinite(colors).all()):
+        return math.nan
+    rows = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=1)
+    # A ridge far below 8-bit steps keeps images of one colour solvable.
+    normal = rows.T @ rows + 1e-6 * len(rows) * torch.eye(4, dtype=rows.dtype, device=rows.device)
+    error = rows @ torch.linalg.solve(normal, rows.T @ truth) - truth
+    return min(-10 * math.log10(max(float(error.square().mean()), 1e-10)), EXACT)
 
 
 def mean_quality(views: Sequence[HeldOutQuality]) -> tuple[float, float]:

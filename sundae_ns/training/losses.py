@@ -93,7 +93,7 @@ class StepLosses:
         if head is None or head.config.mode != "residual" or not (state.head_enabled and self.num_images):
             return 1.0
         passes = state.head_images / self.num_images
-        if not FIRST_PASSES <= passes < math.inf:  # a budget search knows no step at which its head starts
+        if not FIRST_PASSES <= passes < math.inf:  # without a step at which the head starts
             return 1.0
         return 1 + 2 ** math.floor(math.log2(passes)) / HALF_AFTER
 

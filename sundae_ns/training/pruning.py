@@ -70,7 +70,7 @@ class ScheduledPruning(Extension):
             raise
         settled = state.schedule_step >= config.settled_at
         pruned = settled or (config.ends_growth_at is not None and state.pruning["num_prunes"] > 0)
-        if pruned and config.mode != "auto":
+        if pruned:
             with_head = settled and state.schedule_step >= state.head_starts_at
             notify_pruned(state.schedulers, state.step, run.source.total, last=with_head)
         if report is None:
@@ -84,13 +84,12 @@ class ScheduledPruning(Extension):
         write_report(run, report, before=before, after=after)
 
     def finish(self, run: TrainingRun) -> None:
-        """Report the peak, and warn if nothing was pruned; a budget search reports by itself."""
+        """Report the peak, and warn if nothing was pruned."""
         state = run.state
         primitives, memory = state.pruning["peak"], peak_memory(state.device) / 1e6
         CONSOLE.log(f"peak: {primitives:,} primitives, {memory:,.0f} MB of {state.device.type} memory")
         run.log_scalars("Peak", {"primitives": primitives, "memory_mb": memory})
-        if self.schedule.config.mode != "auto":
-            _warn_if_too_short(run, self.schedule.config, run.state.step)
+        _warn_if_too_short(run, self.schedule.config, run.state.step)
 
 
 def _warn_if_too_short(run: TrainingRun, pruning: PruningConfig, last_step: int) -> None:

@@ -18,45 +18,41 @@ class PruningConfig(PruneRule):
     :class:`sundae_ns.pruning.PruneRule` alone.
     """
 
-    mode: Literal["one-shot", "continuous", "auto", "off"] = "one-shot"
+    mode: Literal["one-shot", "continuous", "off"] = "one-shot"
     """Prune once (one-shot, the paper's main strategy), periodically during densification for less peak memory
-    (continuous), down to a budget of PSNR, bytes or primitives (auto), or never (off)."""
-    keep_ratio: float = 0.1
-    """Share of the N primitives that one prune keeps, in (0, 1]: exactly round(keep_ratio * N)."""
+    (continuous), or never (off)."""
+    keep_ratio: float | None = 0.1
+    """Share of the N primitives that one prune keeps, in (0, 1]: exactly round(keep_ratio * N). One-shot: None lets
+    trials on held-out training views decide the number."""
     prune_at: int = 15000
     """Step after which the one-shot prune happens."""
     start: int = 2000
     """First step of continuous pruning."""
     stop: int = 15000
-    """Last step of continuous pruning, or of the search of auto."""
+    """Last step of continuous pruning."""
     every: int = 2000
     """Steps from one continuous prune to the next."""
     max_primitives: int | None = None
-    """Continuous: most primitives at any step, densification included; a prune keeps at most this many. Auto: most
-    primitives of the final field."""
+    """Continuous: most primitives at any step, densification included; a prune keeps at most this many. One-shot: most
+    primitives that the prune keeps."""
     target_primitives: int | None = None
-    """Continuous: each prune keeps exactly this many, instead of a share by the keep ratio. The final field has exactly
-    this many; if densification ends with fewer, primitives are added."""
-    max_psnr_drop: float | None = None
-    """Auto: keep the fewest primitives that, after fine-tuning, lose at most this PSNR in dB against the field before
-    pruning, on held-out training views. 0.1 if no other budget is set."""
+    """Each prune keeps exactly this many, instead of a share or of what trials choose. Continuous: the final field has
+    exactly this many; if densification ends with fewer, primitives are added."""
+    max_drop: float | None = None
+    """One-shot, where trials decide: PSNR in dB that a smaller field may lose against the best one, and SSIM in
+    proportion. None for 0.1 dB and 0.003."""
     max_bytes: int | None = None
-    """Auto: keep the most primitives that fit into this many bytes of parameters, head included."""
-    search_every: int = 250
-    """Auto: steps from one measurement on the held-out views to the next."""
-    patience: int = 4
-    """Auto: measurements after which a cut that has not recovered is taken back, unless half of its predicted gain
-    is enough."""
+    """One-shot, where trials decide: most bytes of the packed scene, by an estimate."""
 
     @property
-    def tolerated_drop(self) -> float:
-        """PSNR that auto may lose on held-out views, dB; 0.1 by default."""
-        return 0.1 if self.max_psnr_drop is None else self.max_psnr_drop
+    def decides(self) -> bool:
+        """Whether trials decide how many primitives the one-shot prune keeps."""
+        return self.mode == "one-shot" and self.keep_ratio is None and self.target_primitives is None
 
     @property
     def ends_growth_at(self) -> int | None:
         """Step of the prune after densification; None if the mode has none."""
-        return self.prune_at if self.mode in ("one-shot", "auto") else None
+        return self.prune_at if self.mode == "one-shot" else None
 
     @property
     def first_prune(self) -> int | None:
@@ -83,33 +79,28 @@ class PruningConfig(PruneRule):
         Raises:
             ConfigError: names the first invalid option and its valid values.
         """
+        if self.mode == "auto":  # type: ignore[comparison-overlap]
+            raise ConfigError("mode auto has gone: one-shot without keep_ratio lets trials decide; use that")
         super().validate()
-        check_share(self.keep_ratio)
-        self.check_at_least(every=1, prune_at=0, start=0, search_every=1, patience=1)
-        self.check_at_least(max_primitives=1, target_primitives=1, max_bytes=1)
+        if self.keep_ratio is not None:
+            check_share(self.keep_ratio)
+        self.check_at_least(every=1, prune_at=0, start=0, max_primitives=1, target_primitives=1, max_bytes=1)
         if self.mode == "continuous" and self.stop < self.start:
             raise ConfigError(f"start ({self.start}) lies after stop ({self.stop}): swap them")
-        homes = {
-            "max_psnr_drop": ("auto",),
-            "max_bytes": ("auto",),
-            "max_primitives": ("continuous", "auto"),
-            "target_primitives": ("continuous",),
-        }
-        given = [name for name in homes if getattr(self, name) is not None]
-        for name in given:
-            if self.mode not in homes[name]:
+        if self.mode == "continuous" and self.keep_ratio is None and self.target_primitives is None:
+            raise ConfigError(
+                "keep_ratio is None and mode is continuous, without trials: give 0.5, or target_primitives"
+            )
+        if self.mode == "off" and (self.max_primitives is not None or self.target_primitives is not None):
+            raise ConfigError("mode is off, which prunes nothing: set mode to one-shot, or drop the number")
+        for name in ("max_drop", "max_bytes"):
+            if getattr(self, name) is not None and not self.decides:
                 raise ConfigError(
-                    f"{name} is set but mode is {self.mode}: set mode to {' or '.join(homes[name])}, or drop {name}"
+                    f"{name} is set, and trials do not decide the number of primitives: set keep_ratio to None and "
+                    "mode to one-shot, as sundae-auto does"
                 )
-        if self.mode == "auto":
-            if len(given) > 1:
-                raise ConfigError(f"{' and '.join(given)} are both set: give one budget, the others follow from it")
-            if not 0 < self.tolerated_drop < float("inf"):
-                raise ConfigError(f"max_psnr_drop is {self.max_psnr_drop}: use a positive number of dB, 0.1 for one")
-            if self.stop < self.prune_at:
-                raise ConfigError(
-                    f"stop ({self.stop}) lies before prune_at ({self.prune_at}): auto has no time to search"
-                )
+        if self.max_drop is not None and not 0 < self.max_drop < float("inf"):
+            raise ConfigError(f"max_drop is {self.max_drop}: use a positive number of dB, 0.1 for one")
         cap, target = self.max_primitives, self.target_primitives
         if cap is not None and target is not None and target > cap:
             raise ConfigError(f"target_primitives ({target}) is more than max_primitives ({cap}): swap them")

@@ -22,7 +22,7 @@ from sundae_ns.training.warning import warn
 SCHEDULE = {
     "pipeline.model": "warmup_length stop_split_at stop_screen_size_at resolution_schedule sh_degree_interval "
     "refine_every",
-    "pipeline.model.pruning": "prune_at start stop every search_every",
+    "pipeline.model.pruning": "prune_at start stop every",
     "pipeline.model.head": "start_at",
 }
 """Options of the model that count steps, by the configuration that has them. Learning rates have more."""
@@ -223,15 +223,10 @@ def _prune(pruning: Any, warm: bool) -> str:
     if pruning.mode == "off":
         return "none"
     after = "at once" if warm else f"after {pruning.prune_at:,}"
-    if pruning.mode == "one-shot":
-        return after
-    last = pruning.stop - (pruning.prune_at if warm else 0)
-    return f"search {after}, until {last:,}, an evaluation every {pruning.search_every:,}"
+    return f"{after}, to as many as trials choose" if pruning.decides and not warm else after
 
 
 def _head(model: Any, warm: bool) -> str:
-    if model.pruning.mode == "auto":
-        return "when the search enables it"
     at = model.pruning.settled_at if model.head.start_at is None else model.head.start_at
     at = max(at - (model.pruning.prune_at if warm else 0), 0)
     when = f"after {at:,}" if at else "from the start"

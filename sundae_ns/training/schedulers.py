@@ -42,17 +42,20 @@ class Decay:
     pruned_at: int | None = None
     after_prune: float = 1.0
     """Factor on the rate after the prune."""
+    ends_at: int | None = None
+    """Step at which the decay after the prune ends, in place of ``max_steps``."""
 
     def __call__(self, step: int) -> float:
         """The multiplier at ``step``."""
-        start, begin, rise, factor = 1.0, 0, 1.0, 1.0
+        start, begin, end, rise, factor = 1.0, 0, self.max_steps, 1.0, 1.0
         if self.pruned_at is None:
             if self.hold_until_prune:
                 return 1.0
         elif self.restart is not None and step >= self.pruned_at:
             start, begin, factor = self.restart, self.pruned_at, self.after_prune
+            end = self.max_steps if self.ends_at is None else self.ends_at
             rise = min((step - begin + 1) / (self.warmup_steps + 1), 1.0)
-        t = (step - begin) / max(self.max_steps - begin, 1)
+        t = (step - begin) / max(end - begin, 1)
         t = min(max(t, 0.0), 1.0)
         if self.shape == "cosine":
             return float(rise * factor * (self.final + (start - self.final) * (1.0 + math.cos(math.pi * t)) / 2.0))
@@ -94,7 +97,14 @@ class PruneAwareDecay(Scheduler):
         )
 
 
-def notify_pruned(schedulers: Mapping[str, LRScheduler], step: int, primitives: int, *, last: bool = True) -> None:
+def notify_pruned(
+    schedulers: Mapping[str, LRScheduler],
+    step: int,
+    primitives: int,
+    *,
+    last: bool = True,
+    ends_at: int | None = None,
+) -> None:
     """Restart every :class:`Decay` among ``schedulers`` at ``step``; later calls change nothing.
 
     Args:
@@ -102,21 +112,31 @@ def notify_pruned(schedulers: Mapping[str, LRScheduler], step: int, primitives: 
         step: training step of the prune.
         primitives: number of primitives that were kept. With fewer than :data:`SPARSE` the rate of the centres rises.
         last: False while pruning goes on or the head is still disabled; rates that hold until then are left alone.
+        ends_at: training step at which they reach their final value, as for a trial; None for that of the run.
     """
     for name, scheduler, decay in _decays(schedulers):
         if decay.pruned_at is None and (last or not decay.hold_until_prune):
-            decay.pruned_at = step
+            decay.pruned_at, decay.ends_at = step, ends_at
             if name == "means":
                 decay.after_prune = min(max(1.0, math.sqrt(SPARSE / max(primitives, 1))), MOST_FACTOR)
             _apply(scheduler)
 
 
-def postpone(schedulers: Mapping[str, LRScheduler], steps: int) -> None:
-    """Let every :class:`Decay` that has restarted begin this many steps later, as for a trial that starts again."""
-    for _, scheduler, decay in _decays(schedulers):
-        if decay.pruned_at is not None:
-            decay.pruned_at += steps
-            _apply(scheduler)
+Restarts = dict[str, tuple[int | None, float, int | None]]
+"""By name: the step at which a decay has restarted, its factor since, and the step at which it ends."""
+
+
+def restarts(schedulers: Mapping[str, LRScheduler]) -> Restarts:
+    """The restarts of every :class:`Decay`; plain values, for checkpoints."""
+    return {name: (decay.pruned_at, decay.after_prune, decay.ends_at) for name, _, decay in _decays(schedulers)}
+
+
+def put_restarts(schedulers: Mapping[str, LRScheduler], saved: Restarts, later: int) -> None:
+    """Put back the :func:`restarts`, this many steps later, as for a trial that starts again."""
+    for name, scheduler, decay in _decays(schedulers):
+        at, decay.after_prune, decay.ends_at = saved[name]
+        decay.pruned_at = None if at is None else at + later
+        _apply(scheduler)
 
 
 def limit_rise(schedulers: Mapping[str, LRScheduler], steps: int) -> None:

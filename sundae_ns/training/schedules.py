@@ -20,6 +20,10 @@ from sundae_ns.training.report import PruneReport
 
 NEVER = -1
 """Value of ``state["pruned_at"]`` before the first prune."""
+COUNT = "count"
+"""Key of the running state with the number that trials have chosen; 0 for the usual share."""
+USUAL_SHARE = 0.1
+"""Share that is kept where trials cannot decide."""
 LEAST_OPACITY = 0.005
 """Lowest opacity of primitives that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
 
@@ -52,7 +56,8 @@ class PruningSchedule:
         """
         config = self.config
         if config.mode == "one-shot":
-            return state["pruned_at"] == NEVER and step >= config.prune_at
+            decided = not config.decides or COUNT in state
+            return decided and state["pruned_at"] == NEVER and step >= config.prune_at
         if config.mode != "continuous":
             return False
         target = config.target_primitives
@@ -61,15 +66,18 @@ class PruningSchedule:
         by_count = most is not None and n > most and (scheduled or step >= config.stop)
         return ((scheduled and target is None) or by_count) and step > state["pruned_at"]
 
-    def target(self, n: int) -> int:
+    def target(self, n: int, state: Mapping[str, Any]) -> int:
         """Number of primitives that a prune keeps of ``n`` finite ones. The one place that decides this number.
 
-        ``target_primitives``, or ``round(keep_ratio * n)``, at least 1, under the cap.
+        ``target_primitives``, the number that trials have chosen, or ``round(keep_ratio * n)``, at least 1, under the
+        cap.
         """
         config = self.config
         if config.target_primitives is not None:
             return min(config.target_primitives, n)
-        count = kept_count(config.keep_ratio, n)
+        chosen = state.get(COUNT, 0) if config.decides else 0
+        share = USUAL_SHARE if config.keep_ratio is None else config.keep_ratio
+        count = min(chosen, n) if chosen else kept_count(share, n)
         return count if config.max_primitives is None else min(count, config.max_primitives)
 
     def initialize_state(self) -> dict[str, Any]:
@@ -99,7 +107,7 @@ class PruningSchedule:
         if self.due(state, step, pruner.total):
             # Continuous pruning draws anew each time, and the same after a resume.
             rule = replace(config, seed=config.seed + step) if config.mode == "continuous" else config
-            report = prune_to(self.target, rule, pruner, state, step, contribute)
+            report = prune_to(lambda n: self.target(n, state), rule, pruner, state, step, contribute)
         lacking = (config.target_primitives or 0) - pruner.total
         if config.mode == "continuous" and step >= config.stop and lacking > 0:
             pruner.add(lacking, LEAST_OPACITY)

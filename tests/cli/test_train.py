@@ -37,15 +37,14 @@ def test_the_printed_command_runs(
 ) -> None:
     words = ["train", str(tmp_path), "-o", "my runs", "--method", method, "--steps", "700"]
     with pytest.raises(Replaced):
-        main([*words, *([] if method == "sundae-auto" else ["--keep", "0.05"])])
+        main([*words, "--keep", "0.05"])
     (line,) = capsys.readouterr().out.splitlines()
     assert shlex.split(line) == ran[0]
     assert ran[0][:2] == ["ns-train", method]
     usual = getattr(method_configs, method.replace("-", "_")).config
     config = tyro.cli(type(usual), default=usual, args=ran[0][2:])
     assert (config.data, config.output_dir, config.max_num_iterations) == (tmp_path, Path("my runs"), 700)
-    if method != "sundae-auto":
-        assert config.pipeline.model.pruning.keep_ratio == 0.05
+    assert config.pipeline.model.pruning.keep_ratio == 0.05
 
 
 def test_what_is_not_given_is_the_method_s_own(tmp_path: Path, ran: list[list[str]]) -> None:
@@ -61,7 +60,6 @@ def test_what_is_not_given_is_the_method_s_own(tmp_path: Path, ran: list[list[st
         (["--keep", "1.5"], "keep is 1.5"),
         (["--steps", "0"], "steps is 0"),
         (["--method", "splatfacto"], "splatfacto is no method of sundae; use one of sundae, "),
-        (["--keep", "0.1", "--method", "sundae-auto"], "leave --keep out"),
         (["gone"], "gone does not exist"),
     ],
 )

@@ -59,7 +59,7 @@ raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("warmup", "mcmc"), ("pruning.mode", "auto"), ("camera_optimizer.mode", "SO3xR3")]
+    ("option", "value"), [("warmup", "mcmc"), ("camera_optimizer.mode", "SO3xR3")]
 )
 def test_options_that_several_ranks_cannot_use_are_refused(config: Any, option: str, value: str) -> None:
     *owners, name = option.split(".")

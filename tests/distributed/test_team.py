@@ -56,7 +56,7 @@ def test_ranks_train_in_larger_batches_without_a_viewer(config: Any) -> None:
     assert (found.max_num_iterations, found.vis) == (config.max_num_iterations // 2, "wandb")
     assert found.pipeline.datamanager.cache_images == "cpu"
     assert config.vis == "viewer+wandb"
-    config.pipeline.model.pruning.mode = "auto"
+    config.pipeline.model.warmup = "mcmc"
     with pytest.raises(ConfigError, match="several GPUs"):
         team.configured(config)
 

@@ -23,10 +23,10 @@ METHODS = {
     "sundae-80": 0.8,
     "sundae-100": 1.0,
     "sundae-auto": None,
-    "sundae-continuous": None,
+    "sundae-continuous": 0.5,
     "sundae-fast": 0.1,
     "sundae-paper": 0.1,
-    "sundae-tiny": None,
+    "sundae-tiny": 0.25,
 }
 
 
@@ -59,8 +59,7 @@ def test_configuration(name: str) -> None:
     assert config.pipeline.datamanager._target is SundaeDatamanager
     model.pruning.validate()
     model.head.validate()
-    if METHODS[name] is not None:
-        assert model.pruning.keep_ratio == METHODS[name]
+    assert model.pruning.keep_ratio == METHODS[name]
     if model.pruning.mode == "one-shot":
         assert model.pruning.prune_at < config.max_num_iterations
     groups = {"means", "scales", "quats", "features_dc", "features_rest", "opacities", "features", "compensation"}
@@ -83,7 +82,7 @@ def test_rule_of_pruning(name: str) -> None:
 
 @pytest.mark.parametrize("name", METHODS)
 def test_the_head_is_undecided_unless_a_method_says_otherwise(name: str) -> None:
-    modes = {"sundae-auto": "residual", "sundae-paper": "features", "sundae-tiny": "residual"}
+    modes = {"sundae-paper": "features", "sundae-tiny": "residual"}
     assert ours()[name].config.pipeline.model.head.mode == modes.get(name, HeadConfig().mode)
 
 

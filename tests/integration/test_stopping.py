@@ -10,10 +10,9 @@ from typing import Any
 
 import pytest
 import torch
-from budget_runs import same, tidy
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
-from trial_runs import LENGTH, PRUNE_AT, STEPS, tiny_run, tiny_scene
+from trial_runs import LENGTH, PRUNE_AT, STEPS, same, tidy, tiny_run, tiny_scene
 
 from sundae_ns.training import averaging, progress
 from sundae_ns.training.heldout import HeldOutQuality
@@ -38,7 +37,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
 def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
     """Fixes PSNR and SSIM of the held-out views at a step; trials end without a head."""
     monkeypatch.setattr(engine, "AVERAGED_EVERY", 1)
-    monkeypatch.setattr(HeadTrialProgress, "best", lambda _: "plain")
+    monkeypatch.setattr(HeadTrialProgress, "best", lambda progress, price=None: "plain")
 
     def fix(
         decibels: Callable[[int], float], similarity: Callable[[int], float] = lambda _: 0.5, held_out: int = 2

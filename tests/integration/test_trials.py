@@ -11,11 +11,10 @@ from typing import Any
 
 import pytest
 import torch
-from budget_runs import same, tidy
 from nerfstudio.engine.callbacks import TrainingCallbackAttributes
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils.eval_utils import eval_setup
-from trial_runs import LENGTH, PRUNE_AT, STEPS, tiny_run, tiny_scene
+from trial_runs import LENGTH, PRUNE_AT, STEPS, same, tidy, tiny_run, tiny_scene
 
 from sundae_ns.callbacks import NerfstudioRun
 from sundae_ns.errors import CheckpointError

@@ -32,8 +32,8 @@ def test_a_rule_knows_no_schedule() -> None:
 @pytest.mark.parametrize(
     "options",
     [
-        {"mode": "auto", "max_psnr_drop": 0.2, "stop": 15000, "start": 30000},
-        {"mode": "auto", "max_bytes": 1000},
+        {"keep_ratio": None, "max_drop": 0.2, "stop": 15000, "start": 30000},
+        {"keep_ratio": None, "max_bytes": 1000},
         {"mode": "continuous", "target_primitives": 10, "max_primitives": 20},
         {"mode": "off"},
     ],

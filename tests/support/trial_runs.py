@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import torch
 from nerfstudio.engine.trainer import Trainer
+from nerfstudio.utils import profiler, writer
 from ray_tracing import write_still_life
+from torch import Tensor
 
 from sundae_ns.method_configs import sundae
 
@@ -30,6 +33,7 @@ def tiny_run(
     name: str = "run",
     save_every: int = 1000,
     start_at: int | None = None,
+    change: Callable[[Any], object] = lambda config: None,
     **options: Any,
 ) -> Trainer:
     config = deepcopy(sundae.config)
@@ -45,6 +49,7 @@ def tiny_run(
     model.head.start_at = start_at
     for option, value in options.items():
         setattr(config, option, value)
+    change(config)
     torch.manual_seed(7)
     config.save_config()
     made: Trainer = config.setup(local_rank=0, world_size=1)
@@ -52,3 +57,28 @@ def tiny_run(
     # A decision must not use test views.
     made.pipeline.get_average_eval_image_metrics = None
     return made
+
+
+def tidy() -> None:
+    # nerfstudio keeps its loggers in globals.
+    writer.EVENT_WRITERS.clear()
+    writer.EVENT_STORAGE.clear()
+    writer.GLOBAL_BUFFER.clear()
+    profiler.PROFILER.clear()
+
+
+def same(a: Any, b: Any, where: str = "") -> None:
+    """Assert that two states have the same tensors and numbers, except for times."""
+    if isinstance(a, dict):
+        assert set(a) == set(b), where
+        for key in a:
+            if key != "seconds":
+                same(a[key], b[key], f"{where}/{key}")
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b)):
+            same(x, y, f"{where}/{i}")
+    elif isinstance(a, Tensor):
+        assert torch.equal(a, b), where
+    else:
+        assert a == b or (a != a and b != b), where

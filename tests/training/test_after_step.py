@@ -12,7 +12,6 @@ import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from sundae_ns.model import SundaeModel
-from sundae_ns.training.budget import BudgetSearch
 from sundae_ns.training.initial_field import Start
 from sundae_ns.training.schedulers import Decay
 
@@ -183,15 +182,3 @@ def test_a_warm_start_counts_from_the_prune(
     training_of(model, trainer_of())
     (line,) = said(capsys)
     assert "training ends after 3 steps, and the head needs more than 3 (head.start-at): it stays disabled" in line
-
-
-def test_a_search_that_never_begins_says_so_once_at_each_end(
-    build: Build, training_of: TrainingOf, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    model = build(pruning={"mode": "auto", "prune_at": 3})
-    monkeypatch.setattr(BudgetSearch, "before_training", lambda *_: None)
-    training = training_of(model, trainer_of())
-    assert len(said(capsys)) == 1
-    training.run_callbacks(TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, 2)
-    training.run_callbacks(TrainingCallbackLocation.AFTER_TRAIN, 2)
-    assert capsys.readouterr().out.count("Warning") == 1

@@ -23,8 +23,3 @@ from sundae_ns.training.pruning_config import PruningConfig
 def test_steps_of_the_prunes(options: dict[str, Any], first: int | None, last: int, settled: int) -> None:
     config = PruningConfig(**options)
     assert (config.first_prune, config.last_due, config.settled_at) == (first, last, settled)
-
-
-def test_a_tenth_of_a_decibel_is_tolerated_by_default() -> None:
-    assert PruningConfig(mode="auto").tolerated_drop == 0.1
-    assert PruningConfig(mode="auto", max_psnr_drop=0.3).tolerated_drop == 0.3

@@ -129,21 +129,11 @@ def test_the_fast_method_is_the_default_shortened_with_an_earlier_prune() -> Non
     fast, short = all_methods["sundae-fast"], fitted("sundae", 18000)
     own = {
         *("pipeline.model.pruning.prune_at", "pipeline.model.stop_split_at", "pipeline.model.reset_alpha_every"),
-        # The default search, of sundae-auto alone.
+        # Of sundae-continuous alone.
         *("pipeline.model.pruning.start", "pipeline.model.pruning.stop", "pipeline.model.pruning.every"),
-        "pipeline.model.pruning.search_every",
     }
     assert {name for name in step_options(fast) if option(fast, name) != option(short, name)} <= own
     assert fast.pipeline.model.pruning.prune_at == fast.pipeline.model.stop_split_at == 6000
-
-
-@pytest.mark.parametrize(("length", "searched"), [(30000, 13000), (15000, 13000), (3000, 2600)])
-def test_a_search_after_a_warm_start_uses_the_whole_run(length: int, searched: int) -> None:
-    config = fitted("sundae-auto", length, warm_start="field.ply")
-    pruning = config.pipeline.model.pruning
-    assert pruning.stop - pruning.prune_at == searched < length
-    assert config.optimizers["means"]["scheduler"].max_steps == length
-    assert f"until {searched:,}" in dict(schedule_table(config))["prune"]
 
 
 def test_a_resumed_run_keeps_its_schedule() -> None:
@@ -197,4 +187,7 @@ def test_tables_of_other_kinds() -> None:
     assert rows["head"] == "after 10,000, if trials favour it"
     assert dict(schedule_table(all_methods["sundae-tiny"]))["head"] == "after 600"
     assert dict(schedule_table(all_methods["sundae-continuous"]))["prune"] == "2,000 to 15,000, every 2,000"
-    assert dict(schedule_table(all_methods["sundae-auto"]))["head"] == "when the search enables it"
+    deciding = deepcopy(all_methods["sundae-auto"])
+    assert dict(schedule_table(deciding))["prune"] == "after 15,000, to as many as trials choose"
+    deciding.pipeline.model.warm_start = "field.ply"
+    assert dict(schedule_table(deciding))["prune"] == "at once"

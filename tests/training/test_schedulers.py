@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import pytest
 import torch
@@ -17,7 +18,8 @@ from sundae_ns.training.schedulers import (
     PruneAwareDecayConfig,
     limit_rise,
     notify_pruned,
-    postpone,
+    put_restarts,
+    restarts,
 )
 
 
@@ -129,14 +131,16 @@ def head_scheduler() -> LambdaLR:
 
 def test_a_trial_that_starts_again_has_the_rates_of_the_first() -> None:
     made, trials = head_scheduler(), []
+    untouched = restarts({"compensation": made})
     notify_pruned({"compensation": made}, 0, SPARSE)
+    began = restarts({"compensation": made})
     for _ in range(3):
         trials.append([])
         for _ in range(12):
             trials[-1].append([group["lr"] for group in made.optimizer.param_groups])
             made.optimizer.step()
             made.step()
-        postpone({"compensation": made}, 12)
+        put_restarts({"compensation": made}, began, 12 * len(trials))
     first, *others = ([weights for weights, _ in trial] for trial in trials)
     assert all(weights == biases for trial in trials for weights, biases in trial)
     assert first[0] == pytest.approx(1 / 10 * 1e-2)
@@ -145,6 +149,16 @@ def test_a_trial_that_starts_again_has_the_rates_of_the_first() -> None:
         assert other[0] == pytest.approx(first[0])
         # The decay has less time left.
         assert other == pytest.approx(first, rel=0.06)
+    # A field that was not pruned yet has the rates of before the prune again.
+    put_restarts({"compensation": made}, untouched, 0)
+    assert made.optimizer.param_groups[0]["lr"] == 1e-2
+
+
+def test_the_rates_of_a_trial_decay_as_those_of_a_run() -> None:
+    decay = Decay(0.01, 1000, 1.0, False, 0, pruned_at=100, ends_at=200)
+    assert [decay(step) for step in (100, 150, 200, 500)] == pytest.approx([1, 0.1, 0.01, 0.01])
+    assert replace(decay, ends_at=None)(1000) == pytest.approx(0.01)
+    assert replace(decay, ends_at=None)(200) > 0.5
 
 
 def test_the_rise_of_a_rate_is_limited_before_it_begins() -> None:

@@ -18,7 +18,7 @@ from sundae_ns.graphs import build_graph
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.report import PruneReport
-from sundae_ns.training.schedules import PruningSchedule
+from sundae_ns.training.schedules import COUNT, PruningSchedule
 
 Field = tuple[dict[str, Parameter], dict[str, Optimizer]]
 
@@ -342,7 +342,7 @@ def test_continuous_prunes_a_step_once() -> None:
         {"sigma": math.inf},
         {"sigma": math.nan},
         {"max_primitives": 0, "mode": "continuous"},
-        {"max_primitives": 100},
+        {"max_primitives": 0},
     ],
 )
 def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> None:
@@ -354,14 +354,14 @@ def test_impossible_options_are_refused_in_one_line(wrong: dict[str, Any]) -> No
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"mode": "auto", "stop": 20000, "max_bytes": 1, "max_primitives": 1}, "max_bytes and max_primitives are both"),
-        ({"mode": "auto", "stop": 20000, "max_psnr_drop": 0.0}, "max_psnr_drop is 0.0"),
-        ({"mode": "auto", "stop": 14999}, "auto has no time to search"),
-        ({"mode": "auto", "stop": 20000, "target_primitives": 5}, "target_primitives is set but mode is auto"),
-        ({"max_bytes": 5}, "max_bytes is set but mode is one-shot: set mode to auto"),
-        ({"mode": "continuous", "max_psnr_drop": 0.1}, "max_psnr_drop is set but mode is continuous"),
+        ({"keep_ratio": None, "max_drop": 0.0}, "max_drop is 0.0"),
+        ({"max_bytes": 5}, "max_bytes is set, and trials do not decide .*: set keep_ratio to None"),
+        ({"keep_ratio": None, "target_primitives": 5, "max_drop": 0.1}, "max_drop is set, and trials do not decide"),
+        ({"mode": "continuous", "max_drop": 0.1}, "max_drop is set, and trials do not decide"),
+        ({"mode": "continuous", "keep_ratio": None}, "keep_ratio is None and mode is continuous"),
+        ({"mode": "off", "max_primitives": 4}, "mode is off, which prunes nothing"),
+        ({"mode": "auto"}, "mode auto has gone: one-shot without keep_ratio lets trials decide"),
         ({"mode": "continuous", "max_primitives": 4, "target_primitives": 5}, "is more than max_primitives"),
-        ({"mode": "auto", "stop": 20000, "search_every": 0}, "search_every is 0"),
     ],
 )
 def test_budgets_that_cannot_work_name_the_mend(options: dict[str, object], message: str) -> None:
@@ -374,16 +374,14 @@ def test_a_target_may_be_the_cap() -> None:
     PruningConfig(mode="continuous", max_primitives=5, target_primitives=5).validate()
 
 
-@pytest.mark.parametrize("budget", [{}, {"max_psnr_drop": 0.5}, {"max_bytes": 100}, {"max_primitives": 1}])
-def test_one_budget_is_enough(budget: dict[str, object]) -> None:
-    PruningConfig(mode="auto", stop=20000, **budget).validate()  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize(
     ("options", "of_60", "of_10"),
     [
         ({"keep_ratio": 0.2}, 12, 2),
         ({"keep_ratio": 0.01}, 1, 1),
+        ({"max_primitives": 5}, 5, 1),
+        ({"target_primitives": 30}, 30, 10),
+        ({"keep_ratio": None, "target_primitives": 30}, 30, 10),
         ({"mode": "continuous", "target_primitives": 30}, 30, 10),
         ({"mode": "continuous", "max_primitives": 30, "keep_ratio": 0.6}, 30, 6),
         ({"mode": "continuous", "keep_ratio": 0.6}, 36, 6),
@@ -391,7 +389,18 @@ def test_one_budget_is_enough(budget: dict[str, object]) -> None:
 )
 def test_the_schedule_decides_how_many_stay(options: dict[str, Any], of_60: int, of_10: int) -> None:
     schedule = PruningSchedule(PruningConfig(**options))
-    assert (schedule.target(60), schedule.target(10)) == (of_60, of_10)
+    assert (schedule.target(60, {}), schedule.target(10, {})) == (of_60, of_10)
+
+
+def test_trials_decide_how_many_stay_and_the_schedule_waits_for_them() -> None:
+    schedule = PruningSchedule(PruningConfig(keep_ratio=None, prune_at=3, max_primitives=40))
+    state = schedule.initialize_state()
+    assert not schedule.due(state, 3, 60)
+    for chosen, kept in ((7, 7), (50, 40), (0, 6)):  # 0 for the usual share
+        decided = {**state, COUNT: chosen}
+        assert schedule.due(decided, 3, 60)
+        assert schedule.target(60, decided) == kept
+    assert schedule.target(5, {**state, COUNT: 7}) == 5
 
 
 @pytest.mark.parametrize("mode", ["off", "one-shot"])

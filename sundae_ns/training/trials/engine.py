@@ -20,7 +20,7 @@ from sundae_ns.training.averaging import AVERAGED_EVERY, RunningMean, weights_of
 from sundae_ns.training.extension import TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality, measure_heldout
-from sundae_ns.training.schedulers import notify_pruned, postpone
+from sundae_ns.training.schedulers import notify_pruned, put_restarts, restarts
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,8 @@ class TrialEngine:
         """Copies of the field by name: a :meth:`FieldState.snapshot`, and the number of ``counted`` steps before it."""
         self.taken_back = 0
         """Steps after which the field went back to before them."""
+        self.held: list[int] = []
+        """Training views that are held out for trials to come, beside those of a trial."""
         self._head_starts_at = head_starts_at
         self._mean = RunningMean()
 
@@ -107,10 +109,10 @@ class TrialEngine:
             self._mean.count_in(weights_of(state))
         return left <= 0
 
-    def measure(self, run: TrainingRun, *, with_ssim: bool = True) -> list[HeldOutQuality]:
+    def measure(self, run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
         """Quality of the held-out views with the mean of the weights, if there is one; the next mean begins anew."""
         with self._mean.shown(weights_of(run.state)):
-            views = measure_heldout(run, with_ssim=with_ssim)
+            views = measure_heldout(run, with_fitted=with_fitted)
         self._mean = RunningMean()
         return views
 
@@ -122,22 +124,22 @@ class TrialEngine:
 
     def keep(self, name: str, state: FieldState, *, head: bool) -> None:
         """Keep a copy of the field, and of the head if asked for, until the trials end."""
-        self.kept[name] = {"counted": state.schedule_step - self.taken_back, **state.snapshot(head=head)}
+        self.kept[name] = {
+            "counted": state.schedule_step - self.taken_back,
+            "taken_back": self.taken_back,
+            "pruning": dict(state.pruning),
+            "restarts": restarts(state.schedulers),
+            **state.snapshot(head=head),
+        }
 
-    def go_back(self, name: str, state: FieldState, *, rates: bool = True) -> None:
-        """Continue with a kept copy of the field.
-
-        Args:
-            name: of the copy.
-            state: the field in training.
-            rates: whether learning rates and counted steps are those of the copy too.
-        """
-        state.restore(self.kept[name])
-        steps = state.schedule_step - self.taken_back - self.kept[name]["counted"]
-        if rates and steps:
-            postpone(state.schedulers, steps)
-            self.taken_back += steps
-            self._count_steps(state)
+    def go_back(self, name: str, state: FieldState) -> None:
+        """Continue with a kept copy of the field, its learning rates and its counted steps."""
+        kept = self.kept[name]
+        state.restore(kept)
+        state.pruning.update({**kept["pruning"], "peak": state.pruning["peak"]})
+        self.taken_back = state.schedule_step - kept["counted"]
+        put_restarts(state.schedulers, kept["restarts"], self.taken_back - kept["taken_back"])
+        self._count_steps(state)
 
     def end(self, run: TrainingRun) -> None:
         """End all trials: forget the kept copies, and serve all training views from the next step on."""

@@ -11,7 +11,7 @@ before, and only the steps of the trials make it forget them.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
@@ -76,6 +76,17 @@ class TrialPlan:
         return [index for fold in self.folds for index in fold]
 
 
+def spread_views(indices: Sequence[int], count: int, half: int) -> list[int]:
+    """Views evenly over a capture, because neighbours in a path look alike.
+
+    Args:
+        indices: of the training views.
+        count: number of views.
+        half: 0 or 1: two choices of the same number that share no view.
+    """
+    return [indices[(2 * i + half) * len(indices) // (2 * count)] for i in range(count)]
+
+
 def plan_trials(indices: Sequence[int], steps: int) -> TrialPlan:
     """Plan the trials of a run.
 
@@ -84,9 +95,7 @@ def plan_trials(indices: Sequence[int], steps: int) -> TrialPlan:
         steps: length of the schedule.
     """
     few = len(indices) < FEW_VIEWS
-    count = 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY))
-    # Evenly over the capture, because neighbours in a path look alike.
-    chosen = [indices[(2 * i + 1) * len(indices) // (2 * count)] for i in range(count)]
+    chosen = spread_views(indices, 2 if few else max(2, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY)), 1)
     length = LEAST_TRIAL * steps / 2 if few else max(LEAST_TRIAL * steps, min(TRIAL_STEPS, MOST_TRIAL * steps))
     return TrialPlan([[index] for index in chosen] if few else [chosen], max(round(length), 1))
 
@@ -126,15 +135,21 @@ class HeadTrialProgress:
         trials = self.measured[first : first + self.folds]
         return [HeldOutQuality(int(pixels), *figures) for trial in trials for pixels, *figures in trial]
 
-    def best(self) -> str:
-        """The largest tried candidate that gains enough PSNR over the best smaller one, and loses no SSIM."""
-        best = "plain"
+    def best(self, price: tuple[float, float] | None = None) -> str:
+        """The largest tried candidate that gains enough over the best smaller one.
+
+        Args:
+            price: PSNR (dB) and SSIM that a doubling of the stored bytes must gain; None for :data:`GAIN_PER_DOUBLING`,
+                and no loss of SSIM.
+        """
+        best, (psnr_price, ssim_price) = "plain", price or (GAIN_PER_DOUBLING, 0.0)
         for candidate in self.tried[1:]:
             figures = (mean_quality(self.qualities(one)) for one in (best, candidate))
             decibels, similarity = (b - a for a, b in zip(*figures, strict=True))
             doublings = math.log2(self.bytes[CANDIDATES.index(candidate)] / self.bytes[CANDIDATES.index(best)])
             # Comparisons with figures that are not finite fail.
-            if math.inf > decibels >= max(LEAST_GAIN, GAIN_PER_DOUBLING * doublings) and similarity >= 0:
+            enough = math.inf > decibels >= max(LEAST_GAIN, psnr_price * doublings)
+            if enough and similarity >= ssim_price * doublings:
                 best = candidate
         return best
 
@@ -146,12 +161,21 @@ class HeadTrials(Extension):
         begins_at: step of the schedule after which the first trial begins: the number of primitives is settled.
         state: the field, whose head stays disabled until its trial.
         engine: carries out the trials.
+        price: what a doubling of the bytes gains if it is spent on primitives, from the trials of counts; None without
+            such trials.
     """
 
     name = "trials"
 
-    def __init__(self, begins_at: int, state: FieldState, engine: TrialEngine) -> None:
+    def __init__(
+        self,
+        begins_at: int,
+        state: FieldState,
+        engine: TrialEngine,
+        price: Callable[[], tuple[float, float] | None] | None = None,
+    ) -> None:
         self.begins_at = begins_at
+        self._price_of_primitives = price
         self.progress = HeadTrialProgress()
         assert state.head is not None
         self._head = state.head.config
@@ -204,7 +228,7 @@ class HeadTrials(Extension):
         elif views < FEWEST_VIEWS:
             self._settle(run, "plain", f"{views} training views are too few to tell whether a head helps")
         elif progress.phase == "holding":
-            run.hold_out(self._planned(run).views)
+            run.hold_out([*self._planned(run).views, *self._engine.held])
         elif progress.phase == "trials":
             self._engine.resume(run)
         elif run.last_step is not None and not self._fits(run):
@@ -215,8 +239,12 @@ class HeadTrials(Extension):
         progress, step = self.progress, run.state.schedule_step
         if progress.phase == "before" and step >= self.begins_at - HOLD_SHARE * progress.steps and self._fits(run):
             progress.phase = "holding"
-            run.hold_out(self._planned(run).views)
-        if progress.phase == "holding" and step >= self.begins_at:
+            run.hold_out([*self._planned(run).views, *self._engine.held])
+        # Trials of counts come first: the field of one of them is not yet the one that is finished.
+        ready = self._engine.trial is None and (
+            run.state.pruning["num_prunes"] > 0 or self._price_of_primitives is None
+        )
+        if progress.phase == "holding" and step >= self.begins_at and ready:
             self._begin(run)
         elif progress.phase == "trials" and self._engine.after_step(run):
             self._end_trial(run)
@@ -230,6 +258,11 @@ class HeadTrials(Extension):
     def held_out(self, run: TrainingRun) -> list[int]:
         """Indices of the views that the chosen field has not seen since before its trial; none without trials."""
         return [] if self.progress.reason else self._planned(run).folds[-1]
+
+    @property
+    def _price(self) -> tuple[float, float] | None:
+        """What a doubling of the bytes must gain: as much as primitives for the same bytes, where a curve tells."""
+        return None if self._price_of_primitives is None else self._price_of_primitives()
 
     def _planned(self, run: TrainingRun) -> TrialPlan:
         if self._plan is None:
@@ -273,7 +306,7 @@ class HeadTrials(Extension):
         progress, state, candidate = self.progress, run.state, self.progress.candidate
         progress.measured.append([list(view) for view in self._engine.measure(run)])
         # What does not pay is not tried with more.
-        last = candidate == self._candidates[-1] or progress.best() != candidate
+        last = candidate == self._candidates[-1] or progress.best(self._price) != candidate
         if candidate in progress.tried and candidate != "plain" and last:
             self._decide(run, candidate)
             return
@@ -283,7 +316,7 @@ class HeadTrials(Extension):
 
     def _decide(self, run: TrainingRun, trained: str) -> None:
         """Continue with the best candidate; ``trained`` is the one that the field is."""
-        progress, decision = self.progress, self.progress.best()
+        progress, decision = self.progress, self.progress.best(self._price)
         figures: dict[str, Any] = {}
         for candidate in progress.tried:
             views = progress.qualities(candidate)

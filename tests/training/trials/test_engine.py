@@ -87,15 +87,6 @@ def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> No
     assert (run.held_out, trials.trial, trials.kept) == ([], None, {})
 
 
-def test_a_field_may_go_back_while_rates_and_steps_go_on(run: FakeRun) -> None:
-    trials = TrialEngine()
-    trials.keep("first", run.state, head=True)
-    trials.start(run, Trial(5))  # type: ignore[arg-type]
-    run.train(trials)
-    trials.go_back("first", run.state, rates=False)
-    assert (height(run), run.state.uncounted) == (0.0, 0)
-
-
 @pytest.mark.parametrize(("averaged", "shown", "own"), [(3, 4.0, 5.0), (0, 5.0, 5.0)])
 def test_the_mean_of_the_last_weights_is_measured(
     run: FakeRun, monkeypatch: pytest.MonkeyPatch, averaged: int, shown: float, own: float

@@ -60,10 +60,10 @@ def test_the_mode_auto_adds_a_trial_and_the_others_do_not(build: Build) -> None:
     assert "trials" in {extension.name for extension in build(head={"mode": "auto"}).extensions}
     for mode in ("residual", "features", "off"):
         assert "trials" not in {extension.name for extension in build(head={"mode": mode}).extensions}
-    searching = build(head={"mode": "auto"}, pruning={"mode": "auto", "stop": 10})
-    names = {extension.name for extension in searching.extensions}
-    assert "budget" in names
-    assert "trials" not in names
+    names = [extension.name for extension in build(head={"mode": "auto"}, pruning={"keep_ratio": None}).extensions]
+    # Trials of counts come before the prune, those of the head after it.
+    assert names.index("count") < names.index("pruning") < names.index("trials")
+    assert "count" not in {extension.name for extension in build().extensions}
 
 
 def test_an_undecided_head_is_residual_and_disabled(build: Build) -> None:

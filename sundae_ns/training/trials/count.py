@@ -1,0 +1,308 @@
+"""The decision how many primitives a field keeps, by trials of several counts (``pruning.keep_ratio`` left out).
+
+Some training views are held out from the first step to the decision: a large field remembers for long what it has seen
+once. From the unpruned field trials of one length follow, each pruned to another count, with rates that decay as those
+of a whole run. Where quality levels off, more primitives are not worth their bytes; where it still climbs, fewer would
+lose what can be seen (:mod:`sundae_ns.training.trials.curve`). The field then goes back to before the prune, and the
+schedule prunes it to the chosen count. Test views are never used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from sundae_ns.errors import PackError
+from sundae_ns.evaluation.document import table
+from sundae_ns.gaussians.parameters import FEATURES
+from sundae_ns.pruning.cutting import FieldPruner
+from sundae_ns.rendering.contribution import contribution
+from sundae_ns.storage import megabytes
+from sundae_ns.storage.morton import scene_order
+from sundae_ns.storage.packing.scene import PackedScene, fit_scene, pack_bytes
+from sundae_ns.training.densification import Densification
+from sundae_ns.training.extension import Extension, TrainingRun
+from sundae_ns.training.field_state import FieldState
+from sundae_ns.training.heldout import HeldOutQuality
+from sundae_ns.training.pruning_config import PruningConfig
+from sundae_ns.training.report import write_record
+from sundae_ns.training.schedulers import notify_pruned
+from sundae_ns.training.schedules import COUNT, USUAL_SHARE, prune_to
+from sundae_ns.training.trials.curve import (
+    CurvePoint,
+    Tolerance,
+    affordable,
+    choose,
+    curve_of,
+    price,
+    still_climbs,
+)
+from sundae_ns.training.trials.engine import Trial, TrialEngine
+from sundae_ns.training.trials.head import HELD_OUT_EVERY, MOST_HELD_OUT, spread_views
+from sundae_ns.training.warning import warn
+
+SHARES = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)
+"""Shares of the primitives that are tried, about a factor of 2 apart, largest first."""
+TRIAL_SHARE = 0.02
+"""Length of a trial as a share of the schedule."""
+WINDOWS = 2
+"""Measurements of a trial, evenly spaced; each of the mean of the weights over half of the steps since the last."""
+LEAST_VIEWS = 32
+"""With fewer training views, those that could be held out are too few to compare counts."""
+MOST_VIEWS = 32
+"""Most training views that the prune of a trial looks at."""
+MOST_TRIALS = 0.3
+"""Largest share of the steps after the prune that all trials may take."""
+SAMPLE = 1 << 13
+"""Neighbouring primitives that are packed to estimate the bytes of a field."""
+FULL = "full"
+"""Name of the copy of the unpruned field."""
+
+
+@dataclass
+class CountTrialProgress:
+    """Numbers of a decision; plain values, for checkpoints."""
+
+    phase: str = "before"
+    """before, holding (views are held out), trials, or done."""
+    steps: int = 0
+    """Length of the schedule when training started: a resumed run may be longer or shorter, its trials may not."""
+    full: int = 0
+    """Number of primitives before the prune."""
+    counts: list[int] = field(default_factory=list)
+    """Number of primitives of each begun trial."""
+    sizes: list[int | None] = field(default_factory=list)
+    """Estimated bytes of the packed field of each finished trial."""
+    measured: list[list[list[list[float]]]] = field(default_factory=list)
+    """For each begun trial, measurement and held-out view: the values of a :class:`HeldOutQuality`."""
+    chosen: int = 0
+    """The chosen number; 0 before the decision."""
+
+    def curve(self) -> list[CurvePoint]:
+        """The points of the finished trials, largest count first; none if masks leave no pixel of the views."""
+        done = len(self.sizes)
+        return curve_of(self.counts[:done], self.measured[:done], self.sizes) if done and self.measured[0][0] else []
+
+
+class CountTrials(Extension):
+    """Decides how many primitives the prune keeps.
+
+    Args:
+        config: options of pruning.
+        densification: its running state starts anew when the trials begin.
+        engine: carries out the trials.
+        alone: whether no other extension saves the state of the engine and enables the head.
+    """
+
+    name = "count"
+
+    def __init__(
+        self, config: PruningConfig, densification: Densification, engine: TrialEngine, *, alone: bool
+    ) -> None:
+        self.config = config
+        self.progress = CountTrialProgress()
+        self._densification = densification
+        self._engine = engine
+        self._alone = alone
+
+    def state_dict(self) -> dict[str, Any]:
+        """Numbers of the decision, and the state of the engine if nothing else saves it."""
+        return {"numbers": asdict(self.progress), **({"engine": self._engine.state_dict()} if self._alone else {})}
+
+    def load_state_dict(self, state: FieldState, saved: Mapping[str, Any]) -> None:
+        """Counterpart of :meth:`state_dict`. A run that was pruned before this extension existed is decided.
+
+        Raises:
+            CheckpointError: the checkpoint lacks the field to which the trials return.
+        """
+        known, numbers = {one.name for one in fields(CountTrialProgress)}, saved.get("numbers", {})
+        self.progress = CountTrialProgress(**{name: value for name, value in numbers.items() if name in known})
+        if self._alone and "engine" in saved:
+            self._engine.load_state_dict(state, saved["engine"])
+        if self.progress.phase == "trials" and self._alone:
+            self._engine.require(FULL)
+            self._engine.enable_head(state, False)
+
+    def before_training(self, run: TrainingRun) -> None:
+        """Hold views out, or take the usual share where trials cannot decide."""
+        progress, state, views = self.progress, run.state, len(run.view_indices())
+        progress.steps = progress.steps or (run.schedule_length or 0) + state.offset
+        if progress.phase == "done" or state.pruning["num_prunes"] and progress.phase != "trials":
+            progress.phase = "done"
+        elif run.images_per_step > 1:
+            self._take_usual(run, "trials of counts need a single GPU")
+        elif state.offset:
+            self._take_usual(run, "a warm start has seen all training views before")
+        elif views < LEAST_VIEWS:
+            self._take_usual(run, f"{views} training views are too few to compare counts")
+        elif not self._fits(run):
+            self._take_usual(run, "the steps after the prune are too few to compare counts")
+        elif progress.phase == "trials":
+            self._engine.resume(run)
+        else:
+            progress.phase, self._engine.held = "holding", self._views(run)
+            run.hold_out(self._engine.held)
+
+    def after_step(self, run: TrainingRun) -> None:
+        """Begin and end trials, decide."""
+        progress = self.progress
+        if progress.phase == "holding" and run.state.schedule_step >= self.config.prune_at:
+            self._begin(run)
+        elif progress.phase == "trials" and self._engine.after_step(run):
+            self._end_window(run)
+
+    def price(self) -> tuple[float, float] | None:
+        """PSNR (dB) and SSIM that twice the bytes gain if they are spent on primitives; None without a curve."""
+        curve = self.progress.curve() if self.progress.phase == "done" else []
+        return price(curve, self.progress.chosen) if curve else None
+
+    @property
+    def _tolerance(self) -> Tolerance:
+        return Tolerance.of_drop(self.config.max_drop)
+
+    @property
+    def _window(self) -> int:
+        return max(round(TRIAL_SHARE * self.progress.steps / WINDOWS), 1)
+
+    def _views(self, run: TrainingRun) -> list[int]:
+        indices = run.view_indices()
+        return spread_views(indices, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY), 0)
+
+    def _fits(self, run: TrainingRun) -> bool:
+        """Whether the trials leave enough of the steps after the prune."""
+        steps = 0 if run.last_step is None else max(run.last_step + 1, run.schedule_length or 0)
+        return len(SHARES) * WINDOWS * self._window <= MOST_TRIALS * (steps - self.config.prune_at)
+
+    def _begin(self, run: TrainingRun) -> None:
+        progress, state = self.progress, run.state
+        FieldPruner(state.field, state.optimizers, [state.densification]).drop_nonfinite()
+        self._densification.initialize(state)  # its statistics would not match the field that comes back
+        progress.phase, progress.full = "trials", run.source.total
+        CONSOLE.log(
+            f"step {state.step}: how many primitives does the scene need? Up to {len(SHARES)} trials of "
+            f"{WINDOWS * self._window:,} steps; {len(self._views(run))} of {len(run.view_indices())} training views "
+            "are held out"
+        )
+        self._engine.enable_head(state, False)
+        self._engine.keep(FULL, state, head=False)
+        self._start_trial(run)
+
+    def _start_trial(self, run: TrainingRun) -> None:
+        """Prune the field for a trial, as the schedule would, by fewer views."""
+        progress, state = self.progress, run.state
+        count = max(round(SHARES[len(progress.counts)] * progress.full), 1)
+
+        def contribute(kept: int | None) -> Tensor:
+            views = run.training_views()
+            return contribution(run.source, views[:: -(-len(views) // MOST_VIEWS)], run.background, run.settings, kept)
+
+        pruner = FieldPruner(state.field, state.optimizers, [state.densification])
+        prune_to(lambda n: min(count, n), self.config, pruner, state.pruning, state.schedule_step, contribute)
+        ends_at = state.step + WINDOWS * self._window
+        notify_pruned(state.schedulers, state.step, count, last=False, ends_at=ends_at)
+        progress.counts.append(count)
+        progress.measured.append([])
+        self._start_window(run)
+
+    def _start_window(self, run: TrainingRun) -> None:
+        self._engine.start(run, Trial(self._window, self._views(run), averaged=self._window / 2, counts=False))
+
+    def _end_window(self, run: TrainingRun) -> None:
+        """Measure; go on, start the next trial from the unpruned field, or decide."""
+        progress, state = self.progress, run.state
+        progress.measured[-1].append([list(view) for view in self._engine.measure(run, with_fitted=True)])
+        if len(progress.measured[-1]) < WINDOWS:
+            self._start_window(run)
+            return
+        progress.sizes.append(packed_size(state.field))
+        self._engine.go_back(FULL, state)
+        curve = progress.curve()
+        if len(progress.counts) < len(SHARES) and curve and not curve[-1].lost(self._tolerance):
+            self._start_trial(run)
+        else:
+            self._decide(run, curve)
+
+    def _decide(self, run: TrainingRun, curve: list[CurvePoint]) -> None:
+        """Choose a count, and let the schedule prune to it."""
+        progress, config = self.progress, self.config
+        if not curve:
+            self._take_usual(run, "masks leave no pixel of the held-out training views")
+            return
+        count, reason = choose(curve, self._tolerance), "the fewest that are as good as the best"
+        limits = {"max-primitives": config.max_primitives}
+        if config.max_bytes is not None:
+            limits["max-bytes"] = affordable(curve, config.max_bytes)
+        for name, most in limits.items():
+            if most is not None and most < count:
+                count, reason = most, f"the most that pruning.{name} allows"
+        self._settle(run, count)
+        self._show(curve, reason)
+        if still_climbs(curve, self._tolerance):
+            CONSOLE.log(
+                "quality still grows at the full count: the scene may need more primitives than densification made; "
+                "a lower --pipeline.model.densify-grad-thresh makes more"
+            )
+        names = HeldOutQuality._fields
+        points = [
+            {**asdict(point), "measured": [[dict(zip(names, one, strict=True)) for one in each] for each in trial]}
+            for point, trial in zip(curve, progress.measured, strict=True)
+        ]
+        run.log_scalars("Curve", {"chosen": count, "full": progress.full})
+        record: dict[str, Any] = {"chosen": count, "full": progress.full, "reason": reason, "step": run.state.step}
+        record |= {"tolerance": self._tolerance._asdict(), "held_out_views": self._views(run)}
+        write_record(run, "curve.json", {**record, "steps_per_trial": WINDOWS * self._window, "curve": points})
+
+    def _show(self, curve: list[CurvePoint], reason: str) -> None:
+        """The curve as a table in the log."""
+        rows = [
+            [
+                *(f"{point.count:,}", "?" if point.bytes is None else megabytes(point.bytes)),
+                f"{point.psnr:.2f} (-{point.psnr_loss:.2f} ± {point.psnr_error:.2f})",
+                f"{point.ssim:.4f} (-{point.ssim_loss:.4f} ± {point.ssim_error:.4f})",
+            ]
+            for point in curve
+        ]
+        heads = ["primitives", "packed", "expected PSNR, dB (less than the best)", "expected SSIM"]
+        CONSOLE.log("\n".join(table(heads, rows, words=0)))
+        CONSOLE.log(f"keeping {self.progress.chosen:,} of {self.progress.full:,} primitives: {reason}")
+
+    def _take_usual(self, run: TrainingRun, reason: str) -> None:
+        """Keep the usual share."""
+        warn(
+            f"pruning keeps {USUAL_SHARE:.0%} of the primitives: {reason}; --pipeline.model.pruning.keep-ratio sets it"
+        )
+        self._settle(run, None)
+
+    def _settle(self, run: TrainingRun, count: int | None) -> None:
+        """End the trials; without a count the schedule keeps the usual share."""
+        progress, state = self.progress, run.state
+        progress.phase, progress.chosen, self._engine.held = "done", count or 0, []
+        state.pruning[COUNT] = count or 0
+        self._engine.end(run)
+        if self._alone:
+            self._engine.enable_head(state, True)
+
+
+def packed_size(field: Mapping[str, Tensor]) -> int | None:
+    """Bytes of the packed field without features, estimated by packing neighbouring primitives; None if it cannot be.
+
+    Args:
+        field: parameters by name ``[N, ...]``.
+    """
+    n = len(field["means"])
+    plain = {name: value.detach() for name, value in field.items() if name != FEATURES}
+    if n > SAMPLE:
+        order = scene_order(plain["means"].float().cpu().numpy())
+        middle = torch.from_numpy(order[(n - SAMPLE) // 2 :][:SAMPLE])
+        plain = {name: value[middle.to(value.device)] for name, value in plain.items()}
+    try:
+        sample = PackedScene({name: value.float().cpu() for name, value in plain.items()})
+        size = len(pack_bytes(*fit_scene(sample))[0])
+    except PackError:
+        return None
+    return round(size * n / min(n, SAMPLE))

@@ -1,0 +1,171 @@
+"""Expected quality as a function of the number of primitives, and the choice of a number by it.
+
+A trial is far shorter than the training that follows, so its images do not show what that training reaches. Two
+figures of a trial foretell it: the quality at its end, and how fast the quality still changes on a logarithmic scale of
+steps. Small fields go on gaining; large ones that fit what differs between the training images lose again. The weights
+of the two were fitted to trainings of six captures at six counts each (``docs/decisions.md``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+PSNR_WEIGHTS = (0.8, 1.5)
+"""Weights of the PSNR at the end of a trial, and of its growth in the last e-fold of steps."""
+SSIM_WEIGHTS = (0.85, 2.0)
+"""The same for SSIM."""
+LOST = 4.0
+"""A count that loses this many times the tolerance, beyond two standard errors, is clearly too small."""
+
+
+class Tolerance(NamedTuple):
+    """What a smaller field may lose against the best one."""
+
+    psnr: float = 0.1
+    """dB."""
+    ssim: float = 0.003
+    """On the scale of SSIM."""
+
+    @classmethod
+    def of_drop(cls, psnr: float | None) -> Tolerance:
+        """The tolerance for a drop of PSNR in dB, SSIM in proportion; the usual one for None."""
+        return cls() if psnr is None else cls(psnr, psnr * cls().ssim / cls().psnr)
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """What to expect of a field of one count, on the held-out training views."""
+
+    count: int
+    """Number of primitives."""
+    bytes: int | None
+    """Bytes of the packed field without a head, estimated; None if unknown."""
+    psnr: float
+    """Expected PSNR after a fit of colours to each photo, dB. Differences to other points are more certain."""
+    ssim: float
+    """Expected SSIM."""
+    psnr_loss: float
+    """PSNR that is lost against the best count, dB."""
+    ssim_loss: float
+    """SSIM that is lost against the best count for SSIM."""
+    psnr_error: float
+    """Standard error of the loss over the views, dB."""
+    ssim_error: float
+    """Standard error of the loss of SSIM over the views."""
+
+    def excess(self, tolerance: Tolerance) -> float:
+        """Largest loss, less its standard error, in units of the tolerance; at most 1 is as good as the best."""
+        psnr = (self.psnr_loss - self.psnr_error) / tolerance.psnr
+        return max(psnr, (self.ssim_loss - self.ssim_error) / tolerance.ssim)
+
+    def lost(self, tolerance: Tolerance) -> bool:
+        """Whether the count is clearly too small, so that fewer need not be tried."""
+        psnr = self.psnr_loss - 2 * self.psnr_error > LOST * tolerance.psnr
+        return psnr or self.ssim_loss - 2 * self.ssim_error > LOST * tolerance.ssim
+
+
+def curve_of(
+    counts: Sequence[int], measured: Sequence[Sequence[Sequence[Sequence[float]]]], sizes: Sequence[int | None]
+) -> list[CurvePoint]:
+    """The curve of some trials, largest count first.
+
+    Args:
+        counts: number of primitives of each trial.
+        measured: for each trial, measurement (evenly spaced, at least two) and view: the values of a
+            :class:`sundae_ns.training.heldout.HeldOutQuality`, with a fitted PSNR.
+        sizes: estimated bytes of each packed field.
+
+    Returns:
+        A point for each trial; losses of a trial whose images are not finite are infinite.
+    """
+    values = np.asarray(measured, dtype=np.float64)  # [T, W, V, 4]
+    pixels = values[0, 0, :, 0] / values[0, 0, :, 0].sum()
+    last, half = values.shape[1], max(values.shape[1] // 2, 1)
+    columns = []
+    for index, weights in ((3, PSNR_WEIGHTS), (2, SSIM_WEIGHTS)):
+        end = values[:, last - 1, :, index]
+        growth = (end - values[:, half - 1, :, index]) / math.log(last / half)
+        expected = weights[0] * end + weights[1] * growth  # [T, V], up to a constant of the capture
+        means = np.where(np.isfinite(expected).all(1), expected @ pixels, -np.inf)
+        best = int(means.argmax())
+        losses, errors = zip(*(_paired(expected[best] - one, pixels) for one in expected), strict=True)
+        columns.append(([float(end[best] @ pixels) - loss for loss in losses], losses, errors))
+    (psnr, psnr_loss, psnr_error), (ssim, ssim_loss, ssim_error) = columns
+    rows = zip(counts, sizes, psnr, ssim, psnr_loss, ssim_loss, psnr_error, ssim_error, strict=True)
+    return [CurvePoint(*row) for row in rows]
+
+
+def _paired(differences: NDArray[np.float64], pixels: NDArray[np.float64]) -> tuple[float, float]:
+    """Weighted mean of the differences over views, and its standard error; an infinite loss if one is not finite."""
+    if not np.isfinite(differences).all():
+        return math.inf, 0.0
+    mean, views = float(differences @ pixels), len(differences)
+    if views < 2:
+        return mean, 0.0
+    squares = float((pixels**2) @ (differences - mean) ** 2)
+    return mean, math.sqrt(squares * views / (views - 1))
+
+
+def choose(curve: Sequence[CurvePoint], tolerance: Tolerance) -> int:
+    """The smallest count that is as good as the best one in PSNR and SSIM.
+
+    Between the smallest tried count that is and the next smaller one, the loss is interpolated over the logarithm of
+    the count. If PSNR and SSIM ask for different counts, the one that loses least, in tolerances, is taken.
+
+    Args:
+        curve: largest count first.
+        tolerance: losses that nobody sees.
+    """
+    excess = [point.excess(tolerance) for point in curve]
+    good = [index for index, value in enumerate(excess) if value <= 1]
+    if not good:
+        return curve[excess.index(min(excess))].count
+    index = good[-1]
+    if index + 1 == len(curve) or not math.isfinite(excess[index + 1]):
+        return curve[index].count
+    part = (1 - excess[index]) / (excess[index + 1] - excess[index])
+    between = (math.log(curve[at].count) for at in (index, index + 1))
+    large, small = between
+    return round(math.exp(large + part * (small - large)))
+
+
+def price(curve: Sequence[CurvePoint], count: int) -> tuple[float, float]:
+    """PSNR (dB) and SSIM that twice as many primitives gain at a count; at least 0."""
+    if len(curve) < 2:
+        return 0.0, 0.0
+    distance = [abs(math.log(a.count * b.count) / 2 - math.log(count)) for a, b in zip(curve, curve[1:], strict=False)]
+    large, small = curve[distance.index(min(distance)) :][:2]
+    doublings = math.log2(large.count / small.count) if large.count > small.count else math.inf
+    gains = (small.psnr_loss - large.psnr_loss) / doublings, (small.ssim_loss - large.ssim_loss) / doublings
+    psnr, ssim = (max(gain, 0.0) if math.isfinite(gain) else 0.0 for gain in gains)
+    return psnr, ssim
+
+
+def affordable(curve: Sequence[CurvePoint], most: int, extra: int = 0) -> int | None:
+    """Largest count whose packed field fits into a number of bytes, by the estimates; None if no size is known.
+
+    Args:
+        curve: the points.
+        most: bytes.
+        extra: bytes of them for something else, such as a head.
+    """
+    known = [(math.log(point.count), math.log(point.bytes)) for point in curve if point.bytes]
+    if not known:
+        return None
+    rest = max(most - extra, 1)
+    if len(known) == 1:
+        return max(int(math.exp(known[0][0]) * rest / math.exp(known[0][1])), 1)
+    x, y = (np.array(column) for column in zip(*known, strict=True))
+    slope, start = np.polyfit(x, y, 1)
+    return max(int(math.exp((math.log(rest) - start) / max(slope, 0.1))), 1)
+
+
+def still_climbs(curve: Sequence[CurvePoint], tolerance: Tolerance) -> bool:
+    """Whether the largest count is the best and the next smaller one clearly worse: more primitives might help."""
+    return len(curve) > 1 and curve[0].excess(tolerance) <= 0 and curve[1].excess(tolerance) > 1

@@ -1,0 +1,141 @@
+"""The curve of quality over the number of primitives, and what is chosen by it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+
+from sundae_ns.training.trials.curve import (
+    PSNR_WEIGHTS,
+    SSIM_WEIGHTS,
+    CurvePoint,
+    Tolerance,
+    affordable,
+    choose,
+    curve_of,
+    price,
+    still_climbs,
+)
+
+COUNTS = (1000, 400, 200, 100)
+Views = list[list[float]]
+
+
+def point(count: int, psnr_loss: float = 0.0, ssim_loss: float = 0.0, error: float = 0.0, size: int = 0) -> CurvePoint:
+    return CurvePoint(count, size or None, 30 - psnr_loss, 0.9 - ssim_loss, psnr_loss, ssim_loss, error, error / 30)
+
+
+def trials(
+    psnr: Sequence[float], ssim: Sequence[float], *, spread: Sequence[float] = (0.0, 0.0, 0.0), growth: float = 0.0
+) -> list[list[Views]]:
+    """Two measurements of each trial; each view differs from the mean by its spread, in every trial."""
+    return [
+        [[[100.0, 0.0, s, p + offset - before] for offset in spread] for before in (growth, 0.0)]
+        for p, s in zip(psnr, ssim, strict=True)
+    ]
+
+
+def test_losses_are_those_against_the_best_of_each_figure() -> None:
+    found = curve_of(COUNTS, trials([30, 31, 30.5, 29], [0.9, 0.89, 0.88, 0.87]), [4, 3, 2, None])
+    assert [one.count for one in found] == list(COUNTS)
+    assert [one.bytes for one in found] == [4, 3, 2, None]
+    assert [one.psnr_loss for one in found] == pytest.approx([PSNR_WEIGHTS[0] * loss for loss in (1, 0, 0.5, 2)])
+    assert [one.ssim_loss for one in found] == pytest.approx([SSIM_WEIGHTS[0] * loss for loss in (0, 0.01, 0.02, 0.03)])
+    assert found[1].psnr == pytest.approx(31)
+    assert found[0].ssim == pytest.approx(0.9)
+
+
+def test_what_still_grows_is_expected_to_end_higher() -> None:
+    growing = trials([30], [0.9], growth=0.2) + trials([30.1], [0.9])
+    found = curve_of((200, 100), growing, [None, None])
+    assert found[0].psnr_loss == 0
+    assert found[1].psnr_loss == pytest.approx(PSNR_WEIGHTS[1] * 0.2 / math.log(2) - PSNR_WEIGHTS[0] * 0.1)
+
+
+def test_the_error_is_of_the_differences_between_counts_on_the_same_view() -> None:
+    """Views differ by decibels from each other, but all counts alike."""
+    alike = curve_of(COUNTS[:2], trials([30, 29], [0.9, 0.9], spread=(-5, 0, 5)), [None, None])
+    assert alike[1].psnr_error == pytest.approx(0, abs=1e-9)
+    unlike = trials([30, 29], [0.9, 0.9])
+    for offset, view in zip((-0.3, 0, 0.3), unlike[1][1], strict=True):
+        view[3] += offset
+    for offset, view in zip((-0.3, 0, 0.3), unlike[1][0], strict=True):
+        view[3] += offset
+    found = curve_of(COUNTS[:2], unlike, [None, None])
+    assert found[1].psnr_error == pytest.approx(PSNR_WEIGHTS[0] * 0.3 / math.sqrt(3))
+
+
+def test_views_count_by_their_pixels() -> None:
+    measured = trials([30, 30], [0.9, 0.9])
+    for window in measured[1]:
+        window[0][0], window[0][3] = 100.0, 20.0
+    for trial in measured:
+        for window in trial:
+            window[0][0] = 1e-9
+    assert curve_of(COUNTS[:2], measured, [None, None])[1].psnr_loss == pytest.approx(0, abs=1e-6)
+
+
+def test_images_that_are_not_finite_lose_everything() -> None:
+    measured = trials([30, 29], [0.9, 0.9])
+    measured[0][1][0][3] = math.nan
+    found = curve_of(COUNTS[:2], measured, [None, None])
+    assert found[0].psnr_loss == math.inf
+    assert found[1].psnr_loss == 0
+    assert choose(found, Tolerance()) == COUNTS[1]
+
+
+@pytest.mark.parametrize(
+    ("losses", "chosen"),
+    [
+        ([(0, 0), (0.05, 0.001), (0.09, 0.002), (1.0, 0.03)], 200),  # all but the last are as good
+        ([(0, 0), (0.3, 0), (0.6, 0), (1.0, 0)], 1000),
+        ([(0.8, 0.03), (0.4, 0.01), (0, 0), (0.05, 0.001)], 100),  # large fields overfit
+        ([(0, 0), (0, 0.02), (0, 0.04), (0, 0.06)], 1000),  # SSIM alone counts, too
+        ([(0.5, 0), (0, 0.006), (0.5, 0.03), (1, 0.1)], 400),  # no count is best in both: the least that is lost
+    ],
+)
+def test_the_fewest_primitives_that_are_as_good_as_the_best(losses: list[tuple[float, float]], chosen: int) -> None:
+    curve = [point(count, *loss) for count, loss in zip(COUNTS, losses, strict=True)]
+    found = choose(curve, Tolerance())
+    smaller = max((count for count in COUNTS if count < chosen), default=0)
+    assert smaller < found <= chosen
+    if chosen in (100, 400):
+        assert found == chosen
+
+
+def test_between_two_counts_the_loss_is_interpolated() -> None:
+    curve = [point(1000), point(400, 0.2)]
+    assert choose(curve, Tolerance()) == round(math.sqrt(1000 * 400))
+    assert choose(curve, Tolerance.of_drop(0.15)) < choose(curve, Tolerance())
+    assert Tolerance.of_drop(0.2) == pytest.approx((0.2, 0.006))
+
+
+def test_what_the_views_cannot_tell_apart_is_no_loss() -> None:
+    assert choose([point(1000), point(400, 0.25, error=0.2)], Tolerance()) == 400
+    assert point(400, 0.9).lost(Tolerance())
+    assert not point(400, 0.9, error=0.3).lost(Tolerance())
+    assert point(400, 0, 0.02).lost(Tolerance())
+
+
+def test_the_price_of_quality_is_what_twice_as_many_primitives_gain() -> None:
+    curve = [point(1000), point(500, 0.1, 0.002), point(250, 0.5, 0.012)]
+    assert price(curve, 800) == pytest.approx((0.1, 0.002))
+    assert price(curve, 300) == pytest.approx((0.4, 0.01))
+    assert price([point(1000, 0.4), point(500)], 500) == (0.0, 0.0)  # more would harm
+    assert price([point(1000)], 1000) == (0.0, 0.0)
+
+
+def test_a_budget_in_bytes_is_a_count_between_the_tried_ones() -> None:
+    curve = [point(1000, size=16000), point(500, size=8000), point(250, size=4000)]
+    assert affordable(curve, 8000) == pytest.approx(500, abs=1)
+    assert affordable(curve, 8000, extra=4000) == pytest.approx(250, abs=1)
+    assert affordable(curve, 100) == pytest.approx(6, abs=1)
+    assert affordable([point(1000)], 100) is None
+
+
+def test_a_curve_that_still_climbs_asks_for_more_primitives() -> None:
+    assert still_climbs([point(1000), point(400, 0.5)], Tolerance())
+    assert not still_climbs([point(1000), point(400, 0.05)], Tolerance())
+    assert not still_climbs([point(1000, 0.3), point(400, 0.5), point(200)], Tolerance())
