@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 from sundae_ns.errors import PackError, StorageError, regular, writing
 
-_LOCK = "training.lock"
+LOCK = "training.lock"
 """Names the process that trains in a folder. The file stays; the system drops its lock when the process ends."""
 UNPACKED = "unpacked"
 """Timestamp of runs that were unpacked; they cannot be trained on."""
@@ -39,26 +39,33 @@ def unpacked_folder(output_dir: Path, name: str) -> Path:
     return folder
 
 
-def reserve(run: Path) -> None:
+def reserve(run: Path, busy: str = "trains in {}; wait for it, or give another --timestamp") -> int:
     """Make a run's folder, reserve it for this process, and remove files that killed processes left unfinished.
 
+    Args:
+        run: the folder.
+        busy: end of the error message, after the name of the other process; ``{}`` stands for the folder.
+
+    Returns:
+        Descriptor of the locked file. The lock lasts while a process has it open.
+
     Raises:
-        StorageError: another process trains in it, or the folder cannot be written.
+        StorageError: another process has reserved it, or the folder cannot be written.
     """
     run = run.resolve()
     if run in _held:
-        return
+        return _held[run].fileno()
     import fcntl
 
     with writing(f"cannot write to the run's folder {run}"):
         run.mkdir(parents=True, exist_ok=True)
-        file = (run / _LOCK).open("a+", encoding="utf-8")
+        file = (run / LOCK).open("a+", encoding="utf-8")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             file.seek(0)
             holder = file.read().strip() or "another process"
-            raise StorageError(f"{holder} trains in {run}; wait for it, or give another --timestamp") from error
+            raise StorageError(f"{holder} {busy.format(run)}") from error
         except OSError as error:
             if error.errno not in (errno.ENOLCK, errno.ENOTSUP):  # network file systems without locks
                 raise
@@ -68,6 +75,7 @@ def reserve(run: Path) -> None:
     for unfinished in [*run.glob("*.partial"), *run.glob("*/partial--1.*")]:
         with suppress(OSError):
             unfinished.unlink()
+    return file.fileno()
 
 
 def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
