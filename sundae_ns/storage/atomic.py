@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -28,9 +29,9 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     try:
         with writing(f"cannot write {path}"):
             yield partial
-            _flush(partial)
+            flush(partial)
             partial.replace(path)
-            _flush(path.parent)
+            flush(path.parent)
     finally:
         with suppress(OSError):
             partial.unlink()
@@ -42,7 +43,17 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def _flush(path: Path) -> None:
+def put_aside(path: Path) -> None:
+    """Rename a damaged file or folder, if there is one, to ``NAME.damaged``, in place of an earlier one."""
+    aside = path.with_name(f"{path.name}.damaged")
+    if not path.exists():
+        return
+    if aside.is_dir():
+        shutil.rmtree(aside)
+    path.replace(aside)
+
+
+def flush(path: Path) -> None:
     """Wait until a file, or the entries of a folder, are on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
