@@ -74,7 +74,7 @@ def demo(
             from sundae_ns.scenes.measure import comparison_of, evaluation, frame_times, sizes
             from sundae_ns.scenes.opening import open_scene
             from sundae_ns.scenes.packed import packed_run
-            from sundae_ns.storage.atomic import replacing, write_text
+            from sundae_ns.storage.atomic import write_bytes, write_image, write_text
             from sundae_ns.storage.runs.folder import prunes_of
 
             evaluated = evaluation(run)
@@ -84,11 +84,9 @@ def demo(
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
             chosen = range(0, len(cameras), max(len(cameras) // SHOWN, 1))[:SHOWN]
             rows = [comparison_of(model, cameras[i], opened.truths[i], f"test view {i}") for i in chosen]
-            with replacing(out / "comparison.png") as partial:
-                comparison_sheet(rows).save(partial, format="png")
+            write_image(out / "comparison.png", comparison_sheet(rows))
             finished, packed = packed_run(run)
-            with replacing(out / "scene.sundae") as partial:
-                partial.write_bytes(packed)
+            write_bytes(out / "scene.sundae", packed)
             write_page(out / "scene.html", finished, packed, title="sundae demo")
 
     results, prunes = evaluated["results"], prunes_of(run)

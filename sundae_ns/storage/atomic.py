@@ -7,8 +7,12 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sundae_ns.errors import writing
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 
 @contextmanager
@@ -41,6 +45,19 @@ def write_text(path: Path, text: str) -> None:
     """Write a small text file atomically; ``StorageError`` if the disk is full or not writable."""
     with replacing(path) as partial:
         partial.write_text(text, encoding="utf-8")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically; ``StorageError`` if the disk is full or not writable."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+def write_image(path: Path, image: Image.Image) -> None:
+    """Write an image atomically in the format of its suffix; ``StorageError`` as for :func:`write_text`."""
+    kind = path.suffix.lower()[1:]
+    with replacing(path) as partial:
+        image.save(partial, format={"jpg": "jpeg"}.get(kind, kind))
 
 
 def put_aside(path: Path) -> None:
