@@ -435,6 +435,21 @@ def test_a_checkpoint_before_a_damaged_one_is_resumed(commands: Commands) -> Non
     assert "--load-dir" in commands.ran[2]
 
 
+def test_a_training_without_its_options_starts_anew_and_is_kept(commands: Commands) -> None:
+    assert run("photos", "-o", "out") == 0
+    empty(Path(RUN, "config.yml"))
+    commands.codes["ns-train"] = 130
+    assert run("photos", "-o", "out") == 130
+    assert "--load-dir" not in commands.ran[-1]
+    # Its last checkpoint is not taken for one of the new training.
+    assert Path(f"{RUN}.damaged/nerfstudio_models/step-000000099.ckpt").exists()
+    commands.codes.clear()
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.names[0] == "ns-train"
+    assert "--load-dir" in commands.ran[0]
+
+
 def test_photos_are_judged_before_anything_starts(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
     os.mkfifo("photos/x.png")
     assert "photos/x.png cannot be read (it is a pipe" in refusal(capsys, "photos", "-o", "out")

@@ -134,6 +134,7 @@ def test_an_interrupted_copy_is_made_again(tmp_path: Path, monkeypatch: pytest.M
             raise OSError(28, "No space left on device")
         return write(path, content)
 
+    (tmp_path / ".sundae_scene.json.partial").write_text("killed here")
     monkeypatch.setattr(Path, "write_bytes", full)
     for number in (1, 2, TRAIN + TEST + 3):  # the marker, an image, transforms.json
         left = number
