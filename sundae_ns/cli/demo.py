@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from sundae_ns.cli.outputs import Overwrite, check_folder
-from sundae_ns.cli.process import loading, percent_of, run_logged, word
+from sundae_ns.cli.process import loading, percent_of, quoted, run_logged, word
 from sundae_ns.errors import ConfigError, writing
 
 METHOD = "sundae-tiny"
@@ -102,5 +102,5 @@ def demo(
     text = report_text(title, stages, (stored.primitives, stored.head), (times.splat, times.head, times.frame))
     console.print(text, highlight=False)
     console.print(f"Images: {out / 'comparison.png'}   In a browser: {out / 'scene.html'}")
-    console.print(f"View: ns-viewer --load-config {run / 'config.yml'}")
+    console.print(f"View: ns-viewer --load-config {quoted(run / 'config.yml')}")
     return 0

@@ -6,13 +6,13 @@ is renamed. A capture that is there is whole.
 
 from __future__ import annotations
 
-import shlex
 import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from sundae_ns.cli.process import quoted
 from sundae_ns.errors import DataError, SundaeError, writing
 
 Matching = Literal["exhaustive", "sequential", "vocab_tree"]
@@ -120,7 +120,7 @@ class Poses:
         if placed < max(LEAST_PHOTOS, LEAST_SHARE * images):
             raise DataError(
                 f"COLMAP placed {placed} of {images} photos; add sharp ones that overlap more, and start in another "
-                f"folder, or train on these with `sundae run {shlex.quote(str(self.capture))} -o OTHER`"
+                f"folder, or train on these with `sundae run {quoted(self.capture)} -o OTHER`"
             )
 
 

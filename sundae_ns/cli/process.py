@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -39,6 +40,11 @@ def loading() -> AbstractContextManager[object]:
 def word(path: Path) -> str:
     """A path as a word of a command; one that begins with a dash would be taken for an option."""
     return f".{os.sep}{path}" if str(path).startswith("-") else str(path)
+
+
+def quoted(path: Path) -> str:
+    """A path as a word of a command that a user copies into a shell."""
+    return shlex.quote(word(path))
 
 
 @contextmanager

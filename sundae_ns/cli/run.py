@@ -15,7 +15,7 @@ import tyro
 
 from sundae_ns.cli.outputs import check_folder
 from sundae_ns.cli.poses import Matching, Poses
-from sundae_ns.cli.process import run_in_group, word
+from sundae_ns.cli.process import quoted, run_in_group, word
 from sundae_ns.cli.results import is_evaluation, is_packed, is_page, is_report
 from sundae_ns.cli.train import command
 from sundae_ns.errors import STOPPED, CheckpointError, ConfigError, DataError, StorageError, SundaeError, writing
@@ -208,7 +208,7 @@ def run(
             for later in plan[number - 1 :]:
                 if later.result is not None:
                     later.result.unlink(missing_ok=True)
-            place = "" if step.folder is None else f"cd {shlex.quote(word(step.folder))} && "
+            place = "" if step.folder is None else f"cd {quoted(step.folder)} && "
             print(f"{heading}:\n{place}{shlex.join(words)}", flush=True)
             code = run_in_group(words, folder=step.folder, locks=[lock])
             if code in STOPPED:

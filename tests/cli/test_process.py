@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sundae_ns.cli.process import run_in_group, word
+from sundae_ns.cli.process import quoted, run_in_group, word
 from sundae_ns.errors import StorageError
 from sundae_ns.storage.runs.folder import reserve
 
@@ -153,3 +153,4 @@ def test_a_command_runs_in_its_folder(tmp_path: Path) -> None:
 
 def test_a_path_is_no_option() -> None:
     assert [word(Path(name)) for name in ("-a", "--help", "a", "/-a")] == ["./-a", "./--help", "a", "/-a"]
+    assert [quoted(Path(name)) for name in ("-a", "a b", "$(b)")] == ["./-a", "'a b'", "'$(b)'"]
