@@ -46,7 +46,7 @@ write_ply(Path(sys.argv[1]), from_points(points, points, sh_degree=1, num_featur
 """
 SCRIPT = """#!{python}
 import sys
-from nerfstudio.scripts.{module} import entrypoint
+from nerfstudio.scripts.train import entrypoint
 sys.exit(entrypoint())
 """
 
@@ -107,9 +107,8 @@ def install(wheel: Path, clean: Path) -> None:
     (site,) = clean.glob("lib/python*/site-packages")
     lent = [path for path in sys.path if any(Path(path).glob("*.dist-info"))]
     (site / "lent.pth").write_text("\n".join(lent or [sysconfig.get_path("purelib")]))
-    for command, module in (("ns-train", "train"), ("ns-eval", "eval")):
-        (clean / "bin" / command).write_text(SCRIPT.format(python=python, module=module))
-        (clean / "bin" / command).chmod(0o755)
+    (clean / "bin" / "ns-train").write_text(SCRIPT.format(python=python))
+    (clean / "bin" / "ns-train").chmod(0o755)
 
 
 def use(clean: Path, cwd: Path, out: Path) -> list[str]:

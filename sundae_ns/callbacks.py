@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.rendering import FieldSource, RenderSettings, TrainingView
+from sundae_ns.storage.runs.folder import find_config, take_records
 from sundae_ns.training.extension import Extension, HeldOutView
 from sundae_ns.training.field_state import FieldState
 
@@ -123,8 +124,18 @@ class NerfstudioRun:
         """Hand the optimizers to the state, and let the extensions check the run."""
         assert self._optimizers is not None
         self.state.optimizers, self.state.schedulers = self._optimizers.optimizers, self._optimizers.schedulers
+        self._take_records()
         for extension in self.model.extensions:
             extension.before_training(self)
+
+    def _take_records(self) -> None:
+        """Take over the records of the run that is resumed, which may lie in another folder."""
+        if self._trainer is None or self.folder is None:
+            return
+        place = self._trainer.config.load_dir or self._trainer.config.load_checkpoint
+        config = None if place is None else find_config(place)
+        if config is not None and config.parent.resolve() != self.folder.resolve():
+            take_records(config.parent, self.folder, (self.state.schedule_step + 1) * self.images_per_step - 1)
 
     def _begin_step(self, step: int) -> None:
         self.state.step = step

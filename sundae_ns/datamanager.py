@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -130,6 +130,16 @@ def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
 def _first(flags: Tensor) -> int:
     """Index of the first True."""
     return int(flags.nonzero()[0])
+
+
+def _shows_something(batch: Mapping[str, Tensor]) -> bool:
+    """Whether a pixel of an image is neither fully transparent nor masked."""
+    image, mask = batch["image"], batch.get("mask")
+    shown = None if mask is None else mask > 0
+    if image.shape[-1] == 4:
+        opaque = image[..., 3:] > 0
+        shown = opaque if shown is None else opaque & shown.to(opaque.device)
+    return shown is None or bool(shown.any())
 
 
 def _fits(cameras: Cameras, device: torch.device) -> bool:
@@ -335,6 +345,11 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             )
             cache_images_device = "cpu"
         loaded = super()._load_images(split, cache_images_device)
+        if split == "train" and loaded and not any(map(_shows_something, loaded)):
+            raise DataError(
+                f"all {len(loaded)} training images are fully transparent or masked, so there is nothing to train on; "
+                "check their alpha channel and their masks"
+            )
         transparent = sum(batch["image"].shape[-1] == 4 for batch in loaded)
         if split == "train" and transparent:
             CONSOLE.print(

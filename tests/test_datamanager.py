@@ -352,6 +352,31 @@ def test_alpha_is_named(own_copy: Path, capsys: Any) -> None:
     assert "empty space" in shown
 
 
+@pytest.mark.parametrize("way", ["transparent", "masked", "transparent where it is not masked"])
+def test_images_that_show_nothing(own_copy: Path, way: str) -> None:
+    meta, (width, height) = json.loads((own_copy / "transforms.json").read_text()), (0, 0)
+    for path in sorted((own_copy / "images").iterdir()):
+        with Image.open(path) as opened:
+            image, (width, height) = opened.convert("RGBA"), opened.size
+        if way != "masked":
+            image.putalpha(Image.new("L", image.size, 0))
+        if way.endswith("masked") and way != "masked":
+            image.putpixel((0, 0), (9, 9, 9, 255))
+        image.save(path)
+    if way != "transparent":
+        mask = Image.new("L", (width, height), 0 if way == "masked" else 255)
+        mask.putpixel((0, 0), 0)
+        mask.save(own_copy / "mask.png")
+        edit(own_copy, frames=[{**frame, "mask_path": "mask.png"} for frame in meta["frames"]])
+    with pytest.raises(DataError, match=f"all {VIEWS} training images are fully transparent or masked"):
+        manager(own_copy).next_train(0)
+    if way == "transparent":  # one image is enough
+        first = own_copy / meta["train_filenames"][0]
+        with Image.open(first) as opened:
+            opened.convert("RGB").save(first)
+        manager(own_copy).next_train(0)
+
+
 def test_a_question_without_a_terminal(own_copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What nerfstudio's COLMAP parser asks if images_2 is missing."""
     monkeypatch.setattr("sundae_ns.datamanager.check_capture", lambda *_, **__: None)

@@ -91,6 +91,7 @@ def test_what_is_not_whole_is_passed_over(tmp_path: Path, harm: Any) -> None:
     harm(tmp_path / name(30))
     path, passed_over = checkpoint.newest_whole(tmp_path)
     assert path == tmp_path / name(20)
+    assert checkpoint.newest_step(tmp_path) == 20
     (line,) = passed_over
     assert name(30) in line
     with pytest.raises(CheckpointError, match="cannot be read"):
@@ -318,12 +319,12 @@ def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path: Path) -> None:
         assert (model.pruning.prune_at, model.resolution_schedule, model.sh_degree_interval) == (1000, 300, 5)
         assert again.optimizers == run.optimizers
     checkpoints = folder / "nerfstudio_models"
-    for step in (999, 1999):
-        (checkpoints / name(step)).write_text("")
+    saved(checkpoints, 999, 1999)
+    (checkpoints / name(2999)).write_text("half")  # the steps that are lost are left
     for words, left in (((), 1000), (("--load-step", "999"), 2000)):
         for place in (folder, checkpoints):
             assert configured(tmp_path, "--load-dir", str(place), *words).max_num_iterations == left
-    (checkpoints / name(2999)).write_text("")
+    saved(checkpoints, 2999)
     with pytest.raises(ConfigError, match="has trained all of its 3,000 steps; give .*--max-num-iterations"):
         configured(tmp_path, "--load-dir", str(folder))
     (folder / "config.yml").write_text("damaged: [")

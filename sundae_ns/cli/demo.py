@@ -1,4 +1,4 @@
-"""``sundae demo``: train and evaluate the shipped capture with nerfstudio's commands."""
+"""``sundae demo``: train the shipped capture with nerfstudio's command, and evaluate it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from sundae_ns.cli.outputs import Overwrite, check_folder
-from sundae_ns.cli.process import console_script, loading, percent_of, run_logged
+from sundae_ns.cli.process import loading, percent_of, quoted, run_logged, word
 from sundae_ns.errors import ConfigError, writing
 
 METHOD = "sundae-tiny"
@@ -25,7 +25,7 @@ def demo(
     steps: int | None = None,
     overwrite: Overwrite = False,
 ) -> int:
-    """Write the embedded capture, train it with ns-train, evaluate it with ns-eval, and print the results.
+    """Write the embedded capture, train it with ns-train, evaluate it, and print the results.
 
     Args:
         out: folder for the capture, the run and the images.
@@ -46,7 +46,7 @@ def demo(
     console = Console()
     scene, run = out / "scene", out / "runs" / "demo" / METHOD / "run"
     device = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "CPU"
-    console.print(f"SUNDAE demo on {device}: train a small scene with ns-train, evaluate it with ns-eval.")
+    console.print(f"SUNDAE demo on {device}: train a small scene with ns-train, and evaluate it.")
     with writing(f"cannot write to {out}"):
         write_demo_capture(scene)
     with Progress(console=console, transient=True) as progress:
@@ -57,7 +57,7 @@ def demo(
             if percent is not None:
                 progress.update(training, completed=percent)
 
-        train = [console_script("ns-train"), METHOD, "--data", str(scene), "--output-dir", str(out / "runs")]
+        train = ["ns-train", METHOD, "--data", word(scene), "--output-dir", word(out / "runs")]
         train += ["--experiment-name", "demo", "--timestamp", "run"]
         train += ["--pipeline.model.background-color", BACKGROUND]
         if steps is not None:
@@ -66,32 +66,30 @@ def demo(
         (run / "prune.json").unlink(missing_ok=True)
         run_logged(train, out / "train.log", show)
         progress.update(training, completed=100)
-        progress.add_task("ns-eval", total=None)
-        evaluate = [console_script("ns-eval"), "--load-config", str(run / "config.yml")]
-        run_logged([*evaluate, "--output-path", str(out / "eval.json")], out / "eval.log")
-        progress.add_task("Timing frames", total=None)
+        progress.add_task("Evaluating", total=None)
 
         # nerfstudio prints messages while it imports and loads.
         with open(out / "measure.log", "w") as log, redirect_stdout(log), redirect_stderr(log):
             from sundae_ns.api.page import write_page
-            from sundae_ns.scenes.measure import comparison_of, frame_times, sizes
+            from sundae_ns.scenes.measure import comparison_of, evaluation, frame_times, sizes
             from sundae_ns.scenes.opening import open_scene
             from sundae_ns.scenes.packed import packed_run
-            from sundae_ns.storage.atomic import replacing
+            from sundae_ns.storage.atomic import write_bytes, write_image, write_text
+            from sundae_ns.storage.runs.folder import prunes_of
 
+            evaluated = evaluation(run)
+            write_text(out / "eval.json", json.dumps(evaluated, indent=2, allow_nan=False) + "\n")
             opened = open_scene(run / "config.yml")
             model, cameras = opened.model, opened.cameras
             times, stored = frame_times(model, cameras, warmup=1, repeats=3), sizes(model)
             chosen = range(0, len(cameras), max(len(cameras) // SHOWN, 1))[:SHOWN]
             rows = [comparison_of(model, cameras[i], opened.truths[i], f"test view {i}") for i in chosen]
-            comparison_sheet(rows).save(out / "comparison.png")
+            write_image(out / "comparison.png", comparison_sheet(rows))
             finished, packed = packed_run(run)
-            with replacing(out / "scene.sundae") as partial:
-                partial.write_bytes(packed)
+            write_bytes(out / "scene.sundae", packed)
             write_page(out / "scene.html", finished, packed, title="sundae demo")
 
-    results = json.loads((out / "eval.json").read_text())["results"]
-    prunes = json.loads((run / "prune.json").read_text()) if (run / "prune.json").exists() else []
+    results, prunes = evaluated["results"], prunes_of(run)
     prune = prunes[-1] if prunes else {"before": model.num_points, "after": model.num_points}
     base = {name.removesuffix("_base"): value for name, value in results.items() if name.endswith("_base")}
     stages = (
@@ -104,5 +102,5 @@ def demo(
     text = report_text(title, stages, (stored.primitives, stored.head), (times.splat, times.head, times.frame))
     console.print(text, highlight=False)
     console.print(f"Images: {out / 'comparison.png'}   In a browser: {out / 'scene.html'}")
-    console.print(f"View: ns-viewer --load-config {run / 'config.yml'}")
+    console.print(f"View: ns-viewer --load-config {quoted(run / 'config.yml')}")
     return 0

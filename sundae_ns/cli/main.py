@@ -15,6 +15,7 @@ import tyro
 
 from sundae_ns.cli.bench import bench
 from sundae_ns.cli.demo import demo
+from sundae_ns.cli.evaluate import evaluate
 from sundae_ns.cli.files import export, prune_file
 from sundae_ns.cli.packing import pack, unpack
 from sundae_ns.cli.process import loading
@@ -58,6 +59,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "view": (view, "show a scene with its head in the browser"),
     "render": (render_file, "render a scene to an image, or a camera path to a video"),
     "report": (report, "measure and compare finished runs: quality, speed, size"),
+    "eval": (evaluate, "evaluate a run as ns-eval does, without running its config.yml"),
     "bench": (bench, "time the frames of a run"),
     "demo": (demo, "train and evaluate the embedded capture; takes minutes on a CPU"),
     "doctor": (doctor, "check this machine, and say how to repair it"),

@@ -13,6 +13,7 @@ from typing import Annotated
 import tyro
 
 from sundae_ns.cli.outputs import Overwrite, check_file
+from sundae_ns.cli.process import quoted
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def unpack(
         with writing(f"cannot write to {out}"):
             path = write_run(found, out, name, data=data)
     print(f"{len(found.field['means']):,} primitives, {'with' if found.head else 'without'} a head")
-    print(f"View: ns-viewer --load-config {path}")
+    print(f"View: ns-viewer --load-config {quoted(path)}")
     if data is not None:
-        print(f"Evaluate: ns-eval --load-config {path}")
+        print(f"Evaluate: ns-eval --load-config {quoted(path)}")
     return 0

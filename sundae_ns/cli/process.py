@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
+from sundae_ns.cli import guard
 from sundae_ns.errors import SundaeError
+
+GUARD = Path(guard.__file__)
+"""Script between a command and this process; see :mod:`sundae_ns.cli.guard`."""
 
 _PERCENT = re.compile(r"^\s*\d+ \(([\d.]+)%\)")
 _TAIL = 12
@@ -31,6 +37,35 @@ def loading() -> AbstractContextManager[object]:
     return Console(stderr=True).status("Loading")
 
 
+def word(path: Path) -> str:
+    """A path as a word of a command; one that begins with a dash would be taken for an option."""
+    return f".{os.sep}{path}" if str(path).startswith("-") else str(path)
+
+
+def quoted(path: Path) -> str:
+    """A path as a word of a command that a user copies into a shell."""
+    return shlex.quote(word(path))
+
+
+@contextmanager
+def _started(
+    words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = (), **options: Any
+) -> Iterator[subprocess.Popen[Any]]:
+    """Start a command without input in a process group of its own, which ends if this process dies.
+
+    Args:
+        words: the command; its program is looked for beside this interpreter first.
+        folder: to run it in; by default that of this process.
+        locks: descriptors of locked files, which stay locked until the group has ended.
+        options: of ``subprocess.Popen``.
+    """
+    guarded = [sys.executable, "-I", str(GUARD), console_script(words[0]), *words[1:]]
+    with subprocess.Popen(
+        guarded, stdin=subprocess.PIPE, start_new_session=True, cwd=folder, pass_fds=locks, **options
+    ) as process:
+        yield process
+
+
 def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], None] | None = None) -> None:
     """Run a command with its output in ``log``.
 
@@ -43,16 +78,12 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
         SundaeError: the command failed; the message ends with the last lines of its output.
     """
     last: deque[str] = deque(maxlen=_TAIL)
-    with open(log, "w", encoding="utf-8") as file:
-        process = subprocess.Popen(
-            arguments,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env={**os.environ, "COLUMNS": "160"},
-            errors="replace",
-        )
+    environment = {**os.environ, "COLUMNS": "160"}
+    output: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "errors": "replace"}
+    with (
+        open(log, "w", encoding="utf-8") as file,
+        _started(arguments, env=environment, **output) as process,
+    ):
         assert process.stdout is not None
         try:
             for line in process.stdout:
@@ -62,7 +93,8 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
                     on_line(line)
             code = process.wait()
         except BaseException:  # an interrupt must not leave the process running
-            process.terminate()
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGTERM)
             process.wait()
             raise
     if code != 0:
@@ -70,31 +102,35 @@ def run_logged(arguments: Sequence[str], log: Path, on_line: Callable[[str], Non
         raise SundaeError(f"{Path(arguments[0]).name} failed with {code}; its log is {log}, which ends with:\n{tail}")
 
 
-def run_in_group(words: Sequence[str]) -> int:
+def run_in_group(words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = ()) -> int:
     """Run a command with its output on the terminal; returns its exit code, or 128 + n if signal n arrived.
 
     A signal reaches the command once, with all processes that it started, whether it comes from a terminal or from
-    another process. The command gets no input. Its program is looked for beside this interpreter first.
+    another process. If this process is killed, the command gets SIGTERM, and SIGKILL after :data:`guard.PATIENCE`.
+
+    Args:
+        words: the command; it gets no input. Its program is looked for beside this interpreter first.
+        folder: to run it in; by default that of this process.
+        locks: descriptors of locked files, which stay locked until the command has ended.
     """
     # A training that loses its terminal saves itself too.
     passed_on = {signal.SIGINT: signal.SIGINT, signal.SIGTERM: signal.SIGTERM, signal.SIGHUP: signal.SIGTERM}
     received: list[int] = []
-    process: subprocess.Popen[bytes] | None = None
+    running: list[subprocess.Popen[Any]] = []
 
     def pass_on(number: int, frame: object) -> None:
         received.append(passed_on[signal.Signals(number)])
-        if process is not None:
+        for process in running:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, received[-1])
 
     before = {number: signal.signal(number, pass_on) for number in passed_on}
     try:
-        process = subprocess.Popen(
-            [console_script(words[0]), *words[1:]], stdin=subprocess.DEVNULL, start_new_session=True
-        )
-        for number in received:  # those that came before there was a process
-            os.killpg(process.pid, number)
-        code = process.wait()
+        with _started(words, folder=folder, locks=locks) as process:
+            running.append(process)
+            for number in received:  # those that came before there was a process
+                os.killpg(process.pid, number)
+            code = process.wait()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -43,9 +43,9 @@ def render_file(
 
     from sundae_ns.api import opening, rendering
     from sundae_ns.api.views import CameraFile, read_cameras, view_in_front
-    from sundae_ns.errors import ConfigError, writing
+    from sundae_ns.errors import ConfigError
     from sundae_ns.evaluation.video import write_video
-    from sundae_ns.storage.atomic import replacing
+    from sundae_ns.storage.atomic import replacing, write_image
 
     suffix = out.suffix.lower()
     if suffix not in (*IMAGES, ".mp4"):
@@ -66,13 +66,12 @@ def render_file(
     if suffix == ".mp4":
         shown = track(views, "Rendering", transient=True, console=Console(stderr=True))
         speed = cameras.frames_per_second or FRAMES_PER_SECOND
-        with writing(f"cannot write {out}"), replacing(out) as partial:
+        with replacing(out) as partial:
             count = write_video(partial, (rendered(each) for each in shown), frames_per_second=speed)
         print(f"{out}: {count} frames of {views[0].width} x {views[0].height} px, {count / speed:.1f} s")
         return 0
     chosen = _chosen(views, view)
-    with writing(f"cannot write {out}"), replacing(out) as partial:
-        rendered(chosen).save(partial, format={".jpg": "jpeg"}.get(suffix, suffix[1:]))
+    write_image(out, rendered(chosen))
     print(f"{out}: {chosen.width} x {chosen.height} px")
     return 0
 

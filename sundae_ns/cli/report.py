@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -181,6 +181,7 @@ def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
     """Write a comparison image of the views with the lowest and the median PSNR."""
     from sundae_ns.evaluation import comparison_sheet
     from sundae_ns.scenes.measure import comparison_of
+    from sundae_ns.storage.atomic import write_image
 
     values = [view.psnr for view in measured.full.views]
     order = sorted(range(len(values)), key=values.__getitem__)
@@ -189,7 +190,7 @@ def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
         comparison_of(opened.model, opened.cameras[index], opened.truths[index], f"{name}: test view {index}")
         for name, index in chosen.items()
     ]
-    comparison_sheet(rows).save(path)
+    write_image(path, comparison_sheet(rows))
 
 
 def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> None:
@@ -216,6 +217,14 @@ def _plot(
 ) -> dict[str, list[tuple[str, str]]]:
     """Write all plots; returns (title, file name) by scene."""
     from sundae_ns.evaluation.plots import MOST_SERIES, colors_of, plot_curves, plot_quality, plot_views
+    from sundae_ns.storage.atomic import write_bytes
+
+    def drawn(name: str, plot: Callable[..., object], *about: object, **options: object) -> bool:
+        buffer = BytesIO()
+        plot(buffer, *about, **options)
+        if buffer.tell():
+            write_bytes(out / f"{name}.png", buffer.getvalue())
+        return buffer.tell() > 0
 
     written: dict[str, list[tuple[str, str]]] = {}
     for number, (scene, runs) in enumerate(scenes.items(), start=1):
@@ -223,16 +232,16 @@ def _plot(
         colors = colors_of([run.label for run in runs])
         plots = written.setdefault(scene, [])
         for cost, cost_name in COSTS.items():
-            if plot_quality(out / f"quality-{cost}{end}.png", runs, cost, colors):
+            if drawn(f"quality-{cost}{end}", plot_quality, runs, cost, colors):
                 plots.append((f"Quality against {cost_name}", f"quality-{cost}{end}.png"))
         # One figure for every few runs, so that colours tell their lines apart.
         for first in range(0, len(runs), MOST_SERIES):
             group = runs[first : first + MOST_SERIES]
             names = f"{end}-from-{first + 1}" if first else end
-            plot_views(out / f"views{names}.png", group, colors)
+            drawn(f"views{names}", plot_views, group, colors)
             plots.append(("PSNR of each test view", f"views{names}.png"))
             known = {run.label: curves[run.label] for run in group if run.label in curves}
             if known:
-                plot_curves(out / f"curves{names}.png", known, colors, title=f"{scene}: training")
+                drawn(f"curves{names}", plot_curves, known, colors, title=f"{scene}: training")
                 plots.append(("Training curves", f"curves{names}.png"))
     return written

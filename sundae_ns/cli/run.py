@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
-import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
 from sundae_ns.cli.outputs import check_folder
-from sundae_ns.cli.process import run_in_group
+from sundae_ns.cli.poses import Matching, Poses
+from sundae_ns.cli.process import quoted, run_in_group, word
+from sundae_ns.cli.results import is_evaluation, is_packed, is_page, is_report
 from sundae_ns.cli.train import command
-from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
-
-Matching = Literal["exhaustive", "sequential", "vocab_tree"]
+from sundae_ns.errors import STOPPED, CheckpointError, ConfigError, DataError, StorageError, SundaeError, writing
 
 SETTINGS = "run.json"
 """File with the settings of the first command; a repeated one must share them."""
-SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".cr2")
-"""Photos that ns-process-data reads."""
-LEAST_SHARE = 0.5
-"""Share of the photos that COLMAP must place; where it places fewer, they overlap too little for a good scene."""
-LEAST_VIEWS = 3
-"""Number of photos that it must place, because nerfstudio holds out at least one for test."""
+BUSY = "works in {}; wait for it, or choose another folder"
 
 
 @dataclass(frozen=True)
@@ -43,6 +37,8 @@ class Step:
     """File that is out of date once an earlier step has run again."""
     check: Callable[[], None] = lambda: None
     """Raises an error if later steps cannot use the result."""
+    folder: Path | None = None
+    """In which the command runs; by default that of this process."""
 
 
 @dataclass(frozen=True)
@@ -72,121 +68,94 @@ class Project:
         """Name of the scene in reports."""
         return self.photos.resolve().name
 
+    @property
+    def poses(self) -> Poses | None:
+        """Makes the capture; None if it is given."""
+        return None if self.capture == self.photos else Poses(self.photos, self.capture, self.matching)
+
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
         evaluated, packed, page = self.out / "eval.json", self.out / "scene.sundae", self.out / "report" / "report.md"
-        web, config, data = self.out / "scene.html", self.run / "config.yml", ("--data", self.capture)
+        web, data = self.out / "scene.html", ("--data", self.capture)
 
-        def step(name: str, result: Path, *words: object) -> Step:
-            return Step(name, lambda: list(map(str, words)), result.is_file, result)
+        def step(name: str, result: Path, whole: Callable[[Path], bool], *words: object) -> Step:
+            line = [word(part) if isinstance(part, Path) else str(part) for part in words]
+            return Step(name, lambda: line, lambda: whole(result), result)
 
+        report = ("sundae", "report", self.run, packed, *data, "-o", page.parent, "--overwrite")
         steps = [
             Step("train", self.train, self.trained),
-            step("evaluate", evaluated, "ns-eval", "--load-config", config, "--output-path", evaluated),
-            step("pack", packed, "sundae", "pack", self.run, "-o", packed, *data),
-            step("report", page, "sundae", "report", self.run, packed, *data, "-o", page.parent, "--overwrite"),
-            step("web page", web, "sundae", "export", packed, "-o", web),
+            step("evaluate", evaluated, is_evaluation, "sundae", "eval", self.run, *data, "-o", evaluated),
+            step("pack", packed, is_packed, "sundae", "pack", self.run, "-o", packed, *data),
+            step("report", page, is_report, *report),
+            step("web page", web, is_page, "sundae", "export", packed, "-o", web),
         ]
-        if self.capture != self.photos:
-            posed = self.capture / "transforms.json"
+        poses = self.poses
+        if poses is not None:
+            place = poses.folder
             steps[:0] = [
-                Step("camera poses", self.poses, posed.is_file),
-                Step("largest model", self.poses_of_largest, self.is_largest, check=self.check_poses),
+                Step("camera poses", poses.find, lambda: poses.found, folder=place),
+                Step("largest model", poses.take_largest, poses.is_largest, check=poses.finish, folder=place),
             ]
         return steps
 
-    def poses(self) -> list[str]:
-        """Command that finds the camera poses.
-
-        Raises:
-            SundaeError: it needs a program that is not installed.
-        """
-        for program, purpose in (("colmap", "finds the camera poses"), ("ffmpeg", "scales the photos")):
-            if shutil.which(program) is None:
-                raise SundaeError(
-                    f"{program} is not installed, which {purpose}; install it with `apt-get install {program}`, "
-                    "or give a capture with poses"
-                )
-        return self.process_photos("--matching-method", self.matching, *([] if _colmap_uses_gpu() else ["--no-gpu"]))
-
-    def process_photos(self, *options: str) -> list[str]:
-        """Command that makes the capture of the photos, with further options."""
-        words = ["ns-process-data", "images", "--data", str(self.photos), "--output-dir", str(self.capture)]
-        return [*words, *options]
-
-    def models(self) -> dict[str, int]:
-        """Numbers of photos of COLMAP's models, by their folders; several if it cannot join them into one."""
-        from sundae_ns.data.colmap import num_images
-
-        found = sorted(path.parent for path in (self.capture / "colmap" / "sparse").glob("*/images.bin"))
-        return {path.relative_to(self.capture).as_posix(): num_images(path) for path in found}
-
-    def is_largest(self) -> bool:
-        """Whether the poses are those of the largest model; ns-process-data takes the first one."""
-        models = self.models()
-        first = models.get("colmap/sparse/0")
-        return first is None or first == max(models.values()) or self.placed() != first
-
-    def poses_of_largest(self) -> list[str]:
-        """Command that replaces the poses by those of the largest model."""
-        models = self.models()
-        largest = max(models, key=models.__getitem__)
-        return self.process_photos("--skip-image-processing", "--skip-colmap", "--colmap-model-path", largest)
-
-    def placed(self) -> int:
-        """Number of photos with a pose."""
-        from sundae_ns.data.capture import read_json
-
-        return len(read_json(self.capture / "transforms.json").get("frames", []))
-
-    def check_poses(self) -> None:
-        """Raise ``DataError`` if COLMAP placed too few photos."""
-        placed = self.placed()
-        images = len(list((self.capture / "images").iterdir()))
-        if placed < max(LEAST_VIEWS, LEAST_SHARE * images):
-            raise DataError(
-                f"COLMAP placed {placed} of {images} photos; add sharp ones that overlap more, and start in another "
-                f"folder, or train on these with `sundae run {shlex.quote(str(self.capture))} -o OTHER`"
-            )
-
     def train(self) -> list[str]:
         """Command that trains, or resumes a training."""
-        saved = self.run / "nerfstudio_models"
-        resumes = any(saved.glob("step-*.ckpt"))
+        saved, resumes = self.run / "nerfstudio_models", self._steps_left() is not None
+        if not resumes and any(saved.glob("*.ckpt")):
+            from sundae_ns.storage.atomic import put_aside
+
+            with writing(f"cannot replace {self.run}"):
+                put_aside(self.run)
         # Without a number of steps, a resumed run trains those that are left.
         words = command(self.capture, self.out / "runs", self.method, self.keep, None if resumes else self.steps)
-        # Curves of the report come from tensorboard's files.
-        words += ["--experiment-name", self.name, "--timestamp", self.run.name, "--vis", "viewer+tensorboard"]
-        return [*words, "--load-dir", str(saved)] if resumes else words
+        # Curves of the report come from tensorboard's files. The name may begin with a dash.
+        words += [f"--experiment-name={self.name}", "--timestamp", self.run.name, "--vis", "viewer+tensorboard"]
+        return [*words, "--load-dir", word(saved)] if resumes else words
 
     def trained(self) -> bool:
         """Whether the last step of the schedule is saved."""
+        left = self._steps_left()
+        return left is not None and left <= 0
+
+    def _steps_left(self) -> int | None:
+        """Number of steps after the newest whole checkpoint; None if there is nothing to resume."""
         from sundae_ns.storage.runs.checkpoint import newest_step
         from sundae_ns.storage.runs.config_file import schedule_length
 
-        step = newest_step(self.run)
-        return step is not None and step + 1 >= schedule_length(self.run / "config.yml")
+        try:
+            step, length = newest_step(self.run), schedule_length(self.run / "config.yml")
+        except CheckpointError:
+            return None
+        return None if step is None else length - step - 1
 
-    def claim(self) -> None:
-        """Make the folder, or check that an earlier command with the same settings made it.
+    def claim(self) -> int:
+        """Make the folder and lock it, or check that an earlier command with the same settings made it.
+
+        Returns:
+            Descriptor of the lock.
 
         Raises:
             ConfigError: its settings were others.
-            StorageError: the folder holds other files, or cannot be written.
+            StorageError: another process works in the folder, it holds other files, or it cannot be written.
         """
+        from sundae_ns.storage.atomic import write_text
+        from sundae_ns.storage.runs.folder import LOCK, reserve
+
         settings = {**asdict(self), "photos": str(self.photos.resolve())}
         del settings["out"]
         path = self.out / SETTINGS
         if self.out.resolve().is_relative_to(self.photos.resolve()):
             raise StorageError(f"{self.out} lies in {self.photos}, which the command reads; choose another folder")
-        check_folder(self.out, reads=[self.photos], overwrite=path.is_file())
+        # An earlier command may have been killed after it made the lock.
+        begun = self.out.is_dir() and all(name.startswith((LOCK, SETTINGS)) for name in os.listdir(self.out))
+        check_folder(self.out, reads=[self.photos], overwrite=begun or path.is_file())
+        with writing(f"cannot make {self.out}"):
+            self.out.mkdir(parents=True, exist_ok=True)
+        lock = reserve(self.out, BUSY)
         if not path.is_file():
-            from sundae_ns.storage.atomic import write_text
-
-            with writing(f"cannot make {self.out}"):
-                self.out.mkdir(parents=True, exist_ok=True)
             write_text(path, json.dumps(settings, indent=1) + "\n")
-            return
+            return lock
         try:
             before = dict(json.loads(path.read_bytes()).items())
         except (ValueError, AttributeError) as error:
@@ -198,6 +167,7 @@ class Project:
                     f"{self.out} was made with {name} {first}, not {now}; "
                     "repeat the first command, or choose another folder"
                 )
+        return lock
 
 
 def run(
@@ -222,10 +192,12 @@ def run(
         matching: photos that COLMAP compares: all pairs, neighbours by name (for frames of a video), or similar ones
             (for thousands of photos; downloads a vocabulary).
     """
-    _check_photos(photos)
+    _check_input(photos)
     command(photos, out, method, keep, steps)  # refuses numbers out of range before the first step
     project = Project(photos, out, method, keep, steps, matching)
-    project.claim()
+    if project.poses is not None and not project.poses.found:
+        project.poses.check()
+    lock = project.claim()
     plan = project.plan()
     for number, step in enumerate(plan, start=1):
         heading = f"# step {number} of {len(plan)}, {step.name}"
@@ -236,8 +208,9 @@ def run(
             for later in plan[number - 1 :]:
                 if later.result is not None:
                     later.result.unlink(missing_ok=True)
-            print(f"{heading}:\n{shlex.join(words)}", flush=True)
-            code = run_in_group(words)
+            place = "" if step.folder is None else f"cd {quoted(step.folder)} && "
+            print(f"{heading}:\n{place}{shlex.join(words)}", flush=True)
+            code = run_in_group(words, folder=step.folder, locks=[lock])
             if code in STOPPED:
                 print("sundae: interrupted; the same command continues here", file=sys.stderr)
                 return code
@@ -249,25 +222,15 @@ def run(
         step.check()
     print(f"# packed scene: {out / 'scene.sundae'}; report: {out / 'report' / 'report.md'}")
     print(f"# to look at the scene: open {out / 'scene.html'} in a browser, or")
-    print(shlex.join(["ns-viewer", "--load-config", str(project.run / "config.yml")]))
+    print(shlex.join(["sundae", "view", word(out / "scene.sundae")]))
     return 0
 
 
-def _check_photos(photos: Path) -> None:
-    """Raise ``DataError`` unless the path is a capture or a folder with photos."""
+def _check_input(photos: Path) -> None:
+    """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos."""
     from sundae_ns.data.capture import no_transforms
 
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, or a capture")
-    if (photos / "transforms.json").is_file():
-        return
-    if photos.is_file() or (photos / "sparse").is_dir():
+    if not (photos / "transforms.json").is_file() and (photos.is_file() or (photos / "sparse").is_dir()):
         raise no_transforms(photos)  # says how to use a video, or a capture in COLMAP layout
-    if not any(path.suffix.lower() in SUFFIXES for path in photos.rglob("*")):
-        raise DataError(f"{photos} holds no photos ({', '.join(SUFFIXES)}); give a folder of photos, or a capture")
-
-
-def _colmap_uses_gpu() -> bool:
-    """Whether COLMAP was built with CUDA, and an NVIDIA driver is here; otherwise its GPU code asks for a display."""
-    text = subprocess.run(["colmap", "-h"], capture_output=True, text=True, check=False, errors="replace").stdout
-    return "with CUDA" in text and shutil.which("nvidia-smi") is not None

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from sundae_ns.cli.process import console_script
+from sundae_ns.cli.process import console_script, word
 from sundae_ns.errors import ConfigError, DataError
 
 
@@ -58,7 +58,7 @@ def command(capture: Path, out: Path, method: str, keep: float | None, steps: in
         raise ConfigError(f"keep is {keep}; give a share in (0, 1]")
     if steps is not None and steps < 1:
         raise ConfigError(f"steps is {steps}; give at least 1")
-    words = ["ns-train", method, "--data", str(capture), "--output-dir", str(out)]
+    words = ["ns-train", method, "--data", word(capture), "--output-dir", word(out)]
     if keep is not None:
         words += ["--pipeline.model.pruning.keep-ratio", f"{keep:g}"]
     if steps is not None:

@@ -28,7 +28,7 @@ _MODELS = {
 }
 _CONVERT = "undistort the capture (colmap image_undistorter), or calibrate it with OPENCV"
 _SHELL = set('"$`\\\n')
-"""Characters that end a quoted word: nerfstudio passes image names to a shell when it scales images down."""
+"""Characters that end a quoted word: nerfstudio passes paths of images to a shell when it scales images down."""
 _CAMERA, _IMAGE, _POINT, _COUNT = map(struct.Struct, ("<iiQQ", "<i7di", "<Q3d3Bd", "<Q"))
 _IMAGE_BYTES = _IMAGE.size + 1 + _COUNT.size  # at least, with an empty name and no observations
 _OBSERVATION, _TRACK = 24, 8
@@ -96,6 +96,8 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
         )
     if not names:
         raise DataError(f"{model} has no images; the reconstruction failed, run it again")
+    if images is not None and _SHELL & set(str(images)):
+        raise DataError(f"{images} has quotes, $, ` or backslashes in its path; rename the folder that has them")
     for name in names:
         if _SHELL & set(name):
             raise DataError(f"{model.name} has an image named {name!r}; rename it without quotes, $, ` and backslashes")

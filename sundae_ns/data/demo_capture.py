@@ -14,6 +14,8 @@ ARCHIVE = Path(__file__).with_name("demo_capture.zip")
 TRANSFORMS = "transforms.json"
 MARKER = ".sundae_scene.json"
 """Lists the files of a copy; its presence permits to replace them. Written first."""
+PARTIAL = ".partial"
+"""End of the name of a file that is being written."""
 
 
 def write_demo_capture(out: Path) -> Path:
@@ -29,7 +31,7 @@ def write_demo_capture(out: Path) -> Path:
         _claim(out, names)
         for name in names:
             (out / name).parent.mkdir(exist_ok=True)
-            (out / name).write_bytes(archive.read(name))
+            _replace(out / name, archive.read(name))
     return out
 
 
@@ -49,7 +51,17 @@ def _claim(out: Path, files: Sequence[str]) -> None:
             # An edited marker must not delete files outside its folder.
             if (out / name).resolve().is_relative_to(out.resolve()):
                 (out / name).unlink(missing_ok=True)
-    elif out.is_dir() and any(out.iterdir()):
+    elif out.is_dir() and any(path.name != MARKER + PARTIAL for path in out.iterdir()):
         raise DataError(f"{out} holds other files than the demo's capture; name a new or an empty folder")
     out.mkdir(parents=True, exist_ok=True)
-    marker.write_text(json.dumps({"files": list(files)}, indent=1))
+    _replace(marker, json.dumps({"files": list(files)}, indent=1).encode())
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file beside its place and rename it, so that an interrupted copy has no half file."""
+    partial = path.with_name(path.name + PARTIAL)
+    try:
+        partial.write_bytes(content)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

@@ -140,4 +140,9 @@ def _select(values: Tensor, rule: PruneRule, count: int, points: Tensor) -> Tens
 
 def diverged(n: int) -> DataError:
     """The error for a field of ``n`` primitives without a finite one."""
+    if n == 0:
+        return DataError(
+            "no primitive is left: all became transparent and were removed, as where images show only their "
+            "background; check the images, their masks and --pipeline.model.background-color"
+        )
     return DataError(f"none of {n} primitives is finite: the training has diverged, go back to an earlier checkpoint")

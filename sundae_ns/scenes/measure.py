@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -14,7 +16,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from sundae_ns.compensation import resize
-from sundae_ns.errors import BackendError, ConfigError
+from sundae_ns.errors import BackendError, ConfigError, DataError
 from sundae_ns.evaluation import (
     HEAD_OFF,
     HEAD_ON,
@@ -27,12 +29,14 @@ from sundae_ns.evaluation import (
     median_ms,
     psnr,
     ssim,
+    without_nan,
 )
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import compensate, draw, scale_plan, zoomed
-from sundae_ns.scenes.opening import Opened
+from sundae_ns.scenes.opening import Opened, open_pipeline
 from sundae_ns.storage import Sizes, bytes_of, bytes_of_module
+from sundae_ns.storage.runs.folder import config_of
 
 MOST_ZOOM = 1000
 """Factor on the sides of an image beyond which no memory holds it."""
@@ -219,6 +223,35 @@ def measure_scene(
         fingerprint=opened.fingerprint,
         command=command,
     )
+
+
+def evaluation(run: Path, *, data: Path | None = None) -> dict[str, Any]:
+    """Metrics of a run on its test views, as ns-eval writes them; None stands for a figure that is not finite.
+
+    Args:
+        run: folder of a run of sundae or splatfacto, or its ``config.yml``. No code in it runs.
+        data: the capture, if it has moved.
+
+    Raises:
+        CheckpointError: the run is of another method, or has no whole checkpoint.
+        DataError: its capture is missing, or cannot be used, or has no test views.
+    """
+    path = config_of(run)
+    opened = open_pipeline(path, data=data)
+    if not opened.pipeline.datamanager.eval_dataset:
+        raise DataError(f"{opened.capture} has no test views, so there is nothing to evaluate {run} on")
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "std_mean", UserWarning)  # of a single view, which has no deviation
+        results = opened.pipeline.get_average_eval_image_metrics(get_std=True)
+    plain: dict[str, Any] = without_nan(
+        {
+            "experiment_name": opened.config.experiment_name,
+            "method_name": opened.config.method_name,
+            "checkpoint": str(path.parent / opened.config.relative_model_dir / f"step-{opened.step:09d}.ckpt"),
+            "results": results,
+        }
+    )
+    return plain
 
 
 def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None, *, with_flip: bool = True) -> ViewQuality:

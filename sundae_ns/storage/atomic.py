@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sundae_ns.errors import writing
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 
 @contextmanager
@@ -28,9 +33,9 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     try:
         with writing(f"cannot write {path}"):
             yield partial
-            _flush(partial)
+            flush(partial)
             partial.replace(path)
-            _flush(path.parent)
+            flush(path.parent)
     finally:
         with suppress(OSError):
             partial.unlink()
@@ -42,7 +47,30 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
-def _flush(path: Path) -> None:
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically; ``StorageError`` if the disk is full or not writable."""
+    with replacing(path) as partial:
+        partial.write_bytes(content)
+
+
+def write_image(path: Path, image: Image.Image) -> None:
+    """Write an image atomically in the format of its suffix; ``StorageError`` as for :func:`write_text`."""
+    kind = path.suffix.lower()[1:]
+    with replacing(path) as partial:
+        image.save(partial, format={"jpg": "jpeg"}.get(kind, kind))
+
+
+def put_aside(path: Path) -> None:
+    """Rename a damaged file or folder, if there is one, to ``NAME.damaged``, in place of an earlier one."""
+    aside = path.with_name(f"{path.name}.damaged")
+    if not path.exists():
+        return
+    if aside.is_dir():
+        shutil.rmtree(aside)
+    path.replace(aside)
+
+
+def flush(path: Path) -> None:
     """Wait until a file, or the entries of a folder, are on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:

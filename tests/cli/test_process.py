@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from sundae_ns.cli.process import run_in_group
+from sundae_ns.cli.process import quoted, run_in_group, word
+from sundae_ns.errors import StorageError
+from sundae_ns.storage.runs.folder import reserve
 
 CHILD = """
 import pathlib, signal, subprocess, sys
@@ -76,3 +78,79 @@ def _ends(pid: int) -> bool:
 
 def test_the_command_gets_no_input() -> None:
     assert run_in_group([sys.executable, "-c", "import sys; raise SystemExit(sys.stdin.read() != '')"]) == 0
+
+
+PARENT = """
+import sys
+from pathlib import Path
+from sundae_ns.cli.process import run_in_group, run_logged
+from sundae_ns.storage.runs.folder import reserve
+words, here = [sys.executable, "-c", sys.argv[1], sys.argv[2]], Path(sys.argv[2])
+if sys.argv[3] == "in a group":
+    run_in_group(words, locks=[reserve(here)])
+else:
+    run_logged(words, here / "log")
+"""
+STUBBORN = """
+import pathlib, signal, subprocess, sys, time
+here = pathlib.Path(sys.argv[1])
+code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); time.sleep(600)"
+grandchild = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+grandchild.stdout.readline()
+(here / "grandchild").write_text(str(grandchild.pid))
+
+def save(number, frame):
+    (here / "saving").touch()
+    while not (here / "saved").exists():
+        time.sleep(0.01)
+    sys.exit(0)
+
+signal.signal(signal.SIGTERM, save)
+(here / "ready").touch()
+while True:
+    time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("way", ["in a group", "logged"])
+def test_a_killed_process_leaves_no_command_behind(tmp_path: Path, way: str) -> None:
+    parent = subprocess.Popen([sys.executable, "-c", PARENT, STUBBORN, tmp_path, way])
+    _wait_for(tmp_path / "ready")
+    parent.kill()
+    parent.wait()
+    _wait_for(tmp_path / "saving")  # the command may end by itself
+    if way == "in a group":
+        with pytest.raises(StorageError, match=f"process {parent.pid} on .* trains in"):
+            reserve(tmp_path)
+    (tmp_path / "saved").touch()
+    assert _ends(int((tmp_path / "grandchild").read_text()))
+    for _ in range(1000):  # the guard ends with the grandchild, a moment before or after it
+        try:
+            reserve(tmp_path)
+            break
+        except StorageError:
+            time.sleep(0.01)
+    reserve(tmp_path)
+
+
+def _wait_for(path: Path) -> None:
+    for _ in range(3000):
+        if path.exists():
+            return
+        time.sleep(0.01)
+    pytest.fail(f"there is no {path.name}")
+
+
+def test_a_command_that_is_not_installed(capfd: pytest.CaptureFixture[str]) -> None:
+    assert run_in_group(["no-such-command-of-sundae"]) == 127
+    assert capfd.readouterr().err == "sundae: no-such-command-of-sundae cannot be started (No such file or directory)\n"
+
+
+def test_a_command_runs_in_its_folder(tmp_path: Path) -> None:
+    code = "import os, sys; raise SystemExit(os.getcwd() != sys.argv[1])"
+    assert run_in_group([sys.executable, "-c", code, str(tmp_path.resolve())], folder=tmp_path) == 0
+
+
+def test_a_path_is_no_option() -> None:
+    assert [word(Path(name)) for name in ("-a", "--help", "a", "/-a")] == ["./-a", "./--help", "a", "/-a"]
+    assert [quoted(Path(name)) for name in ("-a", "a b", "$(b)")] == ["./-a", "'a b'", "'$(b)'"]

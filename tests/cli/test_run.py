@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 import shutil
 import struct
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+import torch
+from PIL import Image
 
 from sundae_ns.cli import main
+from sundae_ns.gaussians import from_points
+from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
 
 PHOTOS = 8
-STEPS = ["ns-process-data", "ns-train", "ns-eval", "sundae pack", "sundae report", "sundae export"]
+STEPS = ["ns-process-data", "ns-train", "sundae eval", "sundae pack", "sundae report", "sundae export"]
 NAMES = ["camera poses", "train", "evaluate", "pack", "report", "web page"]
 
 
@@ -22,6 +31,7 @@ class Commands:
 
     def __init__(self) -> None:
         self.ran: list[list[str]] = []
+        self.folders: list[Path | None] = []
         self.codes: dict[str, int] = {}
         self.placed = PHOTOS
         self.models: list[int] = []
@@ -30,8 +40,9 @@ class Commands:
         """Step of the checkpoint, by the exit code of the training."""
         self.silent = False
 
-    def __call__(self, words: list[str]) -> int:
+    def __call__(self, words: list[str], *, folder: Path | None = None, locks: Sequence[int] = ()) -> int:
         self.ran.append(list(words))
+        self.folders.append(folder)
         name = self.names[-1]
         code = self.codes.get(name, 0)
         if not self.silent:
@@ -43,7 +54,9 @@ class Commands:
         return [" ".join(words[:2]) if words[0] == "sundae" else words[0] for words in self.ran]
 
     def option(self, name: str, place: int = -1) -> str:
-        return self.ran[place][self.ran[place].index(name) + 1]
+        words = self.ran[place]
+        joined = [word.partition("=")[2] for word in words if word.startswith(f"{name}=")]
+        return joined[0] if joined else words[words.index(name) + 1]
 
     def write(self, name: str, words: list[str], code: int) -> None:
         if name == "ns-train":
@@ -55,27 +68,41 @@ class Commands:
                 "!!python/object:sundae_ns.trainer.SundaeTrainerConfig\nschedule_length: 100\n"
             )
             if code in self.saved_at:
-                (folder / "nerfstudio_models" / f"step-{self.saved_at[code]:09d}.ckpt").touch()
+                checkpoint = folder / "nerfstudio_models" / f"step-{self.saved_at[code]:09d}.ckpt"
+                with zipfile.ZipFile(checkpoint, "w") as archive:
+                    archive.writestr("data.pkl", bytes(500))
         elif code:
             return
         elif name == "ns-process-data":
-            capture, placed = Path(self.option("--output-dir")), self.placed
+            assert self.folders[-1] is not None
+            capture, placed = self.folders[-1] / self.option("--output-dir"), self.placed
             if "--skip-colmap" in words:
                 placed = self.models[int(Path(self.option("--colmap-model-path")).name)]
             else:
-                shutil.copytree(self.option("--data"), capture / "images")
+                shutil.copytree(self.folders[-1] / self.option("--data"), capture / "images")
                 for index, images in enumerate(self.models):
                     model = capture / "colmap" / "sparse" / str(index)
                     model.mkdir(parents=True)
                     (model / "images.bin").write_bytes(struct.pack("<Q", images) + bytes(100 * images))
             (capture / "transforms.json").write_text(json.dumps({"frames": [{}] * placed}))
-        elif name == "ns-eval":
-            Path(self.option("--output-path")).write_text("{}")
-        elif name in ("sundae pack", "sundae export"):
-            Path(self.option("-o")).touch()
+        elif name == "sundae eval":
+            Path(self.option("-o")).write_text('{"results": {"psnr": 20.0}}')
+        elif name == "sundae pack":
+            Path(self.option("-o")).write_bytes(packed())
+        elif name == "sundae export":
+            Path(self.option("-o")).write_text("<html><body>a scene</body></html>\n")
         else:
-            Path(self.option("-o")).mkdir(exist_ok=True)
-            (Path(self.option("-o")) / "report.md").touch()
+            folder = Path(self.option("-o"))
+            folder.mkdir(exist_ok=True)
+            Image.effect_noise((30, 20), 50).save(folder / "views.png")
+            (folder / "report.md").write_text("# Report\n\n![PSNR of each test view](views.png)\n")
+
+
+def packed() -> bytes:
+    points = torch.linspace(0, 1, 30).reshape(10, 3)
+    model = {"sh_degree": 0, "rasterize_mode": "classic", "background_color": "black"}
+    scene = PackedScene(from_points(points, points, sh_degree=0, num_features=0), meta={"model": model})
+    return pack_bytes(*fit_scene(scene))[0]
 
 
 @pytest.fixture
@@ -84,13 +111,17 @@ def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "photos").mkdir()
     for index in range(PHOTOS):
-        (tmp_path / "photos" / f"{index}.JPG").touch()
+        photo(Path("photos", f"{index}.JPG"))
     program(tmp_path, "colmap", "COLMAP 3.9 (without CUDA)")
     program(tmp_path, "ffmpeg", "")
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     made = Commands()
     monkeypatch.setattr("sundae_ns.cli.run.run_in_group", made)
     return made
+
+
+def photo(path: Path, kind: str = "jpeg") -> None:
+    Image.new("RGB", (16, 12), "grey").save(path, format=kind)
 
 
 def program(folder: Path, name: str, says: str) -> None:
@@ -119,12 +150,13 @@ def test_photos_become_a_scene_and_a_report(commands: Commands, capsys: pytest.C
     assert commands.names == STEPS
     # Each command is printed before it runs.
     printed = [shlex.split(line) for line in capsys.readouterr().out.splitlines() if not line.startswith("#")]
-    assert printed[:-1] == commands.ran
-    assert printed[-1] == ["ns-viewer", "--load-config", "out/runs/photos/sundae/run/config.yml"]
+    assert printed[0] == ["cd", "out/capture.partial", "&&", *commands.ran[0]]
+    assert printed[1:-1] == commands.ran[1:]
+    assert printed[-1] == ["sundae", "view", "out/scene.sundae"]
     assert commands.option("--matching-method", 0) == "exhaustive"
     assert commands.option("--pipeline.model.pruning.keep-ratio", 1) == "0.2"
     assert commands.option("--max-num-iterations", 1) == "100"
-    for place in (1, 3, 4):
+    for place in (1, 2, 3, 4):
         assert commands.option("--data", place) == "out/capture"
 
 
@@ -309,3 +341,152 @@ def test_damaged_settings(commands: Commands, capsys: pytest.CaptureFixture[str]
     for text in ("[]", "{"):
         Path("out/run.json").write_text(text)
         assert "out/run.json is damaged" in refusal(capsys, "photos", "-o", "out")
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+from sundae_ns.storage.runs.folder import reserve
+reserve(Path("out"))
+print(flush=True)
+sys.stdin.read()
+"""
+
+
+def test_one_command_works_in_a_folder(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    other = subprocess.Popen([sys.executable, "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        line = refusal(capsys, "photos", "-o", "out")
+        assert f"process {other.pid} on " in line
+        assert line.endswith(f"works in {Path('out').resolve()}; wait for it, or choose another folder")
+        assert commands.ran == []
+        other.kill()
+    # The other was killed before it wrote its settings.
+    assert os.listdir("out") == ["training.lock"]
+    assert run("photos", "-o", "out") == 0
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+RUN = "out/runs/photos/sundae/run"
+
+
+@pytest.mark.parametrize("harm", [cut, empty, Path.unlink])
+@pytest.mark.parametrize(
+    ("result", "step"),
+    [
+        ("out/capture/transforms.json", 0),
+        (f"{RUN}/config.yml", 1),
+        (f"{RUN}/nerfstudio_models/step-000000099.ckpt", 1),
+        ("out/eval.json", 2),
+        ("out/scene.sundae", 3),
+        ("out/report/report.md", 4),
+        ("out/report/views.png", 4),
+        ("out/scene.html", 5),
+    ],
+)
+def test_half_a_result_is_made_again(
+    commands: Commands, result: str, step: int, harm: Callable[[Path], object]
+) -> None:
+    assert run("photos", "-o", "out") == 0
+    harm(Path(result))
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.names[0] == STEPS[step]
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.ran == []
+
+
+def test_half_a_capture_is_made_again(commands: Commands) -> None:
+    """The program writes its last file in place, so it may end in the middle of it."""
+    commands.models, commands.placed = [5, PHOTOS], 5
+    commands.codes["ns-process-data"] = 137
+    half = Path("out/capture.partial/capture/transforms.json")
+
+    def killed(name: str, words: list[str], code: int) -> None:
+        half.parent.mkdir(parents=True, exist_ok=True)
+        half.write_text('{"frames": [{}, {}')
+
+    write, commands.write = commands.write, killed  # type: ignore[method-assign]
+    assert run("photos", "-o", "out") == 137
+    assert not Path("out/capture").exists()
+    commands.write = write  # type: ignore[method-assign]
+    commands.codes.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.names == ["ns-process-data"] * 2 + STEPS
+    assert not half.parent.exists()
+
+
+def test_a_checkpoint_before_a_damaged_one_is_resumed(commands: Commands) -> None:
+    commands.codes["ns-train"] = 130
+    assert run("photos", "-o", "out") == 130
+    commands.codes.clear()
+    Path(RUN, "nerfstudio_models", "step-000000099.ckpt").write_bytes(b"PK")
+    assert run("photos", "-o", "out") == 0
+    assert "--load-dir" in commands.ran[2]
+
+
+def test_a_training_without_its_options_starts_anew_and_is_kept(commands: Commands) -> None:
+    assert run("photos", "-o", "out") == 0
+    empty(Path(RUN, "config.yml"))
+    commands.codes["ns-train"] = 130
+    assert run("photos", "-o", "out") == 130
+    assert "--load-dir" not in commands.ran[-1]
+    # Its last checkpoint is not taken for one of the new training.
+    assert Path(f"{RUN}.damaged/nerfstudio_models/step-000000099.ckpt").exists()
+    commands.codes.clear()
+    commands.ran.clear()
+    assert run("photos", "-o", "out") == 0
+    assert commands.names[0] == "ns-train"
+    assert "--load-dir" in commands.ran[0]
+
+
+def test_photos_are_judged_before_anything_starts(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    os.mkfifo("photos/x.png")
+    assert "photos/x.png cannot be read (it is a pipe" in refusal(capsys, "photos", "-o", "out")
+    assert commands.ran == []
+    assert not Path("out").exists()
+    Path("photos/x.png").unlink()
+    assert run("photos", "-o", "out") == 0
+    # Photos are of no more use once there are poses.
+    shutil.rmtree("photos")
+    Path("photos").mkdir()
+    assert run("photos", "-o", "out") == 0
+
+
+def test_names_with_a_dash_are_no_options(commands: Commands) -> None:
+    shutil.copytree("photos", "-photos")
+    assert run("./-photos", "-o", "./-out") == 0
+    for words in commands.ran[1:]:
+        paths = [one for one in words if "photos" in one or "out" in one.replace("--out", "")]
+        assert paths
+        assert all(one.startswith(("./-", "--experiment-name=")) for one in paths), words
+    commands.ran.clear()
+    assert run("./-out/capture", "-o", "./-again", "--keep", "0.5") == 0
+    assert commands.option("--data", 0) == "./-out/capture"
+
+
+def test_photos_keep_their_order_under_plain_names(commands: Commands) -> None:
+    for name in ("-x.jpeg", "$(touch PWNED).JPG"):
+        photo(Path("photos", name))
+    seen: list[str] = []
+    write = commands.write
+
+    def watch(name: str, words: list[str], code: int) -> None:
+        if name == "ns-process-data":
+            folder = Path("out/capture.partial/photos")
+            seen.extend(f"{path.name} {path.resolve().name}" for path in sorted(folder.iterdir()))
+        write(name, words, code)
+
+    commands.write = watch  # type: ignore[method-assign]
+    assert run("photos", "-o", "out") == 0
+    assert seen[:3] == ["00001.jpg $(touch PWNED).JPG", "00002.jpg -x.jpeg", "00003.jpg 0.JPG"]

@@ -121,3 +121,26 @@ def test_an_interrupted_copy_has_no_transforms(tmp_path: Path, monkeypatch: pyte
 
 def test_the_archive_is_small() -> None:
     assert ARCHIVE.stat().st_size < 1_400_000
+
+
+def test_an_interrupted_copy_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write, left = Path.write_bytes, 0
+
+    def full(path: Path, content: bytes) -> int:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            write(path, content[: len(content) // 2])
+            raise OSError(28, "No space left on device")
+        return write(path, content)
+
+    (tmp_path / ".sundae_scene.json.partial").write_text("killed here")
+    monkeypatch.setattr(Path, "write_bytes", full)
+    for number in (1, 2, TRAIN + TEST + 3):  # the marker, an image, transforms.json
+        left = number
+        with pytest.raises(OSError, match="No space"):
+            write_demo_capture(tmp_path)
+        assert not (tmp_path / "transforms.json").exists()
+        assert not list(tmp_path.rglob("*.partial"))
+    write_demo_capture(tmp_path)
+    check_transforms(tmp_path / "transforms.json")

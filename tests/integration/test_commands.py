@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from PIL import Image
 
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
@@ -29,6 +31,28 @@ def test_ns_eval(tiny: Any, call_here: Any, tmp_path: Path) -> None:
     (prune,) = json.loads((tiny.folder / "prune.json").read_text())
     assert found["gaussian_count"] == prune["after"]
     assert found["psnr"] > prune["pruned"]["psnr"]
+
+    said = call_here("sundae", "eval", tiny.folder, "-o", tmp_path / "ours.json")
+    assert f"PSNR {found['psnr']:.4g}, SSIM {found['ssim']:.4g}" in said
+    ours = json.loads((tmp_path / "ours.json").read_text())
+    assert ours["results"].keys() == found.keys()
+    timed = [name for name in found if name.startswith(("fps", "num_rays_per_sec"))]
+    for each in (found, ours["results"]):
+        for name in timed:
+            del each[name]
+    assert ours == result
+
+
+def test_a_single_test_view_has_no_deviation(
+    tiny: Any, call_here: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    every = FullImageDatamanager.fixed_indices_eval_dataloader
+    first = property(lambda manager: every.fget(manager)[:1])
+    monkeypatch.setattr(FullImageDatamanager, "fixed_indices_eval_dataloader", first)
+    call_here("sundae", "eval", tiny.folder, "-o", tmp_path / "eval.json")
+    results = json.loads((tmp_path / "eval.json").read_text(), parse_constant=pytest.fail)["results"]
+    assert results["psnr_std"] is None
+    assert results["psnr"] > 10
 
 
 def pictures(folder: Path) -> list[np.ndarray]:

@@ -5,16 +5,23 @@ from __future__ import annotations
 import json
 import shutil
 import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
 import pytest
+from colmap_models import write_model
+from PIL import Image
 
 from sundae_ns.cli import main
+from sundae_ns.cli.process import run_in_group
+from sundae_ns.errors import StorageError
 from sundae_ns.storage.kinds import kind_of
+from sundae_ns.storage.runs.folder import reserve
 from sundae_ns.trainer import SundaeTrainer
 
 STEPS, STOP_AT = 40, 25
@@ -26,12 +33,13 @@ def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Run ``sundae run`` with its commands in this process, which has imported nerfstudio; poses are the scene's."""
     monkeypatch.chdir(tmp_path)
     shutil.copytree(tiny.scene / "images", "photos")
-    monkeypatch.setattr("sundae_ns.cli.run.shutil.which", lambda _: "/bin/true")
-    monkeypatch.setattr("sundae_ns.cli.run._colmap_uses_gpu", lambda: False)
+    monkeypatch.setattr("sundae_ns.cli.poses.shutil.which", lambda _: "/bin/true")
+    monkeypatch.setattr("sundae_ns.cli.poses._colmap_uses_gpu", lambda: False)
 
-    def here(words: Sequence[str]) -> int:
+    def here(words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = ()) -> int:
         if words[0] == "ns-process-data":
-            shutil.copytree(tiny.scene, words[words.index("--output-dir") + 1])
+            assert folder is not None
+            shutil.copytree(tiny.scene, folder / words[words.index("--output-dir") + 1])
             return 0
         # A viewer in this process would outlive the test.
         words = ["tensorboard" if word == "viewer+tensorboard" else word for word in words]
@@ -89,3 +97,91 @@ def test_photos_to_a_report_with_an_interruption(
 
     assert run(*words) == 0
     assert capfd.readouterr().out.count(": done\n") == 7
+
+
+COLMAP = """#!/bin/sh
+case "$1" in
+    -h) echo "COLMAP 3.9 (without CUDA)" ;;
+    feature_extractor) if [ -e "$HERE/slow" ]; then echo $$ > "$HERE/pid"; exec sleep 600; fi ;;
+    mapper) while [ "$1" != --output_path ]; do shift; done; mkdir -p "$2" && cp -r "$HERE/model" "$2/0" ;;
+esac
+"""
+NASTY = """-a b'c"d$(touch PWNED)`touch PWNED`;touch PWNED&"""
+
+
+@pytest.fixture
+def poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """nerfstudio's own program with another COLMAP, in a folder of its own; no command runs after it. Those asked."""
+    monkeypatch.chdir(tmp_path)
+    write_model(tmp_path / "model", [f"frame_{number:05d}.png" for number in range(1, 5)], (24, 16))
+    for program, script in (("colmap", COLMAP), ("ffmpeg", "#!/bin/sh\n")):
+        (tmp_path / "bin").mkdir(exist_ok=True)
+        (tmp_path / "bin" / program).write_text(script)
+        (tmp_path / "bin" / program).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:/usr/bin:/bin")
+    monkeypatch.setenv("HERE", str(tmp_path))
+    asked: list[list[str]] = []
+
+    def only_poses(words: list[str], **options: Any) -> int:
+        asked.append(words)
+        return run_in_group(words, **options) if words[0] == "ns-process-data" else 3
+
+    monkeypatch.setattr("sundae_ns.cli.run.run_in_group", only_poses)
+    return asked
+
+
+def run_poses(photos: str, out: str) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["run", photos, "-o", out])
+    assert caught.value.code == 3
+
+
+def test_no_name_reaches_a_shell(poses: list[list[str]], tmp_path: Path) -> None:
+    folder, out = Path(NASTY), Path(f"out{NASTY}")
+    folder.mkdir()
+    for name in (f"{NASTY}.png", "-b.PNG", "--help.png", "plain.png"):
+        Image.new("RGB", (24, 16), "grey").save(folder / name, format="png")
+    run_poses(f"./{folder}", str(out))
+    assert [words[0] for words in poses] == ["ns-process-data", "ns-train"]
+    frames = json.loads((out / "capture" / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"images/frame_{number:05d}.png" for number in range(1, 5)]
+    assert sorted(path.name for path in out.iterdir()) == ["capture", "run.json", "training.lock"]
+    assert not list(tmp_path.rglob("PWNED"))
+
+
+def test_a_killed_command_takes_colmap_with_it_and_the_next_one_works(poses: list[list[str]], tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
+    for name in ("a.png", "b.png", "c.png", "d.png"):
+        Image.new("RGB", (24, 16), "grey").save(tmp_path / "photos" / name)
+    (tmp_path / "slow").touch()
+    words = [Path(sys.executable).parent / "sundae", "run", "photos", "-o", "out"]
+    pid = tmp_path / "pid"
+    with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
+        wait(lambda: pid.exists() and pid.read_text().endswith("\n"))
+        second = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert second.returncode == 2
+        assert second.stderr.startswith(f"sundae: process {first.pid} on ")
+        assert len(second.stderr.splitlines()) == 1
+        first.kill()
+    colmap = Path("/proc", pid.read_text().strip())
+    wait(lambda: not colmap.exists() or ") Z " in (colmap / "stat").read_text())
+    (tmp_path / "slow").unlink()
+    wait(lambda: not is_locked(tmp_path / "out"))
+    run_poses("photos", "out")
+    assert [words[0] for words in poses] == ["ns-process-data", "ns-train"]
+
+
+def is_locked(folder: Path) -> bool:
+    try:
+        reserve(folder)
+    except StorageError:
+        return True
+    return False
+
+
+def wait(condition: Callable[[], bool]) -> None:
+    for _ in range(6000):
+        if condition():
+            return
+        time.sleep(0.01)
+    pytest.fail("it takes more than a minute")

@@ -13,10 +13,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 from sundae_ns.errors import DataError, PackError, StorageError, reading, regular, writing
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import replacing, write_ply, write_text
+from sundae_ns.storage.atomic import put_aside, write_image
 
 
 @contextmanager
@@ -137,3 +139,25 @@ def test_only_regular_files_are_read(tmp_path: Path) -> None:
 def test_errors_of_reading_name_the_file(raised: Exception, kind: type[Exception], message: str) -> None:
     with pytest.raises(kind, match=f"^{message}$"), reading(Path("a.x"), "a whole x", PackError, mend="get it again"):
         raise raised
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.webp"])
+def test_half_an_image_is_none(tmp_path: Path, name: str) -> None:
+    write_image(tmp_path / name, Image.new("RGB", (40, 30)))
+    before = (tmp_path / name).read_bytes()
+    with small_disk(10_000), pytest.raises(StorageError, match="ulimit"):
+        write_image(tmp_path / name, Image.effect_noise((400, 300), 100))
+    assert (tmp_path / name).read_bytes() == before
+    assert os.listdir(tmp_path) == [name]
+
+
+def test_what_is_damaged_is_put_aside(tmp_path: Path) -> None:
+    put_aside(tmp_path / "gone")
+    for text in ("first", "second"):
+        (tmp_path / "a").mkdir()
+        (tmp_path / "a" / "b").write_text(text)
+        (tmp_path / "c").write_text(text)
+        for name in ("a", "c"):
+            put_aside(tmp_path / name)
+    assert sorted(os.listdir(tmp_path)) == ["a.damaged", "c.damaged"]
+    assert (tmp_path / "a.damaged" / "b").read_text() == (tmp_path / "c.damaged").read_text() == "second"

@@ -253,6 +253,13 @@ def test_a_field_that_the_optimizers_do_not_hold_is_not_pruned() -> None:
     assert len(foreign["means"]) == 100
 
 
+def test_a_field_without_a_primitive_has_not_diverged() -> None:
+    policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
+    params, optimizers = field(0)
+    with pytest.raises(DataError, match="no primitive is left: all became transparent"):
+        policy.after_step(FieldPruner(params, optimizers), policy.initialize_state(), 0, lambda _: torch.ones(0))
+
+
 def test_a_field_without_a_finite_primitive_names_the_cause() -> None:
     policy = PruningSchedule(PruningConfig(prune_at=0, keep_ratio=0.5))
     params, optimizers = field(10)

@@ -68,9 +68,9 @@ def folder_of(place: Path) -> Path:
 
 
 def newest_step(place: Path) -> int | None:
-    """Step of the newest checkpoint by its name, given it, its folder, or the run's; None if there is none."""
-    found = [place] if place.is_file() else checkpoints(folder_of(place))
-    match = _NAME.fullmatch(found[-1].name) if found else None
+    """Step of the newest whole checkpoint by its name, given it, its folder, or the run's; None if there is none."""
+    found = [place] if place.is_file() else reversed(checkpoints(folder_of(place)))
+    match = next((_NAME.fullmatch(path.name) for path in found if _damage(path) is None), None)
     return None if match is None else int(match[1])
 
 

@@ -13,9 +13,12 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from sundae_ns.errors import PackError, StorageError, regular, writing
+from sundae_ns.storage.atomic import write_text
 
-_LOCK = "training.lock"
+LOCK = "training.lock"
 """Names the process that trains in a folder. The file stays; the system drops its lock when the process ends."""
+PRUNES, TRIALS, STOPPING = "prune.json", "trials.json", "stopping.json"
+"""Records of what a resumed run does not repeat; the watch of the last one follows the decision of the trials."""
 UNPACKED = "unpacked"
 """Timestamp of runs that were unpacked; they cannot be trained on."""
 _held: dict[Path, TextIO] = {}
@@ -39,26 +42,33 @@ def unpacked_folder(output_dir: Path, name: str) -> Path:
     return folder
 
 
-def reserve(run: Path) -> None:
+def reserve(run: Path, busy: str = "trains in {}; wait for it, or give another --timestamp") -> int:
     """Make a run's folder, reserve it for this process, and remove files that killed processes left unfinished.
 
+    Args:
+        run: the folder.
+        busy: end of the error message, after the name of the other process; ``{}`` stands for the folder.
+
+    Returns:
+        Descriptor of the locked file. The lock lasts while a process has it open.
+
     Raises:
-        StorageError: another process trains in it, or the folder cannot be written.
+        StorageError: another process has reserved it, or the folder cannot be written.
     """
     run = run.resolve()
     if run in _held:
-        return
+        return _held[run].fileno()
     import fcntl
 
     with writing(f"cannot write to the run's folder {run}"):
         run.mkdir(parents=True, exist_ok=True)
-        file = (run / _LOCK).open("a+", encoding="utf-8")
+        file = (run / LOCK).open("a+", encoding="utf-8")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             file.seek(0)
             holder = file.read().strip() or "another process"
-            raise StorageError(f"{holder} trains in {run}; wait for it, or give another --timestamp") from error
+            raise StorageError(f"{holder} {busy.format(run)}") from error
         except OSError as error:
             if error.errno not in (errno.ENOLCK, errno.ENOTSUP):  # network file systems without locks
                 raise
@@ -68,6 +78,7 @@ def reserve(run: Path) -> None:
     for unfinished in [*run.glob("*.partial"), *run.glob("*/partial--1.*")]:
         with suppress(OSError):
             unfinished.unlink()
+    return file.fileno()
 
 
 def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
@@ -84,10 +95,32 @@ def prunes_before(path: Path, step: int) -> list[dict[str, Any]]:
     return []
 
 
+def take_records(source: Path, run: Path, step: int) -> None:
+    """Copy the records of a run to the folder of another that resumes it after a step, but those of later steps.
+
+    Args:
+        source: folder of the run that is resumed. Its damaged records are passed over.
+        run: folder of the other; a record that it has is kept.
+        step: step of the checkpoint, in steps of one image.
+
+    Raises:
+        StorageError: no space or no right to write.
+    """
+    prunes = prunes_of(source)
+    before = [record for record in prunes if isinstance(record.get("step"), int) and record["step"] <= step]
+    if before and not (run / PRUNES).exists():
+        write_text(run / PRUNES, json.dumps(before, indent=2))
+    with suppress(OSError, ValueError, AttributeError, TypeError):
+        decided = json.loads(regular(source / TRIALS).read_text(encoding="utf-8")).get("step", step) <= step
+        for name in (TRIALS, STOPPING) if decided else ():
+            if (source / name).is_file() and not (run / name).exists():
+                write_text(run / name, (source / name).read_text(encoding="utf-8"))
+
+
 def prunes_of(run: Path) -> list[dict[str, Any]]:
     """Records of the prunes of a finished run, given its folder; empty if they cannot be read."""
     try:
-        return _records(run / "prune.json")
+        return _records(run / PRUNES)
     except (OSError, ValueError):
         return []
 
@@ -109,7 +142,7 @@ def files_of(run: Path) -> list[Path]:
     if run.is_file() and run.name != "config.yml":
         return [run]
     folder = config_of(run).parent
-    return [folder / name for name in ("config.yml", "nerfstudio_models", "dataparser_transforms.json", "prune.json")]
+    return [folder / name for name in ("config.yml", "nerfstudio_models", "dataparser_transforms.json", PRUNES)]
 
 
 def find_config(path: Path) -> Path | None:

@@ -10,7 +10,15 @@ from pathlib import Path
 import pytest
 
 from sundae_ns.errors import StorageError
-from sundae_ns.storage.runs.folder import files_of, find_config, new_name, prunes_before, prunes_of, reserve
+from sundae_ns.storage.runs.folder import (
+    files_of,
+    find_config,
+    new_name,
+    prunes_before,
+    prunes_of,
+    reserve,
+    take_records,
+)
 
 HOLDER = "import sys, time; from pathlib import Path; from sundae_ns.storage.runs.folder import reserve; "
 HOLDER += "reserve(Path(sys.argv[1])); print(flush=True); time.sleep(600)"
@@ -87,3 +95,26 @@ def test_parts_of_a_run(tmp_path: Path) -> None:
     assert files_of(tmp_path) == files_of(tmp_path / "config.yml")
     assert tmp_path / "nerfstudio_models" in files_of(tmp_path)
     assert files_of(tmp_path / "a.ply") == [tmp_path / "a.ply"]
+
+
+def test_records_follow_a_resumed_run(tmp_path: Path) -> None:
+    old = tmp_path / "old"
+    old.mkdir()
+    take_records(old, tmp_path / "none", 9)  # there are none
+    (old / "prune.json").write_text('[{"step": 3, "after": 9}, {"step": 5, "after": 4}, {"step": 8, "after": 2}]')
+    (old / "trials.json").write_text('{"step": 6, "decision": "head"}')
+    (old / "stopping.json").write_text('{"steps_on_all_views": 7}')
+    for step, prunes, decided in ((2, [], False), (5, [3, 5], False), (6, [3, 5], True), (8, [3, 5, 8], True)):
+        new = tmp_path / f"resumed-after-{step}"
+        new.mkdir()
+        take_records(old, new, step)
+        assert [record["step"] for record in prunes_of(new)] == prunes
+        assert [(new / name).exists() for name in ("trials.json", "stopping.json")] == [decided, decided]
+    (new / "prune.json").write_text("[]")
+    take_records(old, new, 8)
+    assert prunes_of(new) == []  # its own record
+    for text in ("[", "[1]", "1", '{"step": "a"}', '[{"step": "a"}]', "[{}]"):
+        for name in ("prune.json", "trials.json"):
+            (old / name).write_text(text)
+        take_records(old, tmp_path / "none", 9)
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,159 @@
+"""A stranger's run whose ``config.yml`` starts a program: no command of sundae, script or example starts it."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import shutil
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from http.server import ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from sundae_ns.cli import main
+from sundae_ns.cli.main import COMMANDS
+
+ROOT = Path(__file__).parents[2]
+CONFIGS: dict[str, Callable[[str], str]] = {
+    "nothing else": lambda text: "!!python/object/apply:os.system ['touch PWNED']\n",
+    "among options": lambda text: text.replace(
+        "\nload_step: null\n", "\nload_step: !!python/object/new:os.system ['touch PWNED']\n"
+    ),
+}
+WORDS: dict[str, list[str]] = {
+    "run": ["CAPTURE", "-o", "PROJECT", "--method", "sundae-tiny"],
+    "train": ["CAPTURE", "-o", "runs"],
+    "prune": ["RUN", "-o", "out.ply"],
+    "pack": ["RUN", "-o", "out.sundae"],
+    "unpack": ["RUN", "-o", "runs"],
+    "export": ["RUN", "-o", "out.html"],
+    "view": ["RUN", "--no-open-browser"],
+    "render": ["RUN", "-o", "out.png"],
+    "report": ["RUN", "-o", "report"],
+    "eval": ["RUN", "-o", "out.json"],
+    "bench": ["frame", "--load-config", "RUN"],
+    "demo": ["DEMO", "--overwrite"],
+    "doctor": [],
+}
+"""Words of each command on a run, or on a folder with one."""
+SCRIPTS: dict[str, list[str] | str] = {
+    "benchmarks/bands.py": ["RUN", "-o", "bands", "--view", "0"],
+    "benchmarks/bench_export.py": ["--run", "RUN", "--splat-transform", "false"],
+    "benchmarks/bench_formats.py": ["RUN"],
+    "benchmarks/bench_graph.py": ["--field", "RUN", "--points", "200", "--repeats", "1", "--device", "cpu"],
+    "benchmarks/bench_pack.py": ["--run", "RUN", "--repeats", "1"],
+    "benchmarks/bench_page.py": ["RUN"],
+    "benchmarks/bench_viewers.py": ["RUN"],
+    "benchmarks/flicker.py": ["--load-config", "RUN"],
+    "examples/plot_curve.py": "opens a run as render_packed.py does",
+    "examples/render_packed.py": ["RUN", "out.png"],
+    "examples/prune_ply.py": "opens a run as render_packed.py does",
+    "benchmarks/bench_step.py": "makes its field",
+    "benchmarks/bench_training.py": "trains its runs",
+    "benchmarks/browser.py": "trains its run",
+    "benchmarks/check_wheel.py": "trains its run",
+    "benchmarks/job.py": "trains its run, in an empty folder",
+    "benchmarks/kill_and_resume.py": "trains its runs",
+    "benchmarks/memory_growth.py": "trains its run",
+    "benchmarks/multi_gpu.py": "takes a checkpoint without its config.yml",
+    "benchmarks/mutants.py": "takes the sources",
+    "benchmarks/paper.py": "trains its runs",
+    "benchmarks/plot.py": "takes tables",
+    "benchmarks/quality.py": "trains its runs",
+    "benchmarks/still_life.py": "makes a capture",
+    "benchmarks/suite.py": "trains its runs",
+    "benchmarks/tables.py": "takes tables",
+}
+"""Words of each script on a run, or why it takes none."""
+
+
+@pytest.fixture(params=CONFIGS)
+def hostile(
+    request: pytest.FixtureRequest, tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Path]:
+    """A hostile run: alone, in a project of ``sundae run``, and in a folder of ``sundae demo``."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(tiny.scene, "CAPTURE")
+    config = CONFIGS[request.param](tiny.config.read_text())
+    assert "os.system" in config
+    for folder in ("RUN", "PROJECT/runs/CAPTURE/sundae-tiny/run", "DEMO/runs/demo/sundae-tiny/run"):
+        shutil.copytree(tiny.folder, folder)
+        Path(folder, "config.yml").write_text(config)
+    settings = {"photos": str(Path("CAPTURE").resolve()), "method": "sundae-tiny", "matching": "exhaustive"}
+    Path("PROJECT/run.json").write_text(json.dumps({**settings, "keep": None, "steps": None}))
+    yield tmp_path
+    assert not list(tmp_path.rglob("PWNED"))
+
+
+@pytest.mark.parametrize("kind", CONFIGS)
+def test_nerfstudio_would_run_it(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    yaml.load(CONFIGS[kind]("a: 1\nload_step: null\n"), Loader=yaml.Loader)
+    assert Path("PWNED").exists()
+
+
+def test_no_command_and_no_script_is_forgotten() -> None:
+    assert WORDS.keys() == COMMANDS.keys()
+    found = {
+        path.relative_to(ROOT).as_posix() for name in ("benchmarks", "examples") for path in ROOT.glob(f"{name}/*.py")
+    }
+    assert SCRIPTS.keys() == found
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.usefixtures("hostile")
+def test_no_command_runs_it(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def start(words: Sequence[str], *_: Any, **__: Any) -> int:
+        """A command of sundae in this process; one of nerfstudio is only noted."""
+        asked.append(Path(words[0]).name)
+        if asked[-1] != "sundae":
+            return 0
+        with pytest.raises(SystemExit) as caught:
+            main(list(words[1:]))
+        return int(caught.value.code or 0)
+
+    def stop(server: ThreadingHTTPServer) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sundae_ns.cli.run.run_in_group", start)
+    monkeypatch.setattr("sundae_ns.cli.demo.run_logged", start)
+    monkeypatch.setattr(os, "execvp", lambda program, words: start(words))
+    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", stop)
+    with pytest.raises(SystemExit):
+        main([command, *WORDS[command]])
+    # Of nerfstudio's commands, ns-train reads a config.yml by our own reader; the test below starts it.
+    assert set(asked) <= {"ns-train", "sundae"}
+
+
+@pytest.mark.parametrize("script", [name for name, words in SCRIPTS.items() if not isinstance(words, str)])
+@pytest.mark.usefixtures("hostile")
+def test_no_script_runs_it(script: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", [script, *SCRIPTS[script]])
+    with suppress(Exception, SystemExit):
+        runpy.run_path(str(ROOT / script), run_name="__main__")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--load-dir", "RUN/nerfstudio_models"],
+        ["--load-checkpoint", "RUN/nerfstudio_models/step-000000060.ckpt"],
+        ["--pipeline.model.warm-start", "RUN"],
+    ],
+)
+@pytest.mark.usefixtures("hostile")
+def test_training_from_it_runs_nothing_of_it(words: list[str], call_here: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[Any] = []
+    monkeypatch.setattr("nerfstudio.scripts.train.launch", lambda config, **_: begun.append(config.setup(local_rank=0)))
+    call_here(
+        "ns-train", "sundae-tiny", "--data", "CAPTURE", "--max-num-iterations", "60", "--vis", "tensorboard", *words
+    )
+    begun[0].setup()
