@@ -61,6 +61,12 @@ def test_a_page_holds_the_scene_and_no_address(packed: Path, tmp_path: Path) -> 
     assert "default-src 'none'" in page
 
 
+@pytest.mark.parametrize("title", ["@@SCENE@@", "@@SOURCE@@@@POSTER@@", "@@NOTHING@@", r"\1 \\g"])
+def test_a_title_fills_no_other_place(title: str, packed: Path) -> None:
+    plain, page = (page_of(*packed_file(packed), title=name) for name in ("a", title))
+    assert page == plain.replace("<title>a</title>", f"<title>{title}</title>")
+
+
 def test_a_page_shows_the_first_camera_until_it_draws(packed: Path) -> None:
     (code,) = re.findall(r'src="data:image/jpeg;base64,([^"]*)"', page_of(*packed_file(packed), title="a"))
     found = np.asarray(Image.open(io.BytesIO(base64.b64decode(code))), dtype=np.float32)
@@ -111,6 +117,15 @@ def test_a_file_that_is_no_scene_is_refused(packed: Path, tmp_path: Path) -> Non
 def test_the_page_adds_little_to_the_scene() -> None:
     page = (ROOT / "sundae_ns" / "api" / "page.html").read_bytes()
     assert len(gzip.compress(page)) < 100_000
+
+
+@pytest.mark.parametrize("folder", ["web", "web/tests"])
+def test_the_lock_names_the_packages_of_all_systems(folder: str) -> None:
+    """npm of one system leaves out packages of others where they are not installed; npm ci then fails there."""
+    packages = json.loads((ROOT / folder / "package-lock.json").read_text())["packages"]
+    for place, entry in packages.items():
+        for wanted in [*entry.get("dependencies", ()), *entry.get("optionalDependencies", ())]:
+            assert {f"node_modules/{wanted}", f"{place}/node_modules/{wanted}"} & packages.keys(), wanted
 
 
 @needs_node
