@@ -42,7 +42,7 @@ def serve(page: str, port: int) -> ThreadingHTTPServer:
 
         def do_GET(self) -> None:
             """Answer with the page."""
-            port = self.server.server_address[1]
+            port = self.connection.getsockname()[1]
             named = [name.strip().lower() for name in self.headers.get_all("Host", [])]
             if len(named) != 1 or named[0] not in _hosts(port):
                 self._answer(421, f"Open http://127.0.0.1:{port}/; forward it from a port of the same number.".encode())

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import fuzz_packs
 import numpy as np
 import pytest
 import torch
@@ -23,6 +24,7 @@ from chromium import bench_page
 from packed_scenes import KINDS, write_kind
 from PIL import Image
 
+from sundae_ns.api.opening import load
 from sundae_ns.api.packing import scene_of
 from sundae_ns.api.page import page_of, render_first, write_page
 from sundae_ns.api.saving import packed_file
@@ -242,6 +244,8 @@ LIES: dict[str, Callable[[Json], None]] = {
     "two sections of one name": put(":means/low.name", "means/high"),
     "a head of another shape": put("attributes.head.tensors.0.1", [2**27, 2**27]),
     "tensors that are no list": put("attributes.head.tensors", 7),
+    "a tensor named twice": put("attributes.head.tensors.1.0", "net.decoder.0.0.bias"),
+    "a name in two lines": put(":means/low.name", "means\nlow"),
     "no list of sections": put("sections", {}),
 }
 
@@ -288,7 +292,11 @@ def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]]
         "model.head.size": "compact",
         "model.head.num_features": 4,
         "model.head.pixel_unshuffle": 2,
+        "model.head.precision": "fp8",
+        "model.head.phases": 4,
         "model.trained_focal": [0, 1],
+        "model.trained_focal.0": 1e30,
+        "source": [],
     }
     paths = []
     for i, (place, value) in enumerate(lies.items()):
@@ -296,5 +304,15 @@ def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]]
         put(place, value)(changed)
         paths.append(tmp_path / f"{i}.sundae")
         paths[-1].write_bytes(sealed(changed, body))
+        with pytest.raises(PackError):
+            load(paths[-1])
     for name, found in zip(lies, decode(*paths), strict=True):
         assert "error" in found, name
+
+
+@needs_node
+def test_both_readers_give_the_same_verdicts() -> None:
+    """A short version of ``python benchmarks/fuzz_packs.py``, from another seed."""
+    tally, problems = fuzz_packs.run(150, seed=1_000_000)
+    assert not problems
+    assert min(tally["valid"], tally["refused"]) > 10
