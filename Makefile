@@ -56,7 +56,7 @@ web: web/node_modules
 	cd web && npm run --silent check && npm run --silent build
 
 %/node_modules: %/package-lock.json
-	cd $* && npm install --no-save --silent --no-audit --no-fund
+	cd $* && npm ci --silent --no-audit --no-fund
 	touch $@
 
 coverage: $(INSTALLED)

@@ -3,38 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, get_args, get_type_hints
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from sundae_ns.api.scene import Background, Scene
+from sundae_ns.api.scene import Scene
 from sundae_ns.api.sensitivity import sensitivity_of
-from sundae_ns.api.views import is_frame, is_number, view_in_front
+from sundae_ns.api.views import is_frame, view_in_front
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.errors import PackError, SundaeError
+from sundae_ns.errors import PackError
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.gaussians.field import Field
-from sundae_ns.gaussians.parameters import MAX_SH_DEGREE
 from sundae_ns.rendering.views import View
 from sundae_ns.storage.packing import PackedScene
+from sundae_ns.storage.packing.schema import FORMAT, fault
 
-_KINDS = get_type_hints(HeadConfig)
-_HEAD_VALUES: dict[str, Sequence[Any]] = {
-    "mode": get_args(_KINDS["mode"]),
-    "size": get_args(_KINDS["size"]),
-    "pixel_unshuffle": range(1, 9),
-    "num_features": range(1, 257),
-    "precision": get_args(_KINDS["precision"]),
-}
-"""Options of a head that a packed scene states, and their values."""
-_RASTERIZE_MODES = ("classic", "antialiased")
-_MODEL_VALUES: dict[str, Sequence[Any]] = {
-    "sh_degree": range(MAX_SH_DEGREE + 1),
-    "background_color": get_args(Background),
-    "rasterize_mode": _RASTERIZE_MODES,
-}
-"""Options of a model that a packed scene states, and their values."""
+_MODEL: dict[str, Any] = FORMAT["model"]
+_HEAD_OPTIONS: list[str] = _MODEL["properties"]["head"]["required"]
+"""Options of a head that a packed scene states."""
 _CARRIED = ("source", "frame", "capture")
 """Entries of the header that a scene carries along."""
 
@@ -45,10 +32,11 @@ def scene_of(packed: PackedScene) -> Scene:
     Raises:
         PackError: the contents state an impossible model, or another head than they have.
     """
-    stated = packed.meta.get("model")
-    if not isinstance(stated, dict):
-        raise refusal("no model")
-    degree, background, rasterize_mode = _checked(stated, _MODEL_VALUES)
+    stated: dict[str, Any] = packed.meta.get("model")  # type: ignore[assignment]
+    wrong = fault(stated, _MODEL, "model")
+    if wrong is not None:
+        raise refusal(f"no valid {wrong}")
+    degree, focal = int(stated["sh_degree"]), stated.get("trained_focal")
     if packed.field["features_rest"].shape[1] > (degree + 1) ** 2 - 1:
         raise refusal("a lower SH degree than it has")
     meta = {name: packed.meta[name] for name in _CARRIED if packed.meta.get(name) is not None}
@@ -58,9 +46,9 @@ def scene_of(packed: PackedScene) -> Scene:
     return Scene(
         Field(dict(packed.field), "logits" if degree == 0 else "harmonics"),
         _head_of(packed, stated.get("head")),
-        background_color=background,
-        antialiased=rasterize_mode == "antialiased",
-        trained_focal=_focal(stated.get("trained_focal")),
+        background_color=stated["background_color"],
+        antialiased=stated["rasterize_mode"] == "antialiased",
+        trained_focal=None if focal is None else (float(focal[0]), float(focal[1])),
         views=views_of_arrays(packed.cameras),
         in_model_frame=not isinstance(source, dict) or source.get("model_frame") is not False,
         meta=meta,
@@ -80,12 +68,12 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
     field = {name: value.detach() for name, value in scene.field.items() if name != FEATURES or head}
     if cameras is None and scene.views:
         cameras = arrays_of_views(scene.views)
-    options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in _HEAD_VALUES}
+    options = None if scene.head is None else {name: getattr(scene.head.config, name) for name in _HEAD_OPTIONS}
     # Degree 0 stands for logits.
     degree = 0 if scene.field.encoding == "logits" else max(scene.field.sh_degree, 1)
     model = {
         "sh_degree": degree,
-        "rasterize_mode": _RASTERIZE_MODES[scene.antialiased],
+        "rasterize_mode": "antialiased" if scene.antialiased else "classic",
         "background_color": scene.background_color,
         "head": options,
         "trained_focal": list(scene.trained_focal) if head and scene.trained_focal else None,
@@ -122,48 +110,23 @@ def arrays_of_views(views: Sequence[View]) -> dict[str, Tensor]:
     }
 
 
-def _head_of(packed: PackedScene, stated: Any) -> CompensationHead | None:
+def _head_of(packed: PackedScene, stated: Mapping[str, Any] | None) -> CompensationHead | None:
     features = packed.field[FEATURES].shape[1] if FEATURES in packed.field else 0
-    config = HeadConfig(mode="off")
-    if stated is not None:
-        if not isinstance(stated, dict) or set(stated) != set(_HEAD_VALUES):
-            raise refusal("a head of an unknown kind")
-        config = HeadConfig(**dict(zip(_HEAD_VALUES, _checked(stated, _HEAD_VALUES), strict=True)), start_at=0)
-    if config.mode == "off" and not packed.head and features == 0:
+    if stated is None and not packed.head and features == 0:
         return None
-    if features != config.num_features:
+    if stated is None or features != stated["num_features"]:
         raise refusal("another number of features than it has")
-    try:
-        head = CompensationHead(config)
-        head.load_state_dict(packed.head)
-    except (SundaeError, RuntimeError) as error:
-        raise refusal("another head than it has") from error
+    whole = {name: int(stated[name]) for name in ("pixel_unshuffle", "num_features")}
+    config = HeadConfig(**{**stated, **whole}, start_at=0)
+    with torch.device("meta"):  # a wide head takes memory and seconds, which a small file must not cause
+        shapes = {name: value.shape for name, value in CompensationHead(config).state_dict().items()}
+    if {name: value.shape for name, value in packed.head.items()} != shapes:
+        raise refusal("another head than it has")
+    head = CompensationHead(config)
+    head.load_state_dict(packed.head)
     return head.eval()
 
 
 def refusal(reason: str) -> PackError:
     """The error of a scene that states something impossible."""
     return PackError(f"the packed scene states {reason}; update this program, or pack it again")
-
-
-def _checked(stated: Mapping[str, Any], values: Mapping[str, Sequence[Any]]) -> list[Any]:
-    """The stated options, in the order of ``values``.
-
-    Raises:
-        PackError: an option is none of its values.
-    """
-    for name, known in values.items():
-        value = stated.get(name)
-        # By type too: True is 1 and 1.0 is 1 in Python.
-        if type(value) is not type(known[0]) or value not in known:
-            allowed = f"{known[0]} to {known[-1]}" if isinstance(known, range) else ", ".join(known)
-            raise refusal(f"a {name} that is none of {allowed}")
-    return [stated[name] for name in values]
-
-
-def _focal(stated: Any) -> tuple[float, float] | None:
-    if stated is None:
-        return None
-    if not isinstance(stated, list) or len(stated) != 2 or not all(is_number(v) and v > 0 for v in stated):
-        raise refusal("impossible focal lengths")
-    return float(stated[0]), float(stated[1])

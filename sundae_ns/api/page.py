@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import re
 from importlib import resources
 from pathlib import Path
 
@@ -71,9 +72,8 @@ def _filled(scene: Scene, title: str, *, inline: str = "", source: str = "") -> 
         "SCENE": inline,
     }
     page = resources.files("sundae_ns.api").joinpath("page.html").read_text(encoding="utf-8")
-    for name, value in values.items():
-        page = page.replace(f"@@{name}@@", value)
-    return page
+    # In one pass: a title may contain the name of another place.
+    return re.sub("@@([A-Z]+)@@", lambda place: values[place[1]], page)
 
 
 def render_first(scene: Scene) -> Image.Image:

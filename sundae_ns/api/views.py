@@ -164,9 +164,14 @@ def is_frame(stated: Any) -> bool:
     if not isinstance(stated, dict) or not is_number(stated.get("scale")):
         return False
     rows = stated.get("transform")
-    return isinstance(rows, list) and all(isinstance(row, list) and all(map(is_number, row)) for row in rows)
+    if not isinstance(rows, list) or len(rows) not in (3, 4):
+        return False
+    return all(isinstance(row, list) and len(row) == 4 and all(map(is_number, row)) for row in rows)
 
 
 def is_number(value: Any) -> bool:
-    """Whether a value of JSON is a finite number."""
-    return type(value) in (int, float) and math.isfinite(value)
+    """Whether a value of JSON is a number that float64 holds."""
+    try:
+        return type(value) in (int, float) and math.isfinite(value)
+    except OverflowError:
+        return False

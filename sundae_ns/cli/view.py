@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+import sys
 import webbrowser
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from sundae_ns.cli.files import open_packed_file
 from sundae_ns.errors import ConfigError
 
+IDLE_SECONDS = 15.0
+"""A connection that sends or takes nothing for so long is closed."""
+_PIECE = 1 << 16
+
+
+class _Server(ThreadingHTTPServer):
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Report faults only: a browser may leave early."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
 
 def serve(page: str, port: int) -> ThreadingHTTPServer:
     """A server of one page on 127.0.0.1, not yet started.
+
+    It answers only requests for this machine by name (``127.0.0.1``, ``localhost`` or ``[::1]``) and its port: another
+    site whose name resolves to 127.0.0.1 (DNS rebinding) could read the scene otherwise. It closes connections that
+    send or take nothing for :data:`IDLE_SECONDS`.
 
     Raises:
         ConfigError: the port is in use or not allowed.
@@ -22,23 +38,42 @@ def serve(page: str, port: int) -> ThreadingHTTPServer:
     content = page.encode()
 
     class Handler(BaseHTTPRequestHandler):
+        timeout = IDLE_SECONDS
+
         def do_GET(self) -> None:
             """Answer with the page."""
-            found = self.path == "/"
-            self.send_response(200 if found else 404)
+            port = self.connection.getsockname()[1]
+            named = [name.strip().lower() for name in self.headers.get_all("Host", [])]
+            if len(named) != 1 or named[0] not in _hosts(port):
+                self._answer(421, f"Open http://127.0.0.1:{port}/; forward it from a port of the same number.".encode())
+            elif self.path == "/":
+                self._answer(200, content)
+            else:
+                self._answer(404, b"")
+
+        def _answer(self, status: int, body: bytes) -> None:
+            self.send_response(status)
             self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(content) if found else 0))
+            self.send_header("Content-Length", str(len(body)))
             self.end_headers()
-            if found:
-                self.wfile.write(content)
+            # The time limit holds for each call, so a slow connection gets the page in pieces.
+            for start in range(0, len(body), _PIECE):
+                self.wfile.write(body[start : start + _PIECE])
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002
             """Stay silent."""
 
     try:
-        return ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        return _Server(("127.0.0.1", port), Handler)
     except (OSError, OverflowError) as error:
         raise ConfigError(f"port {port} cannot be used ({error}); choose another, or 0 for a free one") from error
+
+
+def _hosts(port: int) -> set[str]:
+    """Values of the header ``Host`` that name this machine."""
+    names = ("127.0.0.1", "localhost", "[::1]")
+    # Browsers leave out the port of the protocol.
+    return {f"{name}:{port}" for name in names} | (set(names) if port == 80 else set())
 
 
 def view(
@@ -46,7 +81,8 @@ def view(
 ) -> int:
     """Show a scene with its head in the browser, until Ctrl-C.
 
-    Serves the page of sundae export on 127.0.0.1 and opens it. From another machine, forward the port by ssh -L.
+    Serves the page of sundae export on 127.0.0.1 and opens it. From another machine, forward the port to the same
+    number: ssh -L 8000:127.0.0.1:8000 with --port 8000.
 
     Args:
         scene: a packed scene, or a run (its folder or config.yml).

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import fuzz_packs
 import numpy as np
 import pytest
 import torch
@@ -23,6 +24,7 @@ from chromium import bench_page
 from packed_scenes import KINDS, write_kind
 from PIL import Image
 
+from sundae_ns.api.opening import load
 from sundae_ns.api.packing import scene_of
 from sundae_ns.api.page import page_of, render_first, write_page
 from sundae_ns.api.saving import packed_file
@@ -59,6 +61,12 @@ def test_a_page_holds_the_scene_and_no_address(packed: Path, tmp_path: Path) -> 
     # The namespace of XHTML is a name, which nothing loads.
     assert set(re.findall(r"https?://[\w./]*", page)) <= {"http://www.w3.org/1999/xhtml"}
     assert "default-src 'none'" in page
+
+
+@pytest.mark.parametrize("title", ["@@SCENE@@", "@@SOURCE@@@@POSTER@@", "@@NOTHING@@", r"\1 \\g"])
+def test_a_title_fills_no_other_place(title: str, packed: Path) -> None:
+    plain, page = (page_of(*packed_file(packed), title=name) for name in ("a", title))
+    assert page == plain.replace("<title>a</title>", f"<title>{title}</title>")
 
 
 def test_a_page_shows_the_first_camera_until_it_draws(packed: Path) -> None:
@@ -111,6 +119,15 @@ def test_a_file_that_is_no_scene_is_refused(packed: Path, tmp_path: Path) -> Non
 def test_the_page_adds_little_to_the_scene() -> None:
     page = (ROOT / "sundae_ns" / "api" / "page.html").read_bytes()
     assert len(gzip.compress(page)) < 100_000
+
+
+@pytest.mark.parametrize("folder", ["web", "web/tests"])
+def test_the_lock_names_the_packages_of_all_systems(folder: str) -> None:
+    """npm of one system leaves out packages of others where they are not installed; npm ci then fails there."""
+    packages = json.loads((ROOT / folder / "package-lock.json").read_text())["packages"]
+    for place, entry in packages.items():
+        for wanted in [*entry.get("dependencies", ()), *entry.get("optionalDependencies", ())]:
+            assert {f"node_modules/{wanted}", f"{place}/node_modules/{wanted}"} & packages.keys(), wanted
 
 
 @needs_node
@@ -227,6 +244,8 @@ LIES: dict[str, Callable[[Json], None]] = {
     "two sections of one name": put(":means/low.name", "means/high"),
     "a head of another shape": put("attributes.head.tensors.0.1", [2**27, 2**27]),
     "tensors that are no list": put("attributes.head.tensors", 7),
+    "a tensor named twice": put("attributes.head.tensors.1.0", "net.decoder.0.0.bias"),
+    "a name in two lines": put(":means/low.name", "means\nlow"),
     "no list of sections": put("sections", {}),
 }
 
@@ -273,7 +292,11 @@ def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]]
         "model.head.size": "compact",
         "model.head.num_features": 4,
         "model.head.pixel_unshuffle": 2,
+        "model.head.precision": "fp8",
+        "model.head.phases": 4,
         "model.trained_focal": [0, 1],
+        "model.trained_focal.0": 1e30,
+        "source": [],
     }
     paths = []
     for i, (place, value) in enumerate(lies.items()):
@@ -281,5 +304,15 @@ def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]]
         put(place, value)(changed)
         paths.append(tmp_path / f"{i}.sundae")
         paths[-1].write_bytes(sealed(changed, body))
+        with pytest.raises(PackError):
+            load(paths[-1])
     for name, found in zip(lies, decode(*paths), strict=True):
         assert "error" in found, name
+
+
+@needs_node
+def test_both_readers_give_the_same_verdicts() -> None:
+    """A short version of ``python benchmarks/fuzz_packs.py``, from another seed."""
+    tally, problems = fuzz_packs.run(150, seed=1_000_000)
+    assert not problems
+    assert min(tally["valid"], tally["refused"]) > 10

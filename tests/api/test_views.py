@@ -12,7 +12,7 @@ import torch
 from fields import random_field
 
 import sundae_ns as sn
-from sundae_ns.api.views import read_cameras
+from sundae_ns.api.views import is_frame, read_cameras
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.field import Field
 
@@ -132,3 +132,27 @@ def test_virtual_views_that_see_nothing_are_refused() -> None:
     broken.field["means"][:] = torch.nan
     with pytest.raises(DataError, match="no camera sees the scene"):
         sn.virtual_views(broken)
+
+
+EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize("rows", [EYE, EYE[:3]])
+def test_a_frame_is_a_transform_and_a_scale(rows: Any) -> None:
+    assert is_frame({"transform": rows, "scale": 2})
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        None,
+        {"transform": EYE},
+        {"transform": EYE[:2], "scale": 1.0},
+        {"transform": [*EYE[:2], [0, 0, 1]], "scale": 1.0},
+        {"transform": [*EYE[:2], [0, 0, 1, "0"]], "scale": 1.0},
+        {"transform": [*EYE[:2], [0, 0, 1, math.nan]], "scale": 1.0},
+        {"transform": EYE, "scale": 10**400},
+    ],
+)
+def test_other_frames_are_none(frame: Any) -> None:
+    assert not is_frame(frame)

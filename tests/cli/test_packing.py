@@ -56,7 +56,7 @@ def test_the_options_of_precision_have_no_prefix(capsys: pytest.CaptureFixture[s
         (["unpack", "nothing"], "nothing cannot be read"),
         (["unpack", "cut.sundae"], "not a whole packed scene"),
         (["unpack", "harmed.sundae"], "the checksum of"),
-        (["unpack", "bare.sundae"], "states no model"),
+        (["unpack", "bare.sundae"], "states no valid model"),
     ],
 )
 def test_refusals_are_one_line(

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import http.client
+import socket
+import struct
 import threading
+import time
 import urllib.error
 import urllib.request
 import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,12 +21,31 @@ from sundae_ns.cli import main
 from sundae_ns.cli import view as command
 from sundae_ns.errors import ConfigError
 
+SECONDS = 60
+"""Time limit of what takes milliseconds, so only a hang reaches it."""
 
-def test_the_server_has_one_page_and_listens_on_this_machine_only() -> None:
-    with command.serve("<p>a scene</p>", 0) as server:
+
+@contextmanager
+def served(page: str) -> Iterator[int]:
+    """The port of a server of one page."""
+    with command.serve(page, 0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         host, port = server.server_address[:2]
         assert host == "127.0.0.1"
+        yield port
+        server.shutdown()
+
+
+def until_gone(name: str) -> None:
+    """Wait until no thread with this in its name is left."""
+    last = time.monotonic() + SECONDS
+    while any(name in thread.name for thread in threading.enumerate()):
+        assert time.monotonic() < last, "the connection stays open"
+        time.sleep(0.01)
+
+
+def test_the_server_has_one_page_and_listens_on_this_machine_only() -> None:
+    with served("<p>a scene</p>") as port:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
             assert answer.read() == b"<p>a scene</p>"
             assert answer.headers["Content-Type"] == "text/html; charset=utf-8"
@@ -28,7 +53,78 @@ def test_the_server_has_one_page_and_listens_on_this_machine_only() -> None:
             urllib.request.urlopen(f"http://127.0.0.1:{port}/etc/passwd")
         with pytest.raises(ConfigError, match=f"port {port} cannot be used"):
             command.serve("", port)
-        server.shutdown()
+
+
+def status_of(port: int, *hosts: str) -> tuple[int, bytes]:
+    """Status and content of an answer to a request with these headers ``Host``."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=SECONDS)
+    connection.putrequest("GET", "/", skip_host=True)
+    for host in hosts:
+        connection.putheader("Host", host)
+    connection.endheaders()
+    answer = connection.getresponse()
+    found = answer.status, answer.read()
+    connection.close()
+    return found
+
+
+def test_only_this_machine_by_name_is_answered() -> None:
+    """Another site whose name resolves to 127.0.0.1 must not read the scene."""
+    with served("a scene") as port:
+        for host in ("127.0.0.1", "localhost", "[::1]", "LocalHost"):
+            assert status_of(port, f"{host}:{port}") == (200, b"a scene")
+        wrong = ["evil.example", f"evil.example:{port}", "localhost", f"localhost:{port + 1}", f"127.0.0.1:{port}0", ""]
+        for hosts in ([host] for host in [*wrong, f"localhost:{port}.evil.example", f"user@localhost:{port}"]):
+            status, content = status_of(port, *hosts)
+            assert status == 421, hosts
+            assert b"a scene" not in content
+        assert status_of(port)[0] == 421
+        assert status_of(port, f"localhost:{port}", f"evil.example:{port}")[0] == 421
+
+
+def test_on_the_default_port_browsers_name_no_port() -> None:
+    assert {"localhost", "127.0.0.1", "[::1]", "localhost:80"} <= command._hosts(80)
+    assert "localhost" not in command._hosts(8080)
+
+
+def test_idle_connections_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "IDLE_SECONDS", 0.2)
+    with served("x" * (32 << 20)) as port:
+        for said in (b"", b"GET / HTTP/1.1\r\nHost: local"):
+            with socket.create_connection(("127.0.0.1", port), timeout=SECONDS) as client:
+                client.sendall(said)
+                assert client.recv(1) == b""
+        # One that asks for the page and takes none of it.
+        with socket.create_connection(("127.0.0.1", port), timeout=SECONDS) as client:
+            client.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
+            assert client.recv(1)
+            until_gone("process_request_thread")
+
+
+def test_a_slow_connection_gets_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command, "IDLE_SECONDS", 1.0)
+    with served("x" * (16 << 20)) as port, socket.socket() as client:
+        client.settimeout(SECONDS)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
+        client.connect(("127.0.0.1", port))
+        client.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
+        received = 0
+        while part := client.recv(1 << 20, socket.MSG_WAITALL):
+            received += len(part)
+            time.sleep(0.1)
+        assert received > 16 << 20
+
+
+def test_a_browser_that_leaves_causes_no_traceback(capfd: pytest.CaptureFixture[str]) -> None:
+    with served("x" * (32 << 20)) as port:
+        client = socket.create_connection(("127.0.0.1", port), timeout=SECONDS)
+        client.sendall(f"GET / HTTP/1.1\r\nHost: localhost:{port}\r\n\r\n".encode())
+        assert client.recv(1)
+        # Close by a reset, as a browser does whose page is left while it loads.
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        client.close()
+        until_gone("process_request_thread")
+    assert "Traceback" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("opens", [True, False])

@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,13 +23,13 @@ from numpy.typing import NDArray
 
 from sundae_ns.errors import PackError, regular
 from sundae_ns.storage.kinds import PACKED
+from sundae_ns.storage.packing import zstd
+from sundae_ns.storage.packing.schema import FORMAT, LIMITS, fault, parsed
 
-VERSION = 2
-SPARE, MAX_RATIO = 8 << 20, 32
-MAX_HEADER = 4 << 20
+VERSION, MAX_HEADER = LIMITS["version"], LIMITS["header"]
+SPARE, MAX_RATIO = LIMITS["spare"], LIMITS["ratio"]
 PADDING = "padding"
 _PREAMBLE = struct.Struct("<8sII32s")
-_DTYPES = ("|u1", "<u2", "<u4", "<u8", "|i1", "<i2", "<f2", "<f4", "<f8")
 _THREADS = 2
 _LEVEL = 19
 
@@ -104,7 +104,7 @@ def _split(array: Array) -> list[bytes]:
     return [plane.tobytes() for plane in planes.transpose(0, 2, 1).reshape(-1, flat.shape[1])]
 
 
-def _join(planes: list[bytes], section: Section) -> Array:
+def _join(planes: Sequence[bytes | NDArray[np.uint8]], section: Section) -> Array:
     """Join planes that :func:`_split` returned."""
     if not planes:
         return np.zeros(section.shape, section.dtype)
@@ -123,15 +123,13 @@ def _compress(plane: bytes) -> bytes:
     return frame if len(frame) < len(plane) else plane
 
 
-def _decompress(part: memoryview, size: int) -> bytes:
-    """Decompress a plane of ``size`` bytes; a frame that states another size is refused."""
+def _decompress(part: memoryview, size: int) -> bytes | NDArray[np.uint8]:
+    """Decompress a plane of ``size`` bytes."""
     if len(part) == size:
         return bytes(part)
     try:
-        if zstandard.frame_content_size(part) != size:
-            raise DamagedError("a section does not unpack to the size that the header states")
-        return zstandard.ZstdDecompressor().decompress(part, max_output_size=size)
-    except zstandard.ZstdError as error:
+        return zstd.decompress(bytes(part), size)
+    except ValueError as error:
         raise DamagedError("a section cannot be decompressed") from error
 
 
@@ -140,7 +138,7 @@ def encode(meta: Mapping[str, Any], arrays: Mapping[str, Array], *, unpacked: in
 
     Args:
         meta: JSON values for the header, without the key ``sections``.
-        arrays: arrays of the dtypes in ``_DTYPES``.
+        arrays: arrays of the dtypes that ``format.json`` lists.
         unpacked: bytes that a reader decodes from the arrays, if more than their own size.
 
     Raises:
@@ -203,29 +201,28 @@ def read_header(path: Path) -> Header:
         if hashlib.sha256(text).digest() != digest:
             raise DamagedError("the checksum of its header is wrong")
         try:
-            meta = json.loads(text, parse_constant=_no_constant)
-        except (ValueError, RecursionError) as error:
+            meta = parsed(text)
+        except ValueError as error:
             raise DamagedError("its header is not JSON") from error
         return Header(meta, _sections(meta, _PREAMBLE.size + length, size), size)
 
 
-def _no_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a number")
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 28
+def check(value: Any, schema: str, place: str = "") -> None:
+    """Raise ``DamagedError`` if a part of the header, at a place in dotted keys, violates a schema of ``FORMAT``."""
+    found = fault(value, FORMAT[schema], place)
+    if found is not None:
+        raise DamagedError(f"its header has no valid {found or schema}")
 
 
 def _sections(meta: Any, offset: int, size: int) -> dict[str, Section]:
-    entries = meta.get("sections") if isinstance(meta, dict) else None
-    if not isinstance(entries, list):
-        raise DamagedError("its header lists no sections")
+    check(meta, "container")
     sections: dict[str, Section] = {}
-    for entry in entries:
-        section = _section(entry, offset)
-        if section is None or section.name in sections:
-            raise DamagedError("its header describes an invalid section")
+    for entry in meta["sections"]:
+        shape, parts = (tuple(map(int, entry[key])) for key in ("shape", "parts"))
+        section = Section(entry["name"], np.dtype(entry["dtype"]), shape, parts, entry["sha256"], offset)
+        longest = section.size // section.planes if section.size else 0
+        if len(parts) != (section.planes if section.size else 0) or max(parts, default=0) > longest:
+            raise DamagedError(f"its header states impossible parts of {section.name}")
         sections[section.name] = section
         offset += section.length
     if offset != size:
@@ -238,23 +235,6 @@ def check_ratio(unpacked: int, size: int) -> None:
     """Raise ``DamagedError`` if a file of ``size`` bytes may not unpack to ``unpacked`` bytes."""
     if unpacked > SPARE + MAX_RATIO * size:
         raise DamagedError(f"{size:,} bytes would unpack to {unpacked:,}")
-
-
-def _section(entry: Any, offset: int) -> Section | None:
-    """A section listed in the header, or None if it is invalid."""
-    if not isinstance(entry, dict) or not all(
-        isinstance(entry.get(key), kind)
-        for key, kind in (("name", str), ("dtype", str), ("shape", list), ("parts", list), ("sha256", str))
-    ):
-        return None
-    shape, parts = entry["shape"], entry["parts"]
-    if entry["dtype"] not in _DTYPES or not 1 <= len(shape) <= 3 or not all(map(_is_count, [*shape, *parts])):
-        return None
-    section = Section(entry["name"], np.dtype(entry["dtype"]), tuple(shape), tuple(parts), entry["sha256"], offset)
-    if section.size == 0:
-        return None if parts else section
-    fits = len(parts) == section.planes and max(parts) <= section.size // section.planes
-    return section if fits else None
 
 
 def read_sections(path: Path, header: Header) -> dict[str, Array]:

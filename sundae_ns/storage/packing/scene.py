@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sundae_ns.errors import PackError
-from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives, sh_degree_of
+from sundae_ns.gaussians.parameters import FEATURES, SPLAT_NAMES, finite_mask, num_primitives
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.packing import container, entropy, quantize, transform
 from sundae_ns.storage.packing.codecs import Codecs, Sensitivity, as_matrix, fit_codecs
@@ -27,14 +28,13 @@ from sundae_ns.storage.packing.config import PackConfig
 from sundae_ns.storage.packing.container import Array, DamagedError, Levels
 from sundae_ns.storage.packing.entropy import Near
 from sundae_ns.storage.packing.quantize import Blocks
+from sundae_ns.storage.packing.schema import FORMAT, fits, in_range
 from sundae_ns.storage.ply import check_field
 
-CAMERAS = {"poses": ("<f4", (3, 4)), "intrinsics": ("<f8", (4,)), "sizes": ("<u4", (2,))}
-"""dtype and shape, after ``[M, ...]``, of the arrays of M cameras: camera-to-world with OpenGL axes in the model's
-coordinates; fx, fy, cx, cy in pixels; width and height in pixels."""
-_MAX_WIDTH = 256
-_LARGEST_STEP = float(np.finfo(np.float32).max) / 2**34
-"""Levels are below 2^24 and a transform adds up to 2^8 products; the sums must stay finite in float32."""
+CAMERAS: dict[str, dict[str, Any]] = FORMAT["sections"]["cameras"]
+"""dtype, shape and range of the arrays of M cameras: ``poses`` ``[M, 3, 4]``, camera-to-world with OpenGL axes in the
+model's coordinates; ``intrinsics`` ``[M, 4]``, fx, fy, cx, cy in pixels; ``sizes`` ``[M, 2]``, width and height."""
+_MAX_WIDTH: int = FORMAT["header"]["properties"]["attributes"]["properties"][FEATURES]["properties"]["width"]["maximum"]
 Decoded = TypeVar("Decoded")
 
 
@@ -158,8 +158,11 @@ def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int
             about[name] = entry
             arrays |= {f"{name}/levels": stream, **{f"{name}/{part}": array for part, array in parts.items()}}
     if scene.cameras is not None:
-        for name, (dtype, _) in CAMERAS.items():
-            arrays[f"cameras/{name}"] = scene.cameras[name].detach().cpu().numpy().astype(dtype)
+        for name, section in CAMERAS.items():
+            array = scene.cameras[name].detach().cpu().numpy().astype(section["dtype"])
+            if not in_range(array, section):
+                raise PackError(f"{name} of the cameras have values that readers refuse; give other cameras")
+            arrays[f"cameras/{name}"] = array
 
     meta = {**scene.meta, "primitives": n, "attributes": about}
     unpacked = 4 * sum(value.numel() for value in (*scene.field.values(), *scene.head.values()))
@@ -170,86 +173,77 @@ def pack_bytes(scene: PackedScene, codecs: Codecs) -> tuple[bytes, dict[str, int
 
 
 class _Reader:
-    """Header and sections of a file; each entry is checked before use. All methods raise ``DamagedError``."""
+    """Header and sections of a file; each section is checked before use. All methods raise ``DamagedError``."""
 
     def __init__(self, header: container.Header, arrays: Mapping[str, Array]) -> None:
         self.size = header.size
         self.meta = header.meta
         self.arrays = arrays
 
-    def section(self, name: str, dtype: str, shape: tuple[int | None, ...]) -> Array:
-        """A finite array of the dtype and the shape, in which None matches any length."""
+    def about(self, attribute: str) -> dict[str, Any]:
+        """The header's entry of an attribute."""
+        entry = self.meta["attributes"].get(attribute)
+        if entry is None:
+            raise DamagedError(f"its header has no valid attributes.{attribute}")
+        found: dict[str, Any] = entry
+        return found
+
+    def array(self, attribute: str, part: str, **lengths: int) -> Array:
+        """A section in the dtype, shape and range that the format states; ``lengths`` are sides that it names."""
+        codec = attribute if attribute == "cameras" else self.about(attribute)["codec"]
+        section, name = FORMAT["sections"][codec][part], f"{attribute}/{part}"
         array = self.arrays.get(name)
-        fits = array is not None and array.dtype.str == dtype and len(array.shape) == len(shape)
-        if array is None or not fits or any(w is not None and w != s for w, s in zip(shape, array.shape)):
+        if array is None or not fits(array, section, lengths):
             raise DamagedError(f"{name} is missing or has another shape")
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise DamagedError(f"{name} has values that are not finite")
+        if not in_range(array, section):
+            raise DamagedError(f"{name} has values that are not finite or out of range")
         return array
 
-    def about(self, name: str, codec: str) -> dict[str, Any]:
-        """The header's entry of an attribute with this codec."""
-        entry = self.meta["attributes"].get(name)
-        if not isinstance(entry, dict) or entry.get("codec") != codec:
-            raise DamagedError(f"its header has no valid codec for {name}")
-        return entry
-
-    def decoded(self, name: str, decode: Callable[..., Decoded], *arguments: Any) -> Decoded:
+    def decoded(self, attribute: str, part: str, decode: Callable[..., Decoded], *arguments: Any) -> Decoded:
         """What the entropy coder decodes from a section."""
-        stream = self.section(name, "|u1", (None,))
+        stream = self.array(attribute, part)
         try:
             return decode(stream, *arguments)
         except DamagedError as error:
-            raise DamagedError(f"{name}: {error}") from error
+            raise DamagedError(f"{attribute}/{part}: {error}") from error
 
-    def levels(self, name: str, codec: str, near: Near, width: int) -> tuple[Levels, float]:
+    def levels(self, name: str, near: Near, width: int) -> tuple[Levels, float]:
         """Levels ``[N, C]`` of an attribute, and their step."""
-        step = self.about(name, codec).get("step")
-        if not isinstance(step, (int, float)) or isinstance(step, bool) or not abs(step) < _LARGEST_STEP:
-            raise DamagedError(f"the step of {name} is not a number within float32")
-        return self.decoded(f"{name}/levels", entropy.decode_levels, width, near), float(step)
-
-
-def _whole(about: Mapping[str, Any], key: str, minimum: int, maximum: int) -> int:
-    """A whole number of the header from ``minimum`` to ``maximum``."""
-    value = about.get(key)
-    if type(value) is not int or not minimum <= value <= maximum:
-        raise DamagedError(f"{key} is not one of {minimum} to {maximum}")
-    return value
+        return self.decoded(name, "levels", entropy.decode_levels, width, near), float(self.about(name)["step"])
 
 
 def _decode_means(reader: _Reader, n: int) -> tuple[Blocks, int, int]:
-    about = reader.about("means", "blocks")
-    bits, size = _whole(about, "bits", 4, 16), _whole(about, "block", 16, 1 << 20)
-    low, high = (reader.section(f"means/{end}", "<f4", (-(-n // size), 3)) for end in ("low", "high"))
-    return Blocks(reader.decoded("means/gaps", entropy.decode_gaps, n, size, bits), low, high), bits, size
+    bits, size = (int(reader.about("means")[key]) for key in ("bits", "block"))
+    low, high = (reader.array("means", end, blocks=-(-n // size)) for end in ("low", "high"))
+    return Blocks(reader.decoded("means", "gaps", entropy.decode_gaps, n, size, bits), low, high), bits, size
 
 
 def _decode_quats(reader: _Reader, near: Near) -> NDArray[np.float32]:
-    levels, step = reader.levels("quats", "xyz", near, 3)
+    levels, step = reader.levels("quats", near, 3)
     found: NDArray[np.float32] = quantize.rotations_at(torch.from_numpy(levels), step).numpy()
     return found
 
 
 def _decode_rows(reader: _Reader, name: str, near: Near, width: int) -> NDArray[np.float32]:
-    levels, step = reader.levels(name, "transform", near, width)
-    mean = reader.section(f"{name}/mean", "<f4", (width,))
-    basis = reader.section(f"{name}/basis", "|i1", (width * width,)).reshape(width, width)
+    levels, step = reader.levels(name, near, width)
+    mean = reader.array(name, "mean", width=width)
+    basis = reader.array(name, "basis", square=width * width).reshape(width, width)
     return transform.rows_at(levels, mean, basis, step)
 
 
 def _decode_head(reader: _Reader) -> dict[str, Tensor]:
     if "head/levels" not in reader.arrays:
         return {}
-    about = reader.about("head", "channels")
-    sources = {part: reader.section(f"head/{part}", "<f4", (None,)) for part in ("plain", "steps", "columns")}
-    tensors = _head_tensors(about.get("tensors"))
-    sizes = {name: int(np.prod(shape, dtype=object)) for name, shape in tensors}
-    count = sum(sizes[name] for name, shape in tensors if len(shape) > 1)
-    if _whole(about, "weights", 0, 1 << 28) != count:
+    about = reader.about("head")
+    sources = {part: reader.array("head", part) for part in ("plain", "steps", "columns")}
+    tensors = {name: tuple(map(int, shape)) for name, shape in about["tensors"]}
+    sizes = {name: math.prod(shape) for name, shape in tensors.items()}
+    count = sum(sizes[name] for name, shape in tensors.items() if len(shape) > 1)
+    if about["weights"] != count:
         raise DamagedError("the head has another number of weights than it states")
     container.check_ratio(4 * count, reader.size)
-    sources["levels"] = reader.decoded("head/levels", entropy.decode_levels, 1, entropy.predecessors(count)).reshape(-1)
+    near = entropy.predecessors(count)
+    sources["levels"] = reader.decoded("head", "levels", entropy.decode_levels, 1, near).reshape(-1)
 
     def take(part: str, count: int) -> Tensor:
         if count > len(sources[part]):
@@ -258,7 +252,7 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
         return torch.from_numpy(taken.astype(np.float32))
 
     head: dict[str, Tensor] = {}
-    for name, shape in tensors:
+    for name, shape in tensors.items():
         if len(shape) <= 1:
             head[name] = take("plain", sizes[name]).reshape(shape)
         else:
@@ -269,28 +263,11 @@ def _decode_head(reader: _Reader) -> dict[str, Tensor]:
     return head
 
 
-def _head_tensors(listed: Any) -> list[tuple[str, tuple[int, ...]]]:
-    """Names and shapes of the head's tensors, as listed in the header."""
-    if not isinstance(listed, list) or len(listed) > 10_000:
-        raise DamagedError("its header does not list the tensors of the head")
-    tensors = []
-    for entry in listed:
-        valid = isinstance(entry, list) and len(entry) == 2 and isinstance(entry[0], str) and isinstance(entry[1], list)
-        if not valid or len(entry[1]) > 5 or not all(type(side) is int and 0 < side < 1 << 28 for side in entry[1]):
-            raise DamagedError("a tensor of the head has an invalid shape")
-        tensors.append((entry[0], tuple(entry[1])))
-    return tensors
-
-
 def _decode_cameras(reader: _Reader) -> dict[str, Tensor] | None:
     if "cameras/poses" not in reader.arrays:
         return None
     count = len(reader.arrays["cameras/poses"])
-    arrays = {
-        name: reader.section(f"cameras/{name}", dtype, (count, *shape)) for name, (dtype, shape) in CAMERAS.items()
-    }
-    if count and (int(arrays["sizes"].min()) < 1 or int(arrays["sizes"].max()) > 1 << 16):
-        raise DamagedError("a camera has an invalid image size")
+    arrays = {name: reader.array("cameras", name, cameras=count) for name in CAMERAS}
     arrays["sizes"] = arrays["sizes"].astype(np.int64)
     return {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
 
@@ -334,17 +311,6 @@ def _decoded(reader: _Reader, n: int, width: int, features: int) -> PackedScene:
 
 def _shape(meta: Mapping[str, Any]) -> tuple[int, int, int]:
     """Numbers of primitives, of SH values of degrees 1 and up, and of features, from the header alone."""
-    refusal = DamagedError("its header contradicts itself")
-    attributes, n = meta.get("attributes"), meta.get("primitives")
-    if not isinstance(attributes, dict) or type(n) is not int or not 1 <= n < 1 << 28:
-        raise refusal
-    widths = []
-    for name in ("features_rest", FEATURES):
-        about = attributes.get(name, {"width": 0})
-        width = about.get("width") if isinstance(about, dict) else None
-        if type(width) is not int or not int(name in attributes) <= width <= _MAX_WIDTH:
-            raise refusal
-        widths.append(width)
-    if widths[0] % 3 or sh_degree_of(widths[0] // 3) is None:
-        raise refusal
-    return n, widths[0], widths[1]
+    container.check(meta, "header")
+    width, features = (int(meta["attributes"].get(name, {"width": 0})["width"]) for name in ("features_rest", FEATURES))
+    return int(meta["primitives"]), width, features

@@ -79,12 +79,12 @@ def resectioned(path: Path, name: str, array: Any) -> None:
 
 
 STATED: dict[str, tuple[str, str, tuple[Any, ...]]] = {
-    "means": ("means", "bits", (3, 17, 16.0, "16", True, None)),
+    "means": ("means", "bits", (3, 17, 12.5, "16", True, None)),
     "blocks": ("means", "block", (15, (1 << 20) + 1)),
     "quats": ("quats", "step", ("0.01", None, 1e39, [0.1])),
     "opacities": ("opacities", "step", ([], "0", True, 1e39, -1e39)),
     "harmonics": ("features_rest", "step", ("0.02", None, 1e39)),
-    "widths": ("features_rest", "width", (0, 8, 10, 9.0, "9", True, None, 257)),
+    "widths": ("features_rest", "width", (0, 8, 10, 9.5, "9", True, None, 257)),
     "features": ("features", "width", (0, 2, 4, 257, None)),
     "a codec": ("scales", "codec", ("blocks", None, ["transform"], "uniform")),
 }
@@ -103,6 +103,9 @@ def test_headers_beyond_the_limits_are_refused(tmp_path: Path, case: str) -> Non
 
 SECTIONS: dict[str, tuple[str, Any]] = {
     "an image without width": ("cameras/sizes", np.array([[64, 48], [0, 24]], np.uint32)),
+    "a focal length of 0": ("cameras/intrinsics", np.array([[0, 1, 0, 0], [1, 1, 0, 0]], np.float64)),
+    "a focal length beyond float32": ("cameras/intrinsics", np.array([[1, 1, 0, 0], [1, 1e300, 0, 0]], np.float64)),
+    "a mean whose sums overflow": ("scales/mean", np.full(3, 3e38, np.float32)),
     "an image of 65,537 pixels": ("cameras/sizes", np.array([[65537, 48], [32, 24]], np.uint32)),
     "a camera too few": ("cameras/sizes", np.array([[64, 48]], np.uint32)),
     "a pose that is infinite": ("cameras/poses", np.full((2, 3, 4), np.inf, np.float32)),
@@ -176,6 +179,35 @@ def test_shapes_of_the_head(tmp_path: Path, shape: list[int], fits: bool) -> Non
     else:
         with pytest.raises(PackError):
             read_scene(path)
+
+
+def test_cameras_that_readers_refuse_are_not_written(tmp_path: Path) -> None:
+    cameras = scene().cameras
+    assert cameras is not None
+    cameras["intrinsics"][0, 0] = -50.0
+    with pytest.raises(PackError, match="intrinsics"):
+        write_scene(tmp_path / "a.sundae", replace(scene(), cameras=cameras))
+
+
+def test_whole_numbers_may_be_written_as_real_ones(tmp_path: Path) -> None:
+    path = tmp_path / "a.sundae"
+    write_scene(path, scene())
+    truth = read_scene(path)
+
+    def real(meta: Json) -> None:
+        meta["primitives"] = float(meta["primitives"])
+        for about in meta["attributes"].values():
+            about |= {key: float(about[key]) for key in ("bits", "block", "width", "weights") if key in about}
+        meta["attributes"]["head"]["tensors"] = [
+            [n, [float(s) for s in shape]] for n, shape in meta["attributes"]["head"]["tensors"]
+        ]
+        for section in meta["sections"]:
+            section |= {key: [float(value) for value in section[key]] for key in ("shape", "parts")}
+
+    restated(path, real)
+    found = read_scene(path)
+    assert all(torch.equal(found.field[name], value) for name, value in truth.field.items())
+    assert all(torch.equal(found.head[name], value) for name, value in truth.head.items())
 
 
 def test_a_header_too_long_for_readers_is_not_written(tmp_path: Path) -> None:

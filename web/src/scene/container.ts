@@ -1,41 +1,19 @@
 // The container of docs/formats.md: named arrays behind a JSON header, all bytes under checksums.
 // Its twin is sundae_ns/storage/packing/container.py; both refuse the same files.
 
-import { decompress } from "fzstd";
+import { type JsonObject, LIMITS, parsed, violation } from "./schema";
+import { decompress, FrameError } from "./zstd";
 
 export class PackError extends Error {}
 
-export type Json = null | boolean | number | string | Json[] | { [key: string]: Json };
-export type JsonObject = { [key: string]: Json };
-
 const MAGIC = [0x89, 0x53, 0x55, 0x4e, 0x44, 0x41, 0x45, 0x0a];
-const VERSION = 2;
 const PREAMBLE = 48;
-const MAX_HEADER = 4 << 20;
-const SPARE = 8 << 20;
-const MAX_RATIO = 32;
 const PADDING = "padding";
-const ITEM_SIZES = new Map([
-  ["|u1", 1],
-  ["<u2", 2],
-  ["<u4", 4],
-  ["<u8", 8],
-  ["|i1", 1],
-  ["<i2", 2],
-  ["<f2", 2],
-  ["<f4", 4],
-  ["<f8", 8],
-]);
 
-type Section = {
-  name: string;
-  dtype: string;
-  shape: number[];
-  parts: number[];
-  sha256: string;
-  /** First byte in the file. */
-  offset: number;
-};
+/** A section as the header states it. */
+type Stated = { name: string; dtype: string; shape: number[]; parts: number[]; sha256: string };
+/** A section with its first byte in the file. */
+type Section = Stated & { offset: number };
 
 /** One section: its bytes, little-endian, with the dtype and the shape that the header states. */
 export type Stored = { dtype: string; shape: number[]; bytes: ArrayBuffer };
@@ -48,9 +26,6 @@ export type Header = {
 export const damaged = (reason: string): PackError =>
   new PackError(`The file is not a whole packed scene (${reason}); get it again, or pack it again.`);
 
-export const isObject = (value: Json | undefined): value is JsonObject =>
-  typeof value === "object" && value !== null && !Array.isArray(value);
-
 const sha256 = async (bytes: Uint8Array<ArrayBuffer>): Promise<string> => {
   if (!globalThis.crypto?.subtle) {
     throw new PackError("The browser checks files only in a secure page; open it from disk, or over https.");
@@ -59,7 +34,7 @@ const sha256 = async (bytes: Uint8Array<ArrayBuffer>): Promise<string> => {
   return [...digest].map((byte) => byte.toString(16).padStart(2, "0")).join("");
 };
 
-const itemSize = (section: Section): number => ITEM_SIZES.get(section.dtype)!;
+const itemSize = (section: Section): number => Number(section.dtype[2]);
 const rowsOf = (shape: number[]): number => (shape.length > 1 ? shape[0]! : 1);
 const countOf = (shape: number[]): number => shape.reduce((product, side) => product * side, 1);
 const sizeOf = (section: Section): number => countOf(section.shape) * itemSize(section);
@@ -74,34 +49,38 @@ export async function readHeader(file: Uint8Array<ArrayBuffer>): Promise<Header>
   if (file.length < PREAMBLE) throw damaged("it ends before its header");
   const preamble = new DataView(file.buffer, file.byteOffset, PREAMBLE);
   const version = preamble.getUint32(8, true);
-  if (version !== VERSION) {
-    throw new PackError(`The file has version ${version} of the format, this page reads ${VERSION}; export it again.`);
+  if (version !== LIMITS.version) {
+    throw new PackError(
+      `The file has version ${version} of the format, this page reads ${LIMITS.version}; export it again.`,
+    );
   }
   const length = preamble.getUint32(12, true);
-  if (length > Math.min(MAX_HEADER, file.length - PREAMBLE)) throw damaged("it ends in its header");
+  if (length > Math.min(LIMITS.header, file.length - PREAMBLE)) throw damaged("it ends in its header");
   const text = file.subarray(PREAMBLE, PREAMBLE + length);
   const stated = [...file.subarray(16, 48)].map((byte) => byte.toString(16).padStart(2, "0")).join("");
   if ((await sha256(text)) !== stated) throw damaged("the checksum of its header is wrong");
-  let meta: Json;
-  try {
-    meta = JSON.parse(new TextDecoder("utf-8", { fatal: true }).decode(text));
-  } catch {
-    throw damaged("its header is not JSON");
-  }
-  if (!isObject(meta) || !Array.isArray(meta.sections)) throw damaged("its header lists no sections");
-  return { meta, sections: readSections(meta.sections, PREAMBLE + length, file.length) };
+  const meta = parsed(text);
+  if (meta === null) throw damaged("its header is not JSON");
+  const wrong = violation(meta, "container");
+  if (wrong !== null) throw damaged(`its header has no valid ${wrong}`);
+  const { sections } = meta as { sections: Stated[] };
+  return { meta: meta as JsonObject, sections: readSections(sections, PREAMBLE + length, file.length) };
 }
 
-function readSections(entries: Json[], start: number, size: number): Map<string, Section> {
+function readSections(entries: Stated[], start: number, size: number): Map<string, Section> {
   const sections = new Map<string, Section>();
   let offset = start;
   let total = 0;
   for (const entry of entries) {
-    const section = readSection(entry, offset);
-    if (section === null || sections.has(section.name)) throw damaged("its header describes an invalid section");
-    sections.set(section.name, section);
-    offset += sum(section.parts);
-    total += sizeOf(section);
+    const section = { ...entry, offset };
+    const [bytes, planes] = [sizeOf(section), planesOf(section)];
+    const { name, parts } = section;
+    if (parts.length !== (bytes ? planes : 0) || parts.some((part) => part > bytes / planes)) {
+      throw damaged(`its header states impossible parts of ${name}`);
+    }
+    sections.set(name, section);
+    offset += sum(parts);
+    total += bytes;
   }
   if (offset !== size) throw damaged(`its header states ${offset} bytes, it has ${size}`);
   checkRatio(total, size);
@@ -110,23 +89,7 @@ function readSections(entries: Json[], start: number, size: number): Map<string,
 
 /** Refuses a file of `size` bytes that unpacks to far more. */
 export function checkRatio(unpacked: number, size: number): void {
-  if (!(unpacked <= SPARE + MAX_RATIO * size)) throw damaged(`${size} bytes would unpack to ${unpacked}`);
-}
-
-const isCount = (value: Json): value is number =>
-  Number.isInteger(value) && 0 <= Number(value) && Number(value) < 2 ** 28;
-
-function readSection(entry: Json, offset: number): Section | null {
-  if (!isObject(entry)) return null;
-  const { name, dtype, shape, parts, sha256 } = entry;
-  if (typeof name !== "string" || typeof dtype !== "string" || typeof sha256 !== "string") return null;
-  if (!Array.isArray(shape) || !Array.isArray(parts) || !ITEM_SIZES.has(dtype)) return null;
-  if (shape.length < 1 || shape.length > 3 || !shape.every(isCount) || !parts.every(isCount)) return null;
-  const section: Section = { name, dtype, shape, parts, sha256, offset };
-  const empty = sizeOf(section) === 0;
-  if (parts.length !== (empty ? 0 : planesOf(section))) return null;
-  const longest = sizeOf(section) / planesOf(section);
-  return !empty && parts.some((part) => part > longest) ? null : section;
+  if (!(unpacked <= LIMITS.spare + LIMITS.ratio * size)) throw damaged(`${size} bytes would unpack to ${unpacked}`);
 }
 
 /** Reads all sections except padding, after their checksums. */
@@ -156,30 +119,13 @@ function join(file: Uint8Array, section: Section): Stored {
   return { dtype, shape, bytes: out.buffer };
 }
 
-/** Decompresses a plane of `size` bytes; a frame that states another size is refused. */
+/** Decompresses a plane of `size` bytes. */
 function unpack(part: Uint8Array, size: number): Uint8Array {
   if (part.length === size) return part;
-  if (contentSize(part) !== size) throw damaged("a section does not unpack to the size that the header states");
   try {
-    const plane = decompress(part, new Uint8Array(size));
-    if (plane.length === size) return plane;
-  } catch {
-    // The reason of the decoder says no more than the message below.
+    return decompress(part, size);
+  } catch (error) {
+    if (error instanceof FrameError) throw damaged("a section cannot be decompressed");
+    throw error;
   }
-  throw damaged("a section cannot be decompressed");
-}
-
-/** The size that a zstandard frame states (RFC 8878, section 3.1.1.1); -1 for none. */
-function contentSize(frame: Uint8Array): number {
-  const bytes = new DataView(frame.buffer, frame.byteOffset, frame.byteLength);
-  if (frame.length < 6 || bytes.getUint32(0, true) !== 0xfd2fb528) return -1;
-  const descriptor = frame[4]!;
-  const single = (descriptor >> 5) & 1;
-  const kind = descriptor >> 6;
-  const at = 5 + (single ? 0 : 1) + [0, 1, 2, 4][descriptor & 3]!;
-  const width = kind === 0 ? single : 1 << kind;
-  if (width === 0 || at + width > frame.length) return -1;
-  if (width === 1) return frame[at]!;
-  if (width === 2) return bytes.getUint16(at, true) + 256;
-  return width === 4 ? bytes.getUint32(at, true) : Number(bytes.getBigUint64(at, true));
 }

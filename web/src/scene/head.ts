@@ -1,6 +1,6 @@
 // The compensation head of a scene: its kind, and its tensors; see sundae_ns/compensation.
 
-import { checkRatio, isObject, type Json } from "./container";
+import { checkRatio } from "./container";
 import { levels, predecessors } from "./entropy";
 import type { Reader } from "./reader";
 
@@ -13,7 +13,9 @@ const WIDTHS: Record<string, [number, number]> = {
   large: [128, 1024],
 };
 const LEVELS = 4;
-const MOST_TENSORS = 10_000;
+
+/** What the header states of a head. */
+export type StatedHead = { mode: string; size: string; pixel_unshuffle: number; num_features: number };
 
 export type HeadKind = {
   /** Whether the head corrects the base colours; otherwise it makes the image from features alone. */
@@ -50,27 +52,24 @@ export function layersOf(kind: HeadKind): { encoder: Layer[][]; decoder: Layer[]
   return { encoder, decoder, out: { name: "net.out", inputs: widths[0]!, outputs: 3 * fold ** 2, side: 1 } };
 }
 
-function kindOf(reader: Reader, stated: Json | undefined): HeadKind {
-  if (!isObject(stated)) throw reader.refuse("its header states a head of an unknown kind");
-  const { mode, size } = stated;
-  if (mode !== "residual" && mode !== "features") throw reader.refuse("its header states an unknown mode of the head");
-  if (typeof size !== "string" || !Object.hasOwn(WIDTHS, size)) {
-    throw reader.refuse("its header states an unknown size of the head");
-  }
+function kindOf({ mode, size, pixel_unshuffle, num_features }: StatedHead): HeadKind {
   const [width, most] = WIDTHS[size]!;
   return {
     residual: mode === "residual",
-    fold: reader.whole(stated, "pixel_unshuffle", 1, 8),
-    features: reader.whole(stated, "num_features", 1, 256),
+    fold: pixel_unshuffle,
+    features: num_features,
     widths: Array.from({ length: LEVELS }, (_, level) => Math.min(width * 2 ** level, most)),
   };
 }
 
 /** The head, or null for a scene without one. */
-export function readHead(reader: Reader, stated: Json | undefined): Head | null {
+export function readHead(reader: Reader, stated: StatedHead | null): Head | null {
   const weighted = reader.has("head/levels");
-  if ((stated === null || stated === undefined) && !weighted) return null;
-  const kind = kindOf(reader, stated);
+  if (stated === null) {
+    if (weighted) throw reader.refuse("its header states no head, but it has one");
+    return null;
+  }
+  const kind = kindOf(stated);
   const tensors = weighted ? readTensors(reader) : new Map<string, Tensor>();
   const { encoder, decoder, out } = layersOf(kind);
   const layers = [...encoder.flat(), ...decoder.flat(), out];
@@ -91,18 +90,17 @@ export function readHead(reader: Reader, stated: Json | undefined): Head | null 
 }
 
 function readTensors(reader: Reader): Map<string, Tensor> {
-  const about = reader.about("head", ["channels"]);
-  const plain = reader.section("head/plain", ["<f4"], [null]) as Float32Array;
-  const steps = reader.section("head/steps", ["<f4"], [null]) as Float32Array;
-  const columns = reader.section("head/columns", ["<f4"], [null]) as Float32Array;
-  const shapes = listed(reader, about.tensors);
+  const { tensors: shapes, weights: stated } = reader.about("head");
+  const [plain, steps, columns] = ["plain", "steps", "columns"].map((part) => reader.array("head", part)) as [
+    Float32Array,
+    Float32Array,
+    Float32Array,
+  ];
   const sizeOf = (shape: number[]): number => shape.reduce((product, side) => product * side, 1);
   const weights = shapes.reduce((sum, [, shape]) => sum + (shape.length > 1 ? sizeOf(shape) : 0), 0);
-  if (reader.whole(about, "weights", 0, 2 ** 28) !== weights) {
-    throw reader.refuse("the head has another number of weights than it states");
-  }
+  if (stated !== weights) throw reader.refuse("the head has another number of weights than it states");
   checkRatio(4 * weights, reader.size);
-  const found = levels(reader.stream("head/levels"), 1, predecessors(weights));
+  const found = levels(reader.array("head", "levels") as Uint8Array, 1, predecessors(weights));
   const taken = { plain: 0, levels: 0, steps: 0, columns: 0 };
   const take = <T extends Float32Array | Int32Array>(name: keyof typeof taken, source: T, count: number): T => {
     const start = taken[name];
@@ -128,18 +126,4 @@ function readTensors(reader: Reader): Map<string, Tensor> {
     tensors.set(name, { shape, values });
   }
   return tensors;
-}
-
-function listed(reader: Reader, entries: Json | undefined): [string, number[]][] {
-  if (!Array.isArray(entries) || entries.length > MOST_TENSORS) {
-    throw reader.refuse("its header does not list the tensors of the head");
-  }
-  return entries.map((entry) => {
-    const [name, shape] = Array.isArray(entry) && entry.length === 2 ? entry : [];
-    const valid = (side: Json): side is number => Number.isInteger(side) && 0 < Number(side) && Number(side) < 2 ** 28;
-    if (typeof name !== "string" || !Array.isArray(shape) || shape.length > 5 || !shape.every(valid)) {
-      throw reader.refuse("a tensor of the head has an invalid shape");
-    }
-    return [name, shape];
-  });
 }

@@ -1,6 +1,7 @@
 // Sections of a file; each is checked before use.
 
-import { type Header, isObject, type Json, type JsonObject, PackError, type Stored } from "./container";
+import { type Header, PackError, type Stored } from "./container";
+import { SECTIONS, type SectionFormat } from "./schema";
 
 export type Numbers =
   | Uint8Array<ArrayBuffer>
@@ -21,8 +22,17 @@ const ARRAYS: Record<string, new (bytes: ArrayBuffer) => Numbers> = {
   "<f4": Float32Array,
   "<f8": Float64Array,
 };
-// Levels are below 2^24 and a transform adds up to 2^8 products; the sums must stay finite in float32.
-const LARGEST = 3.4028234663852886e38 / 2 ** 34;
+
+/** What the header states of an attribute; each has what its codec needs. */
+type Attribute = {
+  codec: string;
+  step: number;
+  width: number;
+  bits: number;
+  block: number;
+  weights: number;
+  tensors: [string, number[]][];
+};
 
 export class Reader {
   constructor(
@@ -45,50 +55,34 @@ export class Reader {
     return this.stored.get(name)!.shape[0]!;
   }
 
-  /** A finite array with one of the dtypes and the shape, in which null matches any length. */
-  section(name: string, dtypes: string[], shape: (number | null)[]): Numbers {
-    const found = this.stored.get(name);
-    const fits = found !== undefined && dtypes.includes(found.dtype) && found.shape.length === shape.length;
-    if (!fits || shape.some((side, i) => side !== null && side !== found.shape[i])) {
-      throw this.refuse(`${name} is missing or has another shape`);
-    }
-    const array = new ARRAYS[found.dtype]!(found.bytes);
-    if (found.dtype.includes("f") && !array.every(Number.isFinite)) {
-      throw this.refuse(`${name} has values that are not finite`);
-    }
-    return array;
-  }
-
-  /** The header's entry of an attribute, with one of the codecs. */
-  about(name: string, codecs: string[]): JsonObject {
-    const attributes = this.header.meta.attributes;
-    const entry = isObject(attributes) ? attributes[name] : undefined;
-    if (!isObject(entry) || typeof entry.codec !== "string" || !codecs.includes(entry.codec)) {
-      throw this.refuse(`its header has no codec for ${name} that this page knows`);
-    }
+  /** The header's entry of an attribute. */
+  about(attribute: string): Attribute {
+    const entry = (this.header.meta.attributes as Record<string, Attribute>)[attribute];
+    if (entry === undefined) throw this.refuse(`its header has no valid attributes.${attribute}`);
     return entry;
   }
 
-  /** A whole number from `minimum` to `maximum`. */
-  whole(about: JsonObject, key: string, minimum: number, maximum: number): number {
-    const value = about[key];
-    if (typeof value !== "number" || !Number.isInteger(value) || value < minimum || value > maximum) {
-      throw this.refuse(`${key} is not one of ${minimum} to ${maximum}`);
+  /** A section in the dtype, shape and range that the format states; `lengths` are sides that it names. */
+  array(attribute: string, part: string, lengths: Record<string, number> = {}): Numbers {
+    const codec = attribute === "cameras" ? attribute : this.about(attribute).codec;
+    const format = SECTIONS[codec]![part]!;
+    const sides = format.shape.map((side) => (typeof side === "string" ? lengths[side]! : side));
+    const name = `${attribute}/${part}`;
+    const found = this.stored.get(name);
+    const fits = found !== undefined && found.dtype === format.dtype && found.shape.length === sides.length;
+    if (!fits || sides.some((side, i) => side !== null && side !== found.shape[i])) {
+      throw this.refuse(`${name} is missing or has another shape`);
     }
-    return value;
+    const array = new ARRAYS[found.dtype]!(found.bytes);
+    if (!inRange(array, format)) throw this.refuse(`${name} has values that are not finite or out of range`);
+    return array;
   }
+}
 
-  /** A list of `count` numbers within the range of float32. */
-  numbers(value: Json | undefined, key: string, count: number): number[] {
-    const fits = (number: Json): number is number => typeof number === "number" && Math.abs(number) < LARGEST;
-    if (!Array.isArray(value) || value.length !== count || !value.every(fits)) {
-      throw this.refuse(`${key} is not a list of ${count} numbers within float32`);
-    }
-    return value;
-  }
-
-  /** A section of coded numbers. */
-  stream(name: string): Uint8Array {
-    return this.section(name, ["|u1"], [null]) as Uint8Array;
-  }
+function inRange(array: Numbers, { minimum = -Infinity, maximum = Infinity }: SectionFormat): boolean {
+  const [lowest, highest] = [[minimum].flat(), [maximum].flat()];
+  return array.every(
+    (value, i) =>
+      Number.isFinite(value) && lowest[i % lowest.length]! <= value && value <= highest[i % highest.length]!,
+  );
 }

@@ -1,10 +1,11 @@
 // A packed scene as arrays; the twin of sundae_ns/storage/packing/scene.py and of its checks.
 
 import { cellsOf, positions, rotations, transformed } from "./codecs";
-import { checkRatio, type Header, isObject, type JsonObject, PackError, readAll, readHeader } from "./container";
+import { checkRatio, damaged, readAll, readHeader } from "./container";
 import { gaps, levels, neighboursOf } from "./entropy";
-import { type Head, readHead } from "./head";
-import { Reader } from "./reader";
+import { type Head, readHead, type StatedHead } from "./head";
+import { type Numbers, Reader } from "./reader";
+import { violation } from "./schema";
 
 export type Floats = Float32Array<ArrayBuffer>;
 
@@ -39,8 +40,6 @@ export type Scene = {
   cameras: Camera[];
 };
 
-const MOST_PRIMITIVES = 2 ** 28;
-const MOST_WIDTH = 256;
 /** Random backgrounds are shown in viser's colour. */
 const BACKGROUNDS: Record<string, [number, number, number]> = {
   random: [0.149, 0.1647, 0.2157],
@@ -51,65 +50,60 @@ const BACKGROUNDS: Record<string, [number, number, number]> = {
 /** Reads a packed scene, with memory bounded by its size; throws a PackError that says what is wrong. */
 export async function readScene(file: Uint8Array<ArrayBuffer>): Promise<Scene> {
   const header = await readHeader(file);
-  const shape = shapeOf(header);
+  const wrong = violation(header.meta, "header") ?? violation(header.meta.model, "model", "model");
+  if (wrong !== null) throw damaged(`its header has no valid ${wrong}`);
+  const { primitives, attributes, model: stated } = header.meta as unknown as Stated;
+  const width = (name: string): number => attributes[name]?.width ?? 0;
+  const shape = { count: primitives, rest: width("features_rest"), features: width("features") };
   checkRatio(4 * shape.count * (14 + shape.rest + shape.features), file.length);
   const reader = new Reader(header, file.length, await readAll(file, header));
-  const model = modelOf(reader);
   const degree = Math.sqrt(shape.rest / 3 + 1) - 1;
-  if (degree > model.degree) throw reader.refuse("its header states a lower SH degree than it has");
+  if (degree > stated.sh_degree) throw reader.refuse("its header states a lower SH degree than it has");
   const field = readField(reader, shape);
-  const head = readHead(reader, model.head);
-  if (head !== null && head.kind.features !== shape.features) {
-    throw reader.refuse("its header states another head than it has");
+  const head = readHead(reader, stated.head ?? null);
+  if ((head?.kind.features ?? 0) !== shape.features) {
+    throw reader.refuse("its header states another number of features than it has");
   }
   return {
     field,
-    features: head === null ? 0 : shape.features,
+    features: shape.features,
     degree,
-    logits: model.degree === 0,
-    antialiased: model.antialiased,
-    background: model.background,
+    logits: stated.sh_degree === 0,
+    antialiased: stated.rasterize_mode === "antialiased",
+    background: BACKGROUNDS[stated.background_color]!,
     head,
-    trainedFocal: model.trainedFocal,
+    trainedFocal: stated.trained_focal ?? null,
     cameras: readCameras(reader),
   };
 }
 
 type Shape = { count: number; rest: number; features: number };
 
-/** Numbers of primitives, of SH values of degrees 1 and up, and of features, from the header alone. */
-function shapeOf(header: Header): Shape {
-  const refusal = new PackError("The file is not a valid scene (its header contradicts itself); pack it again.");
-  const { attributes, primitives } = header.meta;
-  const whole = (value: unknown, most: number): value is number =>
-    typeof value === "number" && Number.isInteger(value) && 1 <= value && value < most;
-  if (!isObject(attributes) || !whole(primitives, MOST_PRIMITIVES)) throw refusal;
-  const width = (name: string): number => {
-    const about = attributes[name];
-    if (about === undefined) return 0;
-    if (!isObject(about) || !whole(about.width, MOST_WIDTH + 1)) throw refusal;
-    return about.width;
+/** What the header states, once it is checked. */
+type Stated = {
+  primitives: number;
+  attributes: Record<string, { width?: number }>;
+  model: {
+    sh_degree: number;
+    rasterize_mode: string;
+    background_color: string;
+    head?: StatedHead | null;
+    trained_focal?: [number, number] | null;
   };
-  const rest = width("features_rest");
-  if (rest % 3 !== 0 || ![1, 2, 3, 4, 5].includes(Math.sqrt(rest / 3 + 1))) throw refusal;
-  return { count: primitives, rest, features: width("features") };
-}
+};
 
 function readField(reader: Reader, { count, rest, features }: Shape): Field {
   const none = new Float32Array(0);
-  const about = reader.about("means", ["blocks"]);
-  const bits = reader.whole(about, "bits", 4, 16);
-  const block = reader.whole(about, "block", 16, 2 ** 20);
-  const [low, high] = ["low", "high"].map(
-    (end) => reader.section(`means/${end}`, ["<f4"], [Math.ceil(count / block), 3]) as Float32Array,
-  );
-  const cells = cellsOf(gaps(reader.stream("means/gaps"), count, block, bits));
+  const { bits, block } = reader.about("means");
+  const blocks = Math.ceil(count / block);
+  const [low, high] = ["low", "high"].map((end) => reader.array("means", end, { blocks }) as Float32Array);
+  const cells = cellsOf(gaps(reader.array("means", "gaps") as Uint8Array, count, block, bits));
   const near = neighboursOf(cells, block);
   const rows = (name: string, width: number): Float32Array => (width ? readRows(reader, name, near, width) : none);
   return {
     count,
     means: positions(cells, low!, high!, bits, block),
-    quats: rotations(...readLevels(reader, "quats", "xyz", near, 3)),
+    quats: rotations(...readLevels(reader, "quats", near, 3)),
     scales: rows("scales", 3),
     opacities: rows("opacities", 1),
     features_dc: rows("features_dc", 3),
@@ -119,63 +113,27 @@ function readField(reader: Reader, { count, rest, features }: Shape): Field {
 }
 
 /** Levels [N, width] of an attribute, and their step. */
-function readLevels(
-  reader: Reader,
-  name: string,
-  codec: string,
-  near: Int32Array,
-  width: number,
-): [Int32Array, number] {
-  const about = reader.about(name, [codec]);
-  const [step] = reader.numbers([about.step ?? null], "step", 1);
-  return [levels(reader.stream(`${name}/levels`), width, near), step!];
+function readLevels(reader: Reader, name: string, near: Int32Array, width: number): [Int32Array, number] {
+  return [levels(reader.array(name, "levels") as Uint8Array, width, near), reader.about(name).step];
 }
 
 function readRows(reader: Reader, name: string, near: Int32Array, width: number): Float32Array {
-  const [found, step] = readLevels(reader, name, "transform", near, width);
-  const mean = reader.section(`${name}/mean`, ["<f4"], [width]) as Float32Array;
-  const basis = reader.section(`${name}/basis`, ["|i1"], [width * width]) as Int8Array;
+  const [found, step] = readLevels(reader, name, near, width);
+  const mean = reader.array(name, "mean", { width }) as Float32Array;
+  const basis = reader.array(name, "basis", { square: width * width }) as Int8Array;
   return transformed(found, mean, basis, step);
 }
 
 function readCameras(reader: Reader): Camera[] {
   if (!reader.has("cameras/poses")) return [];
   const count = reader.rows("cameras/poses");
-  const poses = reader.section("cameras/poses", ["<f4"], [count, 3, 4]);
-  const intrinsics = reader.section("cameras/intrinsics", ["<f8"], [count, 4]);
-  const sizes = reader.section("cameras/sizes", ["<u4"], [count, 2]);
-  if (sizes.some((side) => side < 1 || side > 2 ** 16)) throw reader.refuse("a camera has an invalid image size");
+  const [poses, intrinsics, sizes] = ["poses", "intrinsics", "sizes"].map((part) =>
+    reader.array("cameras", part, { cameras: count }),
+  ) as [Numbers, Numbers, Numbers];
   return Array.from({ length: count }, (_, i) => {
     const [fx, fy, cx, cy] = intrinsics.subarray(4 * i, 4 * i + 4);
     const [width, height] = sizes.subarray(2 * i, 2 * i + 2);
     const pose = [...poses.subarray(12 * i, 12 * i + 12)];
     return { pose, fx: fx!, fy: fy!, cx: cx!, cy: cy!, width: width!, height: height! };
   });
-}
-
-type Model = {
-  degree: number;
-  antialiased: boolean;
-  background: [number, number, number];
-  head: JsonObject[string] | undefined;
-  trainedFocal: [number, number] | null;
-};
-
-function modelOf(reader: Reader): Model {
-  const stated = reader.header.meta.model;
-  if (!isObject(stated)) throw reader.refuse("its header states no model");
-  const { rasterize_mode: mode, background_color: background, trained_focal: focal = null } = stated;
-  if (mode !== "classic" && mode !== "antialiased") throw reader.refuse("its header states an unknown rasterize_mode");
-  if (typeof background !== "string" || !Object.hasOwn(BACKGROUNDS, background)) {
-    throw reader.refuse("its header states an unknown background_color");
-  }
-  const positive = focal === null ? [] : reader.numbers(focal, "trained_focal", 2);
-  if (positive.some((value) => value <= 0)) throw reader.refuse("its header states impossible focal lengths");
-  return {
-    degree: reader.whole(stated, "sh_degree", 0, 4),
-    antialiased: mode === "antialiased",
-    background: BACKGROUNDS[background]!,
-    head: stated.head,
-    trainedFocal: focal === null ? null : [positive[0]!, positive[1]!],
-  };
 }

@@ -1,0 +1,239 @@
+"""Change packed scenes behind valid checksums, and compare the verdicts of both readers; print one JSON line.
+
+    python benchmarks/fuzz_packs.py --count 5000               # needs Node and the page's build tools (make web)
+    python benchmarks/fuzz_packs.py --count 1 --seed 1234 --keep folder
+
+Each seed changes header, arrays, streams or frames of a small scene (``pack_changes.py``). Python opens the result
+and, if it is valid, makes the page of it. The page's decoder opens it under Node. Exits with 1 if the verdicts differ,
+if both decode other positions, cameras or weights, or if either fails with another error than its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import torch
+from pack_changes import Json, Pack, mutated
+
+from sundae_ns.api.packing import scene_of
+from sundae_ns.api.page import page_of
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.errors import SundaeError
+from sundae_ns.gaussians import from_points
+from sundae_ns.storage.packing import PackedScene, read_scene, write_scene
+
+WEB = Path(__file__).parents[1] / "web"
+SECONDS = 60
+"""Time limit of one verdict; it takes milliseconds, so only a hang reaches it."""
+POINTS = 60
+
+
+class Verdict(NamedTuple):
+    """What a reader makes of a file: an error message, or what it has decoded."""
+
+    error: str | None
+    content: Json
+    failed: bool = False
+    """Whether the reader ended with an error that is not its own."""
+
+
+def scenes(folder: Path) -> list[Pack]:
+    """Small scenes of every kind: harmonics, logits, antialiased, and both heads."""
+    residual, features = ("residual", 1, 3), ("features", 2, 4)
+    kinds = [(3, None), (0, None), (1, residual), (4, None), (1, features), (2, None)]
+    return [Pack.of(_scene(folder / f"{i}.sundae", *kind)) for i, kind in enumerate(kinds)]
+
+
+def _scene(path: Path, degree: int, kind: tuple[Any, int, int] | None) -> bytes:
+    torch.manual_seed(degree)
+    points = torch.rand(POINTS, 3) - 0.5
+    width = kind[2] if kind else 1
+    field = {
+        k: v.detach()
+        for k, v in from_points(points, torch.rand(POINTS, 3), sh_degree=degree, num_features=width).items()
+    }
+    field["features_rest"] = 0.2 * torch.randn(POINTS, (degree + 1) ** 2 - 1, 3)
+    field["quats"] = torch.randn(POINTS, 4)
+    head, stated = {}, None
+    if kind is None:
+        field.pop("features")
+    else:
+        field["features"] = torch.randn(POINTS, width)
+        config = HeadConfig(mode=kind[0], size="tiny", pixel_unshuffle=kind[1], num_features=width)
+        # Few weights that are not zero: zeros decode fast.
+        head = {
+            name: value * (torch.rand_like(value) < 0.002)
+            for name, value in CompensationHead(config).state_dict().items()
+        }
+        stated = {
+            name: getattr(config, name) for name in ("mode", "size", "pixel_unshuffle", "num_features", "precision")
+        }
+    poses = torch.eye(4)[:3].repeat(2, 1, 1)
+    poses[:, 2, 3] = torch.tensor([2.0, 0.3])
+    lens = torch.tensor([[20.0, 21.0, 12.0, 9.0]]).double().repeat(2, 1)
+    cameras = {"poses": poses, "intrinsics": lens, "sizes": torch.tensor([[24, 18]]).repeat(2, 1)}
+    model = {
+        "sh_degree": degree,
+        "rasterize_mode": "antialiased" if degree == 4 else "classic",
+        "background_color": ("black", "white", "random")[degree % 3],
+        "head": stated,
+        "trained_focal": [20.0, 21.0] if stated else None,
+    }
+    meta = {
+        "model": model,
+        "source": {"method": "sundae", "step": 9},
+        "frame": {"transform": torch.eye(4).tolist(), "scale": 1.0},
+    }
+    write_scene(path, PackedScene(field, head, cameras, meta))
+    return path.read_bytes()
+
+
+class Hang(BaseException):
+    """Raised by the alarm."""
+
+
+def python_verdict(path: Path) -> Verdict:
+    """The verdict of Python's reader, which also makes the page of a valid file."""
+
+    def stop(*_: object) -> None:
+        raise Hang
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(SECONDS)
+    try:
+        packed = read_scene(path)
+        scene = scene_of(packed)
+        page_of(scene, b"", title="a")
+    except SundaeError as error:
+        one_line = "\n" not in str(error) and len(str(error)) < 600
+        return Verdict(str(error), None, failed=not one_line)
+    except (Exception, Hang) as error:
+        return Verdict(f"{type(error).__name__}: {error}", None, failed=True)
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+    digest = hashlib.sha256(packed.field["means"].numpy().tobytes())
+    for name in sorted(packed.head):
+        digest.update(packed.head[name].contiguous().numpy().tobytes())
+    cameras = packed.cameras or {
+        "poses": torch.zeros(0, 3, 4),
+        "intrinsics": torch.zeros(0, 4),
+        "sizes": torch.zeros(0, 2),
+    }
+    for pose, lens, size in zip(cameras["poses"], cameras["intrinsics"], cameras["sizes"], strict=True):
+        digest.update(torch.cat([pose.reshape(-1).double(), lens, size.double()]).numpy().tobytes())
+    rest = packed.field["features_rest"].shape[1]
+    content = {
+        "digest": digest.hexdigest(),
+        "degree": round((rest + 1) ** 0.5) - 1,
+        "logits": scene.field.encoding == "logits",
+        "antialiased": scene.antialiased,
+        "background": [round(float(value), 4) for value in scene.background],
+        "trainedFocal": list(scene.trained_focal) if scene.trained_focal else None,
+    }
+    return Verdict(None, content)
+
+
+@contextmanager
+def page_verdicts(folder: Path) -> Iterator[Callable[[Path], Verdict]]:
+    """The verdicts of the page's decoder, by one process of Node."""
+    program = folder / "judge.mjs"
+    words = ["tests/judge.ts", "--bundle", "--platform=node", "--format=esm", "--log-level=error"]
+    subprocess.run([WEB / "node_modules/.bin/esbuild", *words, f"--outfile={program}"], cwd=WEB, check=True)
+    with subprocess.Popen(["node", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        ask, answers = process.stdin, process.stdout
+
+        def judge(path: Path) -> Verdict:
+            ask.write(f"{path}\n")
+            ask.flush()
+            found = json.loads(answers.readline())
+            if "digest" in found:
+                return Verdict(None, found)
+            return Verdict(found.get("error", found.get("traceback")), None, failed="traceback" in found)
+
+        yield judge
+        ask.close()
+
+
+def has_node() -> bool:
+    """Whether Node and the page's build tools are here."""
+    return shutil.which("node") is not None and (WEB / "node_modules").is_dir()
+
+
+def problem_of(python: Verdict, page: Verdict) -> str | None:
+    """What is wrong with the verdicts of one file; None if both agree."""
+    for reader, verdict in (("python", python), ("page", page)):
+        if verdict.failed:
+            return f"{reader} fails: {verdict.error}"
+    if (python.error is None) != (page.error is None):
+        return f"python: {python.error or 'valid'}; page: {page.error or 'valid'}"
+    return None if python.content == page.content else f"python has {python.content}, page has {page.content}"
+
+
+def run(count: int, seed: int = 0, keep: Path | None = None) -> tuple[Counter[str], list[str]]:
+    """Judge ``count`` files from a seed on; the numbers of verdicts, and a line for each file on which both differ."""
+    tally: Counter[str] = Counter()
+    problems = []
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        goods = scenes(folder)
+        with page_verdicts(folder) as page_verdict:
+            for i in range(seed, seed + count):
+                path = folder / "a.sundae"
+                path.write_bytes(mutated(goods[i % len(goods)], i))
+                python, page = python_verdict(path), page_verdict(path)
+                tally["valid" if python.error is None else "refused"] += 1
+                problem = problem_of(python, page)
+                if problem is not None:
+                    problems.append(f"seed {i}: {problem}")
+                if keep is not None and (problem is not None or count == 1):
+                    keep.mkdir(parents=True, exist_ok=True)
+                    shutil.copy(path, keep / f"{i}.sundae")
+    return tally, problems
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=5000, help="number of changed files")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first one")
+    parser.add_argument("--keep", type=Path, help="folder for files on which the readers differ")
+    options = parser.parse_args()
+    if not has_node():
+        sys.exit("the page's decoder needs Node and its build tools; run make web")
+    torch.set_num_threads(1)
+    started = time.perf_counter()
+    tally, problems = run(options.count, options.seed, options.keep)
+    print("\n".join(problems), file=sys.stderr)
+    seconds = round(time.perf_counter() - started)
+    print(
+        json.dumps(
+            {
+                "benchmark": "fuzz_packs",
+                "files": options.count,
+                "seed": options.seed,
+                **tally,
+                "differences": len(problems),
+                "seconds": seconds,
+            }
+        )
+    )
+    sys.exit(1 if problems else 0)
+
+
+if __name__ == "__main__":
+    main()
