@@ -18,7 +18,6 @@ ELSEWHERE = {
     "cli/files.py": ["saving.save(pruned.scene, out)"],  # the public function, which renames
     "evaluation/video.py": ["av.open(str(path), 'w', format='mp4', options={'movflags': 'faststart'})"],  # in cli/
     "storage/runs/folder.py": ["(run / LOCK).open('a+', encoding='utf-8')"],  # a lock stays
-    "training/budget/extension.py": ["run.save()"],  # checkpoints
     "training/pruning.py": ["run.save()"],
 }
 """Calls that write in another way, by module."""

@@ -58,9 +58,7 @@ raise ProcessExitedException("process 1 terminated with signal SIGKILL", 1, 7, -
     assert line.startswith("sundae: rank 1 ended (killed by SIGKILL)")
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("warmup", "mcmc"), ("camera_optimizer.mode", "SO3xR3")]
-)
+@pytest.mark.parametrize(("option", "value"), [("warmup", "mcmc"), ("camera_optimizer.mode", "SO3xR3")])
 def test_options_that_several_ranks_cannot_use_are_refused(config: Any, option: str, value: str) -> None:
     *owners, name = option.split(".")
     owner: Any = config.pipeline.model
