@@ -18,7 +18,7 @@ ELSEWHERE = {
     "cli/files.py": ["saving.save(pruned.scene, out)"],  # the public function, which renames
     "evaluation/video.py": ["av.open(str(path), 'w', format='mp4', options={'movflags': 'faststart'})"],  # in cli/
     "storage/runs/folder.py": ["(run / LOCK).open('a+', encoding='utf-8')"],  # a lock stays
-    "training/pruning.py": ["run.save()"],
+    "training/pruning.py": ["run.save()"],  # checkpoints
 }
 """Calls that write in another way, by module."""
 
