@@ -1,5 +1,5 @@
 """A whole training of the default with all trials, its curve, its quality and its packed bytes: python whole.py DATA OUT.json SEED [options]"""
-import json, sys, time
+import json, os, sys, time
 from pathlib import Path
 import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
@@ -8,8 +8,11 @@ from harness.plan import parser_of
 import sundae_ns.training.trials.curve as curve
 import sundae_ns.training.trials.count as count
 curve.LOST = 1e9
+if os.environ.get("ANNEAL") == "0":  # the rate of the centres as at the prune, for comparison
+    real = count.notify_pruned
+    count.notify_pruned = lambda *a, ends_at=None, **k: real(*a, **k)
 data, out, seed = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
-config = parse(["sundae", "--data", str(data), "--machine.seed", seed, *sys.argv[4:], *parser_of(data)])
+config = parse(["sundae-auto", "--data", str(data), "--machine.seed", seed, *sys.argv[4:], *parser_of(data)])
 config.output_dir = Path(f"/tmp/whole/{out.stem}"); config.vis = "tensorboard"; config.experiment_name, config.timestamp = "r", "run"
 config.steps_per_save = config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
 config.pipeline.model.evaluate_prune = False

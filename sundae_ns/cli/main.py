@@ -14,6 +14,7 @@ from typing import NoReturn
 import tyro
 
 from sundae_ns.cli.bench import bench
+from sundae_ns.cli.curve import curve
 from sundae_ns.cli.demo import demo
 from sundae_ns.cli.evaluate import evaluate
 from sundae_ns.cli.files import export, prune_file
@@ -59,6 +60,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "view": (view, "show a scene with its head in the browser"),
     "render": (render_file, "render a scene to an image, or a camera path to a video"),
     "report": (report, "measure and compare finished runs: quality, speed, size"),
+    "curve": (curve, "how many primitives a run needs: the curve by which it has chosen"),
     "eval": (evaluate, "evaluate a run as ns-eval does, without running its config.yml"),
     "bench": (bench, "time the frames of a run"),
     "demo": (demo, "train and evaluate the embedded capture; takes minutes on a CPU"),

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
     from sundae_ns.evaluation import Measured
+    from sundae_ns.evaluation.count_curve import CountCurve
     from sundae_ns.evaluation.curves import Curves
     from sundae_ns.evaluation.plots import Cost
     from sundae_ns.scenes.opening import Opened
@@ -71,6 +72,7 @@ def report(
         from rich.progress import MofNCompleteColumn, Progress, TaskID, TimeRemainingColumn
 
         from sundae_ns.evaluation import Lpips, csv_text, flip_available, lpips_weights_available
+        from sundae_ns.evaluation.count_curve import read_count_curve
         from sundae_ns.evaluation.curves import read_curves
         from sundae_ns.evaluation.document import document
         from sundae_ns.evaluation.metrics import INSTALL_FLIP
@@ -89,6 +91,7 @@ def report(
         notes.append(f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them.")
     done: list[Measured] = []
     curves: dict[str, Curves] = {}
+    counts: dict[str, CountCurve] = {}
     comparisons: dict[str, list[tuple[str, str]]] = {}
     failures: list[SundaeError] = []
     columns = (*Progress.get_default_columns()[:-1], MofNCompleteColumn(), TimeRemainingColumn())
@@ -127,6 +130,8 @@ def report(
                 title = f"{label}: worst and median test view by PSNR"
                 comparisons.setdefault(measured.scene, []).append((title, name))
                 found = read_curves(opened.source) if opened.packed_bytes is None else None
+                decided = read_count_curve(opened.source) if opened.packed_bytes is None else None
+                counts |= {} if decided is None else {label: decided}
                 if found is not None:
                     curves[label] = found
                     measured = replace(measured, peak_vram_mib=max(found.memory.values, default=0.0) or None)
@@ -147,7 +152,7 @@ def report(
         progress.add_task("Plotting", total=None)
         scenes = {scene: [run for run in done if run.scene == scene] for scene in dict.fromkeys(r.scene for r in done)}
         with writing(f"cannot write to {out}"):
-            plots = _plot(out, scenes, curves)
+            plots = _plot(out, scenes, curves, counts)
         notes += [
             f"Comparison within {scene}: its runs have different test views, so their numbers do not compare."
             for scene, own in scenes.items()
@@ -213,10 +218,13 @@ def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> N
 
 
 def _plot(
-    out: Path, scenes: Mapping[str, list[Measured]], curves: Mapping[str, Curves]
+    out: Path,
+    scenes: Mapping[str, list[Measured]],
+    curves: Mapping[str, Curves],
+    counts: Mapping[str, CountCurve],
 ) -> dict[str, list[tuple[str, str]]]:
     """Write all plots; returns (title, file name) by scene."""
-    from sundae_ns.evaluation.plots import MOST_SERIES, colors_of, plot_curves, plot_quality, plot_views
+    from sundae_ns.evaluation.plots import MOST_SERIES, colors_of, plot_counts, plot_curves, plot_quality, plot_views
     from sundae_ns.storage.atomic import write_bytes
 
     def drawn(name: str, plot: Callable[..., object], *about: object, **options: object) -> bool:
@@ -241,6 +249,11 @@ def _plot(
             drawn(f"views{names}", plot_views, group, colors)
             plots.append(("PSNR of each test view", f"views{names}.png"))
             known = {run.label: curves[run.label] for run in group if run.label in curves}
+            for place, run in enumerate(group, start=first + 1):
+                if run.label in counts:
+                    name = f"counts{end}-{place}"
+                    drawn(name, plot_counts, counts[run.label], title=f"{run.label}: trials on held-out training views")
+                    plots.append(("Expected quality against the number of primitives", f"{name}.png"))
             if known:
                 drawn(f"curves{names}", plot_curves, known, colors, title=f"{scene}: training")
                 plots.append(("Training curves", f"curves{names}.png"))

@@ -17,6 +17,7 @@ from sundae_ns.evaluation.measured import HEAD_ON, MEGABYTE, Configuration, Meas
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from sundae_ns.evaluation.count_curve import CountCurve
     from sundae_ns.evaluation.curves import Curve, Curves
 
 Cost = Literal["size", "time", "primitives"]
@@ -75,6 +76,26 @@ def plot_quality(file: Path | IO[bytes], runs: Sequence[Measured], cost: Cost, c
             handles.append(_key(text, color=_GRAY, marker="o", markerfacecolor=face, linestyle="none"))
     _save(figure, file, handles, f"{runs[0].scene}: means over the test views")
     return True
+
+
+def plot_counts(file: Path | IO[bytes], curve: CountCurve, *, title: str) -> None:
+    """Expected PSNR and SSIM against the number of primitives, with errors, and the number that was chosen."""
+    figure, panels = _figure(1, 2, width=5.4, height=3.8)
+    points = [point for point in curve.points if point.psnr_loss is not None and point.ssim_loss is not None]
+    counts = [point.count for point in points]
+    values = ([point.psnr for point in points], [point.ssim for point in points])
+    errors = ([point.psnr_error for point in points], [point.ssim_error for point in points])
+    for panel, (_, label), value, error in zip(panels.flat, _METRICS, values, errors, strict=True):
+        panel.errorbar(counts, value, yerr=error, color=PALETTE[0], marker="o", markersize=5, capsize=3, linewidth=1.3)
+        panel.axvline(curve.chosen, color=PALETTE[1], linestyle="--", linewidth=1.3)
+        panel.set_ylabel(label, fontsize=9)
+        panel.set_xlabel("number of primitives (smaller is better)")
+        _cost_axis(panel, [*counts, curve.chosen])
+    keys = [
+        _key("expected; bars: standard error of the loss over the views", color=PALETTE[0], marker="o"),
+        _key(f"chosen: {curve.chosen:,} of {curve.full:,}", color=PALETTE[1], linestyle="--"),
+    ]
+    _save(figure, file, keys, title)
 
 
 def plot_views(file: Path | IO[bytes], runs: Sequence[Measured], colors: Mapping[str, str]) -> None:

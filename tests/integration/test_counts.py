@@ -12,6 +12,7 @@ import torch
 from nerfstudio.engine.trainer import Trainer
 from trial_runs import PRUNE_AT, STEPS, same, tidy, tiny_run, tiny_scene
 
+from sundae_ns.evaluation.count_curve import read_count_curve
 from sundae_ns.training.heldout import HeldOutQuality
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.trials import count as count_trials
@@ -124,6 +125,9 @@ def test_trials_choose_the_count_and_leave_nothing_else_behind(make: Make, judge
     trials = json.loads((trainer.base_dir / "trials.json").read_text())
     assert not held & set(trials["held_out_views"])
     assert trials["step"] > record["step"]
+    points = read_count_curve(trainer.base_dir)
+    assert points is not None
+    assert [point.count for point in points.points] == [one["count"] for one in record["curve"]]
     (prune,) = json.loads((trainer.base_dir / "prune.json").read_text())
     assert (prune["before"], prune["after"], prune["step"]) == (full, chosen, record["step"])
 

@@ -36,6 +36,7 @@ WORDS: dict[str, list[str]] = {
     "view": ["RUN", "--no-open-browser"],
     "render": ["RUN", "-o", "out.png"],
     "report": ["RUN", "-o", "report"],
+    "curve": ["RUN", "-o", "out.png"],
     "eval": ["RUN", "-o", "out.json"],
     "bench": ["frame", "--load-config", "RUN"],
     "demo": ["DEMO", "--overwrite"],

@@ -18,11 +18,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sundae_ns.errors import PackError
-from sundae_ns.evaluation.document import table
+from sundae_ns.evaluation.count_curve import CURVE, CurvePoint, curve_table
 from sundae_ns.gaussians.parameters import FEATURES
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rendering.contribution import contribution
-from sundae_ns.storage import megabytes
 from sundae_ns.storage.morton import scene_order
 from sundae_ns.storage.packing.scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.training.densification import Densification
@@ -34,11 +33,11 @@ from sundae_ns.training.report import write_record
 from sundae_ns.training.schedulers import notify_pruned
 from sundae_ns.training.schedules import COUNT, USUAL_SHARE, prune_to
 from sundae_ns.training.trials.curve import (
-    CurvePoint,
     Tolerance,
     affordable,
     choose,
     curve_of,
+    is_lost,
     price,
     still_climbs,
 )
@@ -222,7 +221,7 @@ class CountTrials(Extension):
         progress.sizes.append(packed_size(state.field))
         self._engine.go_back(FULL, state)
         curve = progress.curve()
-        if len(progress.counts) < len(SHARES) and curve and not curve[-1].lost(self._tolerance):
+        if len(progress.counts) < len(SHARES) and curve and not is_lost(curve[-1], self._tolerance):
             self._start_trial(run)
         else:
             self._decide(run, curve)
@@ -255,20 +254,11 @@ class CountTrials(Extension):
         run.log_scalars("Curve", {"chosen": count, "full": progress.full})
         record: dict[str, Any] = {"chosen": count, "full": progress.full, "reason": reason, "step": run.state.step}
         record |= {"tolerance": self._tolerance._asdict(), "held_out_views": self._views(run)}
-        write_record(run, "curve.json", {**record, "steps_per_trial": WINDOWS * self._window, "curve": points})
+        write_record(run, CURVE, {**record, "steps_per_trial": WINDOWS * self._window, "curve": points})
 
     def _show(self, curve: list[CurvePoint], reason: str) -> None:
         """The curve as a table in the log."""
-        rows = [
-            [
-                *(f"{point.count:,}", "?" if point.bytes is None else megabytes(point.bytes)),
-                f"{point.psnr:.2f} (-{point.psnr_loss:.2f} ± {point.psnr_error:.2f})",
-                f"{point.ssim:.4f} (-{point.ssim_loss:.4f} ± {point.ssim_error:.4f})",
-            ]
-            for point in curve
-        ]
-        heads = ["primitives", "packed", "expected PSNR, dB (less than the best)", "expected SSIM"]
-        CONSOLE.log("\n".join(table(heads, rows, words=0)))
+        CONSOLE.log("expected at the end, on held-out training views:", *curve_table(curve), sep="\n")
         CONSOLE.log(f"keeping {self.progress.chosen:,} of {self.progress.full:,} primitives: {reason}")
 
     def _take_usual(self, run: TrainingRun, reason: str) -> None:

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sundae_ns.evaluation.count_curve import CurvePoint
 
 PSNR_WEIGHTS = (0.8, 1.5)
 """Weights of the PSNR at the end of a trial, and of its growth in the last e-fold of steps."""
@@ -38,36 +39,16 @@ class Tolerance(NamedTuple):
         return cls() if psnr is None else cls(psnr, psnr * cls().ssim / cls().psnr)
 
 
-@dataclass(frozen=True)
-class CurvePoint:
-    """What to expect of a field of one count, on the held-out training views."""
+def excess(point: CurvePoint, tolerance: Tolerance) -> float:
+    """Largest loss, less its standard error, in units of the tolerance; at most 1 is as good as the best."""
+    psnr = (point.psnr_loss - point.psnr_error) / tolerance.psnr
+    return max(psnr, (point.ssim_loss - point.ssim_error) / tolerance.ssim)
 
-    count: int
-    """Number of primitives."""
-    bytes: int | None
-    """Bytes of the packed field without a head, estimated; None if unknown."""
-    psnr: float
-    """Expected PSNR after a fit of colours to each photo, dB. Differences to other points are more certain."""
-    ssim: float
-    """Expected SSIM."""
-    psnr_loss: float
-    """PSNR that is lost against the best count, dB."""
-    ssim_loss: float
-    """SSIM that is lost against the best count for SSIM."""
-    psnr_error: float
-    """Standard error of the loss over the views, dB."""
-    ssim_error: float
-    """Standard error of the loss of SSIM over the views."""
 
-    def excess(self, tolerance: Tolerance) -> float:
-        """Largest loss, less its standard error, in units of the tolerance; at most 1 is as good as the best."""
-        psnr = (self.psnr_loss - self.psnr_error) / tolerance.psnr
-        return max(psnr, (self.ssim_loss - self.ssim_error) / tolerance.ssim)
-
-    def lost(self, tolerance: Tolerance) -> bool:
-        """Whether the count is clearly too small, so that fewer need not be tried."""
-        psnr = self.psnr_loss - 2 * self.psnr_error > LOST * tolerance.psnr
-        return psnr or self.ssim_loss - 2 * self.ssim_error > LOST * tolerance.ssim
+def is_lost(point: CurvePoint, tolerance: Tolerance) -> bool:
+    """Whether the count is clearly too small, so that fewer need not be tried."""
+    psnr = point.psnr_loss - 2 * point.psnr_error > LOST * tolerance.psnr
+    return psnr or point.ssim_loss - 2 * point.ssim_error > LOST * tolerance.ssim
 
 
 def curve_of(
@@ -122,14 +103,14 @@ def choose(curve: Sequence[CurvePoint], tolerance: Tolerance) -> int:
         curve: largest count first.
         tolerance: losses that nobody sees.
     """
-    excess = [point.excess(tolerance) for point in curve]
-    good = [index for index, value in enumerate(excess) if value <= 1]
+    over = [excess(point, tolerance) for point in curve]
+    good = [index for index, value in enumerate(over) if value <= 1]
     if not good:
-        return curve[excess.index(min(excess))].count
+        return curve[over.index(min(over))].count
     index = good[-1]
-    if index + 1 == len(curve) or not math.isfinite(excess[index + 1]):
+    if index + 1 == len(curve) or not math.isfinite(over[index + 1]):
         return curve[index].count
-    part = (1 - excess[index]) / (excess[index + 1] - excess[index])
+    part = (1 - over[index]) / (over[index + 1] - over[index])
     between = (math.log(curve[at].count) for at in (index, index + 1))
     large, small = between
     return round(math.exp(large + part * (small - large)))
@@ -168,4 +149,4 @@ def affordable(curve: Sequence[CurvePoint], most: int, extra: int = 0) -> int | 
 
 def still_climbs(curve: Sequence[CurvePoint], tolerance: Tolerance) -> bool:
     """Whether the largest count is the best and the next smaller one clearly worse: more primitives might help."""
-    return len(curve) > 1 and curve[0].excess(tolerance) <= 0 and curve[1].excess(tolerance) > 1
+    return len(curve) > 1 and excess(curve[0], tolerance) <= 0 and excess(curve[1], tolerance) > 1

@@ -7,14 +7,15 @@ from collections.abc import Sequence
 
 import pytest
 
+from sundae_ns.evaluation.count_curve import CurvePoint
 from sundae_ns.training.trials.curve import (
     PSNR_WEIGHTS,
     SSIM_WEIGHTS,
-    CurvePoint,
     Tolerance,
     affordable,
     choose,
     curve_of,
+    is_lost,
     price,
     still_climbs,
 )
@@ -114,9 +115,9 @@ def test_between_two_counts_the_loss_is_interpolated() -> None:
 
 def test_what_the_views_cannot_tell_apart_is_no_loss() -> None:
     assert choose([point(1000), point(400, 0.25, error=0.2)], Tolerance()) == 400
-    assert point(400, 0.9).lost(Tolerance())
-    assert not point(400, 0.9, error=0.3).lost(Tolerance())
-    assert point(400, 0, 0.02).lost(Tolerance())
+    assert is_lost(point(400, 0.9), Tolerance())
+    assert not is_lost(point(400, 0.9, error=0.3), Tolerance())
+    assert is_lost(point(400, 0, 0.02), Tolerance())
 
 
 def test_the_price_of_quality_is_what_twice_as_many_primitives_gain() -> None:
