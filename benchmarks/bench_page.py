@@ -66,7 +66,8 @@ def write_scaled(out: Path, scene: Path, side: int) -> PackedScene:
     meta = {**header.meta, **small.meta}
     del meta["sections"]
     assert small.cameras is not None
-    cameras = {f"cameras/{name}": small.cameras[name].numpy().astype(dtype) for name, (dtype, _) in STORED.items()}
+    dtypes = {name: section["dtype"] for name, section in STORED.items()}
+    cameras = {f"cameras/{name}": small.cameras[name].numpy().astype(dtype) for name, dtype in dtypes.items()}
     unpacked = 4 * sum(value.numel() for value in (*small.field.values(), *small.head.values()))
     sections = {**container.read_sections(scene, header), **cameras}
     out.write_bytes(container.encode(meta, sections, unpacked=unpacked)[0])

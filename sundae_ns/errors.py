@@ -61,7 +61,7 @@ class PackError(SundaeError, ValueError):
 
 
 class MemoryExhaustedError(SundaeError, RuntimeError):
-    """The device lacks memory for the field or the image."""
+    """The device lacks memory for the field or the image, or a view has more primitives than any real scene."""
 
 
 class CheckpointError(SundaeError, ValueError):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import logging
 import re
 from importlib import resources
 from pathlib import Path
@@ -18,7 +19,7 @@ from PIL import Image
 from sundae_ns.api.rendering import image_of, render
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import view_in_front
-from sundae_ns.errors import writing
+from sundae_ns.errors import MemoryExhaustedError, writing
 from sundae_ns.storage.atomic import replacing, write_text
 
 SCENE_FILE = "scene.sundae"
@@ -26,6 +27,9 @@ SCENE_FILE = "scene.sundae"
 _POSTER_SIDE = 640
 """Longest side of the image that a page shows until it draws, pixels."""
 _POSTER_QUALITY = 80
+_NO_POSTER = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"
+"""One transparent pixel."""
+_log = logging.getLogger(__name__)
 
 
 def page_of(scene: Scene, packed: bytes, *, title: str) -> str:
@@ -63,11 +67,9 @@ def write_page(path: Path, scene: Scene, packed: bytes, *, title: str) -> int:
 
 def _filled(scene: Scene, title: str, *, inline: str = "", source: str = "") -> str:
     """The page with a scene in base64, or with the address of one."""
-    poster = io.BytesIO()
-    render_first(scene).save(poster, "jpeg", quality=_POSTER_QUALITY)
     values = {
         "TITLE": html.escape(title),
-        "POSTER": f"data:image/jpeg;base64,{base64.b64encode(poster.getvalue()).decode()}",
+        "POSTER": _poster(scene),
         "SOURCE": source,
         "SCENE": inline,
     }
@@ -76,7 +78,23 @@ def _filled(scene: Scene, title: str, *, inline: str = "", source: str = "") -> 
     return re.sub("@@([A-Z]+)@@", lambda place: values[place[1]], page)
 
 
+def _poster(scene: Scene) -> str:
+    """Address of the first image; of an empty one if it cannot be rendered."""
+    try:
+        image = render_first(scene)
+    except MemoryExhaustedError as error:
+        _log.warning("the page has no first image: %s", error)
+        return _NO_POSTER
+    content = io.BytesIO()
+    image.save(content, "jpeg", quality=_POSTER_QUALITY)
+    return f"data:image/jpeg;base64,{base64.b64encode(content.getvalue()).decode()}"
+
+
 def render_first(scene: Scene) -> Image.Image:
-    """The image of the scene's first view, head included, at most 640 pixels wide and high."""
+    """The image of the scene's first view, head included, at most 640 pixels wide and high.
+
+    Raises:
+        MemoryExhaustedError: the view has more primitives than any real scene, or needs more memory than there is.
+    """
     view = scene.views[0] if scene.views else view_in_front(scene)
     return image_of(render(scene, view.zoomed(min(_POSTER_SIDE / max(view.width, view.height), 1.0))).rgb)

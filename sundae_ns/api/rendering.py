@@ -44,7 +44,7 @@ def render(scene: Scene, view: View, *, head: bool = True, backend: BackendName 
 
     Raises:
         BackendError: the rasteriser cannot run on the device of the scene.
-        MemoryExhaustedError: the GPU's memory is full.
+        MemoryExhaustedError: the memory is full, or, on a CPU, the view has more primitives than any real scene.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))

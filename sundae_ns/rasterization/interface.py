@@ -8,6 +8,7 @@ from torch import Tensor
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import MAX_SH_DEGREE
 from sundae_ns.rasterization.constants import constant
+from sundae_ns.rasterization.limits import check_memory
 from sundae_ns.rasterization.types import Backend, ColorBackend, Inputs, Rasterization
 
 
@@ -52,6 +53,8 @@ def rasterize(
 
     Raises:
         DataError: A tensor has the wrong shape, dtype or device, or the image is empty.
+        MemoryExhaustedError: On a CPU, the image or its lists need more memory than there is, or without gradients the
+            view has more primitives than any real scene.
     """
     n = means.shape[0]
     if width < 1 or height < 1:
@@ -65,6 +68,9 @@ def rasterize(
     if colors.dim() != 2 or colors.shape[0] != n or colors.shape[1] < 1:
         raise DataError(f"colors has shape {list(colors.shape)}; pass [{n}, C] with at least one channel")
     _check_alike("means", means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmat=viewmat, K=K)
+    if means.device.type == "cpu":
+        size = (colors.shape[1] + 2) * width * height * means.element_size()
+        check_memory(size, f"images of {width:,} x {height:,} pixels")
     return backend.rasterize(
         Inputs(
             *(means, quats, scales, opacities, colors, viewmat, K, width, height, near_plane, far_plane),

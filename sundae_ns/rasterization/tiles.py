@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from sundae_ns.rasterization.limits import check_pairs
 from sundae_ns.rasterization.projection import Projection
 
 TILE = 8
@@ -22,6 +23,7 @@ MIN_ALPHA = 1.0 / 255.0
 """Contributions fainter than this are skipped."""
 
 BIN = 16  # side of gsplat's tiles
+_PAIR_BYTES = 100  # of the table, its columns and the exponents
 ROUNDING = 1e-3  # slack on exponents, so that rounding never drops a primitive that is blended
 
 
@@ -41,7 +43,11 @@ class TileLists:
 
 @torch.no_grad()
 def build_tile_lists(projection: Projection, opacities: Tensor, width: int, height: int) -> TileLists:
-    """List the primitives of each tile; ``opacities`` ``[N]`` are those to blend."""
+    """List the primitives of each tile; ``opacities`` ``[N]`` are those to blend.
+
+    Raises:
+        MemoryExhaustedError: the lists would be too long.
+    """
     columns, rows = -(-width // TILE), -(-height // TILE)
     visible = ((projection.radii > 0) & (opacities >= MIN_ALPHA)).nonzero()[:, 0]
     ids = visible[projection.depths[visible].argsort(stable=True)]
@@ -59,6 +65,9 @@ def build_tile_lists(projection: Projection, opacities: Tensor, width: int, heig
 
     # One row per tile of each primitive's rectangle of tiles, in order of depth.
     counts = spans[:, 0] * spans[:, 1]
+    if ids.device.type == "cpu":
+        training = projection.means2d.requires_grad
+        check_pairs(int(counts.sum()), len(ids), columns * rows, _PAIR_BYTES, training=training)
     owner = torch.repeat_interleave(counts)
     within = torch.arange(owner.shape[0], device=ids.device) - (counts.cumsum(0) - counts).index_select(0, owner)
     width_of = spans[:, 0].index_select(0, owner)

@@ -12,6 +12,7 @@ from torch import Tensor
 from sundae_ns.compensation import CompensationHead, ScalePlan, over_phases, plan, resize
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.rasterization import Rasterization, rasterize
+from sundae_ns.rasterization.limits import check_memory
 from sundae_ns.rendering.source import NEAR_PLANE, ColorSettings, FieldSource, Primitives, StepResolution
 from sundae_ns.rendering.views import View
 
@@ -111,7 +112,15 @@ def compensate(
         splatted: colours and features without background.
         background: colour ``[3]``.
         training: run once; otherwise as often as ``head.config.phases`` says.
+
+    Raises:
+        MemoryExhaustedError: on a CPU, the layers of the head need more memory than there is.
     """
+    height, width = base.shape[:2]
+    if base.device.type == "cpu":
+        # The last level: its input from below and beside, both joined, and its output, in float32.
+        channels = 4 * head.net.out.in_channels // head.config.pixel_unshuffle**2
+        check_memory(4 * channels * width * height, f"layers of the head for {width:,} x {height:,} pixels")
     seen = (base, splatted.colors, splatted.alpha)
     image = head(*seen) if training else over_phases(head, *seen)
     if head.config.mode == "features":

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 import torch
 from chromium import bench_page
-from packed_scenes import KINDS, write_kind
+from packed_scenes import KINDS, write_bomb, write_kind
 from PIL import Image
 
 from sundae_ns.api.opening import load
@@ -30,6 +30,8 @@ from sundae_ns.api.page import page_of, render_first, write_page
 from sundae_ns.api.saving import packed_file
 from sundae_ns.cli import main
 from sundae_ns.errors import PackError
+from sundae_ns.rasterization.projection import project
+from sundae_ns.rasterization.types import Inputs
 from sundae_ns.storage.packing import read_scene
 
 ROOT = Path(__file__).parents[2]
@@ -83,6 +85,30 @@ def test_the_first_image_is_that_of_the_model(name: str, tmp_path: Path) -> None
     truth = bench_page.truths(scene)[0]["rgb"]
     # Rounded to bytes: sums of another order may cross the edge between two.
     np.testing.assert_allclose(np.asarray(render_first(scene_of(scene))), np.rint(255 * truth), atol=1)
+
+
+def test_a_page_of_too_many_primitives_has_no_first_image(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    bomb = write_bomb(tmp_path / "a.sundae")
+    assert bomb.stat().st_size < 100_000
+    with pytest.raises(SystemExit) as caught:
+        main(["export", str(bomb), "-o", str(tmp_path / "a.html")])
+    assert caught.value.code == 0, capsys.readouterr().err
+    (line,) = caplog.messages
+    assert "the page has no first image: the view has 20,000 primitives in each tile" in line
+    page = (tmp_path / "a.html").read_text()
+    assert "image/jpeg" not in page
+    (code,) = re.findall(r'src="data:image/gif;base64,([^"]*)"', page)
+    assert Image.open(io.BytesIO(base64.b64decode(code))).convert("RGBA").getpixel((0, 0))[3] == 0
+    # An image is refused, and its other view is rendered.
+    for view in (0, 1):
+        with pytest.raises(SystemExit) as caught:
+            main(["render", str(bomb), "-o", str(tmp_path / "a.png"), "--view", str(view)])
+        assert caught.value.code == (0 if view else 2)
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert "primitives in each tile of its image" in err
 
 
 def test_a_folder_has_page_and_scene_apart(packed: Path, tmp_path: Path) -> None:
@@ -308,6 +334,31 @@ def test_the_decoder_refuses_impossible_models(decode: Callable[..., list[Json]]
             load(paths[-1])
     for name, found in zip(lies, decode(*paths), strict=True):
         assert "error" in found, name
+
+
+@needs_node
+def test_the_page_counts_fragments_before_it_draws(tmp_path: Path) -> None:
+    """Without WebGPU; the sums of the quads' rectangles, by Python's projection."""
+    files = [write_kind(tmp_path / f"{i}.sundae", kind) for i, kind in enumerate([*KINDS.values()][::2])]
+    files.append(write_bomb(tmp_path / "bomb.sundae", 30_000))
+    program = bench_page.bundled("overdraw.ts", tmp_path / "overdraw.mjs", "--platform=node")
+    found = subprocess.run(["node", program, *files], check=True, capture_output=True, text=True)
+    for file, line in zip(files, found.stdout.splitlines(), strict=True):
+        scene, counted = load(file), json.loads(line)
+        field, view = scene.field, scene.views[0]
+        opacities = field["opacities"].sigmoid()[:, 0]
+        K, size = view.K, (view.width, view.height)
+        shapes = (field["means"], field["quats"], field["scales"].exp(), opacities, field["means"])
+        flags = {"antialiased": False, "absgrad": False, "render_depth": False}
+        splats = project(Inputs(*shapes, view.viewmat, K, *size, near_plane=0.01, far_plane=1e10, **flags))
+        reach = (2 * (255 * opacities).log()).clamp(min=0).sqrt().clamp(max=3.4)[:, None]
+        reach = reach * splats.covars2d[:, [0, 2]].sqrt()
+        low = (splats.means2d - reach).clamp(min=0)
+        high = torch.minimum(splats.means2d + reach, torch.tensor(size))
+        areas = (high - low).clamp(min=0).prod(dim=1) * ((splats.depths >= 0.01) & (opacities >= 1 / 255))
+        assert counted["fragments"] == pytest.approx(float(areas.double().sum()), rel=1e-3)
+        assert counted["bound"] >= counted["fragments"]
+        assert (counted["fragments"] > 256 * counted["most"]) == (file == files[-1])
 
 
 @needs_node

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from chromium import CHROMIUM, bench_page, browser, needs_chromium, needs_packages
 from numpy.typing import NDArray
-from packed_scenes import KINDS, write_kind
+from packed_scenes import KINDS, write_bomb, write_kind
 
 from sundae_ns.api.page import page_of, write_page
 from sundae_ns.api.saving import packed_file
@@ -50,9 +50,11 @@ setInterval(() => { dot.style.background = (odd ^= 1) ? 'red' : 'blue'; }, 30);
 
 
 @contextmanager
-def opened(address: str, *, state: str = "ready", flags: Any = browser.WEBGPU) -> Iterator[Any]:
+def opened(
+    address: str, *, state: str = "ready", flags: Any = browser.WEBGPU, size: tuple[int, int] = SIZE
+) -> Iterator[Any]:
     """The page of an address, once it has a state."""
-    with browser.Browser(CHROMIUM, *SIZE, flags) as page:
+    with browser.Browser(CHROMIUM, *size, flags) as page:
         page.open(address)
         found = "window.sundae && window.sundae.state !== 'loading'"
         browser.wait_for(lambda: bool(page.evaluate(found)), "the page", SECONDS)
@@ -222,6 +224,21 @@ def test_a_hostile_file_ends_in_a_message(tmp_path: Path) -> None:
     with opened((tmp_path / "a.html").as_uri(), state="failed") as found:
         assert "checksum" in found.evaluate("document.getElementById('message').innerText")
         assert found.evaluate("!document.getElementById('poster').hidden")
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("drawn", ["webgpu", "webgl"])
+def test_a_view_of_too_many_primitives_is_not_drawn(drawn: str, tmp_path: Path) -> None:
+    packed = write_bomb(tmp_path / "a.sundae")
+    write_page(tmp_path / "a.html", *packed_file(packed), title="a")
+    flags = browser.WEBGPU if drawn == "webgpu" else ["--disable-features=WebGPU"]
+    with opened((tmp_path / "a.html").as_uri(), flags=flags, size=(640, 480)) as page:
+        assert page.evaluate("sundae.drawn") == drawn
+        said = "document.getElementById('message').innerText"
+        assert "20,000 primitives cover each of its pixels" in page.evaluate(said)
+        assert image(page, 1, True).min() == 1
+        page.evaluate("document.getElementById('after').click()")
+        browser.wait_for(lambda: "primitives cover" not in page.evaluate(said), "another message", SECONDS)
 
 
 @pytest.mark.browser

@@ -103,6 +103,29 @@ def write_kind(path: Path, kind: Kind) -> Path:
     return path
 
 
+def write_bomb(path: Path, count: int = 20_000) -> Path:
+    """Write a small file of faint primitives, each of which covers the whole image of the first of two cameras.
+
+    The second camera looks the other way.
+    """
+    one = torch.ones(count, 1)
+    field = {
+        "means": 0.01 * torch.rand(count, 3),
+        "quats": one * torch.tensor([1.0, 0.0, 0.0, 0.0]),
+        "scales": one * torch.full((3,), 3.0),
+        "opacities": -4.5 * one,
+        "features_dc": one * torch.zeros(3),
+        "features_rest": torch.zeros(count, 3, 3),
+    }
+    poses = torch.stack([torch.eye(4)[:3], torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))[:3]])
+    poses[:, 2, 3] = 2.0
+    lens = torch.tensor([300.0, 300.0, 160.0, 120.0]).double().repeat(2, 1)
+    cameras = {"poses": poses, "intrinsics": lens, "sizes": torch.tensor([[320, 240]]).repeat(2, 1)}
+    model = {"sh_degree": 1, "rasterize_mode": "classic", "background_color": "white", "head": None}
+    write_scene(path, PackedScene(field, {}, cameras, {"model": model}))
+    return path
+
+
 def _sensitivity(field: Mapping[str, Tensor], head: Mapping[str, Tensor]) -> Sensitivity:
     """Random positive definite forms, and weights that differ by some powers of ten."""
     roots = {name: torch.randn(2 * [field[name][0].numel()]).double() for name in ("features_rest", "features")}

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from sundae_ns.rasterization.cpu.lanes import WIDTH
 from sundae_ns.rasterization.cpu.parallel import as_array, compiled, parallel_for
+from sundae_ns.rasterization.limits import check_pairs
 from sundae_ns.rasterization.projection import Projection
 from sundae_ns.rasterization.tiles import BIN, MIN_ALPHA, ROUNDING, TILE
 
@@ -26,6 +27,7 @@ U, V, HALF_XX, XY, HALF_YY, OPACITY, LIMIT, HALF_WIDTH, HALF_HEIGHT = range(9)
 STEP = WIDTH // TILE
 """Rows of pixels of a tile that are blended in one step."""
 
+_PAIR_BYTES = 10
 _MIN_PER_THREAD = 2_500  # primitives: below 0.1 ms of work, waking a thread costs more than it saves
 _DIGIT_BITS = 11  # bits per pass of the radix sort
 
@@ -54,8 +56,13 @@ class Lists:
 
 @torch.no_grad()
 def build_lists(projection: Projection, opacities: Tensor, width: int, height: int) -> Lists:
-    """List the primitives of each tile; ``opacities`` ``[N]`` are those to blend."""
+    """List the primitives of each tile; ``opacities`` ``[N]`` are those to blend.
+
+    Raises:
+        MemoryExhaustedError: the lists would be too long.
+    """
     columns, rows = -(-width // TILE), -(-height // TILE)
+    training = projection.means2d.requires_grad
     depths, radii, opacity = (as_array(value) for value in (projection.depths, projection.radii, opacities))
     # The bits of positive floats have the order of the floats.
     keys = depths.view(np.uint32 if depths.dtype == np.float32 else np.uint64)
@@ -67,10 +74,13 @@ def build_lists(projection: Projection, opacities: Tensor, width: int, height: i
     measured = (ids, splats, (columns, rows), table, boxes, first_intervals)
     parallel_for(_measure, count, *measured, min_per_thread=_MIN_PER_THREAD)
     np.cumsum(first_intervals, out=first_intervals)
+    # A primitive touches at least one tile in each of its columns.
+    check_pairs(int(first_intervals[-1]), count, columns * rows, _PAIR_BYTES, training=training)
     intervals = np.empty((first_intervals[-1], 2), np.int32)
     found = (table, boxes, first_intervals, intervals, first_slots)
     parallel_for(_find_intervals, count, *found, min_per_thread=_MIN_PER_THREAD)
     np.cumsum(first_slots, out=first_slots)
+    check_pairs(int(first_slots[-1]), count, columns * rows, _PAIR_BYTES, training=training)
     starts, ranks, slots, spans = _sort_by_tile(boxes, first_intervals, intervals, first_slots, columns, rows)
     lengths = np.diff(starts)
     longest_first = np.argsort(-lengths, kind="stable").astype(np.int32)[: np.count_nonzero(lengths)]

@@ -58,7 +58,7 @@ export class Renderer implements Drawer {
   private readonly queries: GPUQuerySet | null;
   private frame: Frame | null = null;
   private frameKey = "";
-  private times: Times = { splat: Number.NaN, head: Number.NaN, withoutHead: false };
+  private times: Times = { splat: Number.NaN, head: Number.NaN, withoutHead: false, crowded: 0 };
 
   constructor(
     gpu: Gpu,
@@ -105,7 +105,12 @@ export class Renderer implements Drawer {
   /** Draws a view, and again if its lists of tiles did not fit. */
   private async whole(view: View, head: boolean, shown: boolean): Promise<Times> {
     const wanted = await this.draw(view, head, shown);
-    if (this.splatter.grow(wanted)) await this.draw(view, head, shown);
+    const { base, seen } = this.frame!;
+    [base, seen ?? base].forEach((target, i) => {
+      const [across, down] = target.tiles;
+      if (wanted[i]! > this.splatter.most(target)) this.times.crowded = wanted[i]! / across / down;
+    });
+    if (!this.times.crowded && this.splatter.grow(Math.max(...wanted))) await this.draw(view, head, shown);
     return this.times;
   }
 
@@ -126,14 +131,14 @@ export class Renderer implements Drawer {
     return out;
   }
 
-  /** Draws one frame; returns how many pairs of tiles and primitives it wanted. */
-  private async draw(view: View, head: boolean, shown: boolean): Promise<number> {
+  /** Draws one frame; returns how many pairs of tiles and primitives the image and what the head sees wanted. */
+  private async draw(view: View, head: boolean, shown: boolean): Promise<number[]> {
     const { device } = this;
     const plan = scalePlan(view, this.scene.trainedFocal);
     const seen = zoomed(view, plan.zoom);
     const asked = head && this.network !== null && plan.weight > 0;
     const corrected = asked && this.network!.fits(seen.width, seen.height) && this.limit(seen.width, seen.height) === 1;
-    this.times = { splat: Number.NaN, head: Number.NaN, withoutHead: asked && !corrected };
+    this.times = { splat: Number.NaN, head: Number.NaN, withoutHead: asked && !corrected, crowded: 0 };
     const frame = this.frameFor(view, corrected ? seen : null);
     const data = new ArrayBuffer(32);
     const correction = frame.seen ?? frame.base;
@@ -190,7 +195,7 @@ export class Renderer implements Drawer {
     pass.end();
   }
 
-  private async finish(encoder: GPUCommandEncoder, corrected: boolean): Promise<number> {
+  private async finish(encoder: GPUCommandEncoder, corrected: boolean): Promise<number[]> {
     const usage = GPUBufferUsage.COPY_DST | GPUBufferUsage.MAP_READ;
     const copy = this.device.createBuffer({ size: this.results.size, usage });
     if (this.queries) encoder.resolveQuerySet(this.queries, 0, corrected ? 4 : 2, this.results, 0);
@@ -203,9 +208,8 @@ export class Renderer implements Drawer {
       const between = (first: number) => Number(stamps[first + 1]! - stamps[first]!) / NANOSECONDS;
       this.times = { ...this.times, splat: between(0), head: corrected ? between(2) : 0 };
     }
-    const wanted = new Uint32Array(data, 256, 2);
-    const most = Math.max(wanted[0]!, wanted[1]!);
+    const wanted = [...new Uint32Array(data, 256, 2)];
     copy.destroy();
-    return most;
+    return wanted;
   }
 }

@@ -1,6 +1,7 @@
 // From the primitives to an image of colours, accumulation and features.
 
 import { coefficientsOf, featuresOf, geometryOf } from "../arrays";
+import { mostPairs } from "../limits";
 import type { Scene } from "../scene/scene";
 import type { View } from "../view";
 import blendCode from "./blend.wgsl";
@@ -236,7 +237,8 @@ export class Splatter {
     const { count } = scene.field;
     const data = new ArrayBuffer(112);
     new Float32Array(data).set([...view.worldToCamera, ...view.center, 0, view.fx, view.fy, view.cx, view.cy]);
-    const whole = [view.width, view.height, ...target.tiles, count, Number(scene.antialiased), pairs.capacity];
+    const sizes = [view.width, view.height, ...target.tiles, count, Number(scene.antialiased)];
+    const whole = [...sizes, pairs.capacity, this.most(target)];
     new Uint32Array(data, 80).set(whole);
     device.queue.writeBuffer(target.view, 0, data);
     encoder.clearBuffer(target.ranges);
@@ -250,7 +252,8 @@ export class Splatter {
     const blocks = grid(blocksOf(count, THREADS));
     new Step(device, kernels.measure, ranked).run(pass, ...blocks);
     new Step(device, kernels.place, { 0: target.view, 3: blockSums, 4: pairs.count, 5: pairs.sizes }).run(pass, 1);
-    new Step(device, kernels.emit, { ...ranked, 6: pairs.tiles[0], 7: pairs.ids[0] }).run(pass, ...blocks);
+    const listed = { ...ranked, 4: pairs.count, 6: pairs.tiles[0], 7: pairs.ids[0] };
+    new Step(device, kernels.emit, listed).run(pass, ...blocks);
     pairs.sorter.encode(pass, pairs.sizes);
     const ranges = new Step(device, kernels.findRanges, { 4: pairs.count, 6: pairs.tiles[0] }, { 0: target.ranges });
     ranges.runAs(pass, pairs.sizes, 12);
@@ -258,6 +261,11 @@ export class Splatter {
     const blended = { 0: target.view, 1: splats, 2: colors, 3: this.features, ...lists };
     new Step(device, this.blend(target.groups - 1), blended).run(pass, ...target.tiles);
     pass.end();
+  }
+
+  /** Most pairs of a view that is drawn into a target. */
+  most({ tiles }: Target): number {
+    return mostPairs(tiles[0] * tiles[1], this.scene.field.count);
   }
 
   /** Copies the number of pairs that the last view wanted into a buffer. */

@@ -3,7 +3,7 @@
 
 struct Pairs {
   count: u32,
-  // Pairs that the view needs, which may be more than the buffers hold.
+  // Pairs that the view needs, which may be more than the buffers hold; the largest number stands for any larger one.
   wanted: u32,
 }
 
@@ -38,7 +38,8 @@ fn measure(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups:
   let block = group.x + group.y * groups.x;
   let total = sums_before(thread, num_tiles(block * THREADS + thread)).y;
   if (thread == 0u && block * THREADS < view.count) {
-    block_sums[block] = total;
+    // One less than a block can have, so that sums of 256 blocks do not overflow.
+    block_sums[block] = min(total, 0xffffffu);
   }
 }
 
@@ -56,12 +57,13 @@ fn place(@builtin(local_invocation_index) thread: u32) {
     if (start + thread < count) {
       block_sums[start + thread] = total + before.x;
     }
-    total += before.y;
+    total = select(total + before.y, 0xffffffffu, total + before.y < total);
     workgroupBarrier();
   }
   if (thread == 0u) {
     pairs.wanted = total;
-    pairs.count = min(total, view.capacity);
+    // Of a view with too many nothing is drawn.
+    pairs.count = select(min(total, view.capacity), 0u, total > view.most);
     blocks[0] = (pairs.count + SORT_BLOCK - 1u) / SORT_BLOCK;
     blocks[1] = 1u;
     blocks[2] = 1u;
@@ -79,7 +81,7 @@ fn emit(@builtin(workgroup_id) group: vec3u, @builtin(num_workgroups) groups: ve
   let rank = block * THREADS + thread;
   let count = num_tiles(rank);
   let before = sums_before(thread, count).x;
-  if (count == 0u) {
+  if (count == 0u || pairs.count == 0u) {
     return;
   }
   var slot = block_sums[block] + before;

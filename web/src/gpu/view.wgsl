@@ -14,6 +14,8 @@ struct View {
   antialiased: u32,
   // Number of pairs of a tile and a primitive that the buffers hold.
   capacity: u32,
+  // Most pairs of a view that is drawn.
+  most: u32,
 }
 
 // A primitive on the screen; its rectangle of tiles is [low, high), x in the low half of a number.

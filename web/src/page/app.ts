@@ -92,13 +92,17 @@ export async function start(program: string): Promise<void> {
   try {
     const scene = await decode(await sceneFile(), program);
     const drawer = await openDrawer(scene, page.canvas, handle, say);
-    await show(drawer, scene, page, handle);
+    await show(drawer, scene, page, handle, say);
     handle.state = "ready";
   } catch (error) {
     say(error instanceof PackError ? error.message : `The page failed (${error}).`);
     handle.state = "failed";
   }
 }
+
+const tooMany = (crowded: number): string =>
+  `This view is not drawn: ${Math.round(crowded).toLocaleString("en")} primitives cover each of its pixels, ` +
+  "more than in any real scene.";
 
 /** WebGPU with the head, or base colours by WebGL2. */
 async function openDrawer(
@@ -121,7 +125,13 @@ async function openDrawer(
   return painter;
 }
 
-async function show(renderer: Drawer, scene: Scene, page: ReturnType<typeof controls>, handle: Handle): Promise<void> {
+async function show(
+  renderer: Drawer,
+  scene: Scene,
+  page: ReturnType<typeof controls>,
+  handle: Handle,
+  say: (text: string) => void,
+): Promise<void> {
   let dirty = true;
   const mark = (): void => {
     dirty = true;
@@ -160,10 +170,12 @@ async function show(renderer: Drawer, scene: Scene, page: ReturnType<typeof cont
     last = ended;
     if (moments.length > FRAMES) moments.shift();
     const fps = (1000 * moments.length) / moments.reduce((sum, value) => sum + value, 0);
-    const { splat, head, withoutHead } = handle.times;
+    const { splat, head, withoutHead, crowded } = handle.times;
     const passes = Number.isNaN(splat) ? "" : ` · splat ${splat.toFixed(1)} ms · head ${head.toFixed(1)} ms`;
     const reason = withoutHead ? " · the view is too large for the head on this GPU" : "";
     page.stats.textContent = `${fps.toFixed(fps < 10 ? 1 : 0)} fps${passes}${reason}`;
+    page.message.textContent = crowded ? tooMany(crowded) : handle.message;
+    page.message.hidden = !page.message.textContent;
     page.scaleValue.textContent = `${page.scale.value}%`;
     handle.frames += 1;
     page.stop.textContent = navigation.stop === null ? "free" : `${navigation.stop + 1} of ${stops.length}`;
@@ -194,10 +206,7 @@ async function show(renderer: Drawer, scene: Scene, page: ReturnType<typeof cont
       return;
     }
     dirty = false;
-    busy = busy.then(draw).catch((error) => {
-      page.message.textContent = `The page failed (${error}).`;
-      page.message.hidden = false;
-    });
+    busy = busy.then(draw).catch((error) => say(`The page failed (${error}).`));
     busy.then(() => requestAnimationFrame(loop));
   };
   requestAnimationFrame(loop);

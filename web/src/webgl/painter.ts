@@ -2,13 +2,17 @@
 
 import { coefficientsOf, geometryOf } from "../arrays";
 import type { Drawer, Times } from "../drawer";
+import { mostPairs } from "../limits";
 import { PackError } from "../scene/container";
 import type { Scene } from "../scene/scene";
 import type { View } from "../view";
+import { boundOf, extentsOf, fragmentsOf } from "./overdraw";
 import fragmentCode from "./splats.frag";
 import vertexCode from "./splats.vert";
 
 const LONGEST = 4096;
+/** Side of the tiles for which limits are stated, pixels. */
+const TILE = 16;
 /** Texels in a row of a table. */
 const ROW = 2048;
 /** Buckets of the sort by depth. */
@@ -28,6 +32,8 @@ class Painter implements Drawer {
   private readonly ids: WebGLBuffer;
   private readonly order: Uint32Array<ArrayBuffer>;
   private readonly keys: Uint32Array;
+  private readonly geometry: Float32Array;
+  private readonly extents: Float32Array;
 
   constructor(
     private readonly gl: WebGL2RenderingContext,
@@ -54,7 +60,9 @@ class Painter implements Drawer {
       throw new PackError("This browser has no WebGPU, and its WebGL cannot draw the scene.");
     }
     gl.useProgram(this.program);
-    this.table(0, "geometry", geometryOf(scene));
+    this.geometry = geometryOf(scene);
+    this.extents = extentsOf(this.geometry);
+    this.table(0, "geometry", this.geometry);
     this.table(1, "coefficients", coefficientsOf({ ...scene, degree, field: lowered(scene, degree) }));
     gl.uniform1i(this.place("antialiased"), Number(scene.antialiased));
 
@@ -129,10 +137,12 @@ class Painter implements Drawer {
     return visible;
   }
 
-  private draw(view: View): void {
+  /** Draws a view, or only its background; returns the mean number of primitives over a pixel if they are too many. */
+  private draw(view: View): number {
     const { gl } = this;
     const m = view.worldToCamera;
-    const visible = this.sort(m);
+    const crowded = this.crowded(view);
+    const visible = crowded ? 0 : this.sort(m);
     gl.bufferData(gl.ARRAY_BUFFER, this.order.subarray(0, visible), gl.STREAM_DRAW);
     gl.viewport(0, 0, view.width, view.height);
     gl.uniformMatrix4fv(this.place("view"), true, [...m, 0, 0, 0, 1]);
@@ -141,11 +151,19 @@ class Painter implements Drawer {
     gl.uniform2f(this.place("size"), view.width, view.height);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, visible);
+    return crowded;
+  }
+
+  private crowded(view: View): number {
+    const pixels = view.width * view.height;
+    const most = TILE ** 2 * mostPairs(pixels / TILE ** 2, this.extents.length);
+    if (boundOf(this.geometry, this.extents, view) <= most) return 0;
+    const fragments = fragmentsOf(this.geometry, view);
+    return fragments <= most ? 0 : fragments / pixels;
   }
 
   async render(view: View): Promise<Times> {
-    this.draw(view);
-    return { splat: Number.NaN, head: Number.NaN, withoutHead: false };
+    return { splat: Number.NaN, head: Number.NaN, withoutHead: false, crowded: this.draw(view) };
   }
 
   async image(view: View): Promise<Uint8ClampedArray<ArrayBuffer>> {
