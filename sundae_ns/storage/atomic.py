@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
+from glob import escape
 from pathlib import Path
 
 from sundae_ns.errors import writing
+
+PARTIAL = ".partial"
+"""Suffix of files that are not complete yet."""
 
 
 @contextmanager
@@ -19,14 +23,16 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
 
     Args:
         path: the file to write; its folder must exist.
-        partial: temporary file in the same folder; by default named after this process.
+        partial: temporary file in the same folder. By default named after this process, and such files of killed
+            processes are removed.
 
     Raises:
         StorageError: the disk is full or not writable.
     """
-    partial = partial or path.with_name(f"{path.name}.{os.getpid()}.partial")
+    owned = partial is None
+    partial = partial or path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
     try:
-        with writing(f"cannot write {path}"):
+        with writing(f"cannot write {path}"), _reserved(path, partial) if owned else nullcontext():
             yield partial
             _flush(partial)
             partial.replace(path)
@@ -34,6 +40,26 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             partial.unlink()
+
+
+@contextmanager
+def _reserved(path: Path, partial: Path) -> Iterator[None]:
+    """Hold a lock on the partial file, and remove those of killed processes: the system drops a lock with its process.
+
+    Where the file system has no locks, none is removed.
+    """
+    import fcntl
+
+    for other in path.parent.glob(f"{escape(path.name)}.*{PARTIAL}"):
+        if not other.name[len(path.name) + 1 : -len(PARTIAL)].isdigit():  # of a file with a longer name
+            continue
+        with suppress(OSError), other.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            other.unlink()
+    with partial.open("wb") as file:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
 
 
 def write_text(path: Path, text: str) -> None:
