@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -46,7 +46,7 @@ def colors_of(labels: Sequence[str]) -> dict[str, str]:
     return {label: PALETTE[i % MOST_SERIES] for i, label in enumerate(labels)}
 
 
-def plot_quality(path: Path, runs: Sequence[Measured], cost: Cost, colors: Mapping[str, str]) -> bool:
+def plot_quality(file: Path | BinaryIO, runs: Sequence[Measured], cost: Cost, colors: Mapping[str, str]) -> bool:
     """PSNR and SSIM of the runs of a scene against a cost; a line connects a field with its head and without.
 
     Runs without this cost are left out. Returns whether there was a point to plot; otherwise no file is written.
@@ -73,11 +73,11 @@ def plot_quality(path: Path, runs: Sequence[Measured], cost: Cost, colors: Mappi
     if any(run.has_head for run in runs):
         for text, face in (("filled: with the head", _GRAY), ("open: without the head", "white")):
             handles.append(_key(text, color=_GRAY, marker="o", markerfacecolor=face, linestyle="none"))
-    _save(figure, path, handles, f"{runs[0].scene}: means over the test views")
+    _save(figure, file, handles, f"{runs[0].scene}: means over the test views")
     return True
 
 
-def plot_views(path: Path, runs: Sequence[Measured], colors: Mapping[str, str]) -> None:
+def plot_views(file: Path | BinaryIO, runs: Sequence[Measured], colors: Mapping[str, str]) -> None:
     """PSNR of every test view of at most :data:`MOST_SERIES` runs of a scene; dashed lines are without the head."""
     count = max(len(run.full.views) for run in runs)
     figure, panels = _figure(1, 1, width=min(7 + 0.12 * count, 16), height=3.8)
@@ -93,10 +93,10 @@ def plot_views(path: Path, runs: Sequence[Measured], colors: Mapping[str, str]) 
     handles = [_key(run.label, color=colors[run.label], marker="o", markersize=4) for run in runs]
     if any(run.has_head for run in runs):
         handles.append(_key("same field, head off", color=_GRAY, linestyle="--"))
-    _save(figure, path, handles, f"{runs[0].scene}: PSNR of each test view")
+    _save(figure, file, handles, f"{runs[0].scene}: PSNR of each test view")
 
 
-def plot_curves(path: Path, curves: Mapping[str, Curves], colors: Mapping[str, str], *, title: str) -> None:
+def plot_curves(file: Path | BinaryIO, curves: Mapping[str, Curves], colors: Mapping[str, str], *, title: str) -> None:
     """Loss, number of primitives, PSNR of training views, and peak memory over training, by label.
 
     There are at least one and at most :data:`MOST_SERIES` runs in ``curves``.
@@ -140,7 +140,7 @@ def plot_curves(path: Path, curves: Mapping[str, Curves], colors: Mapping[str, s
     handles = [_key(label, color=colors[label]) for label in curves]
     if without_head:
         handles.append(_key("PSNR without the head", color=_GRAY, linestyle="--"))
-    _save(figure, path, handles, f"{title} (loss and PSNR are running medians; each step has another view)")
+    _save(figure, file, handles, f"{title} (loss and PSNR are running medians; each step has another view)")
 
 
 def _figure(rows: int, columns: int, *, width: float, height: float) -> tuple[Figure, np.ndarray]:
@@ -157,11 +157,11 @@ def _key(label: str, **look: Any) -> Line2D:
     return Line2D([], [], label=label, **look)
 
 
-def _save(figure: Figure, path: Path, keys: Sequence[Line2D], title: str) -> None:
+def _save(figure: Figure, file: Path | BinaryIO, keys: Sequence[Line2D], title: str) -> None:
     # The legend is below the panels, where it hides no data.
     figure.legend(handles=keys, loc="outside lower center", ncols=min(len(keys), 3), fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=11)
-    figure.savefig(path)
+    figure.savefig(file)
 
 
 def _number(value: float, _: object = None) -> str:

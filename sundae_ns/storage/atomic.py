@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from glob import escape
 from pathlib import Path
 
@@ -64,8 +64,14 @@ def _reserved(path: Path, partial: Path) -> Iterator[None]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a small text file atomically; ``StorageError`` if the disk is full or not writable."""
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_files({path: text.encode()})
+
+
+def write_files(contents: Mapping[Path, bytes]) -> None:
+    """Write files that belong together: all, or none if the disk is full or not writable, a ``StorageError``."""
+    with ExitStack() as stack:
+        for partial, content in [(stack.enter_context(replacing(path)), one) for path, one in contents.items()]:
+            partial.write_bytes(content)
 
 
 def _flush(path: Path) -> None:

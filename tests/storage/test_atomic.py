@@ -19,6 +19,7 @@ import torch
 from sundae_ns.errors import DataError, PackError, StorageError, reading, regular, writing
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import replacing, write_ply, write_text
+from sundae_ns.storage.atomic import write_files
 
 
 @contextmanager
@@ -63,6 +64,16 @@ def test_a_file_is_flushed_before_it_is_renamed(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Path, "replace", lambda path, to: (order.append("rename"), replace(path, to))[1])
     write_text(tmp_path / "a.txt", "new")
     assert order == ["sync", "rename", "sync"]
+
+
+def test_files_that_belong_together_are_written_all_or_none(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+    with small_disk(10_000), pytest.raises(StorageError, match="cannot write .*b.txt"):
+        write_files({tmp_path / "a.txt": b"new", tmp_path / "b.txt": b"x" * 10_001})
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+    write_files({tmp_path / "a.txt": b"new", tmp_path / "b.txt": b"x"})
+    assert [(tmp_path / name).read_text() for name in ("a.txt", "b.txt")] == ["new", "x"]
 
 
 def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_path: Path) -> None:
