@@ -76,9 +76,18 @@ def _of_run(path: Path) -> Scene:
     if config is None:
         reason = "is no run" if path.exists() else "does not exist"
         raise CheckpointError(f"{path} {reason}; give a run, its config.yml, or a .sundae, .ply, .spz or .sog file")
+    if path.suffix == ".ckpt":
+        return scene_of_checkpoint(path, checkpoint.read(path), config)
+    return scene_of_checkpoint(*checkpoint.read_newest(config.parent), config)
+
+
+def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -> Scene:
+    """The scene of a checkpoint ``source`` with the contents ``loaded``, in a run with a ``config.yml``; on the CPU.
+
+    Raises:
+        CheckpointError: the run is of another method, or its parts do not fit together.
+    """
     options = model_options(config)
-    source = path if path.suffix == ".ckpt" else checkpoint.newest_whole(config.parent)[0]
-    loaded = checkpoint.read(source)
     field, state = checkpoint.field_of(loaded, source), checkpoint.model_state(loaded)
     extra = state.get(checkpoint.EXTRA_STATE)
     extra = extra if isinstance(extra, Mapping) else {}

@@ -9,7 +9,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from io import BytesIO, StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -78,7 +78,7 @@ def report(
         from sundae_ns.evaluation.metrics import INSTALL_FLIP
         from sundae_ns.scenes.measure import measure_scene
         from sundae_ns.scenes.opening import open_scene
-        from sundae_ns.storage.atomic import write_text
+        from sundae_ns.storage.atomic import write_files
 
     words = ["sundae", "report", *map(str, runs), "-o", str(out), "--lpips-net", lpips_net]
     words += ["--warmup", str(warmup), "--repeats", str(repeats), *(["--data", str(data)] if data else [])]
@@ -90,6 +90,7 @@ def report(
     if lpips is None:
         notes.append(f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them.")
     done: list[Measured] = []
+    files: dict[str, bytes] = {}
     curves: dict[str, Curves] = {}
     counts: dict[str, CountCurve] = {}
     comparisons: dict[str, list[tuple[str, str]]] = {}
@@ -123,10 +124,11 @@ def report(
                 failures.append(error)
                 notes.append(f"{path}: {error}")
             else:
-                name = f"errors-{number}.{'png' if opened.truths[0].shape[1] <= PNG_WIDTH else 'jpg'}"
                 with writing(f"cannot write to {out}"):
                     out.mkdir(parents=True, exist_ok=True)
-                    _save_errors(out / name, opened, measured)
+                kind = "png" if opened.truths[0].shape[1] <= PNG_WIDTH else "jpeg"
+                name = f"errors-{number}.{kind.replace('jpeg', 'jpg')}"
+                files[name] = _errors(opened, measured, kind)
                 title = f"{label}: worst and median test view by PSNR"
                 comparisons.setdefault(measured.scene, []).append((title, name))
                 found = read_curves(opened.source) if opened.packed_bytes is None else None
@@ -151,17 +153,19 @@ def report(
             raise failures[0]
         progress.add_task("Plotting", total=None)
         scenes = {scene: [run for run in done if run.scene == scene] for scene in dict.fromkeys(r.scene for r in done)}
-        with writing(f"cannot write to {out}"):
-            plots = _plot(out, scenes, curves, counts)
+        plots, figures = _plot(scenes, curves, counts)
         notes += [
             f"Comparison within {scene}: its runs have different test views, so their numbers do not compare."
             for scene, own in scenes.items()
             if len({(run.resolution, len(run.full.views)) for run in own}) > 1
         ]
     images = {scene: [*plots[scene], *comparisons[scene]] for scene in scenes}
-    write_text(out / "report.json", json.dumps([run.as_json() for run in done], indent=1) + "\n")
-    write_text(out / "report.csv", csv_text([run.as_json() for run in done]))
-    write_text(out / "report.md", document(scenes, images, notes, command))
+    rows = [run.as_json() for run in done]
+    files |= figures
+    files["report.json"] = (json.dumps(rows, indent=1) + "\n").encode()
+    files["report.csv"] = csv_text(rows).encode()
+    files["report.md"] = document(scenes, images, notes, command).encode()
+    write_files({out / name: content for name, content in files.items()})
     for note in notes:
         console.print(f"[yellow]Left out: {escape(note)}", highlight=False)
     if video is not None:
@@ -182,11 +186,10 @@ def _label(opened: Opened, taken: Collection[str]) -> str:
     return label
 
 
-def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
-    """Write a comparison image of the views with the lowest and the median PSNR."""
+def _errors(opened: Opened, measured: Measured, kind: str) -> bytes:
+    """A comparison image of the views with the lowest and the median PSNR, as ``png`` or ``jpeg``."""
     from sundae_ns.evaluation import comparison_sheet
     from sundae_ns.scenes.measure import comparison_of
-    from sundae_ns.storage.atomic import write_image
 
     values = [view.psnr for view in measured.full.views]
     order = sorted(range(len(values)), key=values.__getitem__)
@@ -195,7 +198,9 @@ def _save_errors(path: Path, opened: Opened, measured: Measured) -> None:
         comparison_of(opened.model, opened.cameras[index], opened.truths[index], f"{name}: test view {index}")
         for name, index in chosen.items()
     ]
-    write_image(path, comparison_sheet(rows))
+    file = BytesIO()
+    comparison_sheet(rows).save(file, kind)
+    return file.getvalue()
 
 
 def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> None:
@@ -218,43 +223,37 @@ def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> N
 
 
 def _plot(
-    out: Path,
-    scenes: Mapping[str, list[Measured]],
-    curves: Mapping[str, Curves],
-    counts: Mapping[str, CountCurve],
-) -> dict[str, list[tuple[str, str]]]:
-    """Write all plots; returns (title, file name) by scene."""
+    scenes: Mapping[str, list[Measured]], curves: Mapping[str, Curves], counts: Mapping[str, CountCurve]
+) -> tuple[dict[str, list[tuple[str, str]]], dict[str, bytes]]:
+    """Draw all plots; returns (title, file name) by scene, and contents by file name."""
     from sundae_ns.evaluation.plots import MOST_SERIES, colors_of, plot_counts, plot_curves, plot_quality, plot_views
-    from sundae_ns.storage.atomic import write_bytes
 
-    def drawn(name: str, plot: Callable[..., object], *about: object, **options: object) -> bool:
-        buffer = BytesIO()
-        plot(buffer, *about, **options)
-        if buffer.tell():
-            write_bytes(out / f"{name}.png", buffer.getvalue())
-        return buffer.tell() > 0
-
-    written: dict[str, list[tuple[str, str]]] = {}
+    titles: dict[str, list[tuple[str, str]]] = {}
+    files: dict[str, bytes] = {}
     for number, (scene, runs) in enumerate(scenes.items(), start=1):
         end = "" if len(scenes) == 1 else f"-{number}"
         colors = colors_of([run.label for run in runs])
-        plots = written.setdefault(scene, [])
+        plots = titles.setdefault(scene, [])
+
+        def drawn(plot: Callable[..., bool | None], title: str, name: str, /, *arguments: Any, **options: Any) -> None:
+            file = BytesIO()
+            if plot(file, *arguments, **options) is not False:
+                files[name] = file.getvalue()
+                plots.append((title, name))  # noqa: B023
+
         for cost, cost_name in COSTS.items():
-            if drawn(f"quality-{cost}{end}", plot_quality, runs, cost, colors):
-                plots.append((f"Quality against {cost_name}", f"quality-{cost}{end}.png"))
+            drawn(plot_quality, f"Quality against {cost_name}", f"quality-{cost}{end}.png", runs, cost, colors)
         # One figure for every few runs, so that colours tell their lines apart.
         for first in range(0, len(runs), MOST_SERIES):
             group = runs[first : first + MOST_SERIES]
             names = f"{end}-from-{first + 1}" if first else end
-            drawn(f"views{names}", plot_views, group, colors)
-            plots.append(("PSNR of each test view", f"views{names}.png"))
+            drawn(plot_views, "PSNR of each test view", f"views{names}.png", group, colors)
             known = {run.label: curves[run.label] for run in group if run.label in curves}
             for place, run in enumerate(group, start=first + 1):
                 if run.label in counts:
-                    name = f"counts{end}-{place}"
-                    drawn(name, plot_counts, counts[run.label], title=f"{run.label}: trials on held-out training views")
-                    plots.append(("Expected quality against the number of primitives", f"{name}.png"))
+                    title, name = "Expected quality against the number of primitives", f"counts{end}-{place}.png"
+                    about = f"{run.label}: trials on held-out training views"
+                    drawn(plot_counts, title, name, counts[run.label], title=about)
             if known:
-                drawn(f"curves{names}", plot_curves, known, colors, title=f"{scene}: training")
-                plots.append(("Training curves", f"curves{names}.png"))
-    return written
+                drawn(plot_curves, "Training curves", f"curves{names}.png", known, colors, title=f"{scene}: training")
+    return titles, files

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -47,7 +47,7 @@ def colors_of(labels: Sequence[str]) -> dict[str, str]:
     return {label: PALETTE[i % MOST_SERIES] for i, label in enumerate(labels)}
 
 
-def plot_quality(file: Path | IO[bytes], runs: Sequence[Measured], cost: Cost, colors: Mapping[str, str]) -> bool:
+def plot_quality(file: Path | BinaryIO, runs: Sequence[Measured], cost: Cost, colors: Mapping[str, str]) -> bool:
     """PSNR and SSIM of the runs of a scene against a cost; a line connects a field with its head and without.
 
     Runs without this cost are left out. Returns whether there was a point to plot; otherwise no file is written.
@@ -78,7 +78,7 @@ def plot_quality(file: Path | IO[bytes], runs: Sequence[Measured], cost: Cost, c
     return True
 
 
-def plot_counts(file: Path | IO[bytes], curve: CountCurve, *, title: str) -> None:
+def plot_counts(file: Path | BinaryIO, curve: CountCurve, *, title: str) -> None:
     """Expected PSNR and SSIM against the number of primitives, with errors, and the number that was chosen."""
     figure, panels = _figure(1, 2, width=5.4, height=3.8)
     points = [point for point in curve.points if point.psnr_loss is not None and point.ssim_loss is not None]
@@ -98,7 +98,7 @@ def plot_counts(file: Path | IO[bytes], curve: CountCurve, *, title: str) -> Non
     _save(figure, file, keys, title)
 
 
-def plot_views(file: Path | IO[bytes], runs: Sequence[Measured], colors: Mapping[str, str]) -> None:
+def plot_views(file: Path | BinaryIO, runs: Sequence[Measured], colors: Mapping[str, str]) -> None:
     """PSNR of every test view of at most :data:`MOST_SERIES` runs of a scene; dashed lines are without the head."""
     count = max(len(run.full.views) for run in runs)
     figure, panels = _figure(1, 1, width=min(7 + 0.12 * count, 16), height=3.8)
@@ -117,7 +117,7 @@ def plot_views(file: Path | IO[bytes], runs: Sequence[Measured], colors: Mapping
     _save(figure, file, handles, f"{runs[0].scene}: PSNR of each test view")
 
 
-def plot_curves(file: Path | IO[bytes], curves: Mapping[str, Curves], colors: Mapping[str, str], *, title: str) -> None:
+def plot_curves(file: Path | BinaryIO, curves: Mapping[str, Curves], colors: Mapping[str, str], *, title: str) -> None:
     """Loss, number of primitives, PSNR of training views, and peak memory over training, by label.
 
     There are at least one and at most :data:`MOST_SERIES` runs in ``curves``.
@@ -178,7 +178,7 @@ def _key(label: str, **look: Any) -> Line2D:
     return Line2D([], [], label=label, **look)
 
 
-def _save(figure: Figure, file: Path | IO[bytes], keys: Sequence[Line2D], title: str) -> None:
+def _save(figure: Figure, file: Path | BinaryIO, keys: Sequence[Line2D], title: str) -> None:
     # The legend is below the panels, where it hides no data.
     figure.legend(handles=keys, loc="outside lower center", ncols=min(len(keys), 3), fontsize=8, frameon=False)
     figure.suptitle(title, fontsize=11)

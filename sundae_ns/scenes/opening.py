@@ -13,7 +13,7 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 from nerfstudio.engine.trainer import TrainerConfig
 from torch import Tensor
 
-from sundae_ns.api.opening import load
+from sundae_ns.api.opening import scene_of_checkpoint
 from sundae_ns.api.packing import scene_of
 from sundae_ns.datamanager import SundaeDatamanager, no_images_error
 from sundae_ns.errors import CheckpointError, DataError
@@ -170,7 +170,7 @@ def open_pipeline(
         raise no_images_error(path.parent)  # a capture given now would not be parsed as in training
     options = fingerprint(config)  # before a run of splatfacto becomes one of ours
     folder = path.parent / config.relative_model_dir
-    newest, _ = checkpoint.newest_whole(folder)
+    newest, loaded = checkpoint.read_newest(folder)
     foreign = not isinstance(model_config, SundaeModelConfig)
     if foreign:
         pipeline_config.model = stock.model_config(model_config)
@@ -179,9 +179,8 @@ def open_pipeline(
     pipeline_config.datamanager.data = capture
 
     pipeline: Any = pipeline_config.setup(device=_device(), test_mode=test_mode)
-    loaded = checkpoint.read(newest)
     if foreign:
-        put_scene(pipeline.model, load(newest))
+        put_scene(pipeline.model, scene_of_checkpoint(newest, loaded, path))
         pipeline.model.step = int(loaded["step"])
     else:
         pipeline.load_pipeline(loaded["pipeline"], loaded["step"])

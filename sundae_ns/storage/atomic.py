@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from glob import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,9 @@ from sundae_ns.errors import writing
 
 if TYPE_CHECKING:
     from PIL import Image
+
+PARTIAL = ".partial"
+"""Suffix of files that are not complete yet."""
 
 
 @contextmanager
@@ -24,14 +28,16 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
 
     Args:
         path: the file to write; its folder must exist.
-        partial: temporary file in the same folder; by default named after this process.
+        partial: temporary file in the same folder. By default named after this process, and such files of killed
+            processes are removed.
 
     Raises:
         StorageError: the disk is full or not writable.
     """
-    partial = partial or path.with_name(f"{path.name}.{os.getpid()}.partial")
+    owned = partial is None
+    partial = partial or path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
     try:
-        with writing(f"cannot write {path}"):
+        with writing(f"cannot write {path}"), _reserved(path, partial) if owned else nullcontext():
             yield partial
             flush(partial)
             partial.replace(path)
@@ -41,16 +47,41 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
             partial.unlink()
 
 
+@contextmanager
+def _reserved(path: Path, partial: Path) -> Iterator[None]:
+    """Hold a lock on the partial file, and remove those of killed processes: the system drops a lock with its process.
+
+    Where the file system has no locks, none is removed.
+    """
+    import fcntl
+
+    for other in path.parent.glob(f"{escape(path.name)}.*{PARTIAL}"):
+        if not other.name[len(path.name) + 1 : -len(PARTIAL)].isdigit():  # of a file with a longer name
+            continue
+        with suppress(OSError), other.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            other.unlink()
+    with partial.open("wb") as file:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a small text file atomically; ``StorageError`` if the disk is full or not writable."""
-    with replacing(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+    write_files({path: text.encode()})
+
+
+def write_files(contents: Mapping[Path, bytes]) -> None:
+    """Write files that belong together: all, or none if the disk is full or not writable, a ``StorageError``."""
+    with ExitStack() as stack:
+        for partial, content in [(stack.enter_context(replacing(path)), one) for path, one in contents.items()]:
+            partial.write_bytes(content)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically; ``StorageError`` if the disk is full or not writable."""
-    with replacing(path) as partial:
-        partial.write_bytes(content)
+    write_files({path: content})
 
 
 def write_image(path: Path, image: Image.Image) -> None:

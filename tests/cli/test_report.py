@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from sundae_ns.cli.report import _plot
 from sundae_ns.evaluation import HEAD_OFF, Configuration, Measured, ViewQuality
 from sundae_ns.evaluation.curves import Curve, Curves
@@ -28,20 +26,21 @@ def measured(label: str) -> Measured:
     )
 
 
-def test_plots_of_lines_have_at_most_six_runs(tmp_path: Path) -> None:
+def test_plots_of_lines_have_at_most_six_runs() -> None:
     runs = [measured(f"run {i}") for i in range(8)]
     curve = Curve((0, 1), (2.0, 1.0))
     curves = {run.label: Curves(loss=curve) for run in runs[6:]}
-    plots = _plot(tmp_path, {"garden": runs}, curves)
+    plots, files = _plot({"garden": runs}, curves)
     names = [name for _, name in plots["garden"]]
     # Nothing was timed.
     assert names[:2] == ["quality-size.png", "quality-primitives.png"]
     assert names[2:] == ["views.png", "views-from-7.png", "curves-from-7.png"]
-    assert {path.name for path in tmp_path.iterdir()} == set(names)
+    assert set(files) == set(names)
+    assert all(content.startswith(b"\x89PNG") for content in files.values())
 
 
-def test_each_scene_has_its_own_plots(tmp_path: Path) -> None:
+def test_each_scene_has_its_own_plots() -> None:
     scenes = {"garden": [measured("a")], "fox": [measured("b")]}
-    plots = _plot(tmp_path, scenes, {})
+    plots, _ = _plot(scenes, {})
     assert [name for _, name in plots["garden"]] == ["quality-size-1.png", "quality-primitives-1.png", "views-1.png"]
     assert [name for _, name in plots["fox"]] == ["quality-size-2.png", "quality-primitives-2.png", "views-2.png"]

@@ -20,8 +20,10 @@ from sundae_ns.compensation import resize
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError
 from sundae_ns.evaluation import Measured, psnr
 from sundae_ns.rendering import render_view, zoomed
+from sundae_ns.scenes import opening
 from sundae_ns.scenes.measure import compensation, frame_times, measure_scene, rendered_as, sizes
 from sundae_ns.scenes.opening import Opened, open_scene
+from sundae_ns.storage.runs import checkpoint
 
 
 def figures_of(run: Opened, factor: float = 1.0) -> Measured:
@@ -60,6 +62,15 @@ def test_the_timed_frames_are_those_compared_with_the_truth(tiny: Any) -> None:
     assert figures_of(run, 0.5).resolution == f"{width // 2}x{height // 2}"
     # The cameras of the run do not change.
     assert int(run.cameras[0].width) == width
+
+
+def test_a_run_opens_while_its_training_replaces_the_checkpoint(
+    tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Path(shutil.copytree(tiny.folder, tmp_path / "run"))
+    newest = checkpoint.newest_whole(run)[0]
+    monkeypatch.setattr(opening, "_device", lambda: (newest.unlink(missing_ok=True), torch.device("cpu"))[1])
+    assert open_scene(run).steps == tiny.steps  # it reads the capture for seconds after it has found the checkpoint
 
 
 @pytest.mark.parametrize("factor", [0.4, 1.3])

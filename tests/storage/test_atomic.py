@@ -7,6 +7,8 @@ import io
 import os
 import resource
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +20,7 @@ from PIL import Image
 from sundae_ns.errors import DataError, PackError, StorageError, reading, regular, writing
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage import replacing, write_ply, write_text
-from sundae_ns.storage.atomic import put_aside, write_image
+from sundae_ns.storage.atomic import put_aside, write_files, write_image
 
 
 @contextmanager
@@ -63,6 +65,33 @@ def test_a_file_is_flushed_before_it_is_renamed(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Path, "replace", lambda path, to: (order.append("rename"), replace(path, to))[1])
     write_text(tmp_path / "a.txt", "new")
     assert order == ["sync", "rename", "sync"]
+
+
+def test_files_that_belong_together_are_written_all_or_none(tmp_path: Path) -> None:
+    write_text(tmp_path / "a.txt", "old")
+    with small_disk(10_000), pytest.raises(StorageError, match="cannot write .*b.txt"):
+        write_files({tmp_path / "a.txt": b"new", tmp_path / "b.txt": b"x" * 10_001})
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+    write_files({tmp_path / "a.txt": b"new", tmp_path / "b.txt": b"x"})
+    assert [(tmp_path / name).read_text() for name in ("a.txt", "b.txt")] == ["new", "x"]
+
+
+def test_what_killed_processes_left_is_removed_and_what_others_write_stays(tmp_path: Path) -> None:
+    path = tmp_path / "[a].txt"
+    ready = "import sys, os\nfrom pathlib import Path\nfrom sundae_ns.storage import replacing\n"
+    waits = "with replacing(Path(sys.argv[1])) as f:\n    f.write_text('half')\n    print(f, flush=True)\n    input()\n"
+    command = [sys.executable, "-c", ready + waits, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None
+        partial = Path(other.stdout.readline().strip())
+        longer = tmp_path / "[a].txt.ply.2.partial"
+        longer.touch()
+        write_text(path, "new")
+        assert partial.read_text() == "half"
+        other.kill()
+    write_text(path, "newer")
+    assert sorted(os.listdir(tmp_path)) == ["[a].txt", longer.name]
 
 
 def test_full_disk(tmp_path: Path) -> None:

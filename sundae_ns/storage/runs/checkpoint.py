@@ -13,7 +13,7 @@ import zipfile
 from collections.abc import Mapping
 from numbers import Integral
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, BinaryIO, get_args
 
 import numpy as np
 import torch
@@ -100,13 +100,13 @@ def _compact(value: Any) -> Any:
     return value
 
 
-def _damage(path: Path) -> str | None:
+def _damage(file: BinaryIO) -> str | None:
     """Reason why a file is no whole checkpoint; None if its checksums are right, which torch does not verify."""
     try:
-        with zipfile.ZipFile(regular(path)) as archive:
+        with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
             packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
-            if packed or sum(entry.file_size for entry in entries) > path.stat().st_size:
+            if packed or sum(entry.file_size for entry in entries) > os.fstat(file.fileno()).st_size:
                 return "it would unpack to more than its size"
             broken = archive.testzip()
             return None if broken is None else f"{broken} in it is damaged"
@@ -135,10 +135,21 @@ def read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise CheckpointError(f"{path} does not exist; give a .ckpt file, or the folder of them")
     try:
-        if (damage := _damage(path)) is not None:
-            raise ValueError(damage)
+        file = path.open("rb")
+    except OSError as error:
+        raise _unreadable(path, error.strerror or one_line(error)) from error
+    with file:
+        if (damage := _damage(file)) is not None:
+            raise _unreadable(path, damage)
+        return _loaded(file, path)
+
+
+def _loaded(file: BinaryIO, path: Path) -> dict[str, Any]:
+    """The contents of an open checkpoint without damage."""
+    try:
+        file.seek(0)
         with _numpy_numbers_allowed():
-            loaded = torch.load(path, map_location="cpu", weights_only=True)
+            loaded = torch.load(file, map_location="cpu", weights_only=True)
         state = loaded.get("pipeline") if isinstance(loaded, dict) else None
         if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
             raise ValueError("it holds no model")
@@ -149,26 +160,59 @@ def read(path: Path) -> dict[str, Any]:
         reason = str(error).partition("\n")[0] or type(error).__name__
         if isinstance(error, pickle.UnpicklingError):
             reason = "it holds more than tensors and plain values, or nothing that can be read"
-        raise CheckpointError(
-            f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file"
-        ) from error
+        raise _unreadable(path, reason) from error
     return loaded
+
+
+def _unreadable(path: Path, reason: str) -> CheckpointError:
+    return CheckpointError(f"{path} cannot be read as a nerfstudio checkpoint ({reason}); give another file")
 
 
 def newest_whole(folder: Path) -> tuple[Path, list[str]]:
     """The newest whole checkpoint of a folder or a run, and a line for each newer damaged one.
 
+    A training may replace it at any time: :func:`read_newest` reads it too.
+
     Raises:
         CheckpointError: there is none.
     """
-    passed_over: list[str] = []
-    for path in reversed(checkpoints(folder_of(folder))):
-        reason = _damage(path)
-        if reason is None:
-            return path, passed_over
-        passed_over.append(f"{path.name} is not whole ({reason})")
-    found = f" ({'; '.join(passed_over)})" if passed_over else ""
-    raise CheckpointError(f"{folder} holds no whole checkpoint{found}; give the folder of a run that saved one")
+    path, file, passed_over = _open_newest(folder)
+    file.close()
+    return path, passed_over
+
+
+def read_newest(folder: Path) -> tuple[Path, dict[str, Any]]:
+    """The newest whole checkpoint of a folder or a run, and its contents, also while a training replaces it.
+
+    Raises:
+        CheckpointError: there is none, or it is of another kind.
+    """
+    path, file, _ = _open_newest(folder)
+    with file:
+        return path, _loaded(file, path)
+
+
+def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
+    """As :func:`newest_whole`, with the open file, which stays readable after a training has removed it."""
+    found = checkpoints(folder_of(folder))
+    while True:
+        passed_over: list[str] = []
+        for path in reversed(found):
+            try:
+                file = regular(path).open("rb")
+            except OSError as error:
+                passed_over.append(f"{path.name} is not whole ({error.strerror or one_line(error)})")
+                continue
+            reason = _damage(file)
+            if reason is None:
+                return path, file, passed_over
+            file.close()
+            passed_over.append(f"{path.name} is not whole ({reason})")
+        before, found = found, checkpoints(folder_of(folder))
+        if found == before:  # else a training has replaced them since they were listed
+            break
+    skipped = f" ({'; '.join(passed_over)})" if passed_over else ""
+    raise CheckpointError(f"{folder} holds no whole checkpoint{skipped}; give the folder of a run that saved one")
 
 
 def extra_state(
@@ -301,7 +345,8 @@ def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
     if path.is_dir():
         if not checkpoints(folder_of(path)):
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
-        path = newest_whole(path)[0]
+        path, loaded = read_newest(path)
+        return dict(field_of(loaded, path).as_harmonics()), True
     refuse(path, packed="sundae unpack makes a run of it: give that, or its checkpoint")
     if kind_of(path) == "ply" or (path.suffix == ".ply" and path.is_file()):
         field = read_ply(path)
