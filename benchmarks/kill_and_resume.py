@@ -106,7 +106,7 @@ def half_recorded(original: Callable[..., Any]) -> Callable[..., Any]:
 
 PLACES: dict[str, Callable[[int], None]] = {
     "save: half written": lambda n: after(n, sundae_ns.storage.runs.checkpoint.torch, "save", half_saved),
-    "save: not yet on the disk": lambda n: after(3 * n, sundae_ns.storage.atomic, "_flush", at_once),
+    "save: not yet on the disk": lambda n: after(3 * n, sundae_ns.storage.atomic, "flush", at_once),
     "save: the older one not yet gone": lambda n: after(n, sundae_ns.storage.runs.checkpoint, "write", when_done),
     "prune: deciding": lambda n: after(1, sundae_ns.pruning.cutting, "decide", at_once),
     "prune: sliced": lambda n: after(1, sundae_ns.pruning.cutting, "keep", when_done),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 import torch
 
@@ -118,7 +120,7 @@ def test_training_with_ten_times_the_rate_stays_finite(mode: str) -> None:
     optimizer = torch.optim.Adam(module.parameters(), lr=1e-2)  # the methods have 1e-3 at most
     images = [inputs(16, 16) for _ in range(4)]
     truths = [torch.rand(16, 16, 3) for _ in images]
-    for step in range(1000):
+    for step in range(1000 if os.environ.get("SUNDAE_ALL_SEEDS") == "1" else 200):
         optimizer.zero_grad()
         (module(*images[step % 4]) - truths[step % 4]).abs().mean().backward()
         optimizer.step()

@@ -168,7 +168,7 @@ def test_a_pack_that_fails_leaves_the_older_file(tmp_path: Path, monkeypatch: py
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("sundae_ns.storage.atomic._flush", full)
+    monkeypatch.setattr("sundae_ns.storage.atomic.flush", full)
     with pytest.raises(StorageError, match="the disk is full"):
         write_scene(path, PackedScene(random_field()))
     assert [(p.name, p.read_bytes()) for p in tmp_path.iterdir()] == [("a.sundae", b"years of work")]
