@@ -1,4 +1,4 @@
-"""Cameras: of a file, or made for a scene that comes without any."""
+"""Cameras of a file, and the one in front of a scene."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ import torch
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.data.capture import finite, matrix, read_json, side
-from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.gaussians import finite_mask
+from sundae_ns.errors import DataError
 from sundae_ns.rendering import View
 
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
-_NEAREST, _FARTHEST = 0.3, 2.0
-"""Distances of virtual eyes from the middle of the scene, as multiples of the median distance of its primitives."""
 _FOV = 60.0
+"""Vertical field of view of a keyframe that states none, degrees."""
 _FRONT_FOV = math.degrees(2 * math.atan(240 / 500))
 """Field of view in front of a scene, degrees: that of the web page."""
 
@@ -29,43 +27,6 @@ class CameraFile(NamedTuple):
     views: list[View]
     frames_per_second: float | None
     """Speed of a camera path; None for the cameras of a capture."""
-
-
-def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128) -> list[View]:
-    """Cameras that look at a scene from inside and around it, for scenes without cameras.
-
-    Each eye is around the middle of the scene, at 0.3 to 2 times the median distance of the primitives, and looks at
-    a random primitive.
-
-    Args:
-        scene: its finite primitives count.
-        n: number of cameras.
-        seed: of the random draws; the same on every device.
-        size: width and height of the images, pixels.
-
-    Raises:
-        ConfigError: ``n`` or ``size`` is less than 1.
-        DataError: no primitive is finite.
-
-    >>> import torch, sundae_ns as sn
-    >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
-    >>> len(sn.virtual_views(scene, 8))
-    8
-    """
-    if n < 1 or size < 1:
-        raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
-    means = scene.field["means"].detach()[finite_mask(scene.field)].cpu().double()
-    if not len(means):
-        raise DataError(f"none of {scene.num_primitives:,} primitives is finite, so no camera sees the scene")
-    middle = means.median(dim=0).values
-    reach = (means - middle).norm(dim=1).median().clamp_min(1e-6)
-    generator = torch.Generator().manual_seed(seed)
-    direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator, dtype=torch.float64), dim=1)
-    distance = _NEAREST + (_FARTHEST - _NEAREST) * torch.rand(n, 1, generator=generator, dtype=torch.float64)
-    eyes = middle + reach * distance * direction
-    targets = means[torch.randint(len(means), (n,), generator=generator)]
-    pairs = zip(eyes, targets, strict=True)
-    return [View.look_at(eye, target, fov=_FOV, width=size, height=size) for eye, target in pairs]
 
 
 def view_in_front(scene: Scene) -> View:

@@ -134,7 +134,8 @@ def prune_file(
         overwrite: replace an existing file, once the new one is complete.
     """
     from sundae_ns.api import opening, pruning, saving
-    from sundae_ns.api.views import views_of, virtual_views
+    from sundae_ns.api.views import views_of
+    from sundae_ns.api.virtual import virtual_views
     from sundae_ns.errors import ConfigError
     from sundae_ns.gaussians import finite_mask
     from sundae_ns.pruning import PruneRule
