@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,8 +11,11 @@ import numpy as np
 import torch
 
 from sundae_ns.api.scene import Scene
+from sundae_ns.data.camera_axes import OPENGL_TO_OPENCV
 from sundae_ns.data.capture import finite, matrix, read_json, side
+from sundae_ns.data.colmap import images_of
 from sundae_ns.errors import DataError
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rendering import View
 
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
@@ -41,9 +45,10 @@ def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:
     """The cameras of a file, as ideal pinhole cameras: distortion is left out.
 
     Args:
-        path: a ``transforms.json``, the folder with one, or a camera path of nerfstudio's viewer (``.json``).
-        scene: whose coordinates the cameras are to have. A scene of a run needs it for a ``transforms.json``, because
-            training has moved and scaled the capture.
+        path: a ``transforms.json``, the folder with one, a COLMAP model (such as ``sparse/0``), or a camera path of
+            nerfstudio's viewer (``.json``).
+        scene: whose coordinates the cameras are to have. A scene of a run needs it for the cameras of its capture,
+            because training has moved and scaled them.
 
     Raises:
         DataError: the file is missing, damaged, or holds no cameras.
@@ -61,6 +66,8 @@ def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:
 
 def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
     """As :func:`views_of`, with the speed of a camera path."""
+    if path.is_dir() and any((path / name).exists() for name in ("cameras.bin", "cameras.txt")):
+        return CameraFile(_of_colmap(path, scene), None)
     path = path / "transforms.json" if path.is_dir() else path
     content = read_json(path)
     if "camera_path" in content:
@@ -77,10 +84,30 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
         pose = matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where)
         intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in _INTRINSICS]
         size = [side(stated.get(name), name, where) for name in ("w", "h")]
-        moved = transform[:3, :3] @ pose[:3]
-        moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
-        views.append(View.from_pose(torch.from_numpy(moved), intrinsics, *size))
+        views.append(_moved(pose, transform, scale, intrinsics, *size))
     return CameraFile(views, None)
+
+
+def _moved(
+    pose: np.ndarray, transform: np.ndarray, scale: float, intrinsics: Sequence[float], width: int, height: int
+) -> View:
+    """A camera, camera-to-world with OpenGL axes ``[3 or 4, 4]``, after a transform and then a scale."""
+    moved = transform[:3, :3] @ pose[:3]
+    moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
+    return View.from_pose(torch.from_numpy(moved), intrinsics, width, height)
+
+
+def _of_colmap(model: Path, scene: Scene | None) -> list[View]:
+    """Views of a COLMAP model, in its own coordinates or in those of a run trained on it."""
+    transform, scale = _to_model(scene, {}, model.name)
+    views = []
+    for image in images_of(model):
+        quaternion, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
+        rotation = rotation_matrices(quaternion[None])[0].T
+        pose = torch.cat([rotation * rotation.new_tensor(OPENGL_TO_OPENCV), -(rotation @ translation)[:, None]], dim=1)
+        camera = image.camera
+        views.append(_moved(pose.numpy(), transform, scale, camera.intrinsics, camera.width, camera.height))
+    return views
 
 
 def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple[np.ndarray, float]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from colmap_models import write_model
 from fields import random_field
 
 import sundae_ns as sn
@@ -55,6 +56,29 @@ def test_a_camera_path(tmp_path: Path) -> None:
     assert found.frames_per_second == 12
     assert float(view.K[1, 1]) == pytest.approx(24)
     torch.testing.assert_close(view.center, torch.tensor([0.0, 0, 3]))
+
+
+def test_a_colmap_model(tmp_path: Path) -> None:
+    """Its poses are world-to-camera, and the images of a run's capture move as those of a transforms.json do."""
+    write_model(tmp_path, ["a.png", "b.png"], (64, 48))
+    _, view = sn.views_of(tmp_path)
+    assert (view.width, view.height, view.focal) == (64, 48, 18)
+    torch.testing.assert_close(view.viewmat[:3, 3], torch.tensor([0.3, 0.1, 3.0]))
+    turn = [[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
+    trained = scene(in_model_frame=True, meta={"frame": {"transform": turn, "scale": 0.5}})
+    x, y, z = view.center.tolist()
+    moved = sn.views_of(tmp_path, trained)[1].center
+    torch.testing.assert_close(moved, torch.tensor([(1 - y) / 2, (x + 2) / 2, (z + 3) / 2]))
+
+
+def test_a_colmap_model_of_text(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 64 48 20 32 24 0.1\n")
+    half = math.sqrt(0.5)  # a quarter turn about x: the camera looks along y of the world
+    (tmp_path / "images.txt").write_text(f"1 {half} {half} 0 0 0 0 2 1 a.png\n\n")
+    (view,) = sn.views_of(tmp_path)
+    assert view.K.diag().tolist() == [20, 20, 1]
+    torch.testing.assert_close(view.center, torch.tensor([0.0, -2, 0]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(view.viewmat[2, :3], torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
 
 
 def test_cameras_of_a_capture_move_with_its_model(tmp_path: Path) -> None:
