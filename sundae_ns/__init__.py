@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sundae_ns.api.saving import save as save
     from sundae_ns.api.scene import Scene as Scene
     from sundae_ns.api.views import views_of as views_of
-    from sundae_ns.api.views import virtual_views as virtual_views
+    from sundae_ns.api.virtual import virtual_views as virtual_views
     from sundae_ns.errors import SundaeError as SundaeError
     from sundae_ns.pruning import PruneRule as PruneRule
     from sundae_ns.rendering.views import View as View
@@ -48,7 +48,7 @@ _HOMES = {
     "render": "sundae_ns.api.rendering",
     "save": "sundae_ns.api.saving",
     "views_of": "sundae_ns.api.views",
-    "virtual_views": "sundae_ns.api.views",
+    "virtual_views": "sundae_ns.api.virtual",
 }
 """Public names and the modules that hold them."""
 

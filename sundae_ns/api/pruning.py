@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.views import virtual_views
+from sundae_ns.api.virtual import of_unit_size, virtual_views
 from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.pruning import PruneRule, kept_count, prune_field
@@ -23,6 +23,8 @@ class PrunedScene(NamedTuple):
     scene: Scene
     mask: Tensor
     """True for kept primitives of the scene before the prune, bool ``[N]``."""
+    seen: float | None = None
+    """Share of the finite primitives that the views see; None if no view was asked."""
 
 
 def prune(
@@ -94,9 +96,9 @@ def prune_with_mask(
         console = Console(stderr=True)
     if rule.uses_contribution and count < field.num_primitives:
         usable = dataclasses.replace(scene, field=field)
-        seen = views if views is not None else scene.views or virtual_views(usable)
+        sized, seen = of_unit_size(usable, views if views is not None else scene.views or virtual_views(usable))
         weights = contribution(
-            LocalField(field),
+            LocalField(sized.field),
             [TrainingView(view.to(scene.device), None) for view in seen],
             scene.background,
             scene.settings(head=False),
@@ -106,4 +108,5 @@ def prune_with_mask(
     pruned = prune_field(field, rule, count, weights)
     mask = finite.clone()
     mask[finite] = pruned.decision.mask
-    return PrunedScene(dataclasses.replace(scene, field=pruned.field), mask)
+    share = None if weights is None else float((weights > 0).float().mean())
+    return PrunedScene(dataclasses.replace(scene, field=pruned.field), mask, share)

@@ -1,8 +1,9 @@
-"""Cameras: of a file, or made for a scene that comes without any."""
+"""Cameras of a file, and the one in front of a scene."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,15 +11,16 @@ import numpy as np
 import torch
 
 from sundae_ns.api.scene import Scene
+from sundae_ns.data.camera_axes import OPENGL_TO_OPENCV
 from sundae_ns.data.capture import finite, matrix, read_json, side
-from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.gaussians import finite_mask
+from sundae_ns.data.colmap import images_of
+from sundae_ns.errors import DataError
+from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rendering import View
 
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy")
-_NEAREST, _FARTHEST = 0.3, 2.0
-"""Distances of virtual eyes from the middle of the scene, as multiples of the median distance of its primitives."""
 _FOV = 60.0
+"""Vertical field of view of a keyframe that states none, degrees."""
 _FRONT_FOV = math.degrees(2 * math.atan(240 / 500))
 """Field of view in front of a scene, degrees: that of the web page."""
 
@@ -29,43 +31,6 @@ class CameraFile(NamedTuple):
     views: list[View]
     frames_per_second: float | None
     """Speed of a camera path; None for the cameras of a capture."""
-
-
-def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128) -> list[View]:
-    """Cameras that look at a scene from inside and around it, for scenes without cameras.
-
-    Each eye is around the middle of the scene, at 0.3 to 2 times the median distance of the primitives, and looks at
-    a random primitive.
-
-    Args:
-        scene: its finite primitives count.
-        n: number of cameras.
-        seed: of the random draws; the same on every device.
-        size: width and height of the images, pixels.
-
-    Raises:
-        ConfigError: ``n`` or ``size`` is less than 1.
-        DataError: no primitive is finite.
-
-    >>> import torch, sundae_ns as sn
-    >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
-    >>> len(sn.virtual_views(scene, 8))
-    8
-    """
-    if n < 1 or size < 1:
-        raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
-    means = scene.field["means"].detach()[finite_mask(scene.field)].cpu().double()
-    if not len(means):
-        raise DataError(f"none of {scene.num_primitives:,} primitives is finite, so no camera sees the scene")
-    middle = means.median(dim=0).values
-    reach = (means - middle).norm(dim=1).median().clamp_min(1e-6)
-    generator = torch.Generator().manual_seed(seed)
-    direction = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator, dtype=torch.float64), dim=1)
-    distance = _NEAREST + (_FARTHEST - _NEAREST) * torch.rand(n, 1, generator=generator, dtype=torch.float64)
-    eyes = middle + reach * distance * direction
-    targets = means[torch.randint(len(means), (n,), generator=generator)]
-    pairs = zip(eyes, targets, strict=True)
-    return [View.look_at(eye, target, fov=_FOV, width=size, height=size) for eye, target in pairs]
 
 
 def view_in_front(scene: Scene) -> View:
@@ -80,9 +45,10 @@ def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:
     """The cameras of a file, as ideal pinhole cameras: distortion is left out.
 
     Args:
-        path: a ``transforms.json``, the folder with one, or a camera path of nerfstudio's viewer (``.json``).
-        scene: whose coordinates the cameras are to have. A scene of a run needs it for a ``transforms.json``, because
-            training has moved and scaled the capture.
+        path: a ``transforms.json``, the folder with one, a COLMAP model (such as ``sparse/0``), or a camera path of
+            nerfstudio's viewer (``.json``).
+        scene: whose coordinates the cameras are to have. A scene of a run needs it for the cameras of its capture,
+            because training has moved and scaled them.
 
     Raises:
         DataError: the file is missing, damaged, or holds no cameras.
@@ -100,6 +66,8 @@ def views_of(path: Path | str, scene: Scene | None = None) -> list[View]:
 
 def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
     """As :func:`views_of`, with the speed of a camera path."""
+    if path.is_dir() and any((path / name).exists() for name in ("cameras.bin", "cameras.txt")):
+        return CameraFile(_of_colmap(path, scene), None)
     path = path / "transforms.json" if path.is_dir() else path
     content = read_json(path)
     if "camera_path" in content:
@@ -116,10 +84,30 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
         pose = matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where)
         intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in _INTRINSICS]
         size = [side(stated.get(name), name, where) for name in ("w", "h")]
-        moved = transform[:3, :3] @ pose[:3]
-        moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
-        views.append(View.from_pose(torch.from_numpy(moved), intrinsics, *size))
+        views.append(_moved(pose, transform, scale, intrinsics, *size))
     return CameraFile(views, None)
+
+
+def _moved(
+    pose: np.ndarray, transform: np.ndarray, scale: float, intrinsics: Sequence[float], width: int, height: int
+) -> View:
+    """A camera, camera-to-world with OpenGL axes ``[3 or 4, 4]``, after a transform and then a scale."""
+    moved = transform[:3, :3] @ pose[:3]
+    moved[:, 3] = scale * (moved[:, 3] + transform[:3, 3])
+    return View.from_pose(torch.from_numpy(moved), intrinsics, width, height)
+
+
+def _of_colmap(model: Path, scene: Scene | None) -> list[View]:
+    """Views of a COLMAP model, in its own coordinates or in those of a run trained on it."""
+    transform, scale = _to_model(scene, {}, model.name)
+    views = []
+    for image in images_of(model):
+        quaternion, translation = torch.tensor(image.pose, dtype=torch.float64).split([4, 3])
+        rotation = rotation_matrices(quaternion[None])[0].T
+        pose = torch.cat([rotation * rotation.new_tensor(OPENGL_TO_OPENCV), -(rotation @ translation)[:, None]], dim=1)
+        camera = image.camera
+        views.append(_moved(pose.numpy(), transform, scale, camera.intrinsics, camera.width, camera.height))
+    return views
 
 
 def _to_model(scene: Scene | None, content: dict[str, Any], where: str) -> tuple[np.ndarray, float]:

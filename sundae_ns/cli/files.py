@@ -12,7 +12,10 @@ import tyro
 from sundae_ns.cli.outputs import Overwrite, check_file, check_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from sundae_ns.api.scene import Scene
+    from sundae_ns.rendering import View
 
 
 def export(
@@ -93,11 +96,46 @@ def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
         return packed_run(path, data=data)
 
 
+def check_one(amounts: Mapping[str, float | None]) -> None:
+    """Raise ``ConfigError`` if more than one of the options that say how many to keep is given."""
+    from sundae_ns.errors import ConfigError
+
+    given = [name for name, value in amounts.items() if value is not None]
+    if len(given) > 1:
+        raise ConfigError(f"{given[0]} and {given[1]} exclude each other; give one")
+
+
+def cameras_for(scene: Scene, cameras: Path | None, views: int, seed: int) -> Sequence[View]:
+    """Cameras that preserve a scene: of a file or a run, else those stored with the scene, else virtual ones."""
+    from sundae_ns.api import opening
+    from sundae_ns.api.views import views_of
+    from sundae_ns.api.virtual import virtual_views
+    from sundae_ns.storage.kinds import kind_of
+    from sundae_ns.storage.runs.folder import find_config
+
+    if cameras is None:
+        return scene.views or virtual_views(scene, views, seed=seed)
+    if kind_of(cameras) == "packed":
+        return opening.load(cameras).views or virtual_views(scene, views, seed=seed)
+    is_run = (cameras.is_dir() or cameras.name == "config.yml") and find_config(cameras) is not None
+    if not is_run:
+        return views_of(cameras, scene)
+    from sundae_ns.storage.runs.config_file import check_run
+
+    check_run(cameras)  # before nerfstudio is imported, which takes seconds
+    from sundae_ns.api.packing import views_of_arrays
+    from sundae_ns.scenes.packed import contents_of_run
+
+    with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
+        return views_of_arrays(contents_of_run(cameras, max_cameras=views).cameras)
+
+
 def prune_file(
     source: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
     keep: float | None = None,
     count: int | None = None,
+    target_drop: float | None = None,
     score: Literal[
         "detail-contribution", "contribution", "response-contribution", "response", "opacity", "random"
     ] = "detail-contribution",
@@ -120,6 +158,8 @@ def prune_file(
             properties and comments.
         keep: share of the primitives to keep, in (0, 1]; by default 0.1.
         count: number of primitives to keep, in place of a share.
+        target_drop: keep as few as lose at most this PSNR, in dB, of a full field that shows its photos at 30 dB; by
+            the images of held-out cameras.
         score: importance of a primitive: what cameras see of it where there is detail, what they see of it, the same
             times its high-pass response, the response alone, opacity, or a random number.
         selection: systematic and sampled draw at random by score, evenly through space or independently.
@@ -129,31 +169,38 @@ def prune_file(
         signal: graph signal to filter: position, colour, opacity and size, or positions only.
         gamma: share of the kept primitives that the band selection takes from the highest scores.
         views: number of virtual cameras, for scenes that come without cameras.
-        cameras: a transforms.json or a camera path, in place of the scene's own or virtual cameras.
+        cameras: a transforms.json, a COLMAP model (sparse/0), a camera path, a run or a packed scene, in place of the
+            scene's own or virtual cameras.
         seed: random seed.
         overwrite: replace an existing file, once the new one is complete.
     """
     from sundae_ns.api import opening, pruning, saving
-    from sundae_ns.api.views import views_of, virtual_views
     from sundae_ns.errors import ConfigError
     from sundae_ns.gaussians import finite_mask
     from sundae_ns.pruning import PruneRule
     from sundae_ns.storage.kinds import kind_of
     from sundae_ns.storage.ply import keep_vertices
 
-    if keep is not None and count is not None:
-        raise ConfigError("--keep and --count exclude each other; give one")
+    amounts = {"--keep": keep, "--count": count, "--target-drop": target_drop}
+    check_one(amounts)
     if out.suffix.lower() not in saving.SUFFIXES:
         raise ConfigError(f"{out} has no supported suffix; name it {', '.join(saving.SUFFIXES)}")
-    check_file(out, reads=[source], overwrite=overwrite)
+    check_file(out, reads=[source, cameras], overwrite=overwrite)
     redistribution: Literal["merge", "none"] = "merge" if merge else "none"
     rule = PruneRule(selection, score, signal, redistribution=redistribution, gamma=gamma, seed=seed)
     rule.validate()
     scene = opening.load(source)
     seen = None
-    if rule.uses_contribution:
-        stored = views_of(cameras, scene) if cameras is not None else scene.views
-        seen = stored or virtual_views(scene, views, seed=seed)
+    if rule.uses_contribution or target_drop is not None:
+        seen = cameras_for(scene, cameras, views, seed)
+    if target_drop is not None:
+        from sundae_ns.api.target import count_for_drop
+
+        assert seen is not None
+        found = count_for_drop(scene, target_drop, seen, rule, progress=True)
+        count = found.count
+        for number, psnr in found.curve:
+            print(f"{number:12,} primitives: {psnr:.2f} dB against the full field, on held-out cameras")
     if keep is None and count is None:
         keep = 0.1
     pruned = pruning.prune_with_mask(scene, keep=keep, count=count, views=seen, rule=rule, progress=True)
@@ -162,6 +209,8 @@ def prune_file(
     else:
         saving.save(pruned.scene, out)
     print(f"{out}: {pruned.scene.num_primitives:,} of {scene.num_primitives:,} primitives")
+    if pruned.seen is not None and seen:
+        print(f"{len(seen)} cameras see {pruned.seen:.1%} of the primitives")
     if broken := int((~finite_mask(scene.field)).sum()):
         print(f"dropped {broken:,} primitives that were not finite (NaN or infinite)")
     return 0

@@ -10,9 +10,10 @@ import io
 import math
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 from sundae_ns.data.capture import finite, read_bytes, side
 from sundae_ns.errors import DataError, one_line, reading
@@ -33,6 +34,24 @@ _CAMERA, _IMAGE, _POINT, _COUNT = map(struct.Struct, ("<iiQQ", "<i7di", "<Q3d3Bd
 _IMAGE_BYTES = _IMAGE.size + 1 + _COUNT.size  # at least, with an empty name and no observations
 _OBSERVATION, _TRACK = 24, 8
 _MAX_NAME = 4096
+
+
+class ColmapCamera(NamedTuple):
+    """A camera of a model; distortion is left out."""
+
+    width: int
+    height: int
+    intrinsics: tuple[float, float, float, float]
+    """fx, fy, cx, cy, pixels."""
+
+
+class ColmapImage(NamedTuple):
+    """An image of a model."""
+
+    name: str
+    pose: tuple[float, ...]
+    """World-to-camera with OpenCV axes: a quaternion wxyz of length 1, and a translation."""
+    camera: ColmapCamera
 
 
 class _BinaryFile:
@@ -82,20 +101,7 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
     Raises:
         DataError: names the first unusable entry and its place.
     """
-    if not model.is_dir():
-        raise DataError(
-            f"{model} is not a folder; give the folder of the model with colmap --colmap-path (usually sparse/0)"
-        )
-    if (model / "cameras.txt").exists():
-        names = _images_text(model / "images.txt", _cameras_text(model / "cameras.txt"))
-    elif (model / "cameras.bin").exists():
-        names = _images_binary(model / "images.bin", _cameras_binary(model / "cameras.bin"))
-    else:
-        raise DataError(
-            f"{model} holds neither cameras.bin nor cameras.txt; give the folder of the model with --colmap-path"
-        )
-    if not names:
-        raise DataError(f"{model} has no images; the reconstruction failed, run it again")
+    names = [image.name for image in images_of(model)]
     if images is not None and _SHELL & set(str(images)):
         raise DataError(f"{images} has quotes, $, ` or backslashes in its path; rename the folder that has them")
     for name in names:
@@ -114,6 +120,29 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
             raise DataError(f"{model} has no points; start without them with colmap --load-3D-points False")
 
 
+def images_of(model: Path) -> list[ColmapImage]:
+    """The images of a model with their cameras, checked; text before binary, as nerfstudio reads them.
+
+    Raises:
+        DataError: names the first unusable entry and its place.
+    """
+    if not model.is_dir():
+        raise DataError(
+            f"{model} is not a folder; give the folder of the model with colmap --colmap-path (usually sparse/0)"
+        )
+    if (model / "cameras.txt").exists():
+        images = _images_text(model / "images.txt", _cameras_text(model / "cameras.txt"))
+    elif (model / "cameras.bin").exists():
+        images = _images_binary(model / "images.bin", _cameras_binary(model / "cameras.bin"))
+    else:
+        raise DataError(
+            f"{model} holds neither cameras.bin nor cameras.txt; give the folder of the model with --colmap-path"
+        )
+    if not images:
+        raise DataError(f"{model} has no images; the reconstruction failed, run it again")
+    return images
+
+
 def num_images(model: Path) -> int:
     """Number of images that a binary COLMAP model states; ``DataError`` if its ``images.bin`` cannot be read."""
     return _BinaryFile(model / "images.bin").count(_IMAGE_BYTES, "images")
@@ -121,16 +150,18 @@ def num_images(model: Path) -> int:
 
 def _check_camera(
     model: tuple[str, int, int], width: float, height: float, params: Sequence[float], where: str
-) -> None:
+) -> ColmapCamera:
     side(width, "width", where)
     side(height, "height", where)
     if len(params) != model[1]:
         raise DataError(f"{where}: {model[0]} has {model[1]} parameters, not {len(params)}; export it again")
     for index, value in enumerate(params):
         finite(value, f"parameter {index}", where, positive=index < model[2])
+    focal, center = params[: model[2]], params[model[2] : model[2] + 2]
+    return ColmapCamera(int(width), int(height), (focal[0], focal[-1], center[0], center[1]))
 
 
-def _check_pose(pose: Sequence[float], camera: int, cameras: set[int], where: str) -> None:
+def _check_pose(pose: Sequence[float], camera: int, cameras: Collection[int], where: str) -> None:
     for value in pose:
         finite(value, "the pose", where)
     if not abs(math.hypot(*pose[:4]) - 1) < 0.01:
@@ -139,29 +170,29 @@ def _check_pose(pose: Sequence[float], camera: int, cameras: set[int], where: st
         raise DataError(f"{where}: its camera {camera} is not in the model; export it again")
 
 
-def _cameras_binary(path: Path) -> set[int]:
-    file, cameras = _BinaryFile(path), set()
+def _cameras_binary(path: Path) -> dict[int, ColmapCamera]:
+    file, cameras = _BinaryFile(path), dict[int, ColmapCamera]()
     for _ in range(file.count(_CAMERA.size, "cameras")):
         identifier, kind, width, height = file.take(_CAMERA)
         where = f"{path.name}, camera {identifier}"
         if kind not in _MODELS:
             raise DataError(f"{where}: nerfstudio does not support camera model {kind}; {_CONVERT}")
         model = _MODELS[int(kind)]
-        _check_camera(model, width, height, file.take(struct.Struct(f"<{model[1]}d")), where)
+        camera = _check_camera(model, width, height, file.take(struct.Struct(f"<{model[1]}d")), where)
         if identifier in cameras:
             raise DataError(f"{where}: it is listed twice; export it again")
-        cameras.add(int(identifier))
+        cameras[int(identifier)] = camera
     return cameras
 
 
-def _images_binary(path: Path, cameras: set[int]) -> list[str]:
-    file, names = _BinaryFile(path), []
+def _images_binary(path: Path, cameras: Mapping[int, ColmapCamera]) -> list[ColmapImage]:
+    file, images = _BinaryFile(path), []
     for _ in range(file.count(_IMAGE_BYTES, "images")):
         identifier, *pose, camera = file.take(_IMAGE)
         _check_pose(pose, int(camera), cameras, f"{path.name}, image {identifier}")
-        names.append(file.text())
+        images.append(ColmapImage(file.text(), tuple(pose), cameras[int(camera)]))
         file.skip(_OBSERVATION * file.count(_OBSERVATION, "observations"))
-    return names
+    return images
 
 
 def _points_binary(path: Path) -> int:
@@ -203,9 +234,9 @@ def _check_count(path: Path, found: int) -> None:
             raise DataError(f"{path.name} states {int(stated[1]):,} entries and has {found:,}; copy or export it again")
 
 
-def _cameras_text(path: Path) -> set[int]:
+def _cameras_text(path: Path) -> dict[int, ColmapCamera]:
     models = {model[0]: model for model in _MODELS.values()}
-    cameras = set()
+    cameras: dict[int, ColmapCamera] = {}
     for index, line in _lines(path):
         with _errors_in_line(path, index):
             identifier, name, *numbers = line.split()
@@ -213,14 +244,14 @@ def _cameras_text(path: Path) -> set[int]:
             if name not in models:
                 raise DataError(f"{where}: nerfstudio does not support camera model {name}; {_CONVERT}")
             width, height = int(numbers[0]), int(numbers[1])
-            _check_camera(models[name], width, height, [float(value) for value in numbers[2:]], where)
-            cameras.add(int(identifier))
+            parameters = [float(value) for value in numbers[2:]]
+            cameras[int(identifier)] = _check_camera(models[name], width, height, parameters, where)
     _check_count(path, len(cameras))
     return cameras
 
 
-def _images_text(path: Path, cameras: set[int]) -> list[str]:
-    lines, names, index = _all_lines(path), [], 0
+def _images_text(path: Path, cameras: Mapping[int, ColmapCamera]) -> list[ColmapImage]:
+    lines, images, index = _all_lines(path), list[ColmapImage](), 0
     while index < len(lines):
         line = lines[index].strip()
         index += 1
@@ -228,12 +259,13 @@ def _images_text(path: Path, cameras: set[int]) -> list[str]:
             continue
         with _errors_in_line(path, index - 1):
             words = line.split()
-            _check_pose([float(w) for w in words[1:8]], int(words[8]), cameras, f"{path.name}, image {int(words[0])}")
+            pose = tuple(float(word) for word in words[1:8])
+            _check_pose(pose, int(words[8]), cameras, f"{path.name}, image {int(words[0])}")
             if len(words) > 10:
                 raise DataError(
                     f"{path.name}, line {index}: nerfstudio does not read names with spaces; rename the image"
                 )
-            names.append(words[9])
+            images.append(ColmapImage(words[9], pose, cameras[int(words[8])]))
         with _errors_in_line(path, index):
             observations = lines[index].split() if index < len(lines) else []
             if len(observations) % 3:
@@ -241,8 +273,8 @@ def _images_text(path: Path, cameras: set[int]) -> list[str]:
             for x, y, point in zip(observations[0::3], observations[1::3], observations[2::3]):
                 float(x), float(y), int(point)
         index += 1
-    _check_count(path, len(names))
-    return names
+    _check_count(path, len(images))
+    return images
 
 
 def _points_text(path: Path) -> int:

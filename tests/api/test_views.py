@@ -9,9 +9,11 @@ from typing import Any
 
 import pytest
 import torch
+from colmap_models import write_model
 from fields import random_field
 
 import sundae_ns as sn
+from sundae_ns.api.pruning import prune_with_mask
 from sundae_ns.api.views import is_frame, read_cameras
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.field import Field
@@ -54,6 +56,29 @@ def test_a_camera_path(tmp_path: Path) -> None:
     assert found.frames_per_second == 12
     assert float(view.K[1, 1]) == pytest.approx(24)
     torch.testing.assert_close(view.center, torch.tensor([0.0, 0, 3]))
+
+
+def test_a_colmap_model(tmp_path: Path) -> None:
+    """Its poses are world-to-camera, and the images of a run's capture move as those of a transforms.json do."""
+    write_model(tmp_path, ["a.png", "b.png"], (64, 48))
+    _, view = sn.views_of(tmp_path)
+    assert (view.width, view.height, view.focal) == (64, 48, 18)
+    torch.testing.assert_close(view.viewmat[:3, 3], torch.tensor([0.3, 0.1, 3.0]))
+    turn = [[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]
+    trained = scene(in_model_frame=True, meta={"frame": {"transform": turn, "scale": 0.5}})
+    x, y, z = view.center.tolist()
+    moved = sn.views_of(tmp_path, trained)[1].center
+    torch.testing.assert_close(moved, torch.tensor([(1 - y) / 2, (x + 2) / 2, (z + 3) / 2]))
+
+
+def test_a_colmap_model_of_text(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 64 48 20 32 24 0.1\n")
+    half = math.sqrt(0.5)  # a quarter turn about x: the camera looks along y of the world
+    (tmp_path / "images.txt").write_text(f"1 {half} {half} 0 0 0 0 2 1 a.png\n\n")
+    (view,) = sn.views_of(tmp_path)
+    assert view.K.diag().tolist() == [20, 20, 1]
+    torch.testing.assert_close(view.center, torch.tensor([0.0, -2, 0]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(view.viewmat[2, :3], torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
 
 
 def test_cameras_of_a_capture_move_with_its_model(tmp_path: Path) -> None:
@@ -115,14 +140,46 @@ def test_virtual_views_are_the_same_for_a_seed_and_see_the_scene() -> None:
     assert min(seen) > 0
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e6])
+@pytest.mark.parametrize("factor", [1e-3, 1e6])
 def test_virtual_views_of_a_scene_of_any_size(factor: float) -> None:
     moved = scene()
     moved.field["means"] *= factor
+    moved.field["scales"] += math.log(factor)
     apart = [view.center for view in sn.virtual_views(moved, 8)]
     torch.testing.assert_close(
         torch.stack(apart) / factor, torch.stack([v.center for v in sn.virtual_views(scene(), 8)])
     )
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e6])
+def test_a_scene_of_any_size_is_pruned_alike(factor: float) -> None:
+    """The near plane is 0.01 world units away, which is more than the whole of a small scene."""
+    moved = scene()
+    moved.field["means"] *= factor
+    moved.field["scales"] += math.log(factor)
+    own, other = (prune_with_mask(each, 0.3, None, None, None, progress=False) for each in (scene(), moved))
+    assert other.seen == own.seen
+    assert (own.mask == other.mask).float().mean() > 0.95
+
+
+def room(inside: int = 400) -> sn.Scene:
+    """A hollow box of opaque splats around the origin, with a cloud of faint floaters outside of it."""
+    generator = torch.Generator().manual_seed(0)
+    walls = torch.rand(3000, 3, generator=generator) * 2 - 1
+    axis = torch.randint(3, (3000,), generator=generator)
+    walls[torch.arange(3000), axis] = walls[torch.arange(3000), axis].sign()
+    away = torch.nn.functional.normalize(torch.randn(inside, 3, generator=generator), dim=1)
+    floaters = away * (2 + 4 * torch.rand(inside, 1, generator=generator))
+    made = sn.Scene.from_points(torch.cat([walls, floaters]), torch.rand(3000 + inside, 3, generator=generator))
+    made.field["opacities"][:3000], made.field["opacities"][3000:] = 4.0, -1.0
+    made.field["scales"][:3000], made.field["scales"][3000:] = math.log(0.05), math.log(0.4)
+    return made
+
+
+def test_virtual_eyes_are_where_rays_end_on_surfaces() -> None:
+    """Of random eyes of this room two in three are among floaters; most of the chosen ones are inside."""
+    centers = torch.stack([view.center for view in sn.virtual_views(room(), 64)])
+    assert (centers.abs().amax(dim=1) < 1).float().mean() > 0.6
 
 
 def test_virtual_views_that_see_nothing_are_refused() -> None:
@@ -132,6 +189,23 @@ def test_virtual_views_that_see_nothing_are_refused() -> None:
     broken.field["means"][:] = torch.nan
     with pytest.raises(DataError, match="no camera sees the scene"):
         sn.virtual_views(broken)
+    faint = scene()
+    faint.field["opacities"][:] = -20
+    with pytest.raises(DataError, match="no camera sees anything of 100 primitives"):
+        sn.virtual_views(faint)
+
+
+def test_a_scene_in_one_place_is_seen() -> None:
+    point = scene()
+    point.field["means"][:] = 3.0
+    assert float(sn.render(point, sn.virtual_views(point, 1)[0]).accumulation.max()) > 0
+
+
+def test_a_scene_of_many_primitives_is_judged_by_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The few that are drawn cover about what all do, so that the same places are empty or dense."""
+    monkeypatch.setattr("sundae_ns.api.virtual._PROBE_PRIMITIVES", 800)
+    centers = torch.stack([view.center for view in sn.virtual_views(room(), 64)])
+    assert (centers.abs().amax(dim=1) < 1).float().mean() > 0.6
 
 
 EYE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -9,10 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from colmap_models import write_model
 from packed_scenes import KINDS, write_kind
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
+import sundae_ns as sn
 from sundae_ns.cli import main
 from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.parameters import SH_C0, SPLAT_NAMES
@@ -160,6 +164,9 @@ def test_prune_does_not_change_kept_rows(
         (["prune", "in.ply", "-o", "a.ply", "--keep", "0"], "keep is 0.0"),
         (["prune", "in.ply", "-o", "a.splat"], "a.splat has no supported suffix"),
         (["prune", "in.ply", "-o", "a.ply", "--keep", "0.1", "--count", "5"], "--keep and --count exclude each other"),
+        (["prune", "in.ply", "-o", "a.ply", "--keep", "0.1", "--target-drop", "1"], "--keep and --target-drop exclude"),
+        (["prune", "in.ply", "-o", "a.ply", "--target-drop", "0"], "target-drop is 0.0; give a positive number of dB"),
+        (["prune", "in.ply", "-o", "a.ply", "--target-drop", "1", "--views", "1"], "a target needs two views or more"),
         (["prune", "in.ply", "-o", "a.ply", "--count", "0"], "count is 0; give 1 or more"),
         (["prune", "none.ply", "-o", "a.ply"], "none.ply has 5 primitives, and none is finite; export it again"),
         (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 primitives, and none is finite; export it again"),
@@ -255,3 +262,24 @@ def test_fields_are_pruned_without_a_compiler(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", field())
     done = without("numba", ["prune", "a.ply", "-o", "pruned.ply", "--views", "2"], tmp_path)
     assert done.returncode == 0, done.stderr
+
+
+def test_prune_by_the_cameras_of_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those of a packed scene, of a COLMAP model and of a transforms.json; each says how many it is."""
+    scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
+    sn.save(scene, tmp_path / "a.ply")
+    stored = sn.virtual_views(scene, 3, size=32)
+    sn.save(dataclasses.replace(scene, views=tuple(stored)), tmp_path / "a.sundae")
+    write_model(tmp_path / "sparse", ["a.png", "b.png"], (32, 24))
+    frame = {"transform_matrix": [[1, 0, 0, 0.5], [0, 1, 0, 0.5], [0, 0, 1, 3], [0, 0, 0, 1]]}
+    lens = {"fl_x": 30, "fl_y": 30, "cx": 16, "cy": 12, "w": 32, "h": 24}
+    (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
+    for name, number in (("a.sundae", 3), ("sparse", 2), ("transforms.json", 1)):
+        arguments = ["prune", tmp_path / "a.ply", "-o", tmp_path / "out.spz", "--cameras", tmp_path / name]
+        assert run(*arguments, "--count", "50", "--overwrite") == 0
+        text = capsys.readouterr().out
+        assert f"{number} cameras see " in text
+        assert "50 of 200 primitives" in text
+    assert (
+        run("prune", tmp_path / "a.ply", "-o", tmp_path / "transforms.json", "--cameras", tmp_path, "--overwrite") == 2
+    )

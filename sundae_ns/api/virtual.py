@@ -1,0 +1,165 @@
+"""Virtual cameras: views of a scene that comes without any, from the field alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from sundae_ns.api.scene import Scene
+from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.gaussians import finite_mask
+from sundae_ns.gaussians.field import Field
+from sundae_ns.rasterization import rasterize
+from sundae_ns.rendering import View
+from sundae_ns.rendering.render import pass_options
+
+NEAREST, FARTHEST = 0.2, 4.0
+"""Distances of the eyes from the middle of the scene, as multiples of the median distance of its primitives."""
+FOV = 60.0
+CANDIDATES = 3
+"""Cameras that are drawn for each one that is kept."""
+_PROBE_SIZE = 32
+"""Sides of the images that candidates are judged by, pixels."""
+_PROBE_PRIMITIVES = 20_000
+"""Most primitives of these images."""
+_OPAQUE = 0.1
+"""Accumulation from which a pixel shows something."""
+
+
+def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128) -> list[View]:
+    """Cameras that see a scene as a visitor would, for scenes without cameras.
+
+    Eyes are drawn in all directions from the middle of the scene, at 0.2 to 4 times the median distance of its
+    primitives, and look at random primitives. Of three such cameras one is kept: those whose rays end on surfaces, by
+    the spread of depth along the rays of a small image. Inside of matter, behind walls and among floaters rays end
+    anywhere.
+
+    Args:
+        scene: its finite primitives count.
+        n: number of cameras.
+        seed: of the random draws, which are the same on every device.
+        size: width and height of the images, pixels.
+
+    Raises:
+        ConfigError: ``n`` or ``size`` is less than 1.
+        DataError: no primitive is finite, or no camera sees anything.
+
+    >>> import torch, sundae_ns as sn
+    >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
+    >>> len(sn.virtual_views(scene, 8))
+    8
+    """
+    if n < 1 or size < 1:
+        raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
+    field = _usable(scene)
+    means = field["means"].cpu().double()
+    middle, reach = _middle_and_reach(field)
+    generator = torch.Generator().manual_seed(seed)
+    drawn = CANDIDATES * n
+    direction = torch.nn.functional.normalize(torch.randn(drawn, 3, generator=generator, dtype=torch.float64), dim=1)
+    nearness = torch.rand(drawn, 1, generator=generator, dtype=torch.float64)
+    eyes = direction * NEAREST * (FARTHEST / NEAREST) ** nearness
+    targets = (means[torch.randint(len(means), (drawn,), generator=generator)] - middle) / reach
+    cameras = [
+        View.look_at(eye, target, fov=FOV, width=_PROBE_SIZE, height=_PROBE_SIZE)
+        for eye, target in zip(eyes, targets, strict=True)
+    ]
+    spread = _spread_of_depth(dataclasses.replace(scene, field=_probe(field, middle, reach, generator)), cameras)
+    best = spread.argsort(stable=True)[:n]
+    if bool(spread.isinf().all()):
+        raise DataError(
+            f"no camera sees anything of {scene.num_primitives:,} primitives; they are transparent, or the file is "
+            "damaged: export it again"
+        )
+    # In the order of the draws, so that any first few of them are as good as the others.
+    return [
+        View.look_at(middle + reach * eyes[i], middle + reach * targets[i], fov=FOV, width=size, height=size)
+        for i in best.sort().values.tolist()
+    ]
+
+
+def of_unit_size(scene: Scene, views: Sequence[View]) -> tuple[Scene, list[View]]:
+    """A scene of another program scaled to a median distance of 1 from its middle, and its views along with it.
+
+    The near plane is at a fixed distance, and would hide a scene of millimetres. A scene of nerfstudio's model has the
+    size that it was trained at, and stays.
+    """
+    views = list(views)
+    if scene.in_model_frame:
+        return scene, views
+    _, reach = _middle_and_reach(_usable(scene))
+    field = scene.field.replaced(
+        {"means": scene.field["means"] / reach, "scales": scene.field["scales"] - math.log(reach)}
+    )
+    scaled = []
+    for view in views:
+        viewmat = view.viewmat.clone()
+        viewmat[:3, 3] /= reach
+        scaled.append(view._replace(viewmat=viewmat))
+    return dataclasses.replace(scene, field=field), scaled
+
+
+def _usable(scene: Scene) -> Field:
+    """The finite primitives, detached."""
+    finite = finite_mask(scene.field)
+    if not bool(finite.any()):
+        raise DataError(f"none of {scene.num_primitives:,} primitives is finite, so no camera sees the scene")
+    return Field({name: value.detach()[finite] for name, value in scene.field.items()}, scene.field.encoding)
+
+
+def _middle_and_reach(field: Field) -> tuple[Tensor, float]:
+    """Median of the centres ``[3]``, float64, and the median distance from it; in one place, a size."""
+    means = field["means"].detach().cpu().double()
+    middle = means.median(dim=0).values
+    reach = float((means - middle).norm(dim=1).median())
+    if reach == 0:
+        reach = 3 * float(field["scales"].detach().double().amax(dim=1).median().exp())
+    return middle, max(reach, 1e-30)
+
+
+def _probe(field: Field, middle: Tensor, reach: float, generator: torch.Generator) -> Field:
+    """A field of a few primitives that looks alike from afar, of unit size and around the origin.
+
+    Primitives are drawn by their size and opacity, and those drawn grow by as much as covers the others' area.
+    """
+    kept = field
+    if field.num_primitives > _PROBE_PRIMITIVES:
+        axes = field["scales"].cpu().double().sort(dim=1).values[:, 1:]
+        log_size = axes.sum(dim=1) / 2 + torch.nn.functional.logsigmoid(field["opacities"].cpu().double()[:, 0]) / 2
+        size = (log_size - log_size.max()).exp()
+        low, high = 0.0, float(field.num_primitives) / float(size.mean())
+        for _ in range(60):  # the factor at which as many are drawn, by bisection
+            factor = (low + high) / 2
+            low, high = (low, factor) if (factor * size).clamp(max=1).sum() > _PROBE_PRIMITIVES else (factor, high)
+        chance = (low * size).clamp(max=1)
+        drawn = torch.rand(len(chance), generator=generator, dtype=torch.float64) < chance
+        kept = field.rows(drawn.to(field["means"].device))
+        grown = kept["scales"] - chance[drawn].log().to(kept["scales"])[:, None] / 2
+        kept = kept.replaced({"scales": grown})
+    moved = (kept["means"].double() - middle.to(kept["means"].device)) / reach
+    return kept.replaced({"means": moved.float(), "scales": kept["scales"] - math.log(reach)})
+
+
+@torch.no_grad()
+def _spread_of_depth(scene: Scene, views: Sequence[View]) -> Tensor:
+    """Mean over the pixels of each view of the deviation of depth along the ray, over the depth, at most 1 ``[V]``.
+
+    Pixels that show next to nothing count as 1; a view without anything is infinite.
+    """
+    means, settings, found = scene.field["means"], scene.settings(head=False), []
+    for seen in views:
+        view = seen.to(scene.device)
+        z = means @ view.viewmat[2, :3] + view.viewmat[2, 3]
+        channels = torch.stack([torch.ones_like(z), z, z.square()], dim=1)
+        blended = rasterize(colors=channels, **pass_options(scene.field, view, settings)).colors
+        opacity, first, second = blended.unbind(2)
+        shows = opacity > _OPAQUE
+        depth = first / opacity.clamp_min(_OPAQUE)
+        deviation = (second / opacity.clamp_min(_OPAQUE) - depth.square()).clamp_min(0).sqrt()
+        mean = torch.where(shows, (deviation / depth.clamp_min(1e-9)).clamp(max=1), 1.0).mean()
+        found.append(torch.where(opacity.max() > 0, mean, torch.inf))
+    return torch.stack(found).cpu()
