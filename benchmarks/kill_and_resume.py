@@ -1,17 +1,26 @@
-"""Kill training with SIGKILL, resume it, and compare what comes out with an undisturbed run; print one JSON line.
+"""Kill trainings and commands with SIGKILL, repeat them, and compare with undisturbed ones; print a JSON line a kind.
 
-    python benchmarks/kill_and_resume.py                      # 20 kills: while saving, while pruning, at any time
-    python benchmarks/kill_and_resume.py --kills 3 --seed 1
+    python benchmarks/kill_and_resume.py                       # all kinds on a CPU: 20 + 10 + 24 kills
+    python benchmarks/kill_and_resume.py --kinds training --kills 3 --seed 1
+    python benchmarks/kill_and_resume.py --kinds training trials --device cuda             # recorded steps
+    python benchmarks/kill_and_resume.py --kinds training --device cuda --gpus 2           # at any time, any process
 
-Every run is nerfstudio's own training command on a ray-traced scene, in a process of its own. A server process without
-threads imports nerfstudio once and forks the runs. Exits with 1 if any resumed run ended differently.
+- ``training``: while saving, while pruning, at any time.
+- ``trials``: the same in the trials of a head and of a length, with a viewer connected that moves its camera.
+- ``commands``: prune, pack and export over an older result: while the file is written, before it is renamed, at any
+  time. Afterwards the older result or the whole new one must be there, and the same command must succeed.
+
+Every run is nerfstudio's own training command, or one of sundae, on a ray-traced scene, in a process of its own. A
+server process without threads imports nerfstudio once and forks the runs. Exits with 1 if anything was lost. On a CPU a
+resumed run must be the same bit for bit; on CUDA, where sums have no fixed order, its images must be as near to those
+of the undisturbed run as those of a second undisturbed one, less ``SPREAD`` dB.
 """
 
 from __future__ import annotations
 
 import argparse
-import io
 import json
+import math
 import multiprocessing
 import os
 import random
@@ -21,8 +30,11 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
@@ -35,158 +47,182 @@ from nerfstudio.scripts import train
 from ray_tracing import write_still_life
 from rich.progress import track
 
-import sundae_ns.pruning.cutting
-import sundae_ns.storage.atomic
-import sundae_ns.storage.runs.checkpoint
-import sundae_ns.training.report
+import sundae_ns as sn
+from harness import killing
+from harness.watcher import Watcher, free_port
+from sundae_ns.cli.main import main as sundae
 from sundae_ns.errors import CheckpointError
+from sundae_ns.storage.runs import checkpoint
 
-STEPS, SAVE_EVERY, PRUNE_AT = 70, 12, 36
-LONGEST = 600.0
+LONGEST = 900.0
 """Seconds after which a run counts as hanging; it takes about ten."""
-
-# This process has threads (a progress bar's, torch's): a run forked off it could wait for ever for a lock of theirs.
-SERVER = multiprocessing.get_context("forkserver")
-SERVER.set_forkserver_preload(["nerfstudio.scripts.train", "sundae_ns.model", "sundae_ns.trainer"])
-
-OPTIONS = f"""
---experiment-name e --timestamp t --max-num-iterations {STEPS} --steps-per-save {SAVE_EVERY} --vis tensorboard
---viewer.quit-on-train-completion True --steps-per-eval-image 25 --pipeline.model.pruning.prune-at {PRUNE_AT}
---pipeline.model.warmup-length 5 --pipeline.model.refine-every 10 --pipeline.model.densify-grad-thresh 0.0004
---pipeline.model.sh-degree-interval 20
-""".split()
-
-
-def die() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def after(calls: int, module: Any, name: str, place: Callable[[Callable[..., Any]], Callable[..., Any]]) -> None:
-    """Replace ``module.name`` by ``place(original)`` from its ``calls``-th call on."""
-    original, seen = getattr(module, name), [0]
-
-    def wrapper(*arguments: Any, **options: Any) -> Any:
-        seen[0] += 1
-        return (place(original) if seen[0] >= calls else original)(*arguments, **options)
-
-    setattr(module, name, wrapper)
-
-
-def at_once(original: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda *_, **__: die()
-
-
-def when_done(original: Callable[..., Any]) -> Callable[..., Any]:
-    def call(*arguments: Any, **options: Any) -> None:
-        original(*arguments, **options)
-        die()
-
-    return call
-
-
-def half_saved(original: Callable[..., Any]) -> Callable[..., Any]:
-    def call(state: Any, file: Any) -> None:
-        whole = io.BytesIO()
-        original(state, whole)
-        file.write(whole.getvalue()[: len(whole.getvalue()) // 2])
-        file.flush()
-        die()
-
-    return call
-
-
-def half_recorded(original: Callable[..., Any]) -> Callable[..., Any]:
-    def call(path: Path, text: str) -> None:
-        with sundae_ns.storage.atomic.replacing(path) as partial:
-            partial.write_text(text[: len(text) // 2])
-            die()
-
-    return call
-
-
-PLACES: dict[str, Callable[[int], None]] = {
-    "save: half written": lambda n: after(n, sundae_ns.storage.runs.checkpoint.torch, "save", half_saved),
-    "save: not yet on the disk": lambda n: after(3 * n, sundae_ns.storage.atomic, "flush", at_once),
-    "save: the older one not yet gone": lambda n: after(n, sundae_ns.storage.runs.checkpoint, "write", when_done),
-    "prune: deciding": lambda n: after(1, sundae_ns.pruning.cutting, "decide", at_once),
-    "prune: sliced": lambda n: after(1, sundae_ns.pruning.cutting, "keep", when_done),
-    "prune: half recorded": lambda n: after(1, sundae_ns.training.report, "write_text", half_recorded),
-}
+SPREAD = 3.0
+"""Decibels that a resumed run on CUDA may differ more than a second one."""
 ANY = "any time"
 
 
-def plan(kills: int, rng: random.Random) -> list[str]:
-    """Places of the kills: one at each, then random ones; half of the rest at any time."""
-    places = [ANY, *PLACES][:kills]
-    while len(places) < kills:
-        places.append(ANY if len(places) % 2 else rng.choice(list(PLACES)))
-    return places
+@dataclass(frozen=True)
+class Training:
+    """A training that is killed."""
+
+    steps: int
+    save_every: int
+    places: dict[str, killing.Place]
+    options: str
+    watched: bool = False
+    """Whether a viewer is connected."""
+
+    def words(self, scene: Path) -> list[str]:
+        """Arguments of ``ns-train``."""
+        own = f"--max-num-iterations {self.steps} --steps-per-save {self.save_every} {self.options}"
+        return ["sundae-tiny", "--data", str(scene), *COMMON.split(), *own.split()]
 
 
-def train_here(config: TrainerConfig, log: Path, place: str | None, nth: int) -> None:
-    """Train in this process, with its output in ``log``; die the ``nth`` time that ``place`` is reached."""
+COMMON = """
+--experiment-name e --timestamp t --viewer.quit-on-train-completion True --viewer.websocket-host 127.0.0.1
+--steps-per-eval-image 25 --pipeline.model.warmup-length 5 --pipeline.model.refine-every 10
+--pipeline.model.densify-grad-thresh 0.0004 --pipeline.model.sh-degree-interval 20
+"""
+TRAININGS = {
+    "training": Training(70, 12, killing.TRAINING, "--vis tensorboard --pipeline.model.pruning.prune-at 36"),
+    # Trials begin at the prune. With eight views each candidate is tried twice, for four steps.
+    "trials": Training(
+        160,
+        9,
+        killing.TRIALS,
+        "--vis viewer+tensorboard --pipeline.model.pruning.prune-at 40 --pipeline.model.head.mode auto",
+        watched=True,
+    ),
+}
+KILLS = {"training": 20, "trials": 10, "commands": 24}
+
+
+# ------------------------------------------------------------------------------------------------------------ processes
+
+
+def with_log(log: Path) -> None:
+    """Write the output of this process to a log."""
     torch.set_num_threads(1)
     with open(log, "a") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+
+
+def train_here(config: TrainerConfig, log: Path, place: str | None, nth: int) -> None:
+    """Train in this process; die the ``nth`` time that ``place`` is reached."""
+    with_log(log)
     if place is not None:
-        PLACES[place](nth)
+        {**killing.TRAINING, **killing.TRIALS}[place](nth)
     train.main(config)
 
 
-def start(config: TrainerConfig, log: Path, place: str | None = None, nth: int = 1) -> BaseProcess:
-    """Train in a new process."""
-    child = SERVER.Process(target=train_here, args=(config, log, place, nth))
-    child.start()
-    return child
+def command_here(words: Sequence[str], log: Path, place: str | None) -> None:
+    """Run a command of sundae in this process; die when ``place`` is reached."""
+    with_log(log)
+    if place is not None:
+        killing.COMMANDS[place](1)
+    sundae(words)
 
 
-def ended(child: BaseProcess, log: Path) -> int:
-    """Wait for a process; its exit code, or minus the signal that ended it."""
-    child.join(LONGEST)
-    if child.exitcode is None:
-        child.kill()
-        child.join()
-        raise SystemExit(f"a run did not end within {LONGEST} s; the end of its log:\n{log.read_text()[-3000:]}")
-    return child.exitcode
+class Bench:
+    """Runs processes one after another, with one log.
+
+    Args:
+        device: of the trainings; processes on CUDA cannot be forked.
+        log: file for their output.
+    """
+
+    def __init__(self, device: str, log: Path) -> None:
+        self.context: Any = multiprocessing.get_context("spawn" if device == "cuda" else "forkserver")
+        if device == "cpu":
+            # This process has threads (a progress bar's, torch's): a run forked off it could wait for ever for a lock
+            # of theirs.
+            self.context.set_forkserver_preload(["nerfstudio.scripts.train", "sundae_ns.model", "sundae_ns.trainer"])
+        self.log = log
+
+    def start(self, work: Any, *arguments: Any) -> BaseProcess:
+        """Start a process that calls ``work``."""
+        child: BaseProcess = self.context.Process(target=work, args=arguments)
+        child.start()
+        return child
+
+    def ended(self, child: BaseProcess) -> int:
+        """Wait for a process; its exit code, or minus the signal that ended it."""
+        child.join(LONGEST)
+        if child.exitcode is None:
+            child.kill()
+            child.join()
+            self.fail(f"a run did not end within {LONGEST} s")
+        return int(child.exitcode or 0)
+
+    def finish(self, child: BaseProcess) -> None:
+        """Wait for a process that must succeed."""
+        code = self.ended(child)
+        if code != 0:
+            self.fail(f"a run failed with exit code {code}")
+
+    def fail(self, reason: str) -> None:
+        raise SystemExit(f"{reason}; the end of its log:\n{self.log.read_text(errors='replace')[-3000:]}")
+
+    def killed_at_any_time(self, start: Any, again: Any, seconds: float, rng: random.Random) -> bool:
+        """Kill what ``start`` starts within ``seconds``; try ``again`` if it ended before. Whether it was killed.
+
+        Of several processes a random one is killed; the others must end by themselves.
+        """
+        for _ in range(10):
+            child = start()
+            time.sleep(rng.uniform(0.0, seconds))
+            family = [child.pid, *descendants(child.pid)]
+            with suppress(ProcessLookupError):  # it has ended
+                victims = [pid for pid in family if b"resource_tracker" not in command_line(pid)]
+                os.kill(rng.choice(victims), signal.SIGKILL)
+            code = self.ended(child)
+            until = time.monotonic() + LONGEST
+            while any(command_line(pid) for pid in family[1:]):
+                if time.monotonic() > until:
+                    self.fail("a process outlived the one that was killed")
+                time.sleep(0.1)
+            if code != 0:
+                return True
+            again()
+            seconds *= 0.8  # the machine has become faster
+        return False
 
 
-def finish(child: BaseProcess, log: Path) -> None:
-    code = ended(child, log)
-    if code != 0:
-        raise SystemExit(f"a run failed with exit code {code}; the end of its log:\n{log.read_text()[-3000:]}")
+def command_line(pid: int) -> bytes:
+    """Words of a running process; empty if there is none."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""
 
 
-def was_killed(child: BaseProcess, log: Path) -> bool:
-    """Wait for a process; whether it was killed."""
-    return ended(child, log) == -signal.SIGKILL
+def descendants(pid: int) -> list[int]:
+    """Processes that a process started, and theirs."""
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:
+        return []
+    return [one for child in children for one in (int(child), *descendants(int(child)))]
 
 
-def kill_at_any_time(config: TrainerConfig, log: Path, seconds: float, rng: random.Random) -> bool:
-    """Start a run that takes about ``seconds``, and kill it; try again if it ended before. Whether it was killed."""
-    for _ in range(10):
-        child = start(config, log)
-        time.sleep(rng.uniform(0.0, seconds))
-        child.kill()
-        if was_killed(child, log):
-            return True
-        shutil.rmtree(run_folder(config))
-        seconds *= 0.8  # the machine has become faster
-    return False
+# ------------------------------------------------------------------------------------------------------------ trainings
 
 
 def run_folder(config: TrainerConfig) -> Path:
     return Path(config.output_dir) / "e" / "sundae-tiny" / "t"
 
 
-def outcome(folder: Path) -> dict[str, Any]:
-    """Result of a finished run: tensors of the final checkpoint, the record of its prune, and names of its files."""
+def outcome(folder: Path, steps: int) -> dict[str, Any]:
+    """Result of a finished run: tensors of the final checkpoint, its records, and names of its files."""
     models = folder / "nerfstudio_models"
-    state = sundae_ns.storage.runs.checkpoint.read(models / f"step-{STEPS - 1:09d}.ckpt")
+    (last,) = models.glob(f"step-*{steps - 1}.ckpt")
     prunes = json.loads((folder / "prune.json").read_text())
+    state = checkpoint.read(last)
     return {
         "tensors": {name: value for name, value in state["pipeline"].items() if isinstance(value, torch.Tensor)},
         "prunes": [{key: prune[key] for key in ("step", "before", "after", "warm_up", "pruned")} for prune in prunes],
+        "trials": {path.name: json.loads(path.read_text()) for path in folder.glob("[st]*.json")},
         "files": sorted(path.name for path in models.iterdir()),
     }
 
@@ -195,77 +231,224 @@ def same_tensors(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="folder to work in; a temporary one by default")
-    options = parser.parse_args()
-    rng = random.Random(options.seed)
-    root = options.out or Path(tempfile.mkdtemp(prefix="kill-and-resume-"))
-    root.mkdir(parents=True, exist_ok=True)
-    log = root / "log"
-    write_still_life(root / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
-    arguments = ["sundae-tiny", "--data", str(root / "scene"), *OPTIONS]
-    parsed = tyro.cli(AnnotatedBaseConfigUnion, args=arguments)
+def nearness(run: Path, other: Path, device: str) -> float:
+    """PSNR of the images of a run against those of another, dB."""
+    scene, reference = (sn.load(one, device=device) for one in (run, other))
+    return sn.measure(scene, reference, sn.virtual_views(reference, 4)).psnr
+
+
+def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: Path, kills: int) -> dict[str, Any]:
+    """Kill trainings of one kind; what came of it, with ``lost`` for the number of those that ended otherwise."""
+    what, rng = TRAININGS[kind], random.Random(options.seed)
+    scene = root / "scene"
+    if not scene.exists():
+        write_still_life(scene, train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
+    parsed = tyro.cli(AnnotatedBaseConfigUnion, args=what.words(scene))
+    parsed.machine.device_type, parsed.machine.num_devices = options.device, options.gpus
+    exact = options.device == "cpu"
+    watchers: list[Watcher] = []
 
     def configured(name: str) -> TrainerConfig:
         config = deepcopy(parsed)
-        config.output_dir = root / name
+        config.output_dir = root / kind / name
         return config
 
-    whole = configured("whole")
-    finish(start(whole, log), log)
-    began = time.monotonic()
-    expected = configured("again")  # again: the time of a run, and whether the same seed gives the same
-    finish(start(expected, log), log)
-    seconds = time.monotonic() - began
-    reference, again = outcome(run_folder(whole)), outcome(run_folder(expected))
-    repeatable = same_tensors(reference["tensors"], again["tensors"]) and reference["prunes"] == again["prunes"]
+    def started(config: TrainerConfig, place: str | None = None, nth: int = 1) -> BaseProcess:
+        if what.watched:
+            config.viewer.websocket_port = free_port()
+            watchers.append(Watcher(config.viewer.websocket_port))
+        return bench.start(train_here, config, bench.log, place, nth)
+
+    def trained(config: TrainerConfig) -> float:
+        began = time.monotonic()
+        bench.finish(started(config))
+        return time.monotonic() - began
+
+    whole, second = configured("whole"), configured("again")
+    trained(whole)
+    seconds = trained(second)  # again: the time of a run, and whether the same seed gives the same
+    reference, repeated = (outcome(run_folder(config), what.steps) for config in (whole, second))
+    repeatable = not exact or all(
+        (same_tensors(reference["tensors"], repeated["tensors"]), reference["prunes"] == repeated["prunes"])
+    )
+    spread = math.inf if exact else nearness(run_folder(second), run_folder(whole), options.device)
 
     tally: Counter[str] = Counter()
-    places = plan(options.kills, rng)
-    for number, place in enumerate(track(places, description="Killing and resuming", transient=True)):
+    lost = 0
+    nearest: list[float] = []
+    # One kill at each place, then random ones; half of the rest at any time. Ranks have modules of their own.
+    every = [ANY, *(what.places if options.gpus == 1 else ())]
+    places = [every[i] if i < len(every) else ANY if i % 2 else rng.choice(every) for i in range(kills)]
+    for number, place in enumerate(track(places, description=f"Killing: {kind}", transient=True)):
         config = configured(f"killed-{number}")
-        models = run_folder(config) / "nerfstudio_models"
-        nth = rng.randint(1, STEPS // SAVE_EVERY)
+        folder = run_folder(config)
+        models = folder / "nerfstudio_models"
+        nth = rng.randint(1, 5)
         if place == ANY:
-            killed = kill_at_any_time(config, log, seconds, rng)
+            again = partial(shutil.rmtree, folder)
+            killed = bench.killed_at_any_time(partial(started, config), again, seconds, rng)
         else:
-            killed = was_killed(start(config, log, place, nth), log)
+            killed = bench.ended(started(config, place, nth)) == -signal.SIGKILL
         tally["killed"] += killed
         tally[f"at {place}"] += killed
         try:
-            newest, _ = sundae_ns.storage.runs.checkpoint.newest_whole(models)
-            done = int(newest.stem.partition("-")[2]) + 1
-            tally["resumed" if done < STEPS else "killed after the last save"] += 1
+            done = int(checkpoint.newest_whole(models)[0].stem.partition("-")[2]) + 1
+            tally["resumed" if done < what.steps else "killed after the last save"] += 1
         except CheckpointError:
             done = 0
             tally["killed before the first save, so started anew"] += 1
-        if done < STEPS:
+        if done < what.steps:
             resumed = configured(f"killed-{number}")
-            resumed.max_num_iterations = STEPS - done
+            resumed.max_num_iterations = what.steps - done
             resumed.load_dir = models if done else None
-            finish(start(resumed, log), log)
-        found = outcome(run_folder(config))
-        tally["same count"] += found["prunes"] == reference["prunes"] and len(found["prunes"]) == 1
-        tally["bit for bit the same"] += same_tensors(found["tensors"], reference["tensors"])
-        tally["nothing left lying"] += done == STEPS or found["files"] == reference["files"]
-
-    result = {
-        "kills": options.kills,
-        "steps": STEPS,
-        "save_every": SAVE_EVERY,
-        "prune_at": PRUNE_AT,
+            trained(resumed)
+        found = outcome(folder, what.steps)
+        one_prune = len(found["prunes"]) == 1 and found["prunes"][0]["step"] == reference["prunes"][0]["step"]
+        clean = done == what.steps or found["files"] == reference["files"]
+        if exact:
+            same = same_tensors(found["tensors"], reference["tensors"])
+            same = same and found["prunes"] == reference["prunes"] and found["trials"] == reference["trials"]
+        else:
+            nearest.append(nearness(folder, run_folder(whole), options.device))
+            same = nearest[-1] > spread - SPREAD
+        for name, held in (("one prune", one_prune), ("the same result", same), ("nothing left lying", clean)):
+            tally[name] += held
+        lost += not (killed and one_prune and same and clean)
+        shutil.rmtree(config.output_dir)
+    for watcher in watchers:
+        watcher.stop()
+    about = {
+        "steps": what.steps,
+        "save_every": what.save_every,
         "primitives": [reference["prunes"][0]["before"], reference["prunes"][0]["after"]],
-        "same seed, same result": repeatable,
-        **tally,
+        **({"decision": reference["trials"]["trials.json"]["decision"]} if kind == "trials" else {}),
+        "same seed, same result": repeatable if exact else None,
+        **({} if exact else {"psnr_of_a_second_run": spread, "least_psnr_of_a_resumed_run": min(nearest)}),
+        **({"images in viewers": sum(watcher.images for watcher in watchers)} if what.watched else {}),
     }
-    print(json.dumps(result))
+    blind = what.watched and not about["images in viewers"]
+    return {**about, **tally, "lost": lost + (not repeatable) + blind}
+
+
+# ------------------------------------------------------------------------------------------------------------- commands
+
+
+def commands(run: Path, ply: Path) -> dict[str, list[str]]:
+    """Commands that write, without their output, by its name."""
+    return {
+        "pruned.ply": ["prune", str(ply), "--views", "8"],
+        "pruned.sundae": ["prune", str(run), "--views", "8"],
+        "packed.sundae": ["pack", str(run)],
+        "tuned.sundae": ["pack", str(run), "--finetune", "10"],
+        "page.html": ["export", str(run)],
+        "page": ["export", str(run)],
+        "viewers.spz": ["export", str(run)],
+        "viewers.sog": ["export", str(ply)],
+    }
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Contents of all files below a folder, by their paths."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def write_all(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Counterpart of :func:`contents`."""
+    for path, content in files.items():
+        (folder / path).write_bytes(content)
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a page ends as pages do, or a scene opens."""
+    if path.suffix == ".html":
+        return path.read_bytes().rstrip().endswith(b"</html>")
+    try:
+        return sn.load(path).num_primitives > 0
+    except sn.SundaeError:
+        return False
+
+
+def kill_commands(options: argparse.Namespace, bench: Bench, root: Path, kills: int) -> dict[str, Any]:
+    """Kill commands that write over older results; as :func:`kill_trainings`."""
+    rng, folder, exact = random.Random(options.seed), root / "commands", not torch.cuda.is_available()
+    scene = write_still_life(folder / "scene", train_views=8, test_views=2, width=64, height=64, points=300, samples=1)
+    config = tyro.cli(AnnotatedBaseConfigUnion, args=TRAININGS["training"].words(scene))
+    config.output_dir, config.machine.device_type = folder / "out", options.device
+    bench.finish(bench.start(train_here, config, bench.log, None, 1))
+    ply = folder / "scene.ply"
+    bench.finish(bench.start(command_here, ["export", str(run_folder(config)), "-o", str(ply)], bench.log, None))
+    jobs = commands(run_folder(config), ply)
+
+    def place_of(name: str) -> Path:
+        return folder / "written" / name.replace(".", "-")
+
+    def begin(name: str, place: str | None = None) -> BaseProcess:
+        words = [*jobs[name], "-o", str(place_of(name) / name), "--overwrite"]
+        return bench.start(command_here, words, bench.log, place)
+
+    fresh: dict[str, dict[str, bytes]] = {}
+    seconds: dict[str, float] = {}
+    for name in jobs:
+        place_of(name).mkdir(parents=True)
+        began = time.monotonic()
+        bench.finish(begin(name))
+        seconds[name] = time.monotonic() - began
+        fresh[name] = contents(place_of(name))
+
+    tally: Counter[str] = Counter()
+    lost = 0
+    every = [ANY, *killing.COMMANDS]
+    for number in track(range(kills), description="Killing: commands", transient=True):
+        name, place = list(jobs)[number % len(jobs)], every[(number // len(jobs)) % len(every)]
+        older = dict.fromkeys(fresh[name], b"older")
+        age = partial(write_all, place_of(name), older)
+        age()
+        if place == ANY:
+            killed = bench.killed_at_any_time(partial(begin, name), age, seconds[name], rng)
+        else:
+            killed = bench.ended(begin(name, place)) == -signal.SIGKILL
+        found = contents(place_of(name))
+        kept = all(
+            found.get(path) in (older[path], fresh[name][path]) or (not exact and is_whole(place_of(name) / path))
+            for path in older
+        )
+        bench.finish(begin(name))
+        last = contents(place_of(name))
+        again = last == fresh[name] if exact else all(is_whole(place_of(name) / path) for path in last)
+        again = again and last.keys() == older.keys()
+        tally["killed"] += killed
+        tally[f"at {place}"] += killed
+        tally["older or new, and whole"] += kept
+        tally["then the same command succeeds, and nothing is left lying"] += again
+        lost += not (killed and kept and again)
+    return {"commands": {name: words[0] for name, words in jobs.items()}, **tally, "lost": lost}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--kinds", nargs="+", choices=[*KILLS], default=[*KILLS])
+    parser.add_argument("--kills", type=int, help=f"of each kind; by default {KILLS}")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of trainings; commands take any GPU")
+    parser.add_argument("--gpus", type=int, default=1, help="number of ranks")
+    parser.add_argument("--out", type=Path, help="folder to work in; a temporary one by default")
+    options = parser.parse_args()
+    if options.gpus > 1 and (options.device == "cpu" or options.kinds != ["training"]):
+        parser.error("several ranks need --device cuda --kinds training: they have no viewer")
+    root = options.out or Path(tempfile.mkdtemp(prefix="kill-and-resume-"))
+    root.mkdir(parents=True, exist_ok=True)
+    bench = Bench(options.device, root / "log")
+    lost = 0
+    for kind in options.kinds:
+        kills = options.kills or KILLS[kind]
+        work = (options, bench, root, kills)
+        result = kill_commands(*work) if kind == "commands" else kill_trainings(kind, *work)
+        lost += result["lost"]
+        device = torch.cuda.get_device_name(0) if options.device == "cuda" else "cpu"
+        print(json.dumps({"kind": kind, "device": device, "ranks": options.gpus, "kills": kills, **result}), flush=True)
     if options.out is None:
         shutil.rmtree(root)
-    always = ("killed", "same count", "bit for bit the same", "nothing left lying")
-    sys.exit(0 if repeatable and all(tally[name] == options.kills for name in always) else 1)
+    sys.exit(1 if lost else 0)
 
 
 if __name__ == "__main__":
