@@ -110,6 +110,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     torch.manual_seed(0)
+    if torch.get_num_threads() != 1:  # a script that an earlier test ran in this process chose its own
+        torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

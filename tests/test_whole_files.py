@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 WRITERS = {"write_text", "write_bytes", "save", "savefig", "tofile", "imwrite", "imsave", "writestr"}
-FILES = {"partial", "file", "buffer", "poster", "bundle"}
+FILES = {"partial", "content", "file", "buffer", "poster", "bundle"}
 """Names of files that will be renamed, of files opened from them, and of files in memory."""
 ELSEWHERE = {
     "cli/demo.py": ["open(out / 'measure.log', 'w')"],  # a log is read while it is written

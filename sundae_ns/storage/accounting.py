@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from sundae_ns.compensation import CompensationHead, HeadConfig
-from sundae_ns.evaluation.measured import MEGABYTE
 
 BYTES_PER_FLOAT = 4
 
@@ -53,7 +52,7 @@ def rows_within(params: Mapping[str, Tensor], limit: int, count_bytes: Callable[
 
 def megabytes(count: int) -> str:
     """Format bytes in MB = 1e6 bytes: ``31.10 MB``."""
-    return f"{count / MEGABYTE:.2f} MB"
+    return f"{count / 1e6:.2f} MB"
 
 
 class Sizes(NamedTuple):

@@ -30,7 +30,7 @@ def test_plots_of_lines_have_at_most_six_runs() -> None:
     runs = [measured(f"run {i}") for i in range(8)]
     curve = Curve((0, 1), (2.0, 1.0))
     curves = {run.label: Curves(loss=curve) for run in runs[6:]}
-    plots, files = _plot({"garden": runs}, curves)
+    plots, files = _plot({"garden": runs}, curves, {})
     names = [name for _, name in plots["garden"]]
     # Nothing was timed.
     assert names[:2] == ["quality-size.png", "quality-primitives.png"]
@@ -41,6 +41,6 @@ def test_plots_of_lines_have_at_most_six_runs() -> None:
 
 def test_each_scene_has_its_own_plots() -> None:
     scenes = {"garden": [measured("a")], "fox": [measured("b")]}
-    plots, _ = _plot(scenes, {})
+    plots, _ = _plot(scenes, {}, {})
     assert [name for _, name in plots["garden"]] == ["quality-size-1.png", "quality-primitives-1.png", "views-1.png"]
     assert [name for _, name in plots["fox"]] == ["quality-size-2.png", "quality-primitives-2.png", "views-2.png"]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
 import struct
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -36,7 +36,7 @@ def in_process(job: Job, out: Path, on_percent: Callable[[float], object]) -> No
     perform(job, out)
 
 
-def test_stopped_and_continued(tiny: Any, tmp_path: Path) -> None:
+def test_stopped_and_continued(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arms, out = ["sundae", "random-no-head", "mcmc"], tmp_path / "out"
     jobs = plan_scene(
         tiny.scene.resolve(),
@@ -57,12 +57,14 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path) -> None:
     stamps = {path: path.stat().st_mtime_ns for path in (out / "done").iterdir()}
     assert len(stamps) == 3
 
-    # In a process of its own: it starts another one for its job.
-    words = [sys.executable, ROOT / "benchmarks" / "quality.py", tiny.scene, "-o", out, "--arms", *arms]
+    words = [ROOT / "benchmarks" / "quality.py", tiny.scene, "-o", out, "--arms", *arms]
     words += ["--method", "sundae-tiny", "--steps-scale", SCALE, "--seeds", 42]
     words += ["--keep-ratios", 0.5, "--repeat-at", 0.5]
-    done = subprocess.run([str(word) for word in words], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+    # It starts a process for its job.
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(words[0]), run_name="__main__")
+    assert ended.value.code == 0
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
     assert not leftover.exists()
     rows = {row.variant: row for row in read_rows(out / "results.csv")}

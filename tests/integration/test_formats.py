@@ -79,8 +79,9 @@ def test_a_file_of_another_program_takes_the_place_of_its_own_row(
 ) -> None:
     out, file = tmp_path / "formats.csv", tmp_path / "other.ply"
     scene = sn.load(tiny.folder)
+    views = sn.virtual_views(scene, 2)
     for count in (scene.num_primitives, 20):
-        sn.save(sn.prune(scene, count=count) if count < scene.num_primitives else scene, file)
+        sn.save(sn.prune(scene, count=count, views=views) if count < scene.num_primitives else scene, file)
         run(monkeypatch, tiny.folder, "-o", out, "--ply", file, "--program", f"tool {count}")
     rows = [row for row in rows_of(out) if row["format"] == ".ply"]
     assert [(row["program"], row["primitives"]) for row in rows] == [("tool 20", "20")]

@@ -29,7 +29,7 @@ CONFIGS: dict[str, Callable[[str], str]] = {
 WORDS: dict[str, list[str]] = {
     "run": ["CAPTURE", "-o", "PROJECT", "--method", "sundae-tiny"],
     "train": ["CAPTURE", "-o", "runs"],
-    "prune": ["RUN", "-o", "out.ply"],
+    "prune": ["RUN", "-o", "out.ply", "--views", "2"],
     "pack": ["RUN", "-o", "out.sundae"],
     "unpack": ["RUN", "-o", "runs"],
     "export": ["RUN", "-o", "out.html"],

@@ -36,6 +36,8 @@ ELSEWHERE = {
 NAMES = {"$RUN": "RUN", "capture": "CAPTURE", "RUN_OR_PACK_OR_PLY": "other.ply", "FILE": "other.ply", "...": ""}
 SHORTER = {"--finetune": "2", "--view": "2", "--width": "32", "--height": "24", "--train-views": "6"}
 """Values that suit a small run and a small scene."""
+MORE = {"prune": ["--views", "4"]}
+"""Options that shorten commands of ``sundae`` further."""
 
 
 OURS = ("sundae ", "python benchmarks/")
@@ -59,7 +61,7 @@ def commands_of(page: Path, *programs: str) -> Iterator[list[str]]:
             for option, value in SHORTER.items():
                 if option in words:
                     words[words.index(option) + 1] = value
-            yield [word for word in words if word]
+            yield [word for word in words if word] + MORE.get(words[1], [])
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if list(commands_of(page))], ids=lambda page: page.name)

@@ -58,7 +58,13 @@ def differences(one: Any, other: Any) -> dict[str, float]:
     }
 
 
-def alike(trainer_of: MakeTrainer, steps: type[RecordedStep]) -> tuple[Any, Any]:
+@pytest.fixture(scope="module")
+def usual_runs() -> dict[int, Any]:
+    """Usual runs by seed, with which both tests compare."""
+    return {}
+
+
+def alike(trainer_of: MakeTrainer, steps: type[RecordedStep], usual_runs: dict[int, Any]) -> tuple[Any, Any]:
     """A usual run and one by recorded steps that end alike, at the first of a few seeds.
 
     Rounding decides about primitives at thresholds of densification. Of ten seeds two part by 0.03 and 0.07, six by
@@ -67,15 +73,17 @@ def alike(trainer_of: MakeTrainer, steps: type[RecordedStep]) -> tuple[Any, Any]
     """
     found = []
     for seed in (1, 5, 2):
-        usual, recorded = trained(trainer_of, None, seed), trained(trainer_of, steps, seed)
+        if seed not in usual_runs:
+            usual_runs[seed] = trained(trainer_of, None, seed)
+        usual, recorded = usual_runs[seed], trained(trainer_of, steps, seed)
         found.append(differences(recorded.model, usual.model))
         if max(found[-1].values()) < 0.02:
             return usual, recorded
     pytest.fail(f"runs differ at every seed: {found}")
 
 
-def test_a_run_by_recorded_steps_is_the_same(trainer_of: MakeTrainer) -> None:
-    usual, recorded = alike(trainer_of, RecordedStep)
+def test_a_run_by_recorded_steps_is_the_same(trainer_of: MakeTrainer, usual_runs: dict[int, Any]) -> None:
+    usual, recorded = alike(trainer_of, RecordedStep, usual_runs)
     assert recorded._recorded is not None
     for path in sorted(recorded.checkpoint_dir.glob("*.ckpt")):
         loaded = checkpoint.read(path)
@@ -86,8 +94,10 @@ def test_a_run_by_recorded_steps_is_the_same(trainer_of: MakeTrainer) -> None:
     assert not rates  # all are written
 
 
-def test_training_goes_on_where_a_recording_fails(trainer_of: MakeTrainer, capsys: pytest.CaptureFixture[str]) -> None:
-    _, recorded = alike(trainer_of, Failing)
+def test_training_goes_on_where_a_recording_fails(
+    trainer_of: MakeTrainer, usual_runs: dict[int, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, recorded = alike(trainer_of, Failing, usual_runs)
     assert recorded._recorded is None
     assert "without recordings, slower: no memory for a recording" in " ".join(capsys.readouterr().out.split())
 

@@ -9,19 +9,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[2]
+import kill_and_resume
+import pytest
 
 
-def test_killed_anywhere_it_goes_on_as_if_never_killed() -> None:
+def test_killed_anywhere_it_goes_on_as_if_never_killed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """The short version of ``benchmarks/kill_and_resume.py``, which says where the kills fall."""
-    result = subprocess.run(
-        [sys.executable, str(ROOT / "benchmarks" / "kill_and_resume.py"), "--kinds", "training", "--kills", "2"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    found = json.loads(result.stdout.splitlines()[-1])
+    monkeypatch.setattr(sys, "argv", ["kill_and_resume.py", "--kinds", "training", "--kills", "2"])
+    with pytest.raises(SystemExit) as ended:
+        kill_and_resume.main()
+    assert ended.value.code == 0
+    found = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert found["killed"] == found["one prune"] == found["the same result"] == found["nothing left lying"] == 2
     assert found["same seed, same result"]
 

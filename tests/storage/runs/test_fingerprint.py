@@ -108,7 +108,7 @@ def test_the_capture_changes_nothing() -> None:
         "--pipeline.model.head.mode residual",
         "--pipeline.model.head.num-features 5",
         "--pipeline.model.pruning.keep-ratio 0.3",
-        "--pipeline.model.pruning.max-psnr-drop 0.2",
+        "--pipeline.model.pruning.max-primitives 20",
         "--pipeline.model.base-loss-weight 0.3",
         "--pipeline.model.sh-degree 2",
         "--pipeline.model.warm-start field.ply",
