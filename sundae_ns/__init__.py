@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from sundae_ns.errors import SundaeError as SundaeError
     from sundae_ns.pruning import PruneRule as PruneRule
     from sundae_ns.rendering.views import View as View
+    from sundae_ns.scenes.distill import distill as distill
 
 __version__ = "0.1.0"
 
@@ -45,6 +46,7 @@ _HOMES = {
     "Scene": "sundae_ns.api.scene",
     "SundaeError": "sundae_ns.errors",
     "View": "sundae_ns.rendering.views",
+    "distill": "sundae_ns.scenes.distill",
     "load": "sundae_ns.api.opening",
     "measure": "sundae_ns.api.measuring",
     "prune": "sundae_ns.api.pruning",

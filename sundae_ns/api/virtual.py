@@ -83,24 +83,32 @@ def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128)
 
 
 def of_unit_size(scene: Scene, views: Sequence[View]) -> tuple[Scene, list[View]]:
-    """A scene of another program scaled to a median distance of 1 from its middle, and its views along with it.
+    """A scene of another program scaled to a size of 1, and its views along with it; see :func:`size_of`.
 
-    The near plane is at a fixed distance, and would hide a scene of millimetres. A scene of nerfstudio's model has the
-    size that it was trained at, and stays.
+    The near plane is at a fixed distance, and would hide a scene of millimetres.
     """
-    views = list(views)
-    if scene.in_model_frame:
+    views, size = list(views), size_of(scene)
+    if size == 1:
         return scene, views
-    _, reach = _middle_and_reach(_usable(scene))
-    field = scene.field.replaced(
-        {"means": scene.field["means"] / reach, "scales": scene.field["scales"] - math.log(reach)}
-    )
     scaled = []
     for view in views:
         viewmat = view.viewmat.clone()
-        viewmat[:3, 3] /= reach
+        viewmat[:3, 3] /= size
         scaled.append(view._replace(viewmat=viewmat))
-    return dataclasses.replace(scene, field=field), scaled
+    return resized(scene, 1 / size), scaled
+
+
+def size_of(scene: Scene) -> float:
+    """The median distance of the primitives from their middle; 1 for nerfstudio's model, which keeps its size."""
+    return 1.0 if scene.in_model_frame else _middle_and_reach(_usable(scene))[1]
+
+
+def resized(scene: Scene, factor: float) -> Scene:
+    """The scene, without its stored views, ``factor`` times as large."""
+    if factor == 1:
+        return scene
+    values = {"means": scene.field["means"] * factor, "scales": scene.field["scales"] + math.log(factor)}
+    return dataclasses.replace(scene, field=scene.field.replaced(values), views=())
 
 
 def _usable(scene: Scene) -> Field:

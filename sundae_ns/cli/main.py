@@ -16,6 +16,7 @@ import tyro
 from sundae_ns.cli.bench import bench
 from sundae_ns.cli.curve import curve
 from sundae_ns.cli.demo import demo
+from sundae_ns.cli.distill import distill_file
 from sundae_ns.cli.evaluate import evaluate
 from sundae_ns.cli.files import export, prune_file
 from sundae_ns.cli.packing import pack, unpack
@@ -54,6 +55,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "run": (run, "photos to a packed scene, its report and its web page; resumes"),
     "train": (train, "train by ns-train, with short options"),
     "prune": (prune_file, "make any splat scene smaller, without its photos"),
+    "distill": (distill_file, "prune, then train on the full scene's own images, without photos"),
     "pack": (pack, "pack a finished run into one file"),
     "unpack": (unpack, "unpack a scene into a run, for the commands of nerfstudio"),
     "export": (export, "write a scene as a web page, .ply, .spz or .sog"),

@@ -1,0 +1,212 @@
+"""Make full fields small without their photos, by tools and shares; print one CSV row for each small field.
+
+    python benchmarks/prune_without_photos.py RUN ... -o benchmarks/results/prune.csv
+    python benchmarks/prune_without_photos.py RUN --splat-transform splat-transform     # beside PlayCanvas's decimation
+    python benchmarks/prune_without_photos.py RUN --shares 0.5 0.1 --training none
+
+A run of sundae or splatfacto is a full field, and its capture has the test views. ``psnr_to_field`` compares them
+with the full field's own images, ``psnr`` and ``ssim`` with the photographs, and ``psnr_virtual`` compares virtual
+views that no tool was given with the full field. Tools and rules: ``sundae_ns`` by virtual views (``detail-merge``, the
+default) or by the highest opacities, which needs no view, and ``splat-transform --decimate``. Training is none, or that
+of ``sundae distill``: ``distill`` with a head where it pays, ``distill-no-head`` without. ``bytes`` are those of the
+.sundae file, ``bytes_sog`` of the base colours as .sog. With ``-o`` rows that are there are not measured again;
+``--again`` does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+import sundae_ns as sn
+from sundae_ns.errors import SundaeError
+from sundae_ns.rendering.views import view_of
+from sundae_ns.scenes.opening import open_scene
+from sundae_ns.storage.atomic import replacing
+
+COLUMNS = (
+    *("capture", "tool", "rule", "training", "share", "primitives", "bytes", "bytes_sog"),
+    *("psnr_to_field", "psnr", "ssim", "psnr_virtual", "seconds", "device", "seed", "steps"),
+)
+PLACE = ("capture", "tool", "rule", "training", "share", "device", "seed", "steps")
+"""Columns that name a row."""
+OURS, OTHER = "sundae_ns", "splat-transform"
+RULES = {
+    "detail-merge": sn.PruneRule(),
+    "opacity": sn.PruneRule(score="opacity", selection="top", redistribution="none"),
+}
+TRAININGS = ("none", "distill", "distill-no-head")
+HELD_OUT = 32
+
+
+class Full(NamedTuple):
+    """A full field with its test views."""
+
+    capture: str
+    scene: sn.Scene
+    views: list[sn.View]
+    photos: list[Tensor]
+    images: list[Tensor]
+    virtual: list[sn.View]
+
+
+def full_field(run: Path, data: Path | None) -> Full:
+    """Open a run with its test views."""
+    opened = open_scene(run, data=data)
+    device = opened.model.device
+    scene = dataclasses.replace(sn.load(run, device=device), head=None)
+    views = [view_of(camera, device) for camera in opened.cameras]
+    images = [sn.render(scene, view).rgb for view in views]
+    virtual = sn.virtual_views(scene, HELD_OUT, seed=10_000, size=256)
+    return Full(opened.scene, scene, views, opened.truths, images, virtual)
+
+
+def device_of(scene: sn.Scene) -> str:
+    """Name of the device that the work runs on."""
+    return torch.cuda.get_device_name(scene.device) if scene.device.type == "cuda" else "cpu"
+
+
+def jobs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """The rows to make, without their figures."""
+    for share in options.shares:
+        for rule in RULES:
+            yield {"tool": OURS, "rule": rule, "training": "none", "share": share, "steps": 0}
+        for training in options.training:
+            if training != "none":
+                yield {
+                    **{"tool": OURS, "rule": "detail-merge", "training": training, "share": share},
+                    "steps": options.steps,
+                }
+        if options.splat_transform:
+            yield {"tool": OTHER, "rule": "decimate", "training": "none", "share": share, "steps": 0}
+
+
+def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: Path) -> tuple[sn.Scene, float]:
+    """The small scene of a job, and the seconds that it took, without loading and saving."""
+    began, scene, share = time.monotonic(), full.scene, job["share"]
+    if job["tool"] == OTHER:
+        source, out = folder / "full.ply", folder / "small.ply"
+        if not source.exists():
+            sn.save(scene, source)
+        began = time.monotonic()
+        words = [*shlex.split(options.splat_transform), "-w", source, "--decimate", f"{100 * share:g}%", out]
+        subprocess.run([str(word) for word in words], check=True, stdout=sys.stderr)
+        seconds = time.monotonic() - began
+        found = sn.load(out, device=scene.device)
+        return dataclasses.replace(scene, field=found.field), seconds
+    if job["training"] == "none":
+        rule = dataclasses.replace(RULES[job["rule"]], seed=options.seed)
+        views = sn.virtual_views(scene, seed=options.seed) if rule.uses_contribution else None
+        small = sn.prune(scene, keep=share, views=views, rule=rule)
+    else:
+        head = job["training"] == "distill"
+        small = sn.distill(scene, keep=share, steps=options.steps, seed=options.seed, head=head)
+    if scene.device.type == "cuda":
+        torch.cuda.synchronize()
+    return small, time.monotonic() - began
+
+
+def row_of(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """One row with its figures."""
+    small, seconds = made(full, job, options, folder)
+    sizes = {}
+    for suffix in (".sundae", ".sog"):
+        file = folder / f"small{suffix}"
+        sn.save(small, file)
+        sizes[suffix] = file.stat().st_size
+    photos = sn.measure(small, full.photos, full.views)
+    return {
+        **job,
+        "capture": full.capture,
+        "primitives": small.num_primitives,
+        "bytes": sizes[".sundae"],
+        "bytes_sog": sizes[".sog"],
+        "psnr_to_field": f"{sn.measure(small, full.images, full.views).psnr:.3f}",
+        "psnr": f"{photos.psnr:.3f}",
+        "ssim": f"{photos.ssim:.4f}",
+        "psnr_virtual": f"{sn.measure(small, full.scene, full.virtual).psnr:.3f}",
+        "seconds": f"{seconds:.1f}",
+        "device": device_of(full.scene),
+        "seed": options.seed,
+    }
+
+
+def read(path: Path | None) -> list[dict[str, Any]]:
+    """The rows of a table; none if there is none yet."""
+    if path is None or not path.exists():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def place(row: dict[str, Any]) -> tuple[str, ...]:
+    """What names a row."""
+    return tuple(str(row[name]) for name in PLACE)
+
+
+def write(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write a table atomically."""
+    with replacing(path) as partial, open(partial, "w", newline="") as file:
+        table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+
+
+def main() -> int:
+    """Run the script."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="+", type=Path, help="runs of full fields")
+    parser.add_argument("-o", "--out", type=Path, help="table of results; rows that are there are kept")
+    parser.add_argument("--data", type=Path, help="the capture, if it has moved")
+    parser.add_argument("--shares", nargs="+", type=float, default=[0.5, 0.2, 0.1, 0.05])
+    parser.add_argument("--training", nargs="+", choices=TRAININGS, default=list(TRAININGS))
+    parser.add_argument("--steps", type=int, default=3000, help="steps of a distillation")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--splat-transform", help="command of splat-transform, with options if it needs any")
+    parser.add_argument("--again", action="store_true", help="measure rows that are there again")
+    options = parser.parse_args()
+    rows = read(options.out)
+    printed = csv.DictWriter(sys.stdout, COLUMNS, lineterminator="\n")
+    printed.writeheader()
+    failed = 0
+    for run in options.runs:
+        try:
+            full = full_field(run, options.data)
+        except SundaeError as error:
+            print(f"{run}: {error}", file=sys.stderr)
+            failed = 1
+            continue
+        known = {"capture": full.capture, "device": device_of(full.scene), "seed": options.seed}
+        with tempfile.TemporaryDirectory() as folder:
+            for job in jobs(options):
+                there = {place(row) for row in rows}
+                if place({**job, **known}) in there and not options.again:
+                    continue
+                try:
+                    row = row_of(full, job, options, Path(folder))
+                except (SundaeError, OSError, subprocess.CalledProcessError) as error:
+                    print(f"{full.capture}, {job}: {error}", file=sys.stderr)
+                    failed = 1
+                    continue
+                printed.writerow(row)
+                sys.stdout.flush()
+                rows = [other for other in rows if place(other) != place(row)] + [row]
+                if options.out is not None:
+                    write(options.out, rows)
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())
