@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 from sundae_ns.api.measuring import measure
 from sundae_ns.api.pruning import prune_with_mask
@@ -23,7 +23,8 @@ _FEWEST = 16
 """Fewest primitives of the curve."""
 
 
-class Target(NamedTuple):
+@dataclass(frozen=True)
+class Target:
     """A count for a tolerated loss, and the curve that it was read from."""
 
     count: int
