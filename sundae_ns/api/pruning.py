@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.virtual import of_unit_size, virtual_views
-from sundae_ns.errors import ConfigError
+from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.pruning import PruneRule, kept_count, prune_field
 from sundae_ns.rendering import LocalField, TrainingView, View, contribution
@@ -55,7 +55,7 @@ def prune(
 
     Raises:
         ConfigError: neither or both of ``keep`` and ``count`` are given, or they or an option are out of range.
-        DataError: no primitive is finite.
+        DataError: no primitive is finite, or the views see none.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
@@ -105,6 +105,11 @@ def prune_with_mask(
             count=count if rule.uses_detail else None,
             console=console,
         )
+        if not bool((weights > 0).any()):
+            raise DataError(
+                f"{len(seen)} views see none of {field.num_primitives:,} primitives; "
+                "give cameras that look at the scene, or export it again"
+            )
     pruned = prune_field(field, rule, count, weights)
     mask = finite.clone()
     mask[finite] = pruned.decision.mask

@@ -17,7 +17,7 @@ from sundae_ns.rasterization import rasterize
 from sundae_ns.rendering import View
 from sundae_ns.rendering.render import pass_options
 
-NEAREST, FARTHEST = 0.2, 4.0
+NEAREST, FARTHEST = 0.3, 2.0
 """Distances of the eyes from the middle of the scene, as multiples of the median distance of its primitives."""
 FOV = 60.0
 CANDIDATES = 3
@@ -26,27 +26,26 @@ _PROBE_SIZE = 32
 """Sides of the images that candidates are judged by, pixels."""
 _PROBE_PRIMITIVES = 20_000
 """Most primitives of these images."""
-_OPAQUE = 0.1
-"""Accumulation from which a pixel shows something."""
+_OPAQUE, _SHOWN, _NEAR = 0.1, 0.3, 0.1
+"""Accumulation from which a pixel shows something, least share of such pixels, and the share that may be near."""
 
 
 def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128) -> list[View]:
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
-    Eyes are drawn in all directions from the middle of the scene, at 0.2 to 4 times the median distance of its
-    primitives, and look at random primitives. Of three such cameras one is kept: those whose rays end on surfaces, by
-    the spread of depth along the rays of a small image. Inside of matter, behind walls and among floaters rays end
-    anywhere.
+    Eyes are drawn in all directions from the middle of the scene, at 0.3 to 2 times the median distance of its
+    primitives, and look at random primitives. Of three eyes at one distance that one is kept with most room ahead,
+    by the depth of a small image: inside of matter and among floaters something is always near.
 
     Args:
         scene: its finite primitives count.
         n: number of cameras.
-        seed: of the random draws, which are the same on every device.
+        seed: of the random draws, which are the same on every device up to rounding.
         size: width and height of the images, pixels.
 
     Raises:
         ConfigError: ``n`` or ``size`` is less than 1.
-        DataError: no primitive is finite, or no camera sees anything.
+        DataError: no primitive is finite.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(100, 3), torch.rand(100, 3))
@@ -61,24 +60,19 @@ def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128)
     generator = torch.Generator().manual_seed(seed)
     drawn = CANDIDATES * n
     direction = torch.nn.functional.normalize(torch.randn(drawn, 3, generator=generator, dtype=torch.float64), dim=1)
-    nearness = torch.rand(drawn, 1, generator=generator, dtype=torch.float64)
-    eyes = direction * NEAREST * (FARTHEST / NEAREST) ** nearness
+    # Of one distance, because farther eyes have more room, whatever they see.
+    distance = NEAREST + (FARTHEST - NEAREST) * torch.rand(n, 1, generator=generator, dtype=torch.float64)
+    eyes = direction * distance.repeat(CANDIDATES, 1)
     targets = (means[torch.randint(len(means), (drawn,), generator=generator)] - middle) / reach
     cameras = [
         View.look_at(eye, target, fov=FOV, width=_PROBE_SIZE, height=_PROBE_SIZE)
         for eye, target in zip(eyes, targets, strict=True)
     ]
-    spread = _spread_of_depth(dataclasses.replace(scene, field=_probe(field, middle, reach, generator)), cameras)
-    best = spread.argsort(stable=True)[:n]
-    if bool(spread.isinf().all()):
-        raise DataError(
-            f"no camera sees anything of {scene.num_primitives:,} primitives; they are transparent, or the file is "
-            "damaged: export it again"
-        )
-    # In the order of the draws, so that any first few of them are as good as the others.
+    room = _room_ahead(dataclasses.replace(scene, field=_probe(field, middle, reach, generator)), cameras)
+    best = room.view(CANDIDATES, n).argmax(dim=0) * n + torch.arange(n)
     return [
         View.look_at(middle + reach * eyes[i], middle + reach * targets[i], fov=FOV, width=size, height=size)
-        for i in best.sort().values.tolist()
+        for i in best.tolist()
     ]
 
 
@@ -153,21 +147,17 @@ def _probe(field: Field, middle: Tensor, reach: float, generator: torch.Generato
 
 
 @torch.no_grad()
-def _spread_of_depth(scene: Scene, views: Sequence[View]) -> Tensor:
-    """Mean over the pixels of each view of the deviation of depth along the ray, over the depth, at most 1 ``[V]``.
-
-    Pixels that show next to nothing count as 1; a view without anything is infinite.
-    """
+def _room_ahead(scene: Scene, views: Sequence[View]) -> Tensor:
+    """Depth beyond which nine in ten of the pixels of each view lie that show something; 0 if few pixels do ``[V]``."""
     means, settings, found = scene.field["means"], scene.settings(head=False), []
     for seen in views:
         view = seen.to(scene.device)
         z = means @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        channels = torch.stack([torch.ones_like(z), z, z.square()], dim=1)
-        blended = rasterize(colors=channels, **pass_options(scene.field, view, settings)).colors
-        opacity, first, second = blended.unbind(2)
+        channels = torch.stack([torch.ones_like(z), z], dim=1)
+        opacity, depth = rasterize(colors=channels, **pass_options(scene.field, view, settings)).colors.unbind(2)
         shows = opacity > _OPAQUE
-        depth = first / opacity.clamp_min(_OPAQUE)
-        deviation = (second / opacity.clamp_min(_OPAQUE) - depth.square()).clamp_min(0).sqrt()
-        mean = torch.where(shows, (deviation / depth.clamp_min(1e-9)).clamp(max=1), 1.0).mean()
-        found.append(torch.where(opacity.max() > 0, mean, torch.inf))
+        # Pixels that show nothing sort last, and take no part.
+        ordered = torch.where(shows, depth / opacity.clamp_min(_OPAQUE), torch.inf).flatten().sort().values
+        count = shows.sum()
+        found.append(torch.where(count > _SHOWN * shows.numel(), ordered[(count * _NEAR).long()], 0.0))
     return torch.stack(found).cpu()
