@@ -68,18 +68,15 @@ def folder_of(place: Path) -> Path:
 
 
 def newest_step(place: Path) -> int | None:
-    """Step of the newest whole checkpoint by its name, given it, its folder, or the run's; None if there is none."""
-    found = [place] if place.is_file() else reversed(checkpoints(folder_of(place)))
-    match = next((_NAME.fullmatch(path.name) for path in found if _is_whole(path)), None)
+    """Step of a checkpoint by its name, or of the newest whole one of a run or its folder; None if there is none."""
+    if not place.is_file():
+        try:
+            place, file, _ = _open_newest(place)
+        except CheckpointError:
+            return None
+        file.close()
+    match = _NAME.fullmatch(place.name)
     return None if match is None else int(match[1])
-
-
-def _is_whole(path: Path) -> bool:
-    try:
-        with path.open("rb") as file:
-            return _damage(file) is None
-    except OSError:  # it is gone, or cannot be read
-        return False
 
 
 def write(state: Mapping[str, Any], path: Path) -> None:
