@@ -27,7 +27,7 @@ _FEWEST = 16
 class Target:
     """A count for a tolerated loss, and the curve that it was read from."""
 
-    count: int
+    kept: int
     curve: list[tuple[int, float]]
     """Numbers of primitives, and the PSNR of held-out views against the full field's, dB; from many to few."""
 

@@ -198,7 +198,7 @@ def prune_file(
 
         assert seen is not None
         found = count_for_drop(scene, target_drop, seen, rule, progress=True)
-        count = found.count
+        count = found.kept
         for number, psnr in found.curve:
             print(f"{number:12,} primitives: {psnr:.2f} dB against the full field, on held-out cameras")
     if keep is None and count is None:

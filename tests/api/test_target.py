@@ -35,13 +35,13 @@ def test_the_count_meets_the_tolerated_loss(drop: float, ball: sn.Scene, views: 
     found = count_for_drop(ball, drop, views, sn.PruneRule())
     counts = [count for count, _ in found.curve]
     assert counts == [2000 // 2 ** (i + 1) for i in range(len(counts))]
-    assert counts[-1] <= found.count <= 2 * counts[-1] + 1
+    assert counts[-1] <= found.kept <= 2 * counts[-1] + 1
     held_out = views[::8]
-    small = sn.prune(ball, count=found.count, views=[view for i, view in enumerate(views) if i % 8])
+    small = sn.prune(ball, count=found.kept, views=[view for i, view in enumerate(views) if i % 8])
     error = 10 ** (-sn.measure(small, ball, held_out).psnr / 10)
     assert tolerated_error(drop) / 2 < error < 2 * tolerated_error(drop)
 
 
 def test_more_loss_keeps_fewer(ball: sn.Scene, views: list[sn.View]) -> None:
-    one, three = (count_for_drop(ball, drop, views, sn.PruneRule()).count for drop in (0.5, 6.0))
+    one, three = (count_for_drop(ball, drop, views, sn.PruneRule()).kept for drop in (0.5, 6.0))
     assert three < one

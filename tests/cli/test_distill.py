@@ -1,0 +1,72 @@
+"""``sundae distill``."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import sundae_ns as sn
+from sundae_ns.cli import main
+from sundae_ns.scenes.distill import Distillation
+
+
+def run(*words: Any) -> int:
+    with pytest.raises(SystemExit) as caught:
+        main(["distill", *map(str, words)])
+    return int(caught.value.code or 0)
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(200, 3, generator=generator)
+    sn.save(sn.Scene.from_points(points, points), tmp_path / "a.ply")
+    return tmp_path / "a.ply"
+
+
+def test_an_interrupted_distillation_goes_on(
+    source: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = source.with_name("b.spz")
+    words = (source, "-o", out, "--keep", "0.5", "--steps", "6", "--no-head")
+    train_step = Distillation._train_step
+
+    def interrupted(self: Distillation, i: int, steps: int) -> None:
+        train_step(self, i, steps)
+        if i == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Distillation, "_train_step", interrupted)
+    assert run(*words) == 130
+    assert "saved step 4 of 6" in capsys.readouterr().err
+    assert not out.exists()
+    monkeypatch.setattr(Distillation, "_train_step", train_step)
+    assert run(*words) == 0
+    said = capsys.readouterr()
+    assert "going on from step 4 of 6" in said.err
+    assert "100 of 200 primitives, without a head" in said.out
+    assert sorted(path.name for path in source.parent.iterdir()) == ["a.ply", "b.spz"]
+    assert sn.load(out).num_primitives == 100
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["-o", "b.ply"], "b.ply cannot hold a head; name it .sundae, or leave the head out with --no-head"),
+        (["-o", "b.txt"], "b.txt has no supported suffix"),
+        (["-o", "b.sundae", "--keep", "0.1", "--count", "5"], "--keep and --count exclude each other"),
+        (["-o", "b.sundae", "--steps", "0"], "steps is 0; give 1 or more"),
+    ],
+)
+def test_refusals_are_one_line(
+    words: list[str], message: str, source: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(source.parent)
+    assert run("a.ply", *words) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert message in line
