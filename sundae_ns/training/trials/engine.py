@@ -136,7 +136,8 @@ class TrialEngine:
         """Continue with a kept copy of the field, its learning rates and its counted steps."""
         kept = self.kept[name]
         state.restore(kept)
-        state.pruning.update({**kept["pruning"], "peak": state.pruning["peak"]})
+        peak = {name: value for name, value in state.pruning.items() if name == "peak"}  # goes on through all trials
+        state.pruning.update({**kept["pruning"], **peak})
         self.taken_back = state.schedule_step - kept["counted"]
         put_restarts(state.schedulers, kept["restarts"], self.taken_back - kept["taken_back"])
         self._count_steps(state)
