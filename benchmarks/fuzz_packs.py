@@ -3,9 +3,9 @@
     python benchmarks/fuzz_packs.py --count 5000               # needs Node and the page's build tools (make web)
     python benchmarks/fuzz_packs.py --count 1 --seed 1234 --keep folder
 
-Each seed changes header, arrays, streams or frames of a small scene (``pack_changes.py``). Python opens the result
-and, if it is valid, makes the page of it. The page's decoder opens it under Node. Exits with 1 if the verdicts differ,
-if both decode other positions, cameras or weights, or if either fails with another error than its own.
+Each seed changes header, arrays, streams or frames of a small scene (``harness/pack_changes.py``). Python opens the
+result and, if it is valid, makes the page of it. The page's decoder opens it under Node. Exits with 1 if the verdicts
+differ, if both decode other positions, cameras or weights, or if either fails with another error than its own.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import torch
-from pack_changes import Json, Pack, mutated
 
+from harness.pack_changes import Json, Pack, mutated
 from sundae_ns.api.packing import scene_of
 from sundae_ns.api.page import page_of
 from sundae_ns.compensation import CompensationHead, HeadConfig

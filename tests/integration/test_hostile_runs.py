@@ -66,7 +66,6 @@ SCRIPTS: dict[str, list[str] | str] = {
     "benchmarks/memory_growth.py": "trains its run",
     "benchmarks/multi_gpu.py": "takes a checkpoint without its config.yml",
     "benchmarks/mutants.py": "takes the sources",
-    "benchmarks/pack_changes.py": "changes packs",
     "benchmarks/paper.py": "trains its runs",
     "benchmarks/plot.py": "takes tables",
     "benchmarks/prune_without_photos.py": ["RUN", "-o", "prune.csv", "--shares", "0.5", "--steps", "2"],
