@@ -24,7 +24,8 @@ N = 60
 
 def trainer_of(folder: Path | None = None) -> SimpleNamespace:
     """What a run of three steps asks of its trainer."""
-    return SimpleNamespace(last_step=2, base_dir=folder, config=SimpleNamespace(schedule_length=None))
+    config = SimpleNamespace(schedule_length=None, load_dir=None, load_checkpoint=None)
+    return SimpleNamespace(last_step=2, base_dir=folder, config=config)
 
 
 @pytest.mark.parametrize("score", ["detail-contribution", "response-contribution", "opacity"])
