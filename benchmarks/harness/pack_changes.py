@@ -356,8 +356,8 @@ def change_sections(pack: Pack, rng: random.Random) -> None:
 
 
 CHANGES: list[Callable[[Pack, random.Random], None]] = [
-    *(change_value, change_value, change_keys, change_model, change_tensors, change_stream, change_stream),
-    *(change_frame, change_array, change_values, change_values, change_sections),
+    *(change_value, change_value, change_keys, change_model, change_tensors, change_tensors),
+    *(change_stream, change_stream, change_frame, change_array, change_values, change_values, change_sections),
 ]
 
 

@@ -38,7 +38,7 @@ def check_pairs(pairs: int, primitives: int, tiles: int, size: int, *, training:
     if not training and pairs > MOST_PER_TILE * tiles + PER_PRIMITIVE * primitives + ALWAYS:
         raise MemoryExhaustedError(
             f"the view has {pairs // tiles:,} primitives in each tile of its image, but a real scene has less than "
-            f"{MOST_PER_TILE:,}; choose another view, or prune the scene"
+            f"{MOST_PER_TILE:,}; choose another camera"
         )
     check_memory(size * pairs, f"{pairs:,} pairs of a tile and a primitive")
 

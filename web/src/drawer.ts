@@ -9,7 +9,7 @@ export type Times = {
   head: number;
   /** Whether the head was left out because the GPU has no buffers of the size that it needs. */
   withoutHead: boolean;
-  /** Primitives in each tile of a view that has too many, of which nothing is drawn; 0 for any other view. */
+  /** Primitives over each pixel of a view that has too many, of which nothing is drawn; 0 for any other view. */
   crowded: number;
 };
 

@@ -12,6 +12,8 @@ import { Splatter, type Target } from "./splatter";
 const SIDE = 8;
 /** Longest side of an image in pixels, so that two bytes name a tile. */
 const LONGEST = 4096;
+/** Seconds by which other work may delay a view. */
+const DELAY = 2;
 /** Nanoseconds of a pass are rounded by browsers; times are shown in milliseconds. */
 const NANOSECONDS = 1e6;
 
@@ -102,16 +104,40 @@ export class Renderer implements Drawer {
     return this.whole(view, head, true);
   }
 
-  /** Draws a view, and again if its lists of tiles did not fit. */
+  /** Draws a view, and again with longer lists of tiles if it needs them. */
   private async whole(view: View, head: boolean, shown: boolean): Promise<Times> {
-    const wanted = await this.draw(view, head, shown);
-    const { base, seen } = this.frame!;
-    [base, seen ?? base].forEach((target, i) => {
-      const [across, down] = target.tiles;
-      if (wanted[i]! > this.splatter.most(target)) this.times.crowded = wanted[i]! / across / down;
-    });
-    if (!this.times.crowded && this.splatter.grow(Math.max(...wanted))) await this.draw(view, head, shown);
+    let wanted = await this.draw(view, head, shown);
+    let grown = false;
+    while (!this.crowded(wanted) && this.splatter.grow(Math.max(...wanted))) {
+      grown = true;
+      wanted = await this.measure(view, head);
+    }
+    if (grown) await this.draw(view, head, shown);
+    this.times.crowded = this.crowded(wanted);
     return this.times;
+  }
+
+  /** Splats a view, and learns how long it takes; returns what `draw` returns. */
+  private async measure(view: View, head: boolean): Promise<number[]> {
+    let [wanted, seconds]: [number[], number] = [[], 0];
+    // Twice, because other work can delay a fast view for a moment.
+    for (let i = 0; i < 2 && seconds < DELAY; i++) {
+      const started = performance.now();
+      wanted = await this.draw(view, head, false, false);
+      const spent = (performance.now() - started) / 1000;
+      seconds = i === 0 ? spent : Math.min(seconds, spent);
+    }
+    this.splatter.learn(Math.max(...wanted), seconds);
+    return wanted;
+  }
+
+  /** Primitives in each tile if they are too many, given the pairs that the image and what the head sees wanted. */
+  private crowded(wanted: number[]): number {
+    const { base, seen } = this.frame!;
+    const found = [base, seen ?? base].map((target, i) =>
+      wanted[i]! > this.splatter.most(target) ? wanted[i]! / target.tiles[0] / target.tiles[1] : 0,
+    );
+    return Math.max(...found);
   }
 
   async image(view: View, head: boolean): Promise<Uint8ClampedArray<ArrayBuffer>> {
@@ -131,8 +157,12 @@ export class Renderer implements Drawer {
     return out;
   }
 
-  /** Draws one frame; returns how many pairs of tiles and primitives the image and what the head sees wanted. */
-  private async draw(view: View, head: boolean, shown: boolean): Promise<number[]> {
+  /**
+   * Draws one frame; returns how many pairs of tiles and primitives the image and what the head sees wanted.
+   *
+   * @param complete - whether the head runs; otherwise only its image is splatted
+   */
+  private async draw(view: View, head: boolean, shown: boolean, complete = true): Promise<number[]> {
     const { device } = this;
     const plan = scalePlan(view, this.scene.trainedFocal);
     const seen = zoomed(view, plan.zoom);
@@ -154,14 +184,14 @@ export class Renderer implements Drawer {
       this.splatter.encode(encoder, seen, frame.seen);
       this.splatter.copyWanted(encoder, this.results, 260);
     }
-    frame.head?.encode(encoder, this.timed(2));
+    if (complete) frame.head?.encode(encoder, this.timed(2));
     const pass = encoder.beginComputePass();
     const bindings = { 0: frame.sizes, 1: frame.base.pixels, 2: frame.head?.correction ?? this.none };
     const composing = new Step(device, this.compose, { ...bindings, 3: frame.texture.createView() });
     composing.run(pass, blocksOf(view.width, SIDE), blocksOf(view.height, SIDE));
     pass.end();
     if (shown) this.show(encoder, frame);
-    return this.finish(encoder, corrected);
+    return this.finish(encoder, corrected && complete);
   }
 
   private timed(first: number): GPUComputePassTimestampWrites | undefined {

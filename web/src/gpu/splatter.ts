@@ -30,6 +30,10 @@ const SORT_BLOCK = 2048;
 const DIGIT_BITS = 8;
 /** Pairs of a tile and a primitive that the buffers first hold, for each primitive. */
 const PAIRS = 4;
+/** Factor by which lists grow at once; in between, the view is timed. */
+const GROWTH = 4;
+/** Seconds that a view may be expected to take: a software adapter needs minutes where a GPU needs one second. */
+const MOST_SECONDS = 60;
 const SPLAT_BYTES = 32;
 /** Most workgroups along one axis that the scan of blocks uses. */
 const ROW = 32768;
@@ -174,6 +178,8 @@ export class Splatter {
   private readonly kernels: Record<"project" | "measure" | "place" | "emit" | "findRanges", GPUComputePipeline>;
   private readonly blends = new Map<number, GPUComputePipeline>();
   private pairs: Pairs;
+  /** Pairs for which the GPU takes the time that a view may take. */
+  private mostInTime = Number.MAX_SAFE_INTEGER;
 
   constructor(
     gpu: Gpu,
@@ -265,7 +271,12 @@ export class Splatter {
 
   /** Most pairs of a view that is drawn into a target. */
   most({ tiles }: Target): number {
-    return mostPairs(tiles[0] * tiles[1], this.scene.field.count);
+    return this.fitting(Math.min(mostPairs(tiles[0] * tiles[1], this.scene.field.count), this.mostInTime));
+  }
+
+  /** Learns that a view took `seconds`, of `wanted` pairs or as many as the buffers hold. */
+  learn(wanted: number, seconds: number): void {
+    this.mostInTime = Math.floor((MOST_SECONDS / seconds) * Math.min(wanted, this.pairs.capacity));
   }
 
   /** Copies the number of pairs that the last view wanted into a buffer. */
@@ -273,9 +284,9 @@ export class Splatter {
     encoder.copyBufferToBuffer(this.pairs.count, 4, into, offset, 4);
   }
 
-  /** Makes space for so many pairs; returns whether the last image lacked some and can now be whole. */
+  /** Makes space for so many pairs, or for some of them; returns whether the last image lacked some and got space. */
   grow(wanted: number): boolean {
-    const capacity = this.fitting(Math.ceil(wanted * 1.25));
+    const capacity = this.fitting(Math.min(Math.ceil(wanted * 1.25), GROWTH * this.pairs.capacity));
     if (wanted <= this.pairs.capacity || capacity <= this.pairs.capacity) return false;
     this.pairs.destroy();
     this.pairs = new Pairs(this.device, this.sorting, capacity);

@@ -102,7 +102,7 @@ export async function start(program: string): Promise<void> {
 
 const tooMany = (crowded: number): string =>
   `This view is not drawn: ${Math.round(crowded).toLocaleString("en")} primitives cover each of its pixels, ` +
-  "more than in any real scene.";
+  "too many for this page or for this GPU.";
 
 /** WebGPU with the head, or base colours by WebGL2. */
 async function openDrawer(

@@ -11,6 +11,10 @@ import fragmentCode from "./splats.frag";
 import vertexCode from "./splats.vert";
 
 const LONGEST = 4096;
+/** Seconds after which a view is given up: nothing else can run meanwhile. */
+const MOST_SECONDS = 10;
+/** Fragments that are drawn at once. */
+const FEW_FRAGMENTS = 2 ** 29;
 /** Side of the tiles for which limits are stated, pixels. */
 const TILE = 16;
 /** Texels in a row of a table. */
@@ -30,10 +34,13 @@ class Painter implements Drawer {
   readonly hasHead = false;
   private readonly program: WebGLProgram;
   private readonly ids: WebGLBuffer;
+  private readonly id: number;
   private readonly order: Uint32Array<ArrayBuffer>;
   private readonly keys: Uint32Array;
   private readonly geometry: Float32Array;
   private readonly extents: Float32Array;
+  /** Fragments for which the GPU takes the time that a view may take. */
+  private mostInTime = Number.POSITIVE_INFINITY;
 
   constructor(
     private readonly gl: WebGL2RenderingContext,
@@ -74,10 +81,9 @@ class Painter implements Drawer {
     gl.vertexAttribPointer(corner, 2, gl.FLOAT, false, 0, 0);
     this.ids = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.ids);
-    const id = gl.getAttribLocation(this.program, "id");
-    gl.enableVertexAttribArray(id);
-    gl.vertexAttribIPointer(id, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(id, 1);
+    this.id = gl.getAttribLocation(this.program, "id");
+    gl.enableVertexAttribArray(this.id);
+    gl.vertexAttribDivisor(this.id, 1);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.clearColor(...scene.background, 1);
@@ -141,7 +147,11 @@ class Painter implements Drawer {
   private draw(view: View): number {
     const { gl } = this;
     const m = view.worldToCamera;
-    const crowded = this.crowded(view);
+    const bound = boundOf(this.geometry, this.extents, view);
+    const fragments = bound > FEW_FRAGMENTS ? fragmentsOf(this.geometry, view) : 0;
+    const pixels = view.width * view.height;
+    const most = TILE ** 2 * mostPairs(pixels / TILE ** 2, this.extents.length);
+    const crowded = fragments > Math.min(most, this.mostInTime);
     const visible = crowded ? 0 : this.sort(m);
     gl.bufferData(gl.ARRAY_BUFFER, this.order.subarray(0, visible), gl.STREAM_DRAW);
     gl.viewport(0, 0, view.width, view.height);
@@ -150,16 +160,30 @@ class Painter implements Drawer {
     gl.uniform4f(this.place("lens"), view.fx, view.fy, view.cx, view.cy);
     gl.uniform2f(this.place("size"), view.width, view.height);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, visible);
-    return crowded;
+    const whole = this.drawQuads(visible, fragments);
+    if (!whole) gl.clear(gl.COLOR_BUFFER_BIT);
+    return crowded || !whole ? fragments / pixels : 0;
   }
 
-  private crowded(view: View): number {
-    const pixels = view.width * view.height;
-    const most = TILE ** 2 * mostPairs(pixels / TILE ** 2, this.extents.length);
-    if (boundOf(this.geometry, this.extents, view) <= most) return 0;
-    const fragments = fragmentsOf(this.geometry, view);
-    return fragments <= most ? 0 : fragments / pixels;
+  /** Draws quads with about so many fragments; whether they are all drawn within the time that a view may take. */
+  private drawQuads(count: number, fragments: number): boolean {
+    const { gl } = this;
+    const size = Math.ceil(count / Math.max(Math.ceil(fragments / FEW_FRAGMENTS), 1));
+    const started = performance.now();
+    for (let first = 0; first < count; first += size) {
+      const drawn = Math.min(first + size, count);
+      gl.vertexAttribIPointer(this.id, 1, gl.UNSIGNED_INT, 0, 4 * first);
+      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, drawn - first);
+      if (size >= count) return true;
+      // To read a pixel waits for those that are drawn.
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+      const seconds = (performance.now() - started) / 1000;
+      if (seconds > MOST_SECONDS && drawn < count) {
+        this.mostInTime = (MOST_SECONDS / seconds) * (drawn / count) * fragments;
+        return false;
+      }
+    }
+    return true;
   }
 
   async render(view: View): Promise<Times> {
