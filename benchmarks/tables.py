@@ -70,7 +70,7 @@ def runs() -> list[dict[str, Any]]:
     groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in lines_of("runs.csv"):
         if row["variant"] in METHODS:
-            # What a budget keeps differs from seed to seed.
+            # What trials keep differs from seed to seed.
             share = SHARE if row["variant"] == "sundae-auto" else float(row["keep_ratio"] or 0)
             groups.setdefault((row["scene"], list(METHODS).index(row["variant"]), share), []).append(row)
     return [_mean_of(groups[place]) for place in sorted(groups)]

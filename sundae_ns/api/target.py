@@ -54,10 +54,9 @@ def count_for_drop(
     if not 0 < drop < 100:
         raise ConfigError(f"target-drop is {drop}; give a positive number of dB, 0.5 for half a decibel")
     if len(views) < 2:
-        raise ConfigError("a target needs two views or more, one of which is held out; give more views")
+        raise ConfigError("a target needs two views or more, because one of them is held out; give more views")
     scene, seen = of_unit_size(scene, views)
-    held_out = seen[::HELD_OUT_EVERY]
-    shown = [view for i, view in enumerate(seen) if i % HELD_OUT_EVERY]
+    shown, held_out = split(seen)
     tolerated = tolerated_error(drop)
     count = int(finite_mask(scene.field).sum())
     curve: list[tuple[int, float]] = []
@@ -76,6 +75,11 @@ def count_for_drop(
             return Target(math.ceil(before[0] * (count / before[0]) ** share), curve)
         before = count, error
     return Target(count, curve)
+
+
+def split(views: Sequence[View]) -> tuple[list[View], list[View]]:
+    """The views that decide, and those that are held out: every eighth, from the first on."""
+    return [view for i, view in enumerate(views) if i % HELD_OUT_EVERY], list(views[::HELD_OUT_EVERY])
 
 
 def tolerated_error(drop: float) -> float:

@@ -21,7 +21,7 @@ from sundae_ns.api.measuring import measure
 from sundae_ns.api.pruning import prune_with_mask
 from sundae_ns.api.rendering import render
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.target import HELD_OUT_EVERY
+from sundae_ns.api.target import split
 from sundae_ns.api.virtual import of_unit_size, resized, size_of, virtual_views
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError, reading
@@ -38,10 +38,10 @@ from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.losses import StepLosses
 from sundae_ns.training.optimizers import FusedAdamConfig, NetworkAdamConfig
 from sundae_ns.training.recorded import RecordedStep
-from sundae_ns.training.schedulers import MOST_FACTOR, SPARSE
+from sundae_ns.training.schedulers import sparse_factor
 from sundae_ns.training.step import StepInputs, TrainingStep
 from sundae_ns.training.trials.engine import TrialEngine
-from sundae_ns.training.trials.head import GAIN_PER_DOUBLING, LEAST_GAIN
+from sundae_ns.training.trials.head import least_gain
 
 _log = logging.getLogger(__name__)
 
@@ -78,13 +78,7 @@ class Distillation:
 
     Args:
         teacher: the full scene; its own head, if it has one, corrects its images.
-        keep: share of its finite primitives to keep; or
-        count: their number.
-        views: cameras to begin from, of which every eighth is held out; by default virtual ones.
-        steps: number of training steps, trials of the head not counted.
-        seed: of cameras, prune and head.
-        head: whether a head may be added. Held-out views decide whether it is.
-        size: sides of the images of virtual cameras, pixels; by default 512 on a GPU, 128 on a CPU.
+        keep, count, views, steps, seed, head, size: as in :func:`distill`.
         progress: whether the prune shows a progress bar.
 
     Raises:
@@ -113,8 +107,8 @@ class Distillation:
         teacher = dataclasses.replace(teacher, field=teacher.field.rows(finite)) if finite.any() else teacher
         side = size or SIDES.get(teacher.device.type, SIDES["cpu"])
         if views:
-            held_out = views[::HELD_OUT_EVERY]
-            given = [view for i, view in enumerate(views) if i % HELD_OUT_EVERY] or views
+            shown, held_out = split(views)
+            given = shown or views
         else:
             given = virtual_views(teacher, CAMERAS, seed=seed, size=side)
             held_out = virtual_views(teacher, HELD_OUT, seed=seed + 1, size=side)
@@ -214,7 +208,7 @@ class Distillation:
         self.gain = quality[1] - quality[0]
         plain = {name: value for name, value in self.state.field.items() if name != FEATURES}
         ratio = stored_bytes(self.state.field, self._head_config) / stored_bytes(plain, None)
-        if not self.gain >= max(LEAST_GAIN, GAIN_PER_DOUBLING * math.log2(ratio)):
+        if not self.gain >= least_gain(math.log2(ratio)):
             self._remove_head()
 
     def _remove_head(self) -> None:
@@ -227,7 +221,7 @@ class Distillation:
         view = self._camera(i)
         # A teacher of nerfstudio's model may have been trained over random backgrounds; the student sees the shown one.
         target = render(self._teacher, view).rgb
-        sparse = min(max(1.0, math.sqrt(SPARSE / state.field.num_primitives)), MOST_FACTOR)
+        sparse = sparse_factor(state.field.num_primitives)
         factors = {"means": sparse * LAST_MEANS ** (i / steps), "compensation": rate_factor(i, steps)}
         for name, optimizer in state.optimizers.items():
             for group in optimizer.param_groups:
@@ -263,16 +257,13 @@ class Distillation:
     def scene(self) -> Scene:
         """The scene as it is now, at unit size if its source is no nerfstudio model."""
         state = self.state
-        field = Field(
-            {name: value.detach() for name, value in state.field.items() if value.numel() or name != FEATURES}
-        )
-        if state.head is None or not state.head_enabled:
-            field = Field({name: value for name, value in field.items() if name != FEATURES}, state.field.encoding)
+        head = state.head if state.head_enabled else None
+        field = {name: value.detach() for name, value in state.field.items() if name != FEATURES or head is not None}
         return dataclasses.replace(
             self._teacher,
-            field=Field(dict(field), state.field.encoding),
-            head=state.head if state.head_enabled else None,
-            trained_focal=state.trained_focal if state.head_enabled else None,
+            field=Field(field, state.field.encoding),
+            head=head,
+            trained_focal=None if head is None else state.trained_focal,
         )
 
     def quality(self) -> float:
@@ -352,8 +343,8 @@ def distill(
         scene: of any program; it does not change.
         keep: share of the finite primitives to keep, in (0, 1]; by default 0.1.
         count: number of primitives to keep, in place of a share.
-        views: cameras that the steps begin from; by default virtual ones.
-        steps: number of training steps.
+        views: cameras that the steps begin from. Every eighth is held out. By default they are virtual ones.
+        steps: number of training steps; the trials of the head come before them.
         seed: of all random draws.
         head: whether to add a compensation head if held-out views show that it pays.
         size: sides of the images of virtual cameras, pixels; by default 512 on a GPU, 128 on a CPU.

@@ -9,6 +9,9 @@ from sundae_ns.errors import ConfigError
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.selection import check_share
 
+USUAL_SHARE = 0.1
+"""Share that a prune keeps unless it is told otherwise; also where trials cannot decide."""
+
 
 @dataclass
 class PruningConfig(PruneRule):
@@ -21,7 +24,7 @@ class PruningConfig(PruneRule):
     mode: Literal["one-shot", "continuous", "off"] = "one-shot"
     """Prune once (one-shot, the paper's main strategy), periodically during densification for less peak memory
     (continuous), or never (off)."""
-    keep_ratio: float | None = 0.1
+    keep_ratio: float | None = USUAL_SHARE
     """Share of the N primitives that one prune keeps, in (0, 1]: exactly round(keep_ratio * N). One-shot: None lets
     trials on held-out training views decide the number."""
     prune_at: int = 15000

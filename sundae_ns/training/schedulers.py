@@ -97,6 +97,11 @@ class PruneAwareDecay(Scheduler):
         )
 
 
+def sparse_factor(primitives: int) -> float:
+    """Factor on the rate of the centres of a pruned field."""
+    return min(max(1.0, math.sqrt(SPARSE / max(primitives, 1))), MOST_FACTOR)
+
+
 def notify_pruned(
     schedulers: Mapping[str, LRScheduler],
     step: int,
@@ -118,7 +123,7 @@ def notify_pruned(
         if decay.pruned_at is None and (last or not decay.hold_until_prune):
             decay.pruned_at, decay.ends_at = step, ends_at
             if name == "means":
-                decay.after_prune = min(max(1.0, math.sqrt(SPARSE / max(primitives, 1))), MOST_FACTOR)
+                decay.after_prune = sparse_factor(primitives)
             _apply(scheduler)
 
 

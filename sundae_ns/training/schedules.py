@@ -15,15 +15,13 @@ from torch import Tensor
 from sundae_ns.evaluation.timing import now
 from sundae_ns.pruning import PruneRule, kept_count
 from sundae_ns.pruning.cutting import FieldPruner
-from sundae_ns.training.pruning_config import PruningConfig
+from sundae_ns.training.pruning_config import USUAL_SHARE, PruningConfig
 from sundae_ns.training.report import PruneReport
 
 NEVER = -1
 """Value of ``state["pruned_at"]`` before the first prune."""
 COUNT = "count"
 """Key of the running state with the number that trials have chosen; 0 for the usual share."""
-USUAL_SHARE = 0.1
-"""Share that is kept where trials cannot decide."""
 LEAST_OPACITY = 0.005
 """Lowest opacity of primitives that share the appearance of one; 3DGS-MCMC counts lower ones as dead."""
 
@@ -36,12 +34,13 @@ of :func:`sundae_ns.rendering.contribution`."""
 class PruningSchedule:
     """The schedule of a pruning mode.
 
-    ``one-shot`` is the paper's main strategy: training, one prune that keeps ``keep_ratio``, then fine-tuning.
+    ``one-shot`` is the paper's main strategy: training, one prune that keeps ``keep_ratio`` or, once trials have chosen
+    it, their number, then fine-tuning.
     ``continuous`` is the paper's alternative: periodic pruning during densification, for a lower peak of memory. Each
     prune keeps ``keep_ratio``, so the final number is only roughly known; with ``target_primitives`` it is exact,
     because the last prune comes after densification. ``max_primitives`` caps every prune, and every step in between
-    through :class:`sundae_ns.training.densification.CappedStrategy`. The other modes only record the peak: in ``auto``
-    the budget search prunes.
+    through :class:`sundae_ns.training.densification.CappedStrategy`. ``off`` only
+    records the peak.
     """
 
     config: PruningConfig

@@ -12,7 +12,7 @@ from sundae_ns.scenes.opening import _product, _seconds
 @pytest.mark.parametrize(
     ("prunes", "kept"),
     [
-        ([{"before": 200, "after": 60}], 0.3),  # one-shot, or a budget search
+        ([{"before": 200, "after": 60}], 0.3),  # one-shot
         ([{"before": 100, "after": 50}, {"before": 80, "after": 40}], 0.25),  # continuous: the field grows in between
         ([], None),
         ([{"before": 100, "after": 50}, {"after": 40}], None),

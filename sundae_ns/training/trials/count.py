@@ -28,10 +28,10 @@ from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
 from sundae_ns.training.heldout import HeldOutQuality
-from sundae_ns.training.pruning_config import PruningConfig
+from sundae_ns.training.pruning_config import USUAL_SHARE, PruningConfig
 from sundae_ns.training.report import write_record
 from sundae_ns.training.schedulers import notify_pruned
-from sundae_ns.training.schedules import COUNT, USUAL_SHARE, prune_to
+from sundae_ns.training.schedules import COUNT, prune_to
 from sundae_ns.training.trials.curve import (
     Tolerance,
     affordable,

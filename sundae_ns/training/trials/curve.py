@@ -111,8 +111,7 @@ def choose(curve: Sequence[CurvePoint], tolerance: Tolerance) -> int:
     if index + 1 == len(curve) or not math.isfinite(over[index + 1]):
         return curve[index].count
     part = (1 - over[index]) / (over[index + 1] - over[index])
-    between = (math.log(curve[at].count) for at in (index, index + 1))
-    large, small = between
+    large, small = (math.log(point.count) for point in curve[index : index + 2])
     return round(math.exp(large + part * (small - large)))
 
 

@@ -1,7 +1,8 @@
 """The engine of trials: keep copies of a field, train for some steps, measure held-out views, go back or go on.
 
 It holds all of the state of a trial, so that a run resumes in the middle of one. The policies decide:
-:mod:`sundae_ns.training.trials.head`, :mod:`sundae_ns.training.trials.stopping` and :mod:`sundae_ns.training.budget`.
+:mod:`sundae_ns.training.trials.count`, :mod:`sundae_ns.training.trials.head` and
+:mod:`sundae_ns.training.trials.stopping`.
 """
 
 from __future__ import annotations

@@ -76,6 +76,16 @@ class TrialPlan:
         return [index for fold in self.folds for index in fold]
 
 
+def least_gain(doublings: float, price: float | None = None) -> float:
+    """PSNR that a larger scene must gain, dB.
+
+    Args:
+        doublings: of the stored bytes that it takes.
+        price: what each must gain, dB; None for :data:`GAIN_PER_DOUBLING`.
+    """
+    return max(LEAST_GAIN, (GAIN_PER_DOUBLING if price is None else price) * doublings)
+
+
 def spread_views(indices: Sequence[int], count: int, half: int) -> list[int]:
     """Views evenly over a capture, because neighbours in a path look alike.
 
@@ -142,13 +152,13 @@ class HeadTrialProgress:
             price: PSNR (dB) and SSIM that a doubling of the stored bytes must gain; None for :data:`GAIN_PER_DOUBLING`,
                 and no loss of SSIM.
         """
-        best, (psnr_price, ssim_price) = "plain", price or (GAIN_PER_DOUBLING, 0.0)
+        best, (psnr_price, ssim_price) = "plain", price or (None, 0.0)
         for candidate in self.tried[1:]:
             figures = (mean_quality(self.qualities(one)) for one in (best, candidate))
             decibels, similarity = (b - a for a, b in zip(*figures, strict=True))
             doublings = math.log2(self.bytes[CANDIDATES.index(candidate)] / self.bytes[CANDIDATES.index(best)])
             # Comparisons with figures that are not finite fail.
-            enough = math.inf > decibels >= max(LEAST_GAIN, psnr_price * doublings)
+            enough = math.inf > decibels >= least_gain(doublings, psnr_price)
             if enough and similarity >= ssim_price * doublings:
                 best = candidate
         return best
