@@ -7,16 +7,7 @@ both() { for i in 1 2; do echo "== base $i"; PYTHONPATH=$B:/opt/site "$@" base; 
 train() { python3 $R/benchmarks/bench_training.py /tmp/scenes/"$2" --arms sundae -o "$OUT/train-$3-$2.jsonl" 2>&1 | tail -n 3 | cut -c1-600; }
 case $1 in
 1) bash .gpu/setup.sh
-  python3 - <<'P'
-import configparser, glob, os
-for entry in glob.glob("/opt/site/nerfstudio-*.dist-info/entry_points.txt") + glob.glob("/opt/site/sundae_ns-*.dist-info/entry_points.txt"):
-    found = configparser.ConfigParser(); found.optionxform = str; found.read(entry)
-    os.makedirs("/opt/site/bin", exist_ok=True)
-    for name, place in found["console_scripts"].items():
-        module, function = place.split(":"); path = f"/opt/site/bin/{name}"
-        if not os.path.exists(path):
-            open(path, "w").write(f"#!/usr/bin/env python3\nfrom {module} import {function}\n{function}()\n"); os.chmod(path, 0o755)
-P
+  python3 lab/console_scripts.py
   mkdir -p /tmp/scenes $R $B /tmp/logs; cp -r .gpu/scenes/* /tmp/scenes/
   git -C . ls-files -z 2>/dev/null | xargs -0 -r cp --parents -t $R 2>/dev/null || cp -r benchmarks tests docs examples web README.md pyproject.toml CONTRIBUTING.md CHANGELOG.md Makefile method_configs sundae_ns mkdocs.yml $R/
   [ -d $R/tests ] || cp -r benchmarks tests docs examples web *.md pyproject.toml Makefile method_configs sundae_ns mkdocs.yml $R/

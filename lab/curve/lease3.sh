@@ -7,16 +7,7 @@ whole() { for s in ${SEEDS:-42}; do echo "ANNEAL=${ANNEAL:-1} python3 $R/lab/cur
 share() { printf "python3 $R/benchmarks/quality.py /tmp/scenes/$1 -o /tmp/oracle/$1-$2 --arms sundae --seeds 42 --keep-ratios $2 --repeat-at $2\n" > $J/8-share-$2-$1.sh; }
 case $1 in
 1) bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log
-  python3 - <<'P'
-import configparser, glob, os
-for entry in glob.glob("/opt/site/nerfstudio-*.dist-info/entry_points.txt") + glob.glob("/opt/site/sundae_ns-*.dist-info/entry_points.txt"):
-    found = configparser.ConfigParser(); found.optionxform = str; found.read(entry)
-    os.makedirs("/opt/site/bin", exist_ok=True)
-    for name, place in found["console_scripts"].items():
-        module, function = place.split(":"); path = f"/opt/site/bin/{name}"
-        if not os.path.exists(path):
-            open(path, "w").write(f"#!/usr/bin/env python3\nfrom {module} import {function}\n{function}()\n"); os.chmod(path, 0o755)
-P
+  python3 lab/console_scripts.py
   mkdir -p /tmp/scenes $R /tmp/logs /tmp/out $J; cp -r .gpu/scenes/* /tmp/scenes/; cp -r benchmarks tests lab docs examples web *.md pyproject.toml Makefile mkdocs.yml method_configs $R/
   cd /tmp || exit; python3 -c "import sundae_ns; print(sundae_ns.__file__)"
   whole south_building 2; setsid nohup python3 $R/lab/curve/slots.py > /tmp/logs/q.out 2>&1 & sleep 2 ;;
