@@ -7,8 +7,9 @@
 A run of sundae or splatfacto is a full field, and its capture has the test views. ``psnr_to_field`` compares them
 with the full field's own images, ``psnr`` and ``ssim`` with the photographs, and ``psnr_virtual`` compares virtual
 views that no tool was given with the full field. Tools and rules: ``sundae_ns`` by virtual views (``detail-merge``, the
-default) or by the highest opacities, which needs no view, and ``splat-transform --decimate``. Training is none, or that
-of ``sundae distill``: ``distill`` with a head where it pays, ``distill-no-head`` without. ``bytes`` are those of the
+default) or by the highest opacities, which needs no view, and ``splat-transform`` by ``--decimate`` and
+``--decimate-adaptive``, on its CPU path. Training is none, or that of ``sundae distill``: ``distill`` with a head where
+it pays, ``distill-no-head`` without. ``bytes`` are those of the
 .sundae file, ``bytes_sog`` of the base colours as .sog. With ``-o`` rows that are there are not measured again;
 ``--again`` does.
 """
@@ -47,6 +48,7 @@ RULES = {
     "detail-merge": sn.PruneRule(),
     "opacity": sn.PruneRule(score="opacity", selection="top", redistribution="none"),
 }
+OTHER_RULES = ("decimate", "decimate-adaptive")
 TRAININGS = ("none", "distill", "distill-no-head")
 HELD_OUT = 32
 
@@ -90,7 +92,8 @@ def jobs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
                     "steps": options.steps,
                 }
         if options.splat_transform:
-            yield {"tool": OTHER, "rule": "decimate", "training": "none", "share": share, "steps": 0}
+            for rule in OTHER_RULES:
+                yield {"tool": OTHER, "rule": rule, "training": "none", "share": share, "steps": 0}
 
 
 def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: Path) -> tuple[sn.Scene, float]:
@@ -101,7 +104,8 @@ def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: P
         if not source.exists():
             sn.save(scene, source)
         began = time.monotonic()
-        words = [*shlex.split(options.splat_transform), "-w", source, "--decimate", f"{100 * share:g}%", out]
+        words = [*shlex.split(options.splat_transform), "--gpu", "cpu", "-w"]
+        words += [source, f"--{job['rule']}", f"{100 * share:g}%", out]
         subprocess.run([str(word) for word in words], check=True, stdout=sys.stderr)
         seconds = time.monotonic() - began
         found = sn.load(out, device=scene.device)

@@ -18,7 +18,7 @@ def truth(c, s, key):
     r = real[c].get(s)
     return None if r is None else r[key]
 for L in (2,):
-    for key, k in (("psnr", 1), ("ssim", 2)):
+    for key, k in (("psnr", 3), ("ssim", 2)):
         X, y, who = [], [], []
         for c in caps:
             have = [s for s in S if truth(c, s, key) is not None]
@@ -40,7 +40,7 @@ for L in (2,):
             print(L, key, cols, "w", np.round(w, 3), "LOO rmse %.4f" % np.sqrt(np.mean(np.square(err))), "std y %.4f" % y.std(), len(y))
 print("affine-fitted PSNR as the predictor of PSNR")
 for L in (2,):
-    for k in (1,):
+    for k in (3,):
         X, y, who = [], [], []
         for c in caps:
             have = [s for s in S if truth(c, s, "psnr") is not None]
@@ -57,7 +57,7 @@ for L in (2,):
 w = {"psnr": (0.8, 1.5), "ssim": (0.85, 2.0)}
 for L in (2,):
   for c in caps:
-    P = {s: [w[key][0] * feats(c, s, k, L)[0] + w[key][1] * feats(c, s, k, L)[1] for key, k in (("psnr", 1), ("ssim", 2))] for s in S}
+    P = {s: [w[key][0] * feats(c, s, k, L)[0] + w[key][1] * feats(c, s, k, L)[1] for key, k in (("psnr", 3), ("ssim", 2))] for s in S}
     bp, bs = max(v[0] for v in P.values()), max(v[1] for v in P.values())
     ok = [s for s in S if P[s][0] >= bp - .1 and P[s][1] >= bs - .003]
     print(L, c, "chosen", ok, {s: "%.2f %.4f" % (v[0] - bp, v[1] - bs) for s, v in P.items()})

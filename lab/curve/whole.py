@@ -12,7 +12,7 @@ if os.environ.get("ANNEAL") == "0":  # the rate of the centres as at the prune, 
     real = count.notify_pruned
     count.notify_pruned = lambda *a, ends_at=None, **k: real(*a, **k)
 data, out, seed = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
-config = parse(["sundae-auto", "--data", str(data), "--machine.seed", seed, *sys.argv[4:], *parser_of(data)])
+config = parse([os.environ.get("METHOD", "sundae-auto"), "--data", str(data), "--machine.seed", seed, *sys.argv[4:], *parser_of(data)])
 config.output_dir = Path(f"/tmp/whole/{out.stem}"); config.vis = "tensorboard"; config.experiment_name, config.timestamp = "r", "run"
 config.steps_per_save = config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
 config.pipeline.model.evaluate_prune = False
