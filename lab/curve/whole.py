@@ -7,7 +7,11 @@ from harness.job import parse, without_lpips, _set_random_seed
 from harness.plan import parser_of
 import sundae_ns.training.trials.curve as curve
 import sundae_ns.training.trials.count as count
-curve.LOST = 1e9
+if os.environ.get("ALL"):  # all six trials
+    curve.LOST = 1e9
+if os.environ.get("LONG"):  # trials of the head of twice their length
+    import sundae_ns.training.trials.head as head_trials
+    head_trials.TRIAL_STEPS, head_trials.MOST_TRIAL = 2400, 0.08
 if os.environ.get("ANNEAL") == "0":  # the rate of the centres as at the prune, for comparison
     real = count.notify_pruned
     count.notify_pruned = lambda *a, ends_at=None, **k: real(*a, **k)

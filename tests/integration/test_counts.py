@@ -115,7 +115,7 @@ def test_trials_choose_the_count_and_leave_nothing_else_behind(make: Make, judge
     # A count that loses a decibel is clearly too few, so smaller ones are not tried.
     assert [round(one["count"] / full, 2) for one in record["curve"]] == [1.0, 0.4, 0.2, 0.1]
     assert record["step"] == PRUNE_AT + 4 * TRIAL
-    assert [len(one["measured"]) for one in record["curve"]] == [count_trials.WINDOWS] * 4
+    assert [len(one["measured"]) for one in record["curve"]] == [len(held)] * 4
     assert all(one["bytes"] > 0 for one in record["curve"])
     assert torch.equal(fields["before"], fields["after"])
     # Held out from the first step; and the head has held-out views of its own.

@@ -49,8 +49,8 @@ SHARES = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)
 """Shares of the primitives that are tried, about a factor of 2 apart, largest first."""
 TRIAL_SHARE = 0.02
 """Length of a trial as a share of the schedule."""
-WINDOWS = 2
-"""Measurements of a trial, evenly spaced; each of the mean of the weights over half of the steps since the last."""
+MEAN_SHARE = 0.25
+"""Share of a trial, at its end, over which weights are averaged for the measurement."""
 LEAST_VIEWS = 32
 """With fewer training views, those that could be held out are too few to compare counts."""
 MOST_VIEWS = 32
@@ -77,15 +77,15 @@ class CountTrialProgress:
     """Number of primitives of each begun trial."""
     sizes: list[int | None] = field(default_factory=list)
     """Estimated bytes of the packed field of each finished trial."""
-    measured: list[list[list[list[float]]]] = field(default_factory=list)
-    """For each begun trial, measurement and held-out view: the values of a :class:`HeldOutQuality`."""
+    measured: list[list[list[float]]] = field(default_factory=list)
+    """For each finished trial and held-out view: the values of a :class:`HeldOutQuality`."""
     chosen: int = 0
     """The chosen number; 0 before the decision."""
 
     def curve(self) -> list[CurvePoint]:
         """The points of the finished trials, largest count first; none if masks leave no pixel of the views."""
-        done = len(self.sizes)
-        return curve_of(self.counts[:done], self.measured[:done], self.sizes) if done and self.measured[0][0] else []
+        done = len(self.measured)
+        return curve_of(self.counts[:done], self.measured, self.sizes) if done and self.measured[0] else []
 
 
 class CountTrials(Extension):
@@ -144,8 +144,8 @@ class CountTrials(Extension):
         elif progress.phase == "trials":
             self._engine.resume(run)
         else:
-            progress.phase, self._engine.held = "holding", self._views(run)
-            run.hold_out(self._engine.held)
+            progress.phase = "holding"
+            self._engine.hold(run, self.name, self._views(run))
 
     def after_step(self, run: TrainingRun) -> None:
         """Begin and end trials, decide."""
@@ -153,7 +153,7 @@ class CountTrials(Extension):
         if progress.phase == "holding" and run.state.schedule_step >= self.config.prune_at:
             self._begin(run)
         elif progress.phase == "trials" and self._engine.after_step(run):
-            self._end_window(run)
+            self._end_trial(run)
 
     def price(self) -> tuple[float, float] | None:
         """PSNR (dB) and SSIM that twice the bytes gain if they are spent on primitives; None without a curve."""
@@ -165,8 +165,8 @@ class CountTrials(Extension):
         return Tolerance.of_drop(self.config.max_drop)
 
     @property
-    def _window(self) -> int:
-        return max(round(TRIAL_SHARE * self.progress.steps / WINDOWS), 1)
+    def _length(self) -> int:
+        return max(round(TRIAL_SHARE * self.progress.steps), 1)
 
     def _views(self, run: TrainingRun) -> list[int]:
         indices = run.view_indices()
@@ -175,7 +175,7 @@ class CountTrials(Extension):
     def _fits(self, run: TrainingRun) -> bool:
         """Whether the trials leave enough of the steps after the prune."""
         steps = 0 if run.last_step is None else max(run.last_step + 1, run.schedule_length or 0)
-        return len(SHARES) * WINDOWS * self._window <= MOST_TRIALS * (steps - self.config.prune_at)
+        return len(SHARES) * self._length <= MOST_TRIALS * (steps - self.config.prune_at)
 
     def _begin(self, run: TrainingRun) -> None:
         progress, state = self.progress, run.state
@@ -184,7 +184,7 @@ class CountTrials(Extension):
         progress.phase, progress.full = "trials", run.source.total
         CONSOLE.log(
             f"step {state.step}: how many primitives does the scene need? Up to {len(SHARES)} trials of "
-            f"{WINDOWS * self._window:,} steps; {len(self._views(run))} of {len(run.view_indices())} training views "
+            f"{self._length:,} steps; {len(self._views(run))} of {len(run.view_indices())} training views "
             "are held out"
         )
         self._engine.enable_head(state, False)
@@ -202,22 +202,15 @@ class CountTrials(Extension):
 
         pruner = FieldPruner(state.field, state.optimizers, [state.densification])
         prune_to(lambda n: min(count, n), self.config, pruner, state.pruning, state.schedule_step, contribute)
-        ends_at = state.step + WINDOWS * self._window
-        notify_pruned(state.schedulers, state.step, count, last=False, ends_at=ends_at)
+        notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + self._length)
         progress.counts.append(count)
-        progress.measured.append([])
-        self._start_window(run)
+        trial = Trial(self._length, self._views(run), averaged=MEAN_SHARE * self._length, counts=False)
+        self._engine.start(run, trial)
 
-    def _start_window(self, run: TrainingRun) -> None:
-        self._engine.start(run, Trial(self._window, self._views(run), averaged=self._window / 2, counts=False))
-
-    def _end_window(self, run: TrainingRun) -> None:
-        """Measure; go on, start the next trial from the unpruned field, or decide."""
+    def _end_trial(self, run: TrainingRun) -> None:
+        """Measure; start the next trial from the unpruned field, or decide."""
         progress, state = self.progress, run.state
-        progress.measured[-1].append([list(view) for view in self._engine.measure(run, with_fitted=True)])
-        if len(progress.measured[-1]) < WINDOWS:
-            self._start_window(run)
-            return
+        progress.measured.append([list(view) for view in self._engine.measure(run, with_fitted=True)])
         progress.sizes.append(packed_size(state.field))
         self._engine.go_back(FULL, state)
         curve = progress.curve()
@@ -248,13 +241,13 @@ class CountTrials(Extension):
             )
         names = HeldOutQuality._fields
         points = [
-            {**asdict(point), "measured": [[dict(zip(names, one, strict=True)) for one in each] for each in trial]}
+            {**asdict(point), "measured": [dict(zip(names, view, strict=True)) for view in trial]}
             for point, trial in zip(curve, progress.measured, strict=True)
         ]
         run.log_scalars("Curve", {"chosen": count, "full": progress.full})
         record: dict[str, Any] = {"chosen": count, "full": progress.full, "reason": reason, "step": run.state.step}
         record |= {"tolerance": self._tolerance._asdict(), "held_out_views": self._views(run)}
-        write_record(run, CURVE, {**record, "steps_per_trial": WINDOWS * self._window, "curve": points})
+        write_record(run, CURVE, {**record, "steps_per_trial": self._length, "curve": points})
 
     def _show(self, curve: list[CurvePoint], reason: str) -> None:
         """The curve as a table in the log."""
@@ -271,9 +264,9 @@ class CountTrials(Extension):
     def _settle(self, run: TrainingRun, count: int | None) -> None:
         """End the trials; without a count the schedule keeps the usual share."""
         progress, state = self.progress, run.state
-        progress.phase, progress.chosen, self._engine.held = "done", count or 0, []
+        progress.phase, progress.chosen = "done", count or 0
         state.pruning[COUNT] = count or 0
-        self._engine.end(run)
+        self._engine.end(run, self.name)
         if self._alone:
             self._engine.enable_head(state, True)
 

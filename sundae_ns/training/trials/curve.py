@@ -1,9 +1,9 @@
 """Expected quality as a function of the number of primitives, and the choice of a number by it.
 
-A trial is far shorter than the training that follows, so its images do not show what that training reaches. Two
-figures of a trial foretell it: the quality at its end, and how fast the quality still changes on a logarithmic scale of
-steps. Small fields go on gaining; large ones that fit what differs between the training images lose again. The weights
-of the two were fitted to trainings of six captures at six counts each (``docs/decisions.md``).
+A trial is far shorter than the training that follows, so its images do not show what that training reaches. Two things
+foretell it: the quality at the end of the trial, of which differences shrink later, and the count itself, since each
+halving gains more in the steps that follow. The weights of both were fitted to trainings of six captures at up to six
+counts each (``docs/decisions.md``).
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 
 from sundae_ns.evaluation.count_curve import CurvePoint
 
-PSNR_WEIGHTS = (0.8, 1.5)
-"""Weights of the PSNR at the end of a trial, and of its growth in the last e-fold of steps."""
-SSIM_WEIGHTS = (0.85, 2.0)
+PSNR_WEIGHTS = (0.85, 0.15)
+"""Weight of the PSNR at the end of a trial, and dB that each halving of the count gains after it."""
+SSIM_WEIGHTS = (0.7, 0.003)
 """The same for SSIM."""
+CERTAINTY = 0.5
+"""Standard errors by which a loss must exceed the tolerance before it counts."""
 LOST = 4.0
 """A count that loses this many times the tolerance, beyond two standard errors, is clearly too small."""
 
@@ -40,9 +42,9 @@ class Tolerance(NamedTuple):
 
 
 def excess(point: CurvePoint, tolerance: Tolerance) -> float:
-    """Largest loss, less its standard error, in units of the tolerance; at most 1 is as good as the best."""
-    psnr = (point.psnr_loss - point.psnr_error) / tolerance.psnr
-    return max(psnr, (point.ssim_loss - point.ssim_error) / tolerance.ssim)
+    """Largest loss beyond doubt, in units of the tolerance; at most 1 is as good as the best."""
+    psnr = (point.psnr_loss - CERTAINTY * point.psnr_error) / tolerance.psnr
+    return max(psnr, (point.ssim_loss - CERTAINTY * point.ssim_error) / tolerance.ssim)
 
 
 def is_lost(point: CurvePoint, tolerance: Tolerance) -> bool:
@@ -52,27 +54,26 @@ def is_lost(point: CurvePoint, tolerance: Tolerance) -> bool:
 
 
 def curve_of(
-    counts: Sequence[int], measured: Sequence[Sequence[Sequence[Sequence[float]]]], sizes: Sequence[int | None]
+    counts: Sequence[int], measured: Sequence[Sequence[Sequence[float]]], sizes: Sequence[int | None]
 ) -> list[CurvePoint]:
     """The curve of some trials, largest count first.
 
     Args:
         counts: number of primitives of each trial.
-        measured: for each trial, measurement (evenly spaced, at least two) and view: the values of a
-            :class:`sundae_ns.training.heldout.HeldOutQuality`, with a fitted PSNR.
+        measured: for each trial and view the values of a :class:`sundae_ns.training.heldout.HeldOutQuality`, with a
+            fitted PSNR.
         sizes: estimated bytes of each packed field.
 
     Returns:
         A point for each trial; losses of a trial whose images are not finite are infinite.
     """
-    values = np.asarray(measured, dtype=np.float64)  # [T, W, V, 4]
-    pixels = values[0, 0, :, 0] / values[0, 0, :, 0].sum()
-    last, half = values.shape[1], max(values.shape[1] // 2, 1)
+    values = np.asarray(measured, dtype=np.float64)  # [T, V, 4]
+    pixels = values[0, :, 0] / values[0, :, 0].sum()
+    halvings = -np.log2(np.asarray(counts, dtype=np.float64))[:, None]
     columns = []
-    for index, weights in ((3, PSNR_WEIGHTS), (2, SSIM_WEIGHTS)):
-        end = values[:, last - 1, :, index]
-        growth = (end - values[:, half - 1, :, index]) / math.log(last / half)
-        expected = weights[0] * end + weights[1] * growth  # [T, V], up to a constant of the capture
+    for index, (weight, later) in ((3, PSNR_WEIGHTS), (2, SSIM_WEIGHTS)):
+        end = values[:, :, index]
+        expected = weight * end + later * halvings  # [T, V], up to a constant of the capture
         means = np.where(np.isfinite(expected).all(1), expected @ pixels, -np.inf)
         best = int(means.argmax())
         losses, errors = zip(*(_paired(expected[best] - one, pixels) for one in expected), strict=True)

@@ -8,7 +8,7 @@ It holds all of the state of a trial, so that a run resumes in the middle of one
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -56,8 +56,7 @@ class TrialEngine:
         """Copies of the field by name: a :meth:`FieldState.snapshot`, and the number of ``counted`` steps before it."""
         self.taken_back = 0
         """Steps after which the field went back to before them."""
-        self.held: list[int] = []
-        """Training views that are held out for trials to come, beside those of a trial."""
+        self._held: dict[str, list[int]] = {}
         self._head_starts_at = head_starts_at
         self._mean = RunningMean()
 
@@ -96,10 +95,18 @@ class TrialEngine:
             notify_pruned(state.schedulers, state.step, run.source.total)
         self._count_steps(state)
 
+    def hold(self, run: TrainingRun, policy: str, views: Sequence[int]) -> None:
+        """Hold out views for the trials to come of a policy, in place of those before; none ends it.
+
+        While a trial is trained, its own views are held out and no others.
+        """
+        self._held[policy] = list(views)
+        self.resume(run)
+
     def resume(self, run: TrainingRun) -> None:
-        """Hold out the views of the current trial, if there is one."""
-        if self.trial is not None:
-            run.hold_out(self.trial.held_out)
+        """Hold out the views of the current trial, or else those of the trials to come."""
+        coming = {view for views in self._held.values() for view in views}
+        run.hold_out(sorted(coming) if self.trial is None else self.trial.held_out)
 
     def after_step(self, run: TrainingRun) -> bool:
         """Average the weights if it is due; returns whether the current trial has been trained."""
@@ -143,10 +150,10 @@ class TrialEngine:
         put_restarts(state.schedulers, kept["restarts"], self.taken_back - kept["taken_back"])
         self._count_steps(state)
 
-    def end(self, run: TrainingRun) -> None:
-        """End all trials: forget the kept copies, and serve all training views from the next step on."""
+    def end(self, run: TrainingRun, policy: str) -> None:
+        """End the trials of a policy: forget the kept copies, and serve its views from the next step on."""
         self.trial, self.kept, self._mean = None, {}, RunningMean()
-        run.hold_out([])
+        self.hold(run, policy, [])
         self._count_steps(run.state)
 
     def enable_head(self, state: FieldState, enabled: bool) -> None:

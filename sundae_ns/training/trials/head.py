@@ -238,7 +238,7 @@ class HeadTrials(Extension):
         elif views < FEWEST_VIEWS:
             self._settle(run, "plain", f"{views} training views are too few to tell whether a head helps")
         elif progress.phase == "holding":
-            run.hold_out([*self._planned(run).views, *self._engine.held])
+            self._engine.hold(run, self.name, self._planned(run).views)
         elif progress.phase == "trials":
             self._engine.resume(run)
         elif run.last_step is not None and not self._fits(run):
@@ -249,7 +249,7 @@ class HeadTrials(Extension):
         progress, step = self.progress, run.state.schedule_step
         if progress.phase == "before" and step >= self.begins_at - HOLD_SHARE * progress.steps and self._fits(run):
             progress.phase = "holding"
-            run.hold_out([*self._planned(run).views, *self._engine.held])
+            self._engine.hold(run, self.name, self._planned(run).views)
         # Trials of counts come first: the field of one of them is not yet the one that is finished.
         ready = self._engine.trial is None and (
             run.state.pruning["num_prunes"] > 0 or self._price_of_primitives is None
@@ -301,6 +301,7 @@ class HeadTrials(Extension):
             progress.bytes.append(stored_bytes({**plain, FEATURES: features}, head))
         limit_rise(state.schedulers, round(RISE_SHARE * plan.length))
         self._engine.keep("start", state, head=True)
+        self._engine.hold(run, self.name, [])
         self._start_trial(run)
 
     def _start_trial(self, run: TrainingRun) -> None:
@@ -352,7 +353,7 @@ class HeadTrials(Extension):
         if reason:
             CONSOLE.log(f"the head is {'removed' if decision == 'plain' else 'enabled'}: {reason}")
         progress.phase, progress.decision, progress.reason = "done", decision, reason
-        self._engine.end(run)
+        self._engine.end(run, self.name)
         self._engine.enable_head(state, decision != "plain")
         if decision == "plain":
             state.remove_head()

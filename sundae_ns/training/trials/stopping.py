@@ -107,7 +107,7 @@ class EarlyStopping(Extension):
             return
         if run.images_per_step > 1:  # a watch counts steps of one image
             self.progress.phase = "done"
-            self._engine.end(run)
+            self._engine.end(run, self.name)
         self._engine.resume(run)
 
     def after_step(self, run: TrainingRun) -> None:
@@ -125,7 +125,7 @@ class EarlyStopping(Extension):
             elif run.state.schedule_step + self._window > progress.ends:
                 CONSOLE.log(f"step {run.state.step}: the held-out views lose nothing; training goes on, on all views")
                 progress.phase = "done"
-                self._engine.end(run)
+                self._engine.end(run, self.name)
                 self._record(run, None)
             else:
                 self._watch(run)
@@ -175,7 +175,7 @@ class EarlyStopping(Extension):
             "Going back, to train as long on all views"
         )
         self._engine.go_back(_START, run.state)
-        self._engine.end(run)
+        self._engine.end(run, self.name)
         progress.phase = "repeating"
         self._engine.start(run, Trial(length, averaged=self._window))
         self._record(run, length)
@@ -183,7 +183,7 @@ class EarlyStopping(Extension):
     def _pause(self, run: TrainingRun) -> None:
         """Take the mean of the last window, and keep it to the end of the schedule."""
         self._engine.take_mean(run.state)
-        self._engine.end(run)
+        self._engine.end(run, self.name)
         self.progress.phase = "paused"
         CONSOLE.log(f"step {run.state.step}: more training would harm other views; the remaining steps change nothing")
 

@@ -83,7 +83,7 @@ def test_trials_of_several_lengths_go_back_to_any_kept_field(run: FakeRun) -> No
     assert (height(run), state.uncounted, age()) == (0.0, 3 + 2 + 5, 0)
     trials.go_back("second", state)  # its five steps count again
     assert (height(run), state.uncounted, age()) == (5.0, 5, 5)
-    trials.end(run)  # type: ignore[arg-type]
+    trials.end(run, "count")  # type: ignore[arg-type]
     assert (run.held_out, trials.trial, trials.kept) == ([], None, {})
 
 
@@ -111,7 +111,7 @@ def test_steps_that_do_not_count_yet_count_when_the_trials_end(run: FakeRun) -> 
     run.train(trials)
     assert state.head_enabled
     assert state.head_images == -math.inf
-    trials.end(run)  # type: ignore[arg-type]
+    trials.end(run, "count")  # type: ignore[arg-type]
     assert state.head_images == 3
 
 
