@@ -90,7 +90,7 @@ def build(
     extensions += [] if counts is None else [counts]
     extensions.append(ScheduledPruning(schedule, evaluate=options.evaluate_prune))
     if options.head.mode == "auto":
-        decision = HeadTrials(begins_at, state, engine, None if counts is None else counts.price)
+        decision = HeadTrials(begins_at, state, engine, None if counts is None else counts.head_pays)
         extensions += [decision, EarlyStopping(decision, options.ssim_lambda, engine)]
     if options.average_share > 0:
         extensions.append(Averaging(options.average_share, max(pruning.settled_at, state.densify_until)))

@@ -32,6 +32,11 @@ class HeldOutQuality(NamedTuple):
     the photo differ from the others'. NaN if it was not asked for."""
 
 
+def from_values(trial: Sequence[Sequence[float]]) -> list[HeldOutQuality]:
+    """Qualities of views from the lists of values that checkpoints hold."""
+    return [HeldOutQuality(int(pixels), *figures) for pixels, *figures in trial]
+
+
 @torch.no_grad()
 def measure_heldout(run: TrainingRun, *, with_fitted: bool = False) -> list[HeldOutQuality]:
     """Quality of the held-out views as the field is now, with the head if it is enabled; without fully masked views.

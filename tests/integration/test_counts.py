@@ -19,8 +19,8 @@ from sundae_ns.training.trials import count as count_trials
 from sundae_ns.training.trials import engine
 
 VIEWS = 40
-TRIAL = 2
-"""Steps of a trial: a fiftieth of so short a run."""
+TRIAL, HEAD_TRIAL = 2, 5
+"""Steps of a trial of a count and of the head: a fiftieth and a twentieth of so short a run."""
 DECIDED = PRUNE_AT + len(count_trials.SHARES) * TRIAL
 """Step of the decision if all counts are tried."""
 Make = Callable[..., Trainer]
@@ -50,9 +50,10 @@ def make(scene: Path, tmp_path: Path) -> Iterator[Make]:
 
 @pytest.fixture
 def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Fixes what the counts lose against the full field on every held-out view: PSNR in dB by share."""
+    """Fixes what the counts lose against the full field on every held-out view, PSNR in dB by share, and what a head
+    gains at a tenth."""
 
-    def fix(losses: dict[float, float]) -> None:
+    def fix(losses: dict[float, float], head: float = 0.0) -> None:
         real = engine.measure_heldout
 
         def measured(run: Any, **options: Any) -> list[HeldOutQuality]:
@@ -60,7 +61,12 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
             if trials.progress.phase != "trials":
                 return real(run, **options)
             share = count_trials.SHARES[len(trials.progress.counts) - 1]
-            return [HeldOutQuality(100, 30 - losses[share], 0.9, 30 - losses[share]) for _ in run.heldout_views()]
+            found = 30 - losses[share]
+            if trials.progress.tries_head:
+                assert run.state.head_enabled == (len(trials.progress.head) == 1)
+                assert run.source.total == trials.progress.full / 10
+                found = 30 + head * len(trials.progress.head)
+            return [HeldOutQuality(100, found, 0.9, found) for _ in run.heldout_views()]
 
         monkeypatch.setattr(engine, "measure_heldout", measured)
 
@@ -114,17 +120,14 @@ def test_trials_choose_the_count_and_leave_nothing_else_behind(make: Make, judge
     assert model.num_points == chosen  # type: ignore[union-attr]
     # A count that loses a decibel is clearly too few, so smaller ones are not tried.
     assert [round(one["count"] / full, 2) for one in record["curve"]] == [1.0, 0.4, 0.2, 0.1]
-    assert record["step"] == PRUNE_AT + 4 * TRIAL
+    assert record["step"] == PRUNE_AT + 4 * TRIAL + 2 * HEAD_TRIAL
     assert [len(one["measured"]) for one in record["curve"]] == [len(held)] * 4
     assert all(one["bytes"] > 0 for one in record["curve"])
     assert torch.equal(fields["before"], fields["after"])
-    # Held out from the first step; and the head has held-out views of its own.
+    # Held out from the first step.
     assert len(held) == VIEWS // 8
-    assert not held & set(served[: record["step"]])
+    assert not held & set(served[: PRUNE_AT + 4 * TRIAL])
     assert held & set(served[record["step"] + 1 :])
-    trials = json.loads((trainer.base_dir / "trials.json").read_text())
-    assert not held & set(trials["held_out_views"])
-    assert trials["step"] > record["step"]
     points = read_count_curve(trainer.base_dir)
     assert points is not None
     assert [point.count for point in points.points] == [one["count"] for one in record["curve"]]
@@ -132,10 +135,55 @@ def test_trials_choose_the_count_and_leave_nothing_else_behind(make: Make, judge
     assert (prune["before"], prune["after"], prune["step"]) == (full, chosen, record["step"])
 
 
+@pytest.mark.parametrize(("gain", "decision"), [(0.2, "head"), (0.05, "plain"), (-0.3, "plain")])
+def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make: Make, judge: Any, gain: float, decision: str) -> None:
+    judge(LEVEL, gain)
+    trainer = make(head="auto")
+    model: Any = trainer.pipeline.model
+    fresh = {name: value.clone() for name, value in model.state.head.state_dict().items()}
+    (trials,) = (one for one in model.extensions if one.name == "trials")
+    settle, found = trials._settle, {}
+
+    def settled(*words: Any) -> None:
+        found.update({name: value.clone() for name, value in model.state.head.state_dict().items()})
+        settle(*words)
+
+    trials._settle = settled
+    trainer.train()
+    record, verdict = record_of(trainer), json.loads((trainer.base_dir / "trials.json").read_text())
+    assert (record["head"]["pays"], verdict["decision"]) == (decision == "head", decision)
+    assert record["head"]["head"]["psnr"] - record["head"]["plain"]["psnr"] == pytest.approx(gain)
+    assert verdict["step"] == record["step"]
+    assert (model.state.head is None) == (decision == "plain")
+    # What the head learnt on a tenth does not fit the chosen field.
+    assert all(torch.equal(fresh[name], found[name]) for name in fresh)
+    if decision == "head":
+        assert any(not torch.equal(fresh[name], value) for name, value in model.state.head.state_dict().items())
+        assert model.state.head_images == STEPS - 1 - record["step"]
+
+
+def test_where_a_tenth_is_kept_the_head_has_its_usual_trials(make: Make, judge: Any) -> None:
+    judge(dict.fromkeys(count_trials.SHARES, 0.0))
+    trainer = make(head="auto")
+    trainer.train()
+    record, verdict = record_of(trainer), json.loads((trainer.base_dir / "trials.json").read_text())
+    assert record["chosen"] <= record["full"] / 10
+    assert "head" not in record
+    assert verdict["step"] > record["step"]
+    assert not set(record["held_out_views"]) & set(verdict["held_out_views"])
+
+
 @pytest.mark.parametrize(
-    ("head", "stop"), [("residual", 10), ("residual", 45), ("auto", 45), ("residual", DECIDED + 3)]
+    ("head", "stop"),
+    [
+        *(("residual", 10), ("residual", 45), ("residual", DECIDED + 3)),
+        *(("auto", 45), ("auto", DECIDED + 3), ("auto", DECIDED + HEAD_TRIAL + 3)),
+    ],
 )
-def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, head: str, stop: int) -> None:
+def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, judge: Any, head: str, stop: int) -> None:
+    if stop > DECIDED:
+        # All counts are tried, and more than a tenth is chosen, so that the head has its trials.
+        judge({1.0: 0.0, 0.4: 0.0, 0.2: 0.05, 0.1: 0.3, 0.05: 0.3, 0.025: 0.3}, 0.2)
     whole = make(head=head, name="whole", save_every=stop)
     whole.train()
     resumed = make(
@@ -184,7 +232,7 @@ def test_a_budget_works_on_the_same_curve(make: Make, judge: Any, pruning: dict[
 @pytest.mark.parametrize(
     ("options", "reason"),
     [
-        ({"pruning": {"prune_at": 70}}, "the steps after the prune are too few"),
+        ({"pruning": {"prune_at": 75}}, "the steps after the prune are too few"),
         ({"views": 16}, "16 training views are too few"),
     ],
 )

@@ -37,7 +37,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
 def curve(monkeypatch: pytest.MonkeyPatch) -> Curve:
     """Fixes PSNR and SSIM of the held-out views at a step; trials end without a head."""
     monkeypatch.setattr(engine, "AVERAGED_EVERY", 1)
-    monkeypatch.setattr(HeadTrialProgress, "best", lambda progress, price=None: "plain")
+    monkeypatch.setattr(HeadTrialProgress, "best", "plain")
 
     def fix(
         decibels: Callable[[int], float], similarity: Callable[[int], float] = lambda _: 0.5, held_out: int = 2

@@ -3,14 +3,18 @@
 Some training views are held out from the first step to the decision: a large field remembers for long what it has seen
 once. From the unpruned field trials of one length follow, each pruned to another count, with rates that decay as those
 of a whole run. Where quality levels off, more primitives are not worth their bytes; where it still climbs, fewer would
-lose what can be seen (:mod:`sundae_ns.training.trials.curve`). The field then goes back to before the prune, and the
-schedule prunes it to the chosen count. Test views are never used.
+lose what can be seen (:mod:`sundae_ns.training.trials.curve`).
+
+Where quality levels off, a head is the only thing that gains more. It shows what it gains the sooner, the fewer
+primitives there are: so two more trials, without and with it, train the usual share of the primitives if more than that
+are chosen. The field then goes back to before the prune, and the schedule prunes it to the chosen count. Test views
+are never used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import torch
@@ -20,6 +24,7 @@ from torch import Tensor
 from sundae_ns.errors import PackError
 from sundae_ns.evaluation.count_curve import CURVE, CurvePoint, curve_table
 from sundae_ns.gaussians.parameters import FEATURES
+from sundae_ns.pruning import kept_count
 from sundae_ns.pruning.cutting import FieldPruner
 from sundae_ns.rendering.contribution import contribution
 from sundae_ns.storage.morton import scene_order
@@ -27,10 +32,10 @@ from sundae_ns.storage.packing.scene import PackedScene, fit_scene, pack_bytes
 from sundae_ns.training.densification import Densification
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.heldout import HeldOutQuality
+from sundae_ns.training.heldout import HeldOutQuality, from_values, mean_quality
 from sundae_ns.training.pruning_config import USUAL_SHARE, PruningConfig
 from sundae_ns.training.report import write_record
-from sundae_ns.training.schedulers import notify_pruned
+from sundae_ns.training.schedulers import limit_rise, notify_pruned
 from sundae_ns.training.schedules import COUNT, prune_to
 from sundae_ns.training.trials.curve import (
     Tolerance,
@@ -38,24 +43,30 @@ from sundae_ns.training.trials.curve import (
     choose,
     curve_of,
     is_lost,
-    price,
     still_climbs,
 )
 from sundae_ns.training.trials.engine import Trial, TrialEngine
-from sundae_ns.training.trials.head import HELD_OUT_EVERY, MOST_HELD_OUT, spread_views
+from sundae_ns.training.trials.head import (
+    HELD_OUT_EVERY,
+    MEAN_SHARE,
+    MOST_HELD_OUT,
+    RISE_SHARE,
+    TrialPlan,
+    pays,
+    plan_trials,
+    spread_views,
+)
 from sundae_ns.training.warning import warn
 
 SHARES = (1.0, 0.4, 0.2, 0.1, 0.05, 0.025)
 """Shares of the primitives that are tried, about a factor of 2 apart, largest first."""
 TRIAL_SHARE = 0.02
 """Length of a trial as a share of the schedule."""
-MEAN_SHARE = 0.25
-"""Share of a trial, at its end, over which weights are averaged for the measurement."""
 LEAST_VIEWS = 32
 """With fewer training views, those that could be held out are too few to compare counts."""
 MOST_VIEWS = 32
 """Most training views that the prune of a trial looks at."""
-MOST_TRIALS = 0.3
+MOST_TRIALS = 0.4
 """Largest share of the steps after the prune that all trials may take."""
 SAMPLE = 1 << 13
 """Neighbouring primitives that are packed to estimate the bytes of a field."""
@@ -79,8 +90,20 @@ class CountTrialProgress:
     """Estimated bytes of the packed field of each finished trial."""
     measured: list[list[list[float]]] = field(default_factory=list)
     """For each finished trial and held-out view: the values of a :class:`HeldOutQuality`."""
+    tries_head: bool = False
+    """Whether the trials of counts have ended, and the present one is for the head."""
+    head: list[list[list[float]]] = field(default_factory=list)
+    """The same as in ``measured`` for the finished trials without and with a head."""
     chosen: int = 0
     """The chosen number; 0 before the decision."""
+
+    @property
+    def head_pays(self) -> bool | None:
+        """Whether the head gains enough; None without trials of it."""
+        if len(self.head) < 2:
+            return None
+        plain, head = map(from_values, self.head)
+        return pays(plain, head)
 
     def curve(self) -> list[CurvePoint]:
         """The points of the finished trials, largest count first; none if masks leave no pixel of the views."""
@@ -125,7 +148,6 @@ class CountTrials(Extension):
             self._engine.load_state_dict(state, saved["engine"])
         if self.progress.phase == "trials" and self._alone:
             self._engine.require(FULL)
-            self._engine.enable_head(state, False)
 
     def before_training(self, run: TrainingRun) -> None:
         """Hold views out, or take the usual share where trials cannot decide."""
@@ -142,6 +164,7 @@ class CountTrials(Extension):
         elif not self._fits(run):
             self._take_usual(run, "the steps after the prune are too few to compare counts")
         elif progress.phase == "trials":
+            self._engine.enable_head(state, len(progress.head) == 1)
             self._engine.resume(run)
         else:
             progress.phase = "holding"
@@ -155,10 +178,9 @@ class CountTrials(Extension):
         elif progress.phase == "trials" and self._engine.after_step(run):
             self._end_trial(run)
 
-    def price(self) -> tuple[float, float] | None:
-        """PSNR (dB) and SSIM that twice the bytes gain if they are spent on primitives; None without a curve."""
-        curve = self.progress.curve() if self.progress.phase == "done" else []
-        return price(curve, self.progress.chosen) if curve else None
+    def head_pays(self) -> bool | None:
+        """Whether the trials have found that a head pays; None if they leave that to others."""
+        return self.progress.head_pays
 
     @property
     def _tolerance(self) -> Tolerance:
@@ -172,10 +194,15 @@ class CountTrials(Extension):
         indices = run.view_indices()
         return spread_views(indices, min(MOST_HELD_OUT, len(indices) // HELD_OUT_EVERY), 0)
 
+    def _plan(self, run: TrainingRun) -> TrialPlan:
+        """The trials of the head: on the views that it would hold out for trials of its own."""
+        return plan_trials(run.view_indices(), self.progress.steps)
+
     def _fits(self, run: TrainingRun) -> bool:
         """Whether the trials leave enough of the steps after the prune."""
         steps = 0 if run.last_step is None else max(run.last_step + 1, run.schedule_length or 0)
-        return len(SHARES) * self._length <= MOST_TRIALS * (steps - self.config.prune_at)
+        head = 0 if self._alone else 2 * self._plan(run).length
+        return len(SHARES) * self._length + head <= MOST_TRIALS * (steps - self.config.prune_at)
 
     def _begin(self, run: TrainingRun) -> None:
         progress, state = self.progress, run.state
@@ -188,13 +215,34 @@ class CountTrials(Extension):
             "are held out"
         )
         self._engine.enable_head(state, False)
-        self._engine.keep(FULL, state, head=False)
+        self._engine.keep(FULL, state, head=not self._alone)
         self._start_trial(run)
 
     def _start_trial(self, run: TrainingRun) -> None:
-        """Prune the field for a trial, as the schedule would, by fewer views."""
+        """Train the next count."""
         progress, state = self.progress, run.state
         count = max(round(SHARES[len(progress.counts)] * progress.full), 1)
+        self._prune(run, count)
+        notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + self._length)
+        progress.counts.append(count)
+        trial = Trial(self._length, self._views(run), averaged=MEAN_SHARE * self._length, counts=False)
+        self._engine.start(run, trial)
+
+    def _start_head_trial(self, run: TrainingRun) -> None:
+        """Train the usual share, first without a head, then with one."""
+        progress, state, plan = self.progress, run.state, self._plan(run)
+        assert state.head is not None
+        progress.tries_head = True
+        count, width = kept_count(USUAL_SHARE, progress.full), state.head.config.num_features
+        self._prune(run, count)
+        limit_rise(state.schedulers, round(RISE_SHARE * plan.length))
+        notify_pruned(state.schedulers, state.step, count, last=False)
+        trial = Trial(plan.length, plan.views, averaged=MEAN_SHARE * plan.length, counts=False)
+        self._engine.start(run, replace(trial, num_features=width if progress.head else 0))
+
+    def _prune(self, run: TrainingRun, count: int) -> None:
+        """Prune the field as the schedule would, by fewer views."""
+        state = run.state
 
         def contribute(kept: int | None) -> Tensor:
             views = run.training_views()
@@ -202,29 +250,35 @@ class CountTrials(Extension):
 
         pruner = FieldPruner(state.field, state.optimizers, [state.densification])
         prune_to(lambda n: min(count, n), self.config, pruner, state.pruning, state.schedule_step, contribute)
-        notify_pruned(state.schedulers, state.step, count, last=False, ends_at=state.step + self._length)
-        progress.counts.append(count)
-        trial = Trial(self._length, self._views(run), averaged=MEAN_SHARE * self._length, counts=False)
-        self._engine.start(run, trial)
 
     def _end_trial(self, run: TrainingRun) -> None:
         """Measure; start the next trial from the unpruned field, or decide."""
         progress, state = self.progress, run.state
-        progress.measured.append([list(view) for view in self._engine.measure(run, with_fitted=True)])
-        progress.sizes.append(packed_size(state.field))
+        if progress.tries_head:
+            progress.head.append([list(view) for view in self._engine.measure(run)])
+        else:
+            progress.measured.append([list(view) for view in self._engine.measure(run, with_fitted=True)])
+            progress.sizes.append(packed_size(state.field))
         self._engine.go_back(FULL, state)
+        self._engine.enable_head(state, False)
         curve = progress.curve()
-        if len(progress.counts) < len(SHARES) and curve and not is_lost(curve[-1], self._tolerance):
+        more = len(progress.counts) < len(SHARES) and curve and not is_lost(curve[-1], self._tolerance)
+        if more and not progress.tries_head:
             self._start_trial(run)
+        elif self._asks_for_head(curve):
+            self._start_head_trial(run)
         else:
             self._decide(run, curve)
 
-    def _decide(self, run: TrainingRun, curve: list[CurvePoint]) -> None:
-        """Choose a count, and let the schedule prune to it."""
-        progress, config = self.progress, self.config
-        if not curve:
-            self._take_usual(run, "masks leave no pixel of the held-out training views")
-            return
+    def _asks_for_head(self, curve: list[CurvePoint]) -> bool:
+        """Whether a trial of the head is due: where the usual share is kept, others try it as in any run."""
+        if self._alone or not curve or len(self.progress.head) == 2:
+            return False
+        return self._choice(curve)[0] > kept_count(USUAL_SHARE, self.progress.full)
+
+    def _choice(self, curve: list[CurvePoint]) -> tuple[int, str]:
+        """The chosen count, and why."""
+        config = self.config
         count, reason = choose(curve, self._tolerance), "the fewest that are as good as the best"
         limits = {"max-primitives": config.max_primitives}
         if config.max_bytes is not None:
@@ -232,6 +286,15 @@ class CountTrials(Extension):
         for name, most in limits.items():
             if most is not None and most < count:
                 count, reason = most, f"the most that pruning.{name} allows"
+        return count, reason
+
+    def _decide(self, run: TrainingRun, curve: list[CurvePoint]) -> None:
+        """Choose a count, and let the schedule prune to it."""
+        progress = self.progress
+        if not curve:
+            self._take_usual(run, "masks leave no pixel of the held-out training views")
+            return
+        count, reason = self._choice(curve)
         self._settle(run, count)
         self._show(curve, reason)
         if still_climbs(curve, self._tolerance):
@@ -247,7 +310,17 @@ class CountTrials(Extension):
         run.log_scalars("Curve", {"chosen": count, "full": progress.full})
         record: dict[str, Any] = {"chosen": count, "full": progress.full, "reason": reason, "step": run.state.step}
         record |= {"tolerance": self._tolerance._asdict(), "held_out_views": self._views(run)}
-        write_record(run, CURVE, {**record, "steps_per_trial": self._length, "curve": points})
+        record |= {"steps_per_trial": self._length, "curve": points}
+        if progress.head_pays is not None:
+            qualities = map(mean_quality, map(from_values, progress.head))
+            figures = dict(zip(("plain", "head"), qualities, strict=True))
+            CONSOLE.log(
+                f"a tenth of the primitives after {self._plan(run).length:,} steps: "
+                + "; ".join(f"{name} {psnr:.2f} dB, SSIM {ssim:.4f}" for name, (psnr, ssim) in figures.items())
+            )
+            shown = {name: dict(zip(("psnr", "ssim"), one, strict=True)) for name, one in figures.items()}
+            record["head"] = {"pays": progress.head_pays, "steps_per_trial": self._plan(run).length, **shown}
+        write_record(run, CURVE, record)
 
     def _show(self, curve: list[CurvePoint], reason: str) -> None:
         """The curve as a table in the log."""

@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 
 from sundae_ns.evaluation.count_curve import CurvePoint
 
-PSNR_WEIGHTS = (0.85, 0.15)
+PSNR_WEIGHTS = (0.75, 0.1)
 """Weight of the PSNR at the end of a trial, and dB that each halving of the count gains after it."""
-SSIM_WEIGHTS = (0.7, 0.003)
+SSIM_WEIGHTS = (0.75, 0.003)
 """The same for SSIM."""
-CERTAINTY = 0.5
-"""Standard errors by which a loss must exceed the tolerance before it counts."""
 LOST = 4.0
 """A count that loses this many times the tolerance, beyond two standard errors, is clearly too small."""
 
@@ -42,9 +40,8 @@ class Tolerance(NamedTuple):
 
 
 def excess(point: CurvePoint, tolerance: Tolerance) -> float:
-    """Largest loss beyond doubt, in units of the tolerance; at most 1 is as good as the best."""
-    psnr = (point.psnr_loss - CERTAINTY * point.psnr_error) / tolerance.psnr
-    return max(psnr, (point.ssim_loss - CERTAINTY * point.ssim_error) / tolerance.ssim)
+    """The larger of both losses in units of its tolerance; at most 1 is as good as the best."""
+    return max(point.psnr_loss / tolerance.psnr, point.ssim_loss / tolerance.ssim)
 
 
 def is_lost(point: CurvePoint, tolerance: Tolerance) -> bool:
@@ -116,30 +113,17 @@ def choose(curve: Sequence[CurvePoint], tolerance: Tolerance) -> int:
     return round(math.exp(large + part * (small - large)))
 
 
-def price(curve: Sequence[CurvePoint], count: int) -> tuple[float, float]:
-    """PSNR (dB) and SSIM that twice as many primitives gain at a count; at least 0."""
-    if len(curve) < 2:
-        return 0.0, 0.0
-    distance = [abs(math.log(a.count * b.count) / 2 - math.log(count)) for a, b in zip(curve, curve[1:], strict=False)]
-    large, small = curve[distance.index(min(distance)) :][:2]
-    doublings = math.log2(large.count / small.count) if large.count > small.count else math.inf
-    gains = (small.psnr_loss - large.psnr_loss) / doublings, (small.ssim_loss - large.ssim_loss) / doublings
-    psnr, ssim = (max(gain, 0.0) if math.isfinite(gain) else 0.0 for gain in gains)
-    return psnr, ssim
-
-
-def affordable(curve: Sequence[CurvePoint], most: int, extra: int = 0) -> int | None:
+def affordable(curve: Sequence[CurvePoint], most: int) -> int | None:
     """Largest count whose packed field fits into a number of bytes, by the estimates; None if no size is known.
 
     Args:
         curve: the points.
         most: bytes.
-        extra: bytes of them for something else, such as a head.
     """
     known = [(math.log(point.count), math.log(point.bytes)) for point in curve if point.bytes]
     if not known:
         return None
-    rest = max(most - extra, 1)
+    rest = max(most, 1)
     if len(known) == 1:
         return max(int(math.exp(known[0][0]) * rest / math.exp(known[0][1])), 1)
     x, y = (np.array(column) for column in zip(*known, strict=True))

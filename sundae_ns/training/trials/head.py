@@ -23,7 +23,7 @@ from sundae_ns.gaussians import FEATURES
 from sundae_ns.storage import megabytes, stored_bytes
 from sundae_ns.training.extension import Extension, TrainingRun
 from sundae_ns.training.field_state import FieldState
-from sundae_ns.training.heldout import HeldOutQuality, mean_quality
+from sundae_ns.training.heldout import HeldOutQuality, from_values, mean_quality
 from sundae_ns.training.report import write_record
 from sundae_ns.training.schedulers import limit_rise
 from sundae_ns.training.trials.engine import Trial, TrialEngine
@@ -76,14 +76,13 @@ class TrialPlan:
         return [index for fold in self.folds for index in fold]
 
 
-def least_gain(doublings: float, price: float | None = None) -> float:
+def least_gain(doublings: float) -> float:
     """PSNR that a larger scene must gain, dB.
 
     Args:
         doublings: of the stored bytes that it takes.
-        price: what each must gain, dB; None for :data:`GAIN_PER_DOUBLING`.
     """
-    return max(LEAST_GAIN, (GAIN_PER_DOUBLING if price is None else price) * doublings)
+    return max(LEAST_GAIN, GAIN_PER_DOUBLING * doublings)
 
 
 def spread_views(indices: Sequence[int], count: int, half: int) -> list[int]:
@@ -143,25 +142,29 @@ class HeadTrialProgress:
         """Quality of the held-out views after the trials of a candidate, over all folds."""
         first = CANDIDATES.index(candidate) * self.folds
         trials = self.measured[first : first + self.folds]
-        return [HeldOutQuality(int(pixels), *figures) for trial in trials for pixels, *figures in trial]
+        return [view for trial in trials for view in from_values(trial)]
 
-    def best(self, price: tuple[float, float] | None = None) -> str:
-        """The largest tried candidate that gains enough over the best smaller one.
-
-        Args:
-            price: PSNR (dB) and SSIM that a doubling of the stored bytes must gain; None for :data:`GAIN_PER_DOUBLING`,
-                and no loss of SSIM.
-        """
-        best, (psnr_price, ssim_price) = "plain", price or (None, 0.0)
+    @property
+    def best(self) -> str:
+        """The largest tried candidate that gains enough over the best smaller one, and loses no SSIM."""
+        best = "plain"
         for candidate in self.tried[1:]:
-            figures = (mean_quality(self.qualities(one)) for one in (best, candidate))
-            decibels, similarity = (b - a for a, b in zip(*figures, strict=True))
             doublings = math.log2(self.bytes[CANDIDATES.index(candidate)] / self.bytes[CANDIDATES.index(best)])
-            # Comparisons with figures that are not finite fail.
-            enough = math.inf > decibels >= least_gain(doublings, psnr_price)
-            if enough and similarity >= ssim_price * doublings:
+            if pays(self.qualities(best), self.qualities(candidate), doublings):
                 best = candidate
         return best
+
+
+def pays(smaller: Sequence[HeldOutQuality], larger: Sequence[HeldOutQuality], doublings: float = 0.0) -> bool:
+    """Whether a larger scene gains enough PSNR over a smaller one, and loses no SSIM.
+
+    Args:
+        smaller, larger: quality of the held-out views.
+        doublings: of the stored bytes that the larger one takes.
+    """
+    decibels, similarity = (b - a for a, b in zip(*map(mean_quality, (smaller, larger)), strict=True))
+    # Comparisons with figures that are not finite fail.
+    return math.inf > decibels >= least_gain(doublings) and similarity >= 0
 
 
 class HeadTrials(Extension):
@@ -171,8 +174,8 @@ class HeadTrials(Extension):
         begins_at: step of the schedule after which the first trial begins: the number of primitives is settled.
         state: the field, whose head stays disabled until its trial.
         engine: carries out the trials.
-        price: what a doubling of the bytes gains if it is spent on primitives, from the trials of counts; None without
-            such trials.
+        verdict: whether trials of counts have found that the head pays, or None if they leave it to these; called once
+            the field has been pruned. None without such trials.
     """
 
     name = "trials"
@@ -182,10 +185,10 @@ class HeadTrials(Extension):
         begins_at: int,
         state: FieldState,
         engine: TrialEngine,
-        price: Callable[[], tuple[float, float] | None] | None = None,
+        verdict: Callable[[], bool | None] | None = None,
     ) -> None:
         self.begins_at = begins_at
-        self._price_of_primitives = price
+        self._verdict_of_counts = verdict
         self.progress = HeadTrialProgress()
         assert state.head is not None
         self._head = state.head.config
@@ -251,11 +254,14 @@ class HeadTrials(Extension):
             progress.phase = "holding"
             self._engine.hold(run, self.name, self._planned(run).views)
         # Trials of counts come first: the field of one of them is not yet the one that is finished.
-        ready = self._engine.trial is None and (
-            run.state.pruning["num_prunes"] > 0 or self._price_of_primitives is None
-        )
+        counts = self._verdict_of_counts
+        ready = self._engine.trial is None and (counts is None or run.state.pruning["num_prunes"] > 0)
         if progress.phase == "holding" and step >= self.begins_at and ready:
-            self._begin(run)
+            verdict = None if counts is None else counts()
+            if verdict is None:
+                self._begin(run)
+            else:
+                self._settle(run, "head" if verdict else "plain", "the trials of counts have shown what it gains")
         elif progress.phase == "trials" and self._engine.after_step(run):
             self._end_trial(run)
 
@@ -268,11 +274,6 @@ class HeadTrials(Extension):
     def held_out(self, run: TrainingRun) -> list[int]:
         """Indices of the views that the chosen field has not seen since before its trial; none without trials."""
         return [] if self.progress.reason else self._planned(run).folds[-1]
-
-    @property
-    def _price(self) -> tuple[float, float] | None:
-        """What a doubling of the bytes must gain: as much as primitives for the same bytes, where a curve tells."""
-        return None if self._price_of_primitives is None else self._price_of_primitives()
 
     def _planned(self, run: TrainingRun) -> TrialPlan:
         if self._plan is None:
@@ -317,7 +318,7 @@ class HeadTrials(Extension):
         progress, state, candidate = self.progress, run.state, self.progress.candidate
         progress.measured.append([list(view) for view in self._engine.measure(run)])
         # What does not pay is not tried with more.
-        last = candidate == self._candidates[-1] or progress.best(self._price) != candidate
+        last = candidate == self._candidates[-1] or progress.best != candidate
         if candidate in progress.tried and candidate != "plain" and last:
             self._decide(run, candidate)
             return
@@ -327,7 +328,7 @@ class HeadTrials(Extension):
 
     def _decide(self, run: TrainingRun, trained: str) -> None:
         """Continue with the best candidate; ``trained`` is the one that the field is."""
-        progress, decision = self.progress, self.progress.best(self._price)
+        progress, decision = self.progress, self.progress.best
         figures: dict[str, Any] = {}
         for candidate in progress.tried:
             views = progress.qualities(candidate)

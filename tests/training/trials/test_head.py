@@ -144,26 +144,26 @@ def test_a_candidate_must_gain_over_the_cheaper_ones_and_must_not_lose_ssim(
         for pixels, decibels in ((100, 25.0), (300, 20.0))
     ]
     progress = HeadTrialProgress(folds=2, measured=measured, bytes=SIZES)
-    assert progress.best() == best
+    assert progress.best == best
     assert progress.tried == CANDIDATES[: 2 if features is None else 3]
 
 
 def test_a_candidate_counts_when_all_its_folds_have_ended() -> None:
     plain, head = [[10.0, 20.0, 0.5]], [[10.0, 30.0, 0.9]]
-    assert HeadTrialProgress(folds=2, bytes=SIZES, measured=[plain, plain, head]).best() == "plain"
-    assert HeadTrialProgress(folds=2, bytes=SIZES, measured=[plain, plain, head, head]).best() == "head"
+    assert HeadTrialProgress(folds=2, bytes=SIZES, measured=[plain, plain, head]).best == "plain"
+    assert HeadTrialProgress(folds=2, bytes=SIZES, measured=[plain, plain, head, head]).best == "head"
 
 
 @pytest.mark.parametrize(("gain", "size", "best"), [(0.41, 200, "head"), (0.39, 200, "plain"), (0.39, 190, "head")])
 def test_a_candidate_that_takes_more_bytes_must_gain_more(gain: float, size: int, best: str) -> None:
     measured = [[[10.0, 20.0, 0.5]], [[10.0, 20.0 + gain, 0.5]]]
-    assert HeadTrialProgress(bytes=[100, size, 400], measured=measured).best() == best
+    assert HeadTrialProgress(bytes=[100, size, 400], measured=measured).best == best
 
 
 def test_views_count_by_their_pixels() -> None:
     # A gain of 1 dB on few pixels does not outweigh a loss on many.
     plain, head = [[10.0, 20.0, 0.5], [990.0, 20.0, 0.5]], [[10.0, 21.0, 0.6], [990.0, 19.99, 0.6]]
-    assert HeadTrialProgress(bytes=SIZES, measured=[plain, head]).best() == "plain"
+    assert HeadTrialProgress(bytes=SIZES, measured=[plain, head]).best == "plain"
 
 
 def earlier(phase: str, stopping: str) -> dict[str, dict[str, Any]]:
