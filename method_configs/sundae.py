@@ -114,14 +114,15 @@ def method(
 
 
 def _keep(percent: int) -> MethodSpecification:
-    name = "sundae" if percent == 10 else f"sundae-{percent}"
-    description = (
-        f"SUNDAE: spectrally pruned Gaussian field with neural compensation, keeps {percent}% of the primitives."
-    )
-    return method(name, description, pruning=PruningConfig(keep_ratio=percent / 100))
+    description = f"SUNDAE that keeps {percent}% of the primitives, with a head where it pays."
+    return method(f"sundae-{percent}", description, pruning=PruningConfig(keep_ratio=percent / 100))
 
 
-sundae = _keep(10)
+sundae = method(
+    "sundae",
+    "SUNDAE: spectrally pruned Gaussian field with neural compensation, as small as held-out training views allow.",
+    pruning=PruningConfig(keep_ratio=None),
+)
 # The paper's shares; --pipeline.model.pruning.keep-ratio takes any other.
 sundae_1 = _keep(1)
 sundae_30 = _keep(30)
@@ -137,7 +138,7 @@ sundae_continuous = method(
 
 sundae_auto = method(
     "sundae-auto",
-    "SUNDAE that keeps as many primitives as the scene needs, by trials of several numbers on held-out training views.",
+    "Another name of sundae.",
     pruning=PruningConfig(keep_ratio=None),
 )
 

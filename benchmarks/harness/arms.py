@@ -152,9 +152,10 @@ def _checked(entry: Entry, default: str, scale: float, from_scratch: bool) -> Ar
     kind: Kind = "whole"
     if entry.method == MCMC:
         kind = "mcmc"
-    # To a share of the plan; a method that decides about the number trains whole, at its own.
+    # To a share of the plan; an arm of a named method that decides about the number trains whole, at its own.
     pruning = None if mode is None else config.pipeline.model.pruning
-    prunes_once = pruning is not None and pruning.mode == "one-shot" and not pruning.decides
+    decides = pruning is not None and pruning.decides and entry.method is not None
+    prunes_once = pruning is not None and pruning.mode == "one-shot" and not decides
     if prunes_once and kind != "mcmc" and (entry.options or not from_scratch):
         kind = "branch"
     options, ratio = dict(entry.options), None

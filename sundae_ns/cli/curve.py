@@ -24,7 +24,7 @@ def curve(
     """Print how many primitives trials of a run have found necessary: each tried number with what it costs and loses.
 
     Args:
-        run: a run of sundae-auto (its folder or config.yml).
+        run: a run of sundae (its folder or config.yml).
         out: .png to plot the curve to.
         as_json: print JSON in place of the table.
         overwrite: replace an existing file.
@@ -39,7 +39,7 @@ def curve(
         check_file(out, reads=[folder / CURVE], overwrite=overwrite)
     found = read_count_curve(folder)
     if found is None:
-        raise CheckpointError(f"{folder} has no {CURVE}: no trials of counts; train it with ns-train sundae-auto")
+        raise CheckpointError(f"{folder} has no {CURVE}: no trials of counts; train it with ns-train sundae")
     if as_json:
         print(json.dumps(asdict(found), allow_nan=False))
     else:

@@ -100,7 +100,7 @@ class PruningConfig(PruneRule):
             if getattr(self, name) is not None and not self.decides:
                 raise ConfigError(
                     f"{name} is set, and trials do not decide the number of primitives: set keep_ratio to None and "
-                    "mode to one-shot, as sundae-auto does"
+                    "mode to one-shot, as sundae does"
                 )
         if self.max_drop is not None and not 0 < self.max_drop < float("inf"):
             raise ConfigError(f"max_drop is {self.max_drop}: use a positive number of dB, 0.1 for one")

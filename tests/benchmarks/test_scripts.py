@@ -246,9 +246,12 @@ def test_packed_formats_stand_side_by_side(monkeypatch: pytest.MonkeyPatch, tmp_
     assert [line.split(" | ") for line in tables["packed_headline"]()[2:]] == [
         ["| fox", "splatfacto, 30,000 steps, earlier default", "", "8.0 MB, 29.4 dB", "", " |"],
         ["| ", "splatfacto, 30,000 steps", "", "", "9.0 MB, 29.5 dB", " |"],
-        ["| ", "**sundae**", "", "", "", "2.0 MB, 31.0 dB |"],
+        ["| ", "**sundae**, fixed share", "", "", "", "2.0 MB, 31.0 dB |"],
     ]
-    assert tables["formats"]()[-1] == "| fox, **sundae** | `.sundae` | sundae_ns | 100 | 2.00 | 31.00 | 0.8500 |"
+    assert (
+        tables["formats"]()[-1]
+        == "| fox, **sundae**, fixed share | `.sundae` | sundae_ns | 100 | 2.00 | 31.00 | 0.8500 |"
+    )
 
 
 def test_plots(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_the_plot_is_a_picture_and_replaces_nothing(run: Path, capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("content", "options", "cause"),
     [
-        (None, [], "no trials of counts; train it with ns-train sundae-auto"),
+        (None, [], "no trials of counts; train it with ns-train sundae"),
         ("", [], "curve.json cannot be read"),
         (json.dumps({**RECORD, "chosen": "many"}), [], "curve.json cannot be read"),
         (json.dumps({**RECORD, "curve": [{"count": 3}]}), [], "curve.json cannot be read"),

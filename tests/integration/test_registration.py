@@ -16,7 +16,7 @@ from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.model import SundaeModel
 
 METHODS = {
-    "sundae": 0.1,
+    "sundae": None,
     "sundae-1": 0.01,
     "sundae-30": 0.3,
     "sundae-50": 0.5,

@@ -84,7 +84,7 @@ def test_a_twentieth_of_the_steps() -> None:
         "images": "1/4 until 150, 1/2 until 300, then full size",
         "densification": "25 to 750, every 50; opacities never reset",
         "SH degree": "+1 every 50 steps",
-        "prune": "after 750",
+        "prune": "after 750, to as many as trials choose",
         "head": "after 750, if trials favour it",
         "learning rates": "decay until 1,500",
     }

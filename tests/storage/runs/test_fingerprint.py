@@ -91,7 +91,7 @@ def test_every_value_counts(other: Options) -> None:
         "--output-dir elsewhere --experiment-name other --timestamp now --vis tensorboard --viewer.websocket-port 9",
         "--steps-per-save 7 --steps-per-eval-all-images 7 --logging.steps-per-log 7 "
         "--pipeline.model.evaluate-prune False",
-        "--pipeline.datamanager.cache-images cpu --max-num-iterations 30000 --pipeline.model.pruning.keep-ratio 0.1",
+        "--pipeline.datamanager.cache-images cpu --max-num-iterations 30000 --pipeline.model.pruning.gamma 0.5",
     ],
 )
 def test_seeds_paths_logs_and_defaults_in_words_change_nothing(words: str) -> None:
@@ -134,8 +134,9 @@ def test_a_saved_configuration_keeps_it(tmp_path: Path, method: str) -> None:
 
 
 def test_methods_differ() -> None:
-    found = [of(base=(method, "--data", "x")) for method in ("sundae", "sundae-30", "sundae-auto", "splatfacto")]
+    found = [of(base=(method, "--data", "x")) for method in ("sundae", "sundae-30", "sundae-fast", "splatfacto")]
     assert len(set(found)) == len(found)
+    assert of(base=("sundae-auto", "--data", "x")) == found[0], "another name, the same method"
 
 
 def test_options_that_are_left_out_exist() -> None:
