@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -132,22 +133,23 @@ def test_trials_choose_the_count_and_leave_nothing_else_behind(make: Make, judge
     assert (prune["before"], prune["after"], prune["step"]) == (full, chosen, record["step"])
 
 
-@pytest.mark.parametrize(
-    ("head", "stop"), [("residual", 10), ("residual", 45), ("auto", 45), ("residual", DECIDED + 3)]
-)
-def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, head: str, stop: int) -> None:
-    whole = make(head=head, name="whole", save_every=stop)
+@pytest.mark.parametrize(("head", "stops"), [("residual", (10, 45, DECIDED + 3)), ("auto", (45,))])
+def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, head: str, stops: tuple[int, ...]) -> None:
+    """Before and in the trials, and after the decision."""
+    whole = make(head=head, name="whole", save_every=math.gcd(*stops))
     whole.train()
-    resumed = make(
-        head=head, name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1
-    )
-    resumed.train()
-    last = f"step-{STEPS - 1:09d}.ckpt"
-    a, b = (torch.load(one.checkpoint_dir / last, map_location="cpu", weights_only=True) for one in (whole, resumed))
-    for part in ("pipeline", "optimizers", "schedulers"):
-        same(a[part], b[part])
-    if stop < record_of(whole)["step"]:
-        assert record_of(whole) == record_of(resumed)
+    for stop in stops:
+        more = STEPS - stop - 1
+        name = f"from {stop}"
+        resumed = make(head=head, name=name, load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=more)
+        resumed.train()
+        last = f"step-{STEPS - 1:09d}.ckpt"
+        folders = (whole.checkpoint_dir, resumed.checkpoint_dir)
+        a, b = (torch.load(folder / last, map_location="cpu", weights_only=True) for folder in folders)
+        for part in ("pipeline", "optimizers", "schedulers"):
+            same(a[part], b[part])
+        if stop < record_of(whole)["step"]:
+            assert record_of(whole) == record_of(resumed)
 
 
 def test_a_head_in_any_case_rests_during_the_trials_and_counts_its_own_steps(make: Make, judge: Any) -> None:
