@@ -30,6 +30,7 @@ from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
+from sundae_ns.storage.runs.random_state import random_state, set_random_state
 from sundae_ns.training.interruption import Interruption, resume_command
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
@@ -324,7 +325,7 @@ class SundaeTrainer(Trainer):
             "optimizers": {name: value.state_dict() for name, value in self.optimizers.optimizers.items()},
             "schedulers": {name: value.state_dict() for name, value in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
-            "random": checkpoint.random_state(),
+            "random": random_state(),
         }
         state = self.team.gathered(own, model.head, list(model.state.field))
         if state is None:  # another rank writes
@@ -374,5 +375,5 @@ class SundaeTrainer(Trainer):
             self.optimizers.load_schedulers(loaded["schedulers"])
         self.grad_scaler.load_state_dict(loaded["scalers"])
         if "random" in loaded:  # nerfstudio's own trainer saves none
-            checkpoint.set_random_state(loaded["random"])
+            set_random_state(loaded["random"])
         self.team.restored(self.model.state, self.config.machine.seed, self._start_step)

@@ -27,6 +27,8 @@ OLD_PATHS = ("pruning/config.py",)
 """Modules that hold no code, only the old path of a class that the ``config.yml`` of earlier runs names."""
 MAX_MODULES = 6
 """Modules beside the folders in the package's root."""
+MAX_LINES = 400
+"""Lines of a module."""
 LISTER = """
 import importlib, json, pkgutil, sys
 for room in sys.argv[1:]:
@@ -120,6 +122,11 @@ def test_few_modules_stand_beside_the_folders() -> None:
     assert len(modules) <= MAX_MODULES, modules
 
 
+def test_no_module_is_long() -> None:
+    lines = {str(path.relative_to(ROOT)): len(path.read_text().splitlines()) for path in modules().values()}
+    assert not {name: count for name, count in lines.items() if count > MAX_LINES}
+
+
 def test_rooms_import_only_lower_floors() -> None:
     found = {}
     for room, path in sources():
@@ -164,8 +171,7 @@ def test_nothing_below_the_shell_knows_it(name: str) -> None:
     ]
 
 
-def test_the_model_is_short_and_asks_for_no_kind() -> None:
+def test_the_model_asks_for_no_kind() -> None:
     text = (ROOT / PACKAGE / "model.py").read_text()
-    assert len(text.splitlines()) < 400
     for word in ("shards", "budget", "preview"):
         assert word not in text.lower(), word

@@ -27,6 +27,7 @@ from sundae_ns.errors import CheckpointError, ConfigError, DataError, StorageErr
 from sundae_ns.method_configs import sundae_tiny
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import load_config
+from sundae_ns.storage.runs.random_state import random_state, set_random_state
 from sundae_ns.trainer import SundaeTrainer, SundaeTrainerConfig
 from sundae_ns.training.interruption import Interruption
 from sundae_ns.training.run_length import set_schedule
@@ -140,10 +141,10 @@ def test_random_numbers_go_on_where_they_were_left(tmp_path: Path) -> None:
         return [random.random(), random.gauss(0, 1), np.random.rand(), np.random.randn(), torch.randn(3).tolist()]
 
     draw()
-    checkpoint.write({**state(1), "random": checkpoint.random_state()}, tmp_path / name(1))
+    checkpoint.write({**state(1), "random": random_state()}, tmp_path / name(1))
     expected = draw()
     assert draw() != expected
-    checkpoint.set_random_state(checkpoint.read(tmp_path / name(1))["random"])
+    set_random_state(checkpoint.read(tmp_path / name(1))["random"])
     assert draw() == expected
 
 

@@ -127,15 +127,11 @@ def _head_of(state: Mapping[str, Any], options: Mapping[str, Any], source: Path)
     known = options["head"] if isinstance(options.get("head"), dict) else {}
     fields = {name: known[name] for name in ("pixel_unshuffle", "precision", "phases", "fused") if name in known}
     mode = "features" if known.get("mode") == "features" else "residual"
-    shapes = {name: value.shape for name, value in weights.items()}
     for size in sorted(SIZES, key=lambda size: size != known.get("size")):
         config = HeadConfig(mode=mode, size=size, num_features=features.shape[1], **fields)  # type: ignore[arg-type]
-        with torch.device("meta"):
-            candidate = CompensationHead(config)
-        if {name: value.shape for name, value in candidate.state_dict().items()} == shapes:
-            head = CompensationHead(config)
-            head.load_state_dict(weights)
-            return head.eval()
+        head = CompensationHead.of_weights(config, weights)
+        if head is not None:
+            return head
     raise CheckpointError(f"{source} has a head that does not fit its own config.yml; give another run")
 
 

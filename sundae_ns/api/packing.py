@@ -118,13 +118,10 @@ def _head_of(packed: PackedScene, stated: Mapping[str, Any] | None) -> Compensat
         raise refusal("another number of features than it has")
     whole = {name: int(stated[name]) for name in ("pixel_unshuffle", "num_features")}
     config = HeadConfig(**{**stated, **whole}, start_at=0)
-    with torch.device("meta"):  # a wide head takes memory and seconds, which a small file must not cause
-        shapes = {name: value.shape for name, value in CompensationHead(config).state_dict().items()}
-    if {name: value.shape for name, value in packed.head.items()} != shapes:
+    head = CompensationHead.of_weights(config, packed.head)
+    if head is None:
         raise refusal("another head than it has")
-    head = CompensationHead(config)
-    head.load_state_dict(packed.head)
-    return head.eval()
+    return head
 
 
 def refusal(reason: str) -> PackError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -116,6 +117,18 @@ class CompensationHead(nn.Module):
     def __init__(self, config: HeadConfig) -> None:
         super().__init__()
         self._build(config)
+
+    @classmethod
+    def of_weights(cls, config: HeadConfig, weights: Mapping[str, Tensor]) -> CompensationHead | None:
+        """A head for evaluation with the weights of a ``state_dict``; None if they do not fit the configuration."""
+        # A wide head takes memory and seconds, which a small file must not cause: compare the shapes first.
+        with torch.device("meta"):
+            fresh = cls(config).state_dict()
+        if weights.keys() != fresh.keys() or any(value.shape != weights[name].shape for name, value in fresh.items()):
+            return None
+        head = cls(config)
+        head.load_state_dict(weights)
+        return head.eval()
 
     def _build(self, config: HeadConfig) -> None:
         config = config.resolved

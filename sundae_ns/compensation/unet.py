@@ -23,7 +23,9 @@ def _double_conv(c_in: int, c_out: int) -> nn.Sequential:
     for channels in (c_in, c_out):
         conv = nn.Conv2d(channels, c_out, 3, padding=1)
         # Keep the variance of activations through the depth (He et al. 2015): there is no normalisation.
-        nn.init.kaiming_normal_(conv.weight, a=SLOPE)
+        # For a tensor without values torch would import its compiler, which takes most of a second.
+        if not conv.weight.is_meta:
+            nn.init.kaiming_normal_(conv.weight, a=SLOPE)
         nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
         layers += [conv, nn.LeakyReLU(SLOPE, inplace=True)]
     return nn.Sequential(*layers)

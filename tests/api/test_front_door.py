@@ -15,6 +15,8 @@ import torch
 from fields import random_field
 
 import sundae_ns as sn
+from sundae_ns.compensation import CompensationHead, HeadConfig
+from sundae_ns.gaussians.field import Field
 from sundae_ns.storage import write_ply
 
 ROOT = Path(__file__).parents[2]
@@ -22,6 +24,10 @@ FUNCTIONS = ("load", "measure", "prune", "render", "save", "views_of", "virtual_
 WITHOUT_NERFSTUDIO = """
 import sys
 sys.modules["nerfstudio"] = None
+import sundae_ns as sn
+scene = sn.load("headed.sundae")
+sn.render(scene, sn.View.look_at((2.0, 2.0, 2.0), (0.5, 0.5, 0.5), width=64, height=48))
+assert scene.head and "torch._dynamo" not in sys.modules  # the import of torch's compiler takes most of a second
 exec(sys.stdin.read())
 assert not any(name.split(".")[0] == "nerfstudio" and module for name, module in sys.modules.items())
 """
@@ -39,6 +45,10 @@ def garden(tmp_path: Path) -> Path:
     field = random_field(200, features=0)
     field["scales"] += 2
     write_ply(tmp_path / "garden.ply", field)
+    # With a head for its one feature.
+    field["features"] = torch.zeros(200, 1)
+    head = CompensationHead(HeadConfig(size="tiny", num_features=1))
+    sn.save(sn.Scene(Field(field), head), tmp_path / "headed.sundae")
     return tmp_path
 
 

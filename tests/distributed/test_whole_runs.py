@@ -222,7 +222,9 @@ def main(folder: Path, name: str) -> None:
         sys.argv = ["ns-train"]
         show_in_one_line()
         stopped = StoppedTrainerConfig(**{k: v for k, v in vars(plain).items() if k != "_target"})
-        torch.multiprocessing.spawn(train_rank, (folder / "meeting-of-the-stopped", stopped), nprocs=RANKS)
+        # Forked ranks have imported nerfstudio; those that are killed are spawned, as ns-train does.
+        meeting = folder / "meeting-of-the-stopped"
+        torch.multiprocessing.start_processes(train_rank, (meeting, stopped), nprocs=RANKS, start_method="fork")
         return
     config = DyingTrainerConfig(**{k: v for k, v in vars(plain).items() if k != "_target"})
     config.load_checkpoint = models(folder, "train") / f"step-{SAVED_AT:09d}.ckpt"

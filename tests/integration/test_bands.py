@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from bands import bands
@@ -35,7 +34,7 @@ def test_points_lie_where_the_run_renders_them(tiny: Any, tmp_path: Path, what: 
     assert result["primitives"] == result["bands"][0]["kept"]["high"] + result["bands"][0]["kept"]["low"]
     assert set(os.listdir(tmp_path)) == {*result["files"], "bands.json"}
     with Image.open(tmp_path / "bands-0.5.png") as sheet:
-        assert len(np.unique(np.asarray(sheet).reshape(-1, 3), axis=0)) > 100
+        assert len(sheet.getcolors(sheet.width * sheet.height)) > 100
 
 
 def test_a_view_that_is_not_there(tiny: Any, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -174,29 +175,30 @@ def test_where_a_tenth_is_kept_the_head_has_its_usual_trials(make: Make, judge: 
 
 
 @pytest.mark.parametrize(
-    ("head", "stop"),
-    [
-        *(("residual", 10), ("residual", 45), ("residual", DECIDED + 3)),
-        *(("auto", 45), ("auto", DECIDED + 3), ("auto", DECIDED + HEAD_TRIAL + 3)),
-    ],
+    ("head", "stops"),
+    [("residual", (10, 45, DECIDED + 3)), ("auto", (45, DECIDED + 3, DECIDED + HEAD_TRIAL + 3))],
 )
-def test_a_resumed_run_takes_the_same_decision_bit_for_bit(make: Make, judge: Any, head: str, stop: int) -> None:
-    if stop > DECIDED:
-        # All counts are tried, and more than a tenth is chosen, so that the head has its trials.
-        judge({1.0: 0.0, 0.4: 0.0, 0.2: 0.05, 0.1: 0.45, 0.05: 0.65, 0.025: 0.8}, 0.2)
-    whole = make(head=head, name="whole", save_every=stop)
+def test_a_resumed_run_takes_the_same_decision_bit_for_bit(
+    make: Make, judge: Any, head: str, stops: tuple[int, ...]
+) -> None:
+    """Before and in the trials of counts, in those of the head, and after the decision."""
+    # All counts are tried, and more than a tenth is chosen, so that the head has its trials.
+    judge({1.0: 0.0, 0.4: 0.0, 0.2: 0.05, 0.1: 0.45, 0.05: 0.65, 0.025: 0.8}, 0.2)
+    whole = make(head=head, name="whole", save_every=math.gcd(*stops))
     whole.train()
-    resumed = make(
-        head=head, name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1
-    )
-    resumed.train()
-    last = f"step-{STEPS - 1:09d}.ckpt"
-    a, b = (torch.load(one.checkpoint_dir / last, map_location="cpu", weights_only=True) for one in (whole, resumed))
-    for part in ("pipeline", "optimizers", "schedulers"):
-        same(a[part], b[part])
-    if stop < record_of(whole)["step"]:
-        assert record_of(whole) == record_of(resumed)
-    if stop > DECIDED and head == "auto":
+    for stop in stops:
+        more = STEPS - stop - 1
+        name = f"from {stop}"
+        resumed = make(head=head, name=name, load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=more)
+        resumed.train()
+        last = f"step-{STEPS - 1:09d}.ckpt"
+        folders = (whole.checkpoint_dir, resumed.checkpoint_dir)
+        a, b = (torch.load(folder / last, map_location="cpu", weights_only=True) for folder in folders)
+        for part in ("pipeline", "optimizers", "schedulers"):
+            same(a[part], b[part])
+        if stop < record_of(whole)["step"]:
+            assert record_of(whole) == record_of(resumed)
+    if head == "auto":
         assert record_of(whole)["step"] == DECIDED + 2 * HEAD_TRIAL
 
 

