@@ -1,6 +1,6 @@
 """Draw the plots of docs/results.md from benchmarks/results, into docs/figures.
 
-python benchmarks/plot.py            # runs.png, heads.png, rules.png
+python benchmarks/plot.py            # curve.png, runs.png, heads.png, rules.png
 python benchmarks/plot.py runs       # one of them
 """
 
@@ -35,9 +35,9 @@ KEPT_RULES = {
 SHORT = {
     "splatfacto": "splatfacto",
     "sundae-warm-up": "full field",
-    "sundae": "sundae",
+    "sundae": "10%",
     "sundae-fast": "fast",
-    "sundae-auto": "auto",
+    "sundae-auto": "sundae",
     "sundae-with-head": "with head",
     "sundae-no-head": "no head",
     "sundae-no-head-bytes": "13%, no head",
@@ -74,6 +74,49 @@ def plot_runs() -> Any:
         panel.set_xlabel("MB in fp32, head included (smaller is better)")
         panel.set_ylabel("test PSNR, dB (higher is better)")
         panel.grid(alpha=0.3)
+    return figure
+
+
+def plot_curve() -> Any:
+    """PSNR and SSIM of packed scenes against their size: fixed shares as a line, and what the default has chosen."""
+    rows = [row for row in lines_of("curve.csv") if row["seed"] == "42"]
+    stock = {row["capture"]: row for row in lines_of("formats.csv") if row["method"] == "splatfacto"}
+    stock = {row["capture"]: row for row in stock.values() if row["format"] == ".sundae"}
+    captures = list(dict.fromkeys(row["capture"] for row in rows))
+    figure, panels = plt.subplots(
+        2, len(captures), figsize=(3 * len(captures), 5.5), layout="constrained", sharex="col"
+    )
+    for column, capture in zip(panels.T, captures, strict=True):
+        own = [row for row in rows if row["capture"] == capture]
+        fixed = sorted((row for row in own if row["chosen"] == "no"), key=lambda row: float(row["share"]))
+        for panel, metric in zip(column, ("psnr", "ssim"), strict=True):
+            sizes = [int(row["packed_bytes"]) / MB for row in fixed]
+            values = [float(row[f"packed_{metric}"]) for row in fixed]
+            panel.plot(sizes, values, "-", color="tab:blue", label="fixed shares")
+            for row, x, y in zip(fixed, sizes, values, strict=True):
+                panel.plot(x, y, "o", color="tab:blue", markerfacecolor="tab:blue" if row["head"] == "yes" else "white")
+                panel.annotate(
+                    f"{100 * float(row['share']):g}%", (x, y), (4, -10), textcoords="offset points", fontsize=7
+                )
+            for row in own:
+                if row["chosen"] == "yes":
+                    place = int(row["packed_bytes"]) / MB, float(row[f"packed_{metric}"])
+                    shown = "tab:red" if row["head"] == "yes" else "white"
+                    panel.plot(*place, "D", color="tab:red", markerfacecolor=shown, markersize=8, label="sundae")
+            if capture in stock:
+                place = int(stock[capture]["bytes"]) / MB, float(stock[capture][metric])
+                panel.plot(*place, "s", color="gray", label="splatfacto")
+            panel.set_xscale("log")
+            panel.xaxis.set_major_formatter("{x:g}")
+            panel.xaxis.set_minor_formatter(NullFormatter())
+            panel.set_xticks([0.3, 1, 3, 10])
+            panel.grid(alpha=0.3)
+        column[0].set_title(capture, fontsize=10)
+        column[1].set_xlabel("MB, packed")
+    panels[0, 0].set_ylabel("test PSNR, dB")
+    panels[1, 0].set_ylabel("test SSIM")
+    seen = {name: line for panel in panels.flat for line, name in zip(*panel.get_legend_handles_labels(), strict=True)}
+    figure.legend(seen.values(), seen, fontsize=9, loc="outside lower center", ncols=3)
     return figure
 
 
@@ -128,6 +171,7 @@ def plot_rules() -> Any:
 
 
 PLOTS: dict[str, Callable[[], Any]] = {
+    "curve": plot_curve,
     "runs": plot_runs,
     "heads": plot_heads,
     "rules": plot_rules,
@@ -136,7 +180,7 @@ PLOTS: dict[str, Callable[[], Any]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("plots", nargs="*", default=list(PLOTS), help="runs, heads, rules; by default all")
+    parser.add_argument("plots", nargs="*", default=list(PLOTS), help="curve, runs, heads, rules; by default all")
     parser.add_argument("-o", "--out", type=Path, default=FIGURES, help="folder")
     options = parser.parse_args()
     odd = [name for name in options.plots if name not in PLOTS]

@@ -3,7 +3,7 @@
 set -u
 export PYTHONPATH=/opt/site PATH=/opt/site/bin:$PATH OMP_NUM_THREADS=4 SLOTS=4
 R=/tmp/repo; J=/tmp/jobs
-auto() { echo "METHOD=sundae python3 $R/lab/curve/whole.py /tmp/scenes/$1 /tmp/out/default-$1-42.json 42" > $J/$2-default-$1.sh; }
+auto() { echo "python3 $R/benchmarks/quality.py /tmp/scenes/$1 -o /tmp/oracle/$1 --arms sundae-auto --seeds 42; cp /tmp/oracle/$1/done/*.json /tmp/out/; for f in curve trials prune; do cp \$(find /tmp/oracle/$1/jobs -name \$f.json | head -1) /tmp/out/\$f-$1.json; done" > $J/$2-default-$1.sh; }
 prune() {
   printf "sundae unpack /tmp/packed/$1.sundae -o /tmp/full/$1 --data /tmp/scenes/$1 && python3 $R/benchmarks/prune_without_photos.py /tmp/full/$1 -o /tmp/out/prune-$1.csv --shares 0.1 0.5 --training none && python3 $R/benchmarks/prune_without_photos.py /tmp/full/$1 -o /tmp/out/prune-$1.csv --shares 0.1 --training distill distill-no-head\n" > $J/20-prune-$1.sh; }
 case $1 in
