@@ -25,6 +25,7 @@ from sundae_ns.callbacks import NerfstudioRun, training_views
 from sundae_ns.compensation import CompensationHead, HeadConfig, Window
 from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, no_images_error, view_index
 from sundae_ns.evaluation import Lpips, psnr, ssim
+from sundae_ns.evaluation.count_curve import CurvePoint
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.rasterization import Backend, select_backend
 from sundae_ns.rendering.contribution import contribution
@@ -41,6 +42,7 @@ from sundae_ns.training.initial_field import Start
 from sundae_ns.training.losses import StepLosses
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.step import StepInputs, TrainingStep, training_part
+from sundae_ns.training.trials.count import CountTrials
 from sundae_ns.viewer import ViewerControls
 
 
@@ -112,7 +114,7 @@ class SundaeModel(SplatfactoModel):
         self.lpips = Lpips()  # type: ignore[assignment]
         self.crop_box: OrientedBox | None = None
         self.background_color = torch.tensor(SHOWN_BACKGROUNDS[config.background_color])
-        self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution)
+        self.viewer_controls = ViewerControls(self.state, config.pruning, self.contribution, self.count_curve)
         self.compensated = True
         """Whether images outside of a viewer get the head's correction."""
         self._response = ShownResponse()
@@ -277,6 +279,10 @@ class SundaeModel(SplatfactoModel):
         """Summed blending weight of each primitive ``[N]``; see :func:`sundae_ns.rendering.contribution`."""
         views, settings = training_views(self, datamanager), self.render_settings(training=False)
         return contribution(self.source, views, self.background_color, settings, count, console=CONSOLE)
+
+    def count_curve(self) -> list[CurvePoint]:
+        """The curve by which trials have chosen the number of primitives; empty without them."""
+        return [point for one in self.extensions if isinstance(one, CountTrials) for point in one.progress.curve()]
 
     # ----------------------------------------------------------------------------------------------------- training
 

@@ -9,18 +9,25 @@ from __future__ import annotations
 
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
-from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerControl, ViewerDropdown, ViewerSlider
+from nerfstudio.viewer.viewer_elements import (
+    ViewerCheckbox,
+    ViewerControl,
+    ViewerDropdown,
+    ViewerSlider,
+    ViewerText,
+)
 from torch import Tensor
 
 from sundae_ns.compensation import PHASES
 from sundae_ns.errors import ConfigError, SundaeError, one_line
+from sundae_ns.evaluation.count_curve import CurvePoint, expected_change
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import Pruned, PruneRule, band_rule, field_graph, kept_count, prune_field
@@ -97,9 +104,16 @@ class ViewerControls(torch.nn.Module):
         state: the field.
         configured: the rule of the run's prune.
         contribute: computes contributions.
+        curve: the curve by which trials have chosen the number of primitives; empty without them.
     """
 
-    def __init__(self, state: FieldState, configured: PruneRule, contribute: ContributionOf) -> None:
+    def __init__(
+        self,
+        state: FieldState,
+        configured: PruneRule,
+        contribute: ContributionOf,
+        curve: Callable[[], Sequence[CurvePoint]] = list,
+    ) -> None:
         super().__init__()
         self.compensate = ViewerCheckbox("Neural compensation", True, hint="Off shows the base colours alone")
         self.phases: ViewerDropdown[str] = ViewerDropdown(
@@ -110,7 +124,9 @@ class ViewerControls(torch.nn.Module):
             cb_hook=self._set_phases,
         )
         hint = "Show only what a prune to this share would keep; 1 shows everything"
-        self.keep_ratio = ViewerSlider("Keep ratio", 1.0, STEP, 1.0, STEP, hint=hint)
+        self.keep_ratio = ViewerSlider("Keep ratio", 1.0, STEP, 1.0, STEP, cb_hook=self._show_expected, hint=hint)
+        hint = "Number of primitives and, where trials have found it, what so few lose if they are trained on"
+        self.expected = ViewerText("Expected", "", disabled=True, hint=hint)
         rules = list(get_args(RuleName))
         hint = "Rule of the previewed prune; the head is disabled in a preview"
         self.rule = ViewerDropdown("Rule", rules[0], rules, hint=hint)
@@ -118,7 +134,7 @@ class ViewerControls(torch.nn.Module):
         """Gives access to the viewer, and so to the training views."""
         self.training_field = False
         """Whether a trainer changes the field."""
-        self._state, self._configured, self._contribute = state, configured, contribute
+        self._state, self._configured, self._contribute, self._curve = state, configured, contribute, curve
         self._lock = threading.Lock()
         self._seen: _FieldVersion | None = None
         self._graphs: dict[str, NeighborGraph] = {}
@@ -136,6 +152,13 @@ class ViewerControls(torch.nn.Module):
         head = self._state.head
         if head is not None:
             head.config = replace(head.config, phases=int(chosen.value))  # type: ignore[arg-type]
+
+    def _show_expected(self, slider: ViewerSlider) -> None:
+        n = self._state.field.num_primitives
+        count = kept_count(float(slider.value), n)
+        change = expected_change(self._curve(), n, count)
+        figures = "" if change is None else f": {change[0]:+.2f} dB, SSIM {change[1]:+.4f}"
+        self.expected.value = f"{count:,} primitives{figures}"
 
     def visible(self, source: FieldSource, crop: Tensor | None, *, compensate: bool) -> Visible | None:
         """What the next image shows; None if it shows no primitive.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any, get_args
@@ -21,6 +22,7 @@ from torch import Tensor
 import sundae_ns.pruning.decision
 import sundae_ns.viewer
 from sundae_ns.compensation import HeadConfig
+from sundae_ns.evaluation.count_curve import CurvePoint, expected_change
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.pruning import PruneRule, response
 from sundae_ns.pruning.cutting import FieldPruner
@@ -28,7 +30,7 @@ from sundae_ns.rendering import LocalField, render_view
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.schedules import PruningSchedule
-from sundae_ns.viewer import RuleName, previewed_rule
+from sundae_ns.viewer import RuleName, ViewerControls, previewed_rule
 
 N = 90
 RULES: tuple[RuleName, ...] = get_args(RuleName)
@@ -118,6 +120,23 @@ def test_the_viewer_finds_slider_and_menu() -> None:
     assert found["Custom Elements/model/viewer_controls/rule"] is model.viewer_controls.rule
     assert not list(model.viewer_controls.parameters())
     assert not [name for name in model.state_dict() if "viewer_controls" in name]
+
+
+def test_the_slider_tells_what_fewer_primitives_lose() -> None:
+    points = [CurvePoint(n, None, 30.0, 0.9, loss, loss / 40, 0.0, 0.0) for n, loss in ((N, 0.0), (N // 3, 0.6))]
+    model, _ = build()
+    controls = ViewerControls(model.state, model.config.pruning, model.contribution, lambda: points)
+    for share, text in (
+        (1.0, f"{N:,} primitives: +0.00 dB, SSIM +0.0000"),
+        (1 / 3, f"{N // 3} primitives: -0.60 dB, SSIM -0.0150"),
+        (0.1, f"{N // 10} primitives"),  # nobody has tried so few
+    ):
+        controls.keep_ratio.value = share
+        controls._show_expected(controls.keep_ratio)
+        assert controls.expected.value == text
+    half = expected_change(points, N // 3, round(N / math.sqrt(3)))
+    assert half == pytest.approx((0.3, 0.0075), abs=0.01)
+    assert model.count_curve() == []
 
 
 @pytest.mark.parametrize("rule", RULES)

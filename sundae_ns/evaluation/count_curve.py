@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import numpy as np
+
 from sundae_ns.errors import CheckpointError
 from sundae_ns.evaluation.document import table
 from sundae_ns.evaluation.measured import MEGABYTE
@@ -77,6 +79,26 @@ def _number(value: object) -> float | None:
     if value is None or isinstance(value, (int, float)) and not isinstance(value, bool):
         return value
     raise TypeError(f"{value!r} is no number")
+
+
+def expected_change(points: Sequence[CurvePoint], count: int, other: int) -> tuple[float, float] | None:
+    """Change of PSNR (dB) and SSIM from one count to another, after training; None beyond the tried counts.
+
+    Between two tried counts the losses are interpolated over the logarithm of the count.
+
+    Args:
+        points: of a curve, in any order.
+        count, other: numbers of primitives.
+    """
+    known = sorted((point for point in points if math.isfinite(point.psnr_loss)), key=lambda point: point.count)
+    if not known or not all(known[0].count <= one <= known[-1].count for one in (count, other)):
+        return None
+    places = [math.log(point.count) for point in known]
+    changes = []
+    for losses in ([point.psnr_loss for point in known], [point.ssim_loss for point in known]):
+        before, after = np.interp([math.log(count), math.log(other)], places, losses)
+        changes.append(float(before - after))
+    return changes[0], changes[1]
 
 
 def curve_table(points: Sequence[CurvePoint]) -> list[str]:
