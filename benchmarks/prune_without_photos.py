@@ -45,7 +45,7 @@ PLACE = ("capture", "tool", "rule", "training", "share", "device", "seed", "step
 """Columns that name a row."""
 OURS, OTHER = "sundae_ns", "splat-transform"
 RULES = {
-    "detail-merge": sn.PruneRule(),
+    "detail-merge": sn.PruneRule(selection="pairs"),
     "opacity": sn.PruneRule(score="opacity", selection="top", redistribution="none"),
 }
 OTHER_RULES = ("decimate", "decimate-adaptive")

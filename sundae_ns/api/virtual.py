@@ -19,23 +19,26 @@ from sundae_ns.rendering.render import pass_options
 
 NEAREST, FARTHEST = 0.3, 2.0
 """Distances of the eyes from the middle of the scene, as multiples of the median distance of its primitives."""
-FOV = 60.0
-CANDIDATES = 3
-"""Cameras that are drawn for each one that is kept."""
-_PROBE_SIZE = 32
+FOV = 40.0
+FIRST, ROUNDS, MOVED = 4, 4, 3
+"""Cameras that are drawn for each one that is kept; then rounds, and the moved ones of a round."""
+STEP = 0.3
+"""How far an eye moves in a round, as a share of its distance from the middle."""
+_PROBE_SIZE = 24
 """Sides of the images that candidates are judged by, pixels."""
 _PROBE_PRIMITIVES = 20_000
 """Most primitives of these images."""
-_OPAQUE, _SHOWN, _NEAR = 0.1, 0.3, 0.1
-"""Accumulation from which a pixel shows something, least share of such pixels, and the share that may be near."""
 
 
-def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128) -> list[View]:
+def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 256) -> list[View]:
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
-    Eyes are drawn in all directions from the middle of the scene, at 0.3 to 2 times the median distance of its
-    primitives, and look at random primitives. Of three eyes at one distance that one is kept with most room ahead,
-    by the depth of a small image: inside of matter and among floaters something is always near.
+    A field shows where its photographs were taken: training splits primitives until each covers few pixels of the
+    images, so from there all of them look small. From elsewhere some are blobs, and so are matter and floaters that
+    are too near. Eyes are drawn in all directions from the middle of the scene, at 0.3 to 2 times the median distance
+    of its primitives, and look at random primitives. Of four the one is kept whose small image shows the finest
+    primitives, by the mean logarithm of their angle; where nothing is seen, that of one radian. Then it climbs: four
+    times the best of three moved cameras takes its place if it is better.
 
     Args:
         scene: its finite primitives count.
@@ -58,21 +61,35 @@ def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128)
     means = field["means"].cpu().double()
     middle, reach = _middle_and_reach(field)
     generator = torch.Generator().manual_seed(seed)
-    drawn = CANDIDATES * n
-    direction = torch.nn.functional.normalize(torch.randn(drawn, 3, generator=generator, dtype=torch.float64), dim=1)
-    # Of one distance, because farther eyes have more room, whatever they see.
-    distance = NEAREST + (FARTHEST - NEAREST) * torch.rand(n, 1, generator=generator, dtype=torch.float64)
-    eyes = direction * distance.repeat(CANDIDATES, 1)
-    targets = (means[torch.randint(len(means), (drawn,), generator=generator)] - middle) / reach
-    cameras = [
-        View.look_at(eye, target, fov=FOV, width=_PROBE_SIZE, height=_PROBE_SIZE)
-        for eye, target in zip(eyes, targets, strict=True)
-    ]
-    room = _room_ahead(dataclasses.replace(scene, field=_probe(field, middle, reach, generator)), cameras)
-    best = room.view(CANDIDATES, n).argmax(dim=0) * n + torch.arange(n)
+    probe, sizes = _probe(field, middle, reach, generator)
+    judge = dataclasses.replace(scene, field=probe)
+
+    def random_targets(count: int) -> Tensor:
+        return (means[torch.randint(len(means), (count,), generator=generator)] - middle) / reach
+
+    def normal(count: int) -> Tensor:
+        return torch.randn(count, 3, generator=generator, dtype=torch.float64)
+
+    def finest(eyes: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The best of the cameras n apart, and their coarseness."""
+        coarseness = _coarseness(judge, sizes, eyes, targets).view(-1, n)
+        best = coarseness.argmin(dim=0) * n + torch.arange(n)
+        return eyes[best], targets[best], coarseness.amin(dim=0)
+
+    direction = torch.nn.functional.normalize(normal(FIRST * n), dim=1)
+    share = torch.rand(FIRST * n, 1, generator=generator, dtype=torch.float64)
+    eyes, targets, coarseness = finest(direction * NEAREST * (FARTHEST / NEAREST) ** share, random_targets(FIRST * n))
+    for _ in range(ROUNDS):
+        near, ahead = eyes.repeat(MOVED, 1), targets.repeat(MOVED, 1)
+        moved = near + STEP / 3**0.5 * near.norm(dim=1, keepdim=True) * normal(len(near))
+        turns = torch.rand(len(near), 1, generator=generator) < 0.5  # the others look at the same primitive
+        moved, ahead, found = finest(moved, torch.where(turns, random_targets(len(near)), ahead))
+        better = found < coarseness
+        eyes, targets = torch.where(better[:, None], moved, eyes), torch.where(better[:, None], ahead, targets)
+        coarseness = torch.where(better, found, coarseness)
     return [
-        View.look_at(middle + reach * eyes[i], middle + reach * targets[i], fov=FOV, width=size, height=size)
-        for i in best.tolist()
+        View.look_at(middle + reach * eye, middle + reach * target, fov=FOV, width=size, height=size)
+        for eye, target in zip(eyes, targets, strict=True)
     ]
 
 
@@ -123,41 +140,47 @@ def _middle_and_reach(field: Field) -> tuple[Tensor, float]:
     return middle, max(reach, 1e-30)
 
 
-def _probe(field: Field, middle: Tensor, reach: float, generator: torch.Generator) -> Field:
+def _probe(field: Field, middle: Tensor, reach: float, generator: torch.Generator) -> tuple[Field, Tensor]:
     """A field of a few primitives that looks alike from afar, of unit size and around the origin.
 
     Primitives are drawn by their size and opacity, and those drawn grow by as much as covers the others' area.
+
+    Returns:
+        The field of M primitives, and the logarithms of their sizes before they grew ``[M]``.
     """
+    sizes = field["scales"].double().sort(dim=1).values[:, 1:].mean(dim=1) - math.log(reach)
     kept = field
     if field.num_primitives > _PROBE_PRIMITIVES:
-        axes = field["scales"].cpu().double().sort(dim=1).values[:, 1:]
-        log_size = axes.sum(dim=1) / 2 + torch.nn.functional.logsigmoid(field["opacities"].cpu().double()[:, 0]) / 2
-        size = (log_size - log_size.max()).exp()
+        weight = sizes.cpu() + torch.nn.functional.logsigmoid(field["opacities"].cpu().double()[:, 0]) / 2
+        size = (weight - weight.max()).exp()
         low, high = 0.0, float(field.num_primitives) / float(size.mean())
         for _ in range(60):  # the factor at which as many are drawn, by bisection
             factor = (low + high) / 2
             low, high = (low, factor) if (factor * size).clamp(max=1).sum() > _PROBE_PRIMITIVES else (factor, high)
         chance = (low * size).clamp(max=1)
         drawn = torch.rand(len(chance), generator=generator, dtype=torch.float64) < chance
-        kept = field.rows(drawn.to(field["means"].device))
+        kept, sizes = field.rows(drawn.to(field["means"].device)), sizes[drawn.to(sizes.device)]
         grown = kept["scales"] - chance[drawn].log().to(kept["scales"])[:, None] / 2
         kept = kept.replaced({"scales": grown})
     moved = (kept["means"].double() - middle.to(kept["means"].device)) / reach
-    return kept.replaced({"means": moved.float(), "scales": kept["scales"] - math.log(reach)})
+    values = {"means": moved.float(), "scales": kept["scales"] - math.log(reach)}
+    return kept.replaced(values), sizes.float()
 
 
 @torch.no_grad()
-def _room_ahead(scene: Scene, views: Sequence[View]) -> Tensor:
-    """Depth beyond which nine in ten of the pixels of each view lie that show something; 0 if few pixels do ``[V]``."""
+def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor) -> Tensor:
+    """Mean over the pixels of each camera of the logarithm of the angle of what they show, at most 0 ``[V]``.
+
+    Args:
+        sizes: logarithms of the primitives' sizes ``[N]``.
+        eyes: ``[V, 3]``.
+        targets: ``[V, 3]``.
+    """
     means, settings, found = scene.field["means"], scene.settings(head=False), []
-    for seen in views:
-        view = seen.to(scene.device)
-        z = means @ view.viewmat[2, :3] + view.viewmat[2, 3]
-        channels = torch.stack([torch.ones_like(z), z], dim=1)
-        opacity, depth = rasterize(colors=channels, **pass_options(scene.field, view, settings)).colors.unbind(2)
-        shows = opacity > _OPAQUE
-        # Pixels that show nothing sort last, and take no part.
-        ordered = torch.where(shows, depth / opacity.clamp_min(_OPAQUE), torch.inf).flatten().sort().values
-        count = shows.sum()
-        found.append(torch.where(count > _SHOWN * shows.numel(), ordered[(count * _NEAR).long()], 0.0))
+    for eye, target in zip(eyes, targets, strict=True):
+        view = View.look_at(eye, target, fov=FOV, width=_PROBE_SIZE, height=_PROBE_SIZE).to(scene.device)
+        distances = (means - eye.to(means)).norm(dim=1).clamp_min(1e-9)
+        angles = (sizes - distances.log()).clamp_max(0)
+        # Blending adds nothing where nothing is seen: the logarithm of one radian.
+        found.append(rasterize(colors=angles[:, None], **pass_options(scene.field, view, settings)).colors.mean())
     return torch.stack(found).cpu()

@@ -139,7 +139,7 @@ def prune_file(
     score: Literal[
         "detail-contribution", "contribution", "response-contribution", "response", "opacity", "random"
     ] = "detail-contribution",
-    selection: Literal["systematic", "sampled", "band", "top"] = "systematic",
+    selection: Literal["pairs", "systematic", "sampled", "band", "top"] = "pairs",
     merge: bool = True,
     signal: Literal["attributes", "positions"] = "attributes",
     gamma: float = 0.5,
@@ -162,10 +162,11 @@ def prune_file(
             the images of held-out cameras.
         score: importance of a primitive: what cameras see of it where there is detail, what they see of it, the same
             times its high-pass response, the response alone, opacity, or a random number.
-        selection: systematic and sampled draw at random by score, evenly through space or independently.
-            Band keeps the highest and lowest scores (the paper's rule, with score response, signal positions and
-            no merge). Top keeps the highest scores.
-        merge: merge dropped primitives into their nearest kept ones along the neighbour graph.
+        selection: pairs merges the two primitives that differ least, weighted by score, until few enough are left.
+            Systematic and sampled draw at random by score, evenly through space or independently. Band keeps the
+            highest and lowest scores (the paper's rule, with score response, signal positions and no merge). Top keeps
+            the highest scores.
+        merge: merge dropped primitives into the kept ones of their groups, or nearest along the neighbour graph.
         signal: graph signal to filter: position, colour, opacity and size, or positions only.
         gamma: share of the kept primitives that the band selection takes from the highest scores.
         views: number of virtual cameras, for scenes that come without cameras.

@@ -110,6 +110,43 @@ def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: 
     return result
 
 
+def lower_entries(scales: Tensor, quats: Tensor) -> Tensor:
+    """The six different entries of the covariances, diagonal first ``[N, 6]``; arguments as for :func:`covariances`."""
+    return covariances(scales, quats)[:, _LOWER[0], _LOWER[1]]
+
+
+def outer_entries(vectors: Tensor) -> Tensor:
+    """Entries of ``v v^T`` in the order of :func:`lower_entries` ``[N, 6]``, of vectors ``[N, 3]``."""
+    return vectors[:, _LOWER[0]] * vectors[:, _LOWER[1]]
+
+
+def pair_overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor) -> Tensor:
+    """Bhattacharyya coefficient of pairs of primitives, as :func:`overlap`; 0 for one that overflows.
+
+    Args:
+        means: world units ``[N, 3]``.
+        entries: of positive definite covariances, by :func:`lower_entries` ``[N, 6]``.
+        first, second: the pairs, int64 ``[P]``.
+
+    Returns:
+        ``[P]``, dtype of ``means``.
+    """
+    result = means.new_empty(len(first))
+    for chunk in torch.arange(len(first), device=first.device).split(PAIRS):
+        i, j = first[chunk], second[chunk]
+        log_dets = [_cholesky(entries[ends], 0.0)[:3] for ends in (i, j)]
+        middle = (entries[i] + entries[j]) / 2
+        a, b, c, ba, ca, cb = _cholesky(middle, 0.0)
+        x, y, z = (means[i] - means[j]).unbind(dim=-1)
+        x = x / a
+        y = (y - ba * x) / b
+        z = (z - ca * x - cb * y) / c
+        log_det = sum(pivot.log() for pivots in log_dets for pivot in pivots)
+        exponent = -(x * x + y * y + z * z) / 8 + log_det / 2 - (a.log() + b.log() + c.log())
+        result[chunk] = exponent.clamp_max(0).exp().nan_to_num(0.0)
+    return result
+
+
 def _cholesky(entries: Tensor, least_variance: float) -> tuple[Tensor, ...]:
     """Cholesky factors ``[...]`` of symmetric matrices with entries ``[..., 6]``, both in the order of ``_LOWER``.
 

@@ -14,6 +14,7 @@ from sundae_ns.gaussians.field import Field, as_field
 from sundae_ns.gaussians.parameters import finite_mask
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning.edges import field_graph
+from sundae_ns.pruning.pairing import pair_labels
 from sundae_ns.pruning.redistribution import merged
 from sundae_ns.pruning.rule import PruneRule
 from sundae_ns.pruning.scores import response, score
@@ -107,7 +108,13 @@ def decide(
     elif graph is None:
         graph = field_graph(usable, rule)
     magnitude = response(usable, rule, graph) if rule.uses_response else None
-    selected = _select(score(usable, rule, magnitude, contribution), rule, count, usable["means"])
+    scores, labels = score(usable, rule, magnitude, contribution), None
+    if rule.selection == "pairs":
+        assert graph is not None
+        labels = pair_labels(usable, graph, scores, count)
+        selected = labels == torch.arange(n_finite, device=labels.device)
+    else:
+        selected = _select(scores, rule, count, usable["means"])
     mask = finite.clone()
     mask[finite] = selected.to(mask.device)
     values = None
@@ -117,7 +124,7 @@ def decide(
             raise ConfigError(
                 "a merge needs a pass over the training views and there are none: set redistribution to none"
             )
-        values = merged(usable, graph, selected, contribution)
+        values = merged(usable, graph, selected, contribution, labels)
     return Decision(
         mask=mask,
         kept=count,

@@ -81,7 +81,9 @@ def _label_either_way(graph: NeighborGraph, label: Tensor, distance: Tensor, len
 
 
 @torch.no_grad()
-def merged(params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, weight: Tensor) -> dict[str, Tensor]:
+def merged(
+    params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, weight: Tensor, labels: Tensor | None = None
+) -> dict[str, Tensor]:
     """Merge the primitives of each Voronoi cell of the graph into its kept one; see :func:`voronoi_labels`, and
     :func:`sundae_ns.gaussians.merging.merge` for the result.
 
@@ -91,11 +93,12 @@ def merged(params: Mapping[str, Tensor], graph: NeighborGraph, mask: Tensor, wei
         params: the field, all finite, N primitives.
         mask: True for primitives to keep, bool ``[N]``.
         weight: weight of each primitive in the merge, its summed blending weight over the training views ``[N]``.
+        labels: of groups that take the place of the Voronoi cells, int64 ``[N]``; -1 for primitives that are dropped.
 
     Returns:
         Parameters of the kept primitives ``[M, ...]``.
     """
-    labels = voronoi_labels(graph, mask)
+    labels = voronoi_labels(graph, mask) if labels is None else labels
     if as_field(params).encoding == "harmonics":
         return merge(params, labels, weight)
     own = params["features_dc"].detach()

@@ -18,9 +18,10 @@ class PruneRule:
     signal="positions", edges="centres", redistribution="none"``.
     """
 
-    selection: Literal["sampled", "systematic", "band", "top"] = "systematic"
-    """How scores select primitives: one draw in each stretch of space (systematic), independent draws (sampled), the
-    highest scores (top), or both ends of the ranking as in the paper (band)."""
+    selection: Literal["sampled", "systematic", "pairs", "band", "top"] = "systematic"
+    """How scores select primitives: one draw in each stretch of space (systematic), independent draws (sampled), one
+    for each group of the pairs that differ least (pairs), the highest scores (top), or both ends of the ranking as in
+    the paper (band)."""
     score: Literal["response-contribution", "detail-contribution", "response", "contribution", "opacity", "random"] = (
         "detail-contribution"
     )
@@ -32,8 +33,8 @@ class PruneRule:
     edges: Literal["centres", "appearance"] = "appearance"
     """Weights of the graph: by distance, overlap and colour (appearance), or as in the paper by distance (centres)."""
     redistribution: Literal["none", "merge"] = "merge"
-    """Whether each dropped primitive is merged into the kept one that is nearest along the graph (merge), or discarded
-    as in the paper (none). A merge needs a pass over the training views."""
+    """Whether each dropped primitive is merged into the kept one that is nearest along the graph, or of its group
+    (merge), or discarded as in the paper (none). A merge needs a pass over the training views."""
     gamma: float = 0.5
     """Share of the kept primitives that the band selection takes from the high end, in [0, 1]."""
     num_neighbors: int = 16
@@ -56,8 +57,8 @@ class PruneRule:
 
     @property
     def uses_graph(self) -> bool:
-        """Whether score or merge need the neighbour graph."""
-        return self.uses_response or self.redistribution == "merge"
+        """Whether score, selection or merge need the neighbour graph."""
+        return self.uses_response or self.redistribution == "merge" or self.selection == "pairs"
 
     @property
     def uses_response(self) -> bool:

@@ -162,24 +162,63 @@ def test_a_scene_of_any_size_is_pruned_alike(factor: float) -> None:
     assert (own.mask == other.mask).float().mean() > 0.95
 
 
-def test_virtual_eyes_have_room_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+def centers_of(made: sn.Scene, n: int = 32) -> torch.Tensor:
+    return torch.stack([view.center for view in sn.virtual_views(made, n)])
+
+
+def ball(n: int, generator: torch.Generator) -> torch.Tensor:
+    return torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=1)
+
+
+def test_virtual_eyes_are_not_in_a_fog(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer are in a fog around half of a ball than of random ones; also if a few primitives stand for all."""
     generator = torch.Generator().manual_seed(0)
-    points = torch.nn.functional.normalize(torch.randn(2000, 3, generator=generator), dim=1)
+    points = ball(2000, generator)
     fog = 4 * torch.rand(1000, 3, generator=generator) - torch.tensor([0.0, 2.0, 2.0])
     made = sn.Scene.from_points(torch.cat([points, fog]), torch.rand(3000, 3, generator=generator))
     made.field["opacities"][:2000], made.field["opacities"][2000:] = 4.0, -1.0
     made.field["scales"][:2000], made.field["scales"][2000:] = math.log(0.05), math.log(0.4)
 
     def in_fog() -> float:
-        centers = torch.stack([view.center for view in sn.virtual_views(made, 64)])
+        centers = centers_of(made)
         return float(((centers[:, 0] > 0) & (centers.norm(dim=1) > 1.2)).float().mean())
 
     all_judge = in_fog()
     monkeypatch.setattr("sundae_ns.api.virtual._PROBE_PRIMITIVES", 800)
     few_judge = in_fog()
-    monkeypatch.setattr("sundae_ns.api.virtual.CANDIDATES", 1)
+    monkeypatch.setattr("sundae_ns.api.virtual.FIRST", 1)
+    monkeypatch.setattr("sundae_ns.api.virtual.ROUNDS", 0)
     assert max(all_judge, few_judge) < in_fog() - 0.1
+
+
+def test_virtual_eyes_are_inside_of_a_room_whose_walls_are_fine_inside(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Primitives behind the walls, which no photograph saw, are coarse."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.cat([ball(3000, generator), 1.2 * ball(300, generator)])
+    made = sn.Scene.from_points(points, torch.rand(3300, 3, generator=generator))
+    made.field["opacities"][:] = 6.0
+    made.field["scales"][:3000], made.field["scales"][3000:] = math.log(0.03), math.log(0.15)
+    inside = (centers_of(made).norm(dim=1) < 1).float().mean()
+    assert inside > 0.9
+    monkeypatch.setattr("sundae_ns.api.virtual.FIRST", 1)
+    monkeypatch.setattr("sundae_ns.api.virtual.ROUNDS", 0)
+    assert (centers_of(made).norm(dim=1) < 1).float().mean() < inside - 0.2
+
+
+def test_virtual_eyes_are_outside_of_an_object_and_look_at_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From within, its primitives are large; from far away, most of an image is empty."""
+    generator = torch.Generator().manual_seed(0)
+    solid = ball(3000, generator) * torch.rand(3000, 1, generator=generator) ** (1 / 3)
+    made = sn.Scene.from_points(solid, torch.rand(3000, 3, generator=generator))
+    made.field["opacities"][:], made.field["scales"][:] = 2.0, math.log(0.05)
+    views = sn.virtual_views(made, 32)
+    centers, ahead = (torch.stack(found) for found in ([v.center for v in views], [v.viewmat[2, :3] for v in views]))
+    outside = centers.norm(dim=1) > 1
+    assert float(torch.linalg.cross(centers, ahead).norm(dim=1)[outside].max()) < 1  # the line of sight hits it
+    assert float(((ahead * centers).sum(dim=1) < 0)[outside].float().mean()) == 1
+    monkeypatch.setattr("sundae_ns.api.virtual.FIRST", 1)
+    monkeypatch.setattr("sundae_ns.api.virtual.ROUNDS", 0)
+    assert outside.float().mean() > (centers_of(made).norm(dim=1) > 1).float().mean() + 0.2
 
 
 def test_virtual_views_that_see_nothing_are_refused() -> None:
