@@ -5,7 +5,7 @@ export PYTHONPATH=/opt/site PATH=/opt/site/bin:$PATH OMP_NUM_THREADS=4 SLOTS=4
 R=/tmp/repo; J=/tmp/jobs
 auto() { echo "python3 $R/benchmarks/quality.py /tmp/scenes/$1 -o /tmp/oracle/$1 --arms sundae-auto --seeds 42; cp /tmp/oracle/$1/done/*.json /tmp/out/; for f in curve trials prune; do cp \$(find /tmp/oracle/$1/jobs -name \$f.json | head -1) /tmp/out/\$f-$1.json; done" > $J/$2-default-$1.sh; }
 prune() {
-  printf "sundae unpack /tmp/packed/$1.sundae -o /tmp/full/$1 --data /tmp/scenes/$1 && python3 $R/benchmarks/prune_without_photos.py /tmp/full/$1 -o /tmp/out/prune-$1.csv --shares 0.1 0.5 --training none && python3 $R/benchmarks/prune_without_photos.py /tmp/full/$1 -o /tmp/out/prune-$1.csv --shares 0.1 --training distill distill-no-head\n" > $J/20-prune-$1.sh; }
+  printf "sundae unpack /tmp/packed/$1.sundae -o /tmp/full/$1 --name r --data /tmp/scenes/$1 && python3 $R/benchmarks/prune_without_photos.py \$(dirname \$(find /tmp/full/$1 -name config.yml)) -o /tmp/out/prune-$1.csv --shares 0.1 0.5 --training none && python3 $R/benchmarks/prune_without_photos.py \$(dirname \$(find /tmp/full/$1 -name config.yml)) -o /tmp/out/prune-$1.csv --shares 0.1 --training distill distill-no-head\n" > $J/20-prune-$1.sh; }
 case $1 in
 1) bash .gpu/setup.sh > /tmp/setup.log 2>&1; tail -n 1 /tmp/setup.log
   python3 lab/console_scripts.py
@@ -16,6 +16,8 @@ case $1 in
 3) cp -r .gpu/scenes/* /tmp/scenes/; mv .gpu/packed/* /tmp/packed/; auto dinosaur 14; auto stone_horse 15; prune bonsai; prune fox; prune stone_horse
   echo "timeout 200 python3 $R/benchmarks/kill_and_resume.py --kinds training --device cuda --kills 2" > $J/30-kills1.sh
   echo "CUDA_VISIBLE_DEVICES=0,1 timeout 200 python3 $R/benchmarks/kill_and_resume.py --kinds training --device cuda --gpus 2 --kills 2" > $J/31-kills2.sh
+  echo "METHOD=sundae python3 $R/lab/curve/whole.py /tmp/scenes/stone_horse /tmp/out/pairs-stone_horse.json 42 --pipeline.model.pruning.keep-ratio 0.1 --pipeline.model.head.mode off --pipeline.model.pruning.selection pairs" > $J/40-pairs-stone_horse.sh
+  echo "METHOD=sundae python3 $R/lab/curve/whole.py /tmp/scenes/bonsai /tmp/out/pairs-bonsai.json 42 --pipeline.model.pruning.keep-ratio 0.1 --pipeline.model.head.mode off --pipeline.model.pruning.selection pairs" > $J/41-pairs-bonsai.sh
   touch $J/END
   until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "${2:-300}" ]; do sleep 1; done
   tar -czf "$OUT/out.tgz" -C /tmp out logs; cat /tmp/logs/queue.log; tail -n 3 /tmp/logs/3*.log | cut -c1-400 ;;
