@@ -21,6 +21,9 @@ WIDTH = 0.01
 PART = 0.5
 """Share of the possible merges of a round that happen; the others wait for what the better ones leave."""
 
+MOST_ROUNDS = 256
+"""Most rounds; a field needs about 60. Thousands of clones that share their neighbours would need many more."""
+
 
 @torch.no_grad()
 def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tensor, count: int) -> Tensor:
@@ -56,7 +59,9 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
     usable = (first >= 0) & (second >= 0)
     pairs = _unique(first[usable], second[usable], n)
     cost = groups.cost(*pairs)
-    while left > count and len(cost):
+    for _ in range(MOST_ROUNDS):
+        if left == count or not len(cost):
+            break
         chosen = _cheapest_of_both(pairs, cost, n)
         chosen = chosen[: min(left - count, max(1, round(PART * len(chosen))))]
         stays, goes = groups.join(pairs[0][chosen], pairs[1][chosen])
@@ -71,7 +76,7 @@ def pair_labels(params: Mapping[str, Tensor], graph: NeighborGraph, weight: Tens
         renewed = _unique(target[pairs[0][moved]], target[pairs[1][moved]], n)
         cost = torch.cat([cost[~moved], groups.cost(*renewed)])
         pairs = torch.cat([pairs[0][~moved], renewed[0]]), torch.cat([pairs[1][~moved], renewed[1]])
-    if left > count:  # of islands without a bridge the heaviest stay
+    if left > count:  # of islands without a bridge, and of clones, the heaviest stay
         heads = (label == torch.arange(n, device=device)).nonzero().squeeze(1)
         lightest = heads[torch.sort(groups.weight[heads], stable=True).indices[: left - count]]
         gone = torch.zeros(n, dtype=torch.bool, device=device)

@@ -67,14 +67,19 @@ def test_the_most_alike_pair_merges_first() -> None:
     assert labels.tolist() == [1, 1, 2, 3]
 
 
-def test_equal_primitives_merge_in_few_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All pairs of a chain cost the same; by their order each round would merge one of them."""
-    field, rounds = row(*range(512)), []
-    count = pairing._cheapest_of_both
-    monkeypatch.setattr(pairing, "_cheapest_of_both", lambda *given: rounds.append(None) or count(*given))
-    labels = pair_labels(field, graph_of(field), torch.ones(512), 128)
-    assert len(labels[labels >= 0].unique()) == 128
-    assert len(rounds) < 40
+def test_equal_pairs_merge_many_at_once() -> None:
+    """All pairs of a chain cost the same; in their own order only the first would be the cheapest of both ends."""
+    field = row(*[0.0] * 256)
+    first = torch.arange(255)
+    groups = pairing._Groups(field, torch.ones(256), torch.device("cpu"))
+    chosen = pairing._cheapest_of_both((first, first + 1), groups.cost(first, first + 1), 256)
+    assert len(chosen) > 50
+
+
+def test_clones_that_share_their_neighbours_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pairing, "MOST_ROUNDS", 3)
+    pruned = prune_field(row(*[0.0] * 256), PAIRS, 64, torch.ones(256))
+    assert pruned.field.num_primitives == 64
 
 
 def test_of_islands_the_heaviest_stay() -> None:
