@@ -9,12 +9,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from sundae_ns.api.cost import prune_cost, require_memory
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.virtual import of_unit_size, virtual_views
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.pruning import PruneRule, kept_count, prune_field
 from sundae_ns.rendering import LocalField, TrainingView, View, contribution
+
+LONG = 60.0
+"""Seconds from which a prune with a progress bar states its cost first."""
 
 
 class PrunedScene(NamedTuple):
@@ -56,6 +60,7 @@ def prune(
     Raises:
         ConfigError: neither or both of ``keep`` and ``count`` are given, or they or an option are out of range.
         DataError: no primitive is finite, or the views see none.
+        MemoryExhaustedError: the host has too little memory; nothing was started.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
@@ -63,6 +68,16 @@ def prune(
     20
     """
     return prune_with_mask(scene, keep, count, views, rule, progress=progress).scene
+
+
+def check_amount(keep: float | None, count: int | None) -> None:
+    """Raise ``ConfigError`` unless one of the two is given, and is in its range."""
+    if (keep is None) == (count is None):
+        raise ConfigError("prune needs either keep (a share) or count (a number of primitives); give one of them")
+    if keep is not None and not 0 < keep <= 1:
+        raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
+    if count is not None and count < 1:
+        raise ConfigError(f"count is {count}; give 1 or more primitives")
 
 
 @torch.no_grad()
@@ -76,12 +91,7 @@ def prune_with_mask(
     progress: bool,
 ) -> PrunedScene:
     """As :func:`prune`, with the mask of the kept primitives."""
-    if (keep is None) == (count is None):
-        raise ConfigError("prune needs either keep (a share) or count (a number of primitives); give one of them")
-    if keep is not None and not 0 < keep <= 1:
-        raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
-    if count is not None and count < 1:
-        raise ConfigError(f"count is {count}; give 1 or more primitives")
+    check_amount(keep, count)
     rule = rule or PruneRule()
     finite = finite_mask(scene.field)
     field = scene.field if bool(finite.all()) else scene.field.rows(finite)
@@ -89,14 +99,24 @@ def prune_with_mask(
         count = kept_count(keep, field.num_primitives)
     assert count is not None
 
-    weights = console = None
+    n, numbers = field.num_primitives, sum(value.shape[1:].numel() for value in field.values())
+    usable = dataclasses.replace(scene, field=field)
+    seen: Sequence[View] = ()
+    if rule.uses_contribution and count < n:
+        seen = views if views is not None else scene.views or virtual_views(usable)
+    cost = prune_cost(n, numbers, rule, count / max(n, 1), seen)
+    on_host, console = field["means"].device.type == "cpu", None
+    if on_host:
+        require_memory(cost, n, loaded=True)
     if progress:
         from rich.console import Console
 
         console = Console(stderr=True)
-    if rule.uses_contribution and count < field.num_primitives:
-        usable = dataclasses.replace(scene, field=field)
-        sized, seen = of_unit_size(usable, views if views is not None else scene.views or virtual_views(usable))
+        if on_host and cost.seconds > LONG:
+            console.print(f"{n:,} primitives, {len(seen)} cameras: {cost}", highlight=False)
+    weights = None
+    if rule.uses_contribution and count < n:
+        sized, seen = of_unit_size(usable, seen)
         weights = contribution(
             LocalField(sized.field),
             [TrainingView(view.to(scene.device), None) for view in seen],

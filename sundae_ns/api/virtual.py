@@ -110,7 +110,10 @@ def _usable(scene: Scene) -> Field:
     finite = finite_mask(scene.field)
     if not bool(finite.any()):
         raise DataError(f"none of {scene.num_primitives:,} primitives is finite, so no camera sees the scene")
-    return Field({name: value.detach()[finite] for name, value in scene.field.items()}, scene.field.encoding)
+    values = {name: value.detach() for name, value in scene.field.items()}
+    if not bool(finite.all()):  # else a large field would be copied for nothing
+        values = {name: value[finite] for name, value in values.items()}
+    return Field(values, scene.field.encoding)
 
 
 def _middle_and_reach(field: Field) -> tuple[Tensor, float]:
