@@ -163,7 +163,9 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
     nearest: list[float] = []
     # One kill at each place, then random ones; half of the rest at any time. Ranks have modules of their own.
     every = [ANY, *(what.places if options.gpus == 1 else ())]
-    places = [every[i] if i < len(every) else ANY if i % 2 else rng.choice(every) for i in range(kills)]
+    # A seed starts where those before it end, so that short calls reach every place.
+    numbers = range(options.seed * kills, (options.seed + 1) * kills)
+    places = [every[i] if i < len(every) else ANY if i % 2 else rng.choice(every) for i in numbers]
     for number, place in enumerate(track(places, description=f"Killing: {kind}", transient=True)):
         config = configured(f"killed-{number}")
         folder = run_folder(config)
@@ -283,7 +285,8 @@ def kill_commands(options: argparse.Namespace, bench: Bench, root: Path, kills: 
     tally: Counter[str] = Counter()
     lost = 0
     every = [ANY, *killing.COMMANDS]
-    for number in track(range(kills), description="Killing: commands", transient=True):
+    numbers = range(options.seed * kills, (options.seed + 1) * kills)
+    for number in track(numbers, description="Killing: commands", transient=True):
         name, place = list(jobs)[number % len(jobs)], every[(number // len(jobs)) % len(every)]
         older = dict.fromkeys(fresh[name], b"older")
         age = partial(write_all, place_of(name), older)
@@ -313,7 +316,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kinds", nargs="+", choices=[*KILLS], default=[*KILLS])
     parser.add_argument("--kills", type=int, help=f"of each kind; by default {KILLS}")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="0, 1, 2 ... go on through the places of the kills")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of trainings; commands take any GPU")
     parser.add_argument("--gpus", type=int, default=1, help="number of ranks")
     parser.add_argument("--out", type=Path, help="folder to work in; a temporary one by default")
