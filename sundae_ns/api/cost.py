@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Sequence
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -12,8 +12,9 @@ import torch
 
 from sundae_ns.errors import MemoryExhaustedError
 from sundae_ns.pruning import PruneRule
-from sundae_ns.rendering import View
 
+LONG = 60.0
+"""Seconds from which the cost of a prune is stated."""
 _FLOAT = 4
 _EDGE, _GRAPH = 17, 160
 """Most bytes of an edge and of a primitive while the graph is built and weighted."""
@@ -41,7 +42,9 @@ class PruneCost(NamedTuple):
         return f"about {_gigabytes(self.memory)} of memory and {time}"
 
 
-def prune_cost(primitives: int, numbers: int, rule: PruneRule, keep: float, views: Sequence[View]) -> PruneCost:
+def prune_cost(
+    primitives: int, numbers: int, rule: PruneRule, keep: float, views: int = 0, pixels: int = 0
+) -> PruneCost:
     """Estimate a prune.
 
     Args:
@@ -49,16 +52,22 @@ def prune_cost(primitives: int, numbers: int, rule: PruneRule, keep: float, view
         numbers: numbers of each primitive, 14 at SH degree 0 and 59 at degree 3.
         rule: of the prune.
         keep: share of the primitives to keep.
-        views: cameras that the rule looks from; empty if it needs none.
+        views: number of cameras that the rule looks from; 0 if it needs none.
+        pixels: number of pixels of all of them.
     """
     field = _FLOAT * numbers * primitives
     added, seconds = _VIEWED, 0.0
     if rule.uses_graph:
         merge = _INDEX * rule.num_neighbors + _MERGE + keep * numbers * _MERGED
         added, seconds = max(_EDGE * rule.num_neighbors + _GRAPH, round(merge)), primitives * _SECONDS
-    pixels = sum(view.width * view.height for view in views)
-    seen = primitives * len(views) * _SECONDS_OF_VIEW + pixels * _SECONDS_OF_PIXEL
+    seen = primitives * views * _SECONDS_OF_VIEW + pixels * _SECONDS_OF_PIXEL
     return PruneCost(field + added * primitives, field, seconds + seen / torch.get_num_threads())
+
+
+def state(cost: PruneCost, primitives: int, views: int) -> None:
+    """Print the cost of a prune of more than a minute on stderr."""
+    if cost.seconds > LONG:
+        print(f"{primitives:,} primitives, {views} cameras: {cost}", file=sys.stderr, flush=True)
 
 
 def require_memory(cost: PruneCost, primitives: int, *, loaded: bool) -> None:

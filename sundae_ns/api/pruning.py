@@ -9,16 +9,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from sundae_ns.api.cost import prune_cost, require_memory
+from sundae_ns.api.cost import prune_cost, require_memory, state
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.virtual import of_unit_size, virtual_views
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians import finite_mask
 from sundae_ns.pruning import PruneRule, kept_count, prune_field
 from sundae_ns.rendering import LocalField, TrainingView, View, contribution
-
-LONG = 60.0
-"""Seconds from which a prune with a progress bar states its cost first."""
 
 
 class PrunedScene(NamedTuple):
@@ -89,8 +86,9 @@ def prune_with_mask(
     rule: PruneRule | None,
     *,
     progress: bool,
+    stated: bool = False,
 ) -> PrunedScene:
-    """As :func:`prune`, with the mask of the kept primitives."""
+    """As :func:`prune`, with the mask of the kept primitives; ``stated`` if its cost was stated already."""
     check_amount(keep, count)
     rule = rule or PruneRule()
     finite = finite_mask(scene.field)
@@ -104,7 +102,8 @@ def prune_with_mask(
     seen: Sequence[View] = ()
     if rule.uses_contribution and count < n:
         seen = views if views is not None else scene.views or virtual_views(usable)
-    cost = prune_cost(n, numbers, rule, count / max(n, 1), seen)
+    pixels = sum(view.width * view.height for view in seen)
+    cost = prune_cost(n, numbers, rule, count / max(n, 1), len(seen), pixels)
     on_host, console = field["means"].device.type == "cpu", None
     if on_host:
         require_memory(cost, n, loaded=True)
@@ -112,8 +111,8 @@ def prune_with_mask(
         from rich.console import Console
 
         console = Console(stderr=True)
-        if on_host and cost.seconds > LONG:
-            console.print(f"{n:,} primitives, {len(seen)} cameras: {cost}", highlight=False)
+        if on_host and not stated:
+            state(cost, n, len(seen))
     weights = None
     if rule.uses_contribution and count < n:
         sized, seen = of_unit_size(usable, seen)

@@ -20,6 +20,8 @@ from sundae_ns.rendering.render import pass_options
 NEAREST, FARTHEST = 0.3, 2.0
 """Distances of the eyes from the middle of the scene, as multiples of the median distance of its primitives."""
 FOV = 60.0
+VIRTUAL_SIZE = 128
+"""Default width and height of the images, pixels."""
 CANDIDATES = 3
 """Cameras that are drawn for each one that is kept."""
 _PROBE_SIZE = 32
@@ -30,7 +32,7 @@ _OPAQUE, _SHOWN, _NEAR = 0.1, 0.3, 0.1
 """Accumulation from which a pixel shows something, least share of such pixels, and the share that may be near."""
 
 
-def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 128) -> list[View]:
+def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = VIRTUAL_SIZE) -> list[View]:
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
     Eyes are drawn in all directions from the middle of the scene, at 0.3 to 2 times the median distance of its

@@ -176,7 +176,8 @@ def prune_file(
         overwrite: replace an existing file, once the new one is complete.
     """
     from sundae_ns.api import opening, pruning, saving
-    from sundae_ns.api.cost import prune_cost, require_memory
+    from sundae_ns.api.cost import prune_cost, require_memory, state
+    from sundae_ns.api.virtual import VIRTUAL_SIZE
     from sundae_ns.errors import ConfigError
     from sundae_ns.gaussians import finite_mask
     from sundae_ns.pruning import PruneRule
@@ -194,10 +195,16 @@ def prune_file(
     redistribution: Literal["merge", "none"] = "merge" if merge else "none"
     rule = PruneRule(selection, score, signal, redistribution=redistribution, gamma=gamma, seed=seed)
     rule.validate()
-    if kind_of(source) == "ply":
+    stated = False
+    if kind_of(source) == "ply":  # its header has the size; reading takes minutes
         n, numbers = stated_size(source)
         share = keep if keep is not None else (count or 0) / max(n, 1)
-        require_memory(prune_cost(n, numbers, rule, share, ()), n, loaded=False)
+        looks = views if rule.uses_contribution and cameras is None else 0
+        cost = prune_cost(n, numbers, rule, share, looks, looks * VIRTUAL_SIZE**2)
+        require_memory(cost, n, loaded=False)
+        if cameras is None and target_drop is None:
+            stated = True
+            state(cost, n, looks)
     scene = opening.load(source)
     seen = None
     if rule.uses_contribution or target_drop is not None:
@@ -210,7 +217,7 @@ def prune_file(
         count = found.kept
         for number, psnr in found.curve:
             print(f"{number:12,} primitives: {psnr:.2f} dB against the full field, on held-out cameras")
-    pruned = pruning.prune_with_mask(scene, keep=keep, count=count, views=seen, rule=rule, progress=True)
+    pruned = pruning.prune_with_mask(scene, keep=keep, count=count, views=seen, rule=rule, progress=True, stated=stated)
     if kind_of(source) == "ply" and out.suffix.lower() == ".ply":
         keep_vertices(source, out, pruned.mask, pruned.scene.field if merge else None)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +64,24 @@ def test_a_long_prune_states_its_cost(
 ) -> None:
     words = ["prune", str(file), "--views", "2", "-o"]
     for limit, stated in ((60.0, False), (0.0, True)):
-        monkeypatch.setattr(pruning, "LONG", limit)
+        monkeypatch.setattr(cost, "LONG", limit)
         with pytest.raises(SystemExit) as end:
             main([*words, str(file.with_name(f"{limit}.ply"))])
         assert not end.value.code
-        assert ("2,000 primitives, 2 cameras: about 0.0 GB of memory and seconds" in capsys.readouterr().err) is stated
+        assert (
+            capsys.readouterr().err.count("2,000 primitives, 2 cameras: about 0.0 GB of memory and seconds") == stated
+        )
+
+
+def test_a_file_states_its_cost_before_it_is_read(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(cost, "LONG", 0.0)
+    monkeypatch.setattr(opening, "load", lambda _: sys.exit(3))
+    with pytest.raises(SystemExit) as end:
+        main(["prune", str(file), "-o", str(file.with_name("b.ply"))])
+    assert end.value.code == 3
+    assert capsys.readouterr().err.startswith("2,000 primitives, 128 cameras: about 0.0 GB of memory")
 
 
 def test_free_memory_obeys_the_limit_of_the_process() -> None:
