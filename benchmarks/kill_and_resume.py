@@ -21,8 +21,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import multiprocessing
-import os
 import random
 import shutil
 import signal
@@ -30,8 +28,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
@@ -43,19 +40,16 @@ import torch
 import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import TrainerConfig
-from nerfstudio.scripts import train
 from ray_tracing import write_still_life
 from rich.progress import track
 
 import sundae_ns as sn
 from harness import killing
+from harness.processes import Bench, command_here, train_here
 from harness.watcher import Watcher, free_port
-from sundae_ns.cli.main import main as sundae
 from sundae_ns.errors import CheckpointError
 from sundae_ns.storage.runs import checkpoint
 
-LONGEST = 900.0
-"""Seconds after which a run counts as hanging; it takes about ten."""
 SPREAD = 3.0
 """Decibels that a resumed run on CUDA may differ more than a second one."""
 ANY = "any time"
@@ -95,115 +89,6 @@ TRAININGS = {
     ),
 }
 KILLS = {"training": 20, "trials": 10, "commands": 24}
-
-
-# ------------------------------------------------------------------------------------------------------------ processes
-
-
-def with_log(log: Path) -> None:
-    """Write the output of this process to a log."""
-    torch.set_num_threads(1)
-    with open(log, "a") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-
-
-def train_here(config: TrainerConfig, log: Path, place: str | None, nth: int) -> None:
-    """Train in this process; die the ``nth`` time that ``place`` is reached."""
-    with_log(log)
-    if place is not None:
-        {**killing.TRAINING, **killing.TRIALS}[place](nth)
-    train.main(config)
-
-
-def command_here(words: Sequence[str], log: Path, place: str | None) -> None:
-    """Run a command of sundae in this process; die when ``place`` is reached."""
-    with_log(log)
-    if place is not None:
-        killing.COMMANDS[place](1)
-    sundae(words)
-
-
-class Bench:
-    """Runs processes one after another, with one log.
-
-    Args:
-        device: of the trainings; processes on CUDA cannot be forked.
-        log: file for their output.
-    """
-
-    def __init__(self, device: str, log: Path) -> None:
-        self.context: Any = multiprocessing.get_context("spawn" if device == "cuda" else "forkserver")
-        if device == "cpu":
-            # This process has threads (a progress bar's, torch's): a run forked off it could wait for ever for a lock
-            # of theirs.
-            self.context.set_forkserver_preload(["nerfstudio.scripts.train", "sundae_ns.model", "sundae_ns.trainer"])
-        self.log = log
-
-    def start(self, work: Any, *arguments: Any) -> BaseProcess:
-        """Start a process that calls ``work``."""
-        child: BaseProcess = self.context.Process(target=work, args=arguments)
-        child.start()
-        return child
-
-    def ended(self, child: BaseProcess) -> int:
-        """Wait for a process; its exit code, or minus the signal that ended it."""
-        child.join(LONGEST)
-        if child.exitcode is None:
-            child.kill()
-            child.join()
-            self.fail(f"a run did not end within {LONGEST} s")
-        return int(child.exitcode or 0)
-
-    def finish(self, child: BaseProcess) -> None:
-        """Wait for a process that must succeed."""
-        code = self.ended(child)
-        if code != 0:
-            self.fail(f"a run failed with exit code {code}")
-
-    def fail(self, reason: str) -> None:
-        raise SystemExit(f"{reason}; the end of its log:\n{self.log.read_text(errors='replace')[-3000:]}")
-
-    def killed_at_any_time(self, start: Any, again: Any, seconds: float, rng: random.Random) -> bool:
-        """Kill what ``start`` starts within ``seconds``; try ``again`` if it ended before. Whether it was killed.
-
-        Of several processes a random one is killed; the others must end by themselves.
-        """
-        for _ in range(10):
-            child = start()
-            time.sleep(rng.uniform(0.0, seconds))
-            family = [child.pid, *descendants(child.pid)]
-            with suppress(ProcessLookupError):  # it has ended
-                victims = [pid for pid in family if b"resource_tracker" not in command_line(pid)]
-                os.kill(rng.choice(victims), signal.SIGKILL)
-            code = self.ended(child)
-            until = time.monotonic() + LONGEST
-            while any(command_line(pid) for pid in family[1:]):
-                if time.monotonic() > until:
-                    self.fail("a process outlived the one that was killed")
-                time.sleep(0.1)
-            if code != 0:
-                return True
-            again()
-            seconds *= 0.8  # the machine has become faster
-        return False
-
-
-def command_line(pid: int) -> bytes:
-    """Words of a running process; empty if there is none."""
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes()
-    except OSError:
-        return b""
-
-
-def descendants(pid: int) -> list[int]:
-    """Processes that a process started, and theirs."""
-    try:
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    except OSError:
-        return []
-    return [one for child in children for one in (int(child), *descendants(int(child)))]
 
 
 # ------------------------------------------------------------------------------------------------------------ trainings
@@ -278,7 +163,9 @@ def kill_trainings(kind: str, options: argparse.Namespace, bench: Bench, root: P
     nearest: list[float] = []
     # One kill at each place, then random ones; half of the rest at any time. Ranks have modules of their own.
     every = [ANY, *(what.places if options.gpus == 1 else ())]
-    places = [every[i] if i < len(every) else ANY if i % 2 else rng.choice(every) for i in range(kills)]
+    # A seed starts where those before it end, so that short calls reach every place.
+    numbers = range(options.seed * kills, (options.seed + 1) * kills)
+    places = [every[i] if i < len(every) else ANY if i % 2 else rng.choice(every) for i in numbers]
     for number, place in enumerate(track(places, description=f"Killing: {kind}", transient=True)):
         config = configured(f"killed-{number}")
         folder = run_folder(config)
@@ -398,7 +285,8 @@ def kill_commands(options: argparse.Namespace, bench: Bench, root: Path, kills: 
     tally: Counter[str] = Counter()
     lost = 0
     every = [ANY, *killing.COMMANDS]
-    for number in track(range(kills), description="Killing: commands", transient=True):
+    numbers = range(options.seed * kills, (options.seed + 1) * kills)
+    for number in track(numbers, description="Killing: commands", transient=True):
         name, place = list(jobs)[number % len(jobs)], every[(number // len(jobs)) % len(every)]
         older = dict.fromkeys(fresh[name], b"older")
         age = partial(write_all, place_of(name), older)
@@ -428,7 +316,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kinds", nargs="+", choices=[*KILLS], default=[*KILLS])
     parser.add_argument("--kills", type=int, help=f"of each kind; by default {KILLS}")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="0, 1, 2 ... go on through the places of the kills")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="of trainings; commands take any GPU")
     parser.add_argument("--gpus", type=int, default=1, help="number of ranks")
     parser.add_argument("--out", type=Path, help="folder to work in; a temporary one by default")

@@ -1,4 +1,7 @@
-"""One job of a comparison: trained by nerfstudio, saved, opened again from its files, and measured."""
+"""One job of a comparison: trained by nerfstudio, saved, opened again from its files, and measured.
+
+``OUT/jobs/KEY/job.json`` describes it. quality.py, suite.py and paper.py start a process of it.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, NoReturn
 
 import torch
 import tyro
@@ -22,6 +25,7 @@ from nerfstudio.utils import profiler, writer
 
 from harness.alone import watched_gpu
 from harness.plan import Job, Words, done_file, job_folder
+from harness.script import run_script
 from sundae_ns.api.opening import load
 from sundae_ns.errors import BackendError, CheckpointError, PackError
 from sundae_ns.evaluation import Lpips, Measured, lpips_weights_available
@@ -254,3 +258,20 @@ def _forget() -> None:
     gc.collect()
     if torch.cuda.is_available():
         torch.cuda.empty_cache()
+
+
+def job(out: Annotated[Path, tyro.conf.Positional], key: Annotated[str, tyro.conf.Positional]) -> int:
+    """Train, save and measure; a job that is done is not done again.
+
+    Args:
+        out: folder of the comparison.
+        key: name of the job.
+    """
+    plain = json.loads((job_folder(out, key) / "job.json").read_text(encoding="utf-8"))
+    perform(Job(**{**plain, "options": tuple(plain["options"]), "parser": tuple(plain["parser"])}), out)
+    return 0
+
+
+def main() -> NoReturn:
+    """Do the job that the command line names, and exit."""
+    run_script(job, __doc__)

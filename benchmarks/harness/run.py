@@ -27,8 +27,8 @@ from sundae_ns.storage.atomic import write_text
 
 STOPPED = 130
 """Exit code after an interrupt, as in shells."""
-JOB = Path(__file__).parents[1] / "job.py"
-"""Script that does one job."""
+START_JOB = "import sys; sys.path[0] = sys.argv.pop(1); from harness.job import main; main()"
+"""Program that does one job; its arguments are the folder of this package, that of the comparison, and the key."""
 ERROR = "sundae: "
 """Start of the line in which a command reports an error of the package."""
 
@@ -209,7 +209,7 @@ def spawn(job: Job, out: Path, on_percent: OnPercent) -> None:
     # Another shard may wait for the same warm-up.
     log = job_folder(out, job.key) / f"log-{os.getpid()}.txt"
     try:
-        run_logged([sys.executable, str(JOB), str(out), job.key], log, on_line)
+        run_logged([sys.executable, "-c", START_JOB, str(Path(__file__).parents[1]), str(out), job.key], log, on_line)
     except SundaeError as error:
         *_, last = str(error).splitlines()
         if last.startswith(ERROR):  # an error of the package, complete in one line

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from sundae_ns.api.cost import prune_cost, require_memory, state
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.virtual import of_unit_size, virtual_views
 from sundae_ns.errors import ConfigError, DataError
@@ -59,6 +60,7 @@ def prune(
     Raises:
         ConfigError: neither or both of ``keep`` and ``count`` are given, or they or an option are out of range.
         DataError: no primitive is finite, or the views see none.
+        MemoryExhaustedError: the host has too little memory; nothing was started.
 
     >>> import torch, sundae_ns as sn
     >>> scene = sn.Scene.from_points(torch.rand(200, 3), torch.rand(200, 3))
@@ -66,6 +68,16 @@ def prune(
     20
     """
     return prune_with_mask(scene, keep, count, views, rule, progress=progress).scene
+
+
+def check_amount(keep: float | None, count: int | None) -> None:
+    """Raise ``ConfigError`` unless one of the two is given, and is in its range."""
+    if (keep is None) == (count is None):
+        raise ConfigError("prune needs either keep (a share) or count (a number of primitives); give one of them")
+    if keep is not None and not 0 < keep <= 1:
+        raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
+    if count is not None and count < 1:
+        raise ConfigError(f"count is {count}; give 1 or more primitives")
 
 
 @torch.no_grad()
@@ -77,14 +89,10 @@ def prune_with_mask(
     rule: PruneRule | None,
     *,
     progress: bool,
+    stated: bool = False,
 ) -> PrunedScene:
-    """As :func:`prune`, with the mask of the kept primitives."""
-    if (keep is None) == (count is None):
-        raise ConfigError("prune needs either keep (a share) or count (a number of primitives); give one of them")
-    if keep is not None and not 0 < keep <= 1:
-        raise ConfigError(f"keep is {keep}; give a share in (0, 1], 0.1 to keep a tenth")
-    if count is not None and count < 1:
-        raise ConfigError(f"count is {count}; give 1 or more primitives")
+    """As :func:`prune`, with the mask of the kept primitives; ``stated`` if its cost was stated already."""
+    check_amount(keep, count)
     rule = rule or DEFAULT_RULE
     finite = finite_mask(scene.field)
     field = scene.field if bool(finite.all()) else scene.field.rows(finite)
@@ -92,14 +100,25 @@ def prune_with_mask(
         count = kept_count(keep, field.num_primitives)
     assert count is not None
 
-    weights = console = None
+    n, numbers = field.num_primitives, sum(value.shape[1:].numel() for value in field.values())
+    usable = dataclasses.replace(scene, field=field)
+    seen: Sequence[View] = ()
+    if rule.uses_contribution and count < n:
+        seen = views if views is not None else scene.views or virtual_views(usable)
+    pixels = sum(view.width * view.height for view in seen)
+    cost = prune_cost(n, numbers, rule, count / max(n, 1), len(seen), pixels)
+    on_host, console = field["means"].device.type == "cpu", None
+    if on_host:
+        require_memory(cost, n, loaded=True)
     if progress:
         from rich.console import Console
 
         console = Console(stderr=True)
-    if rule.uses_contribution and count < field.num_primitives:
-        usable = dataclasses.replace(scene, field=field)
-        sized, seen = of_unit_size(usable, views if views is not None else scene.views or virtual_views(usable))
+        if on_host and not stated:
+            state(cost, n, len(seen))
+    weights = None
+    if rule.uses_contribution and count < n:
+        sized, seen = of_unit_size(usable, seen)
         weights = contribution(
             LocalField(sized.field),
             [TrainingView(view.to(scene.device), None) for view in seen],

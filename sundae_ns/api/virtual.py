@@ -20,6 +20,8 @@ from sundae_ns.rendering.render import pass_options
 NEAREST, FARTHEST = 0.3, 2.0
 """Distances of the eyes from the middle of the scene, as multiples of the median distance of its primitives."""
 FOV = 40.0
+VIRTUAL_SIZE = 256
+"""Default width and height of the images, pixels."""
 FIRST, ROUNDS, MOVED = 4, 4, 3
 """Cameras that are drawn for each one that is kept; then rounds, and the moved ones of a round."""
 STEP = 0.3
@@ -30,7 +32,7 @@ _PROBE_PRIMITIVES = 20_000
 """Most primitives of these images."""
 
 
-def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = 256) -> list[View]:
+def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = VIRTUAL_SIZE) -> list[View]:
     """Cameras that see a scene as a visitor would, for scenes without cameras.
 
     A field shows where its photographs were taken: training splits primitives until each covers few pixels of the
@@ -127,7 +129,10 @@ def _usable(scene: Scene) -> Field:
     finite = finite_mask(scene.field)
     if not bool(finite.any()):
         raise DataError(f"none of {scene.num_primitives:,} primitives is finite, so no camera sees the scene")
-    return Field({name: value.detach()[finite] for name, value in scene.field.items()}, scene.field.encoding)
+    values = {name: value.detach() for name, value in scene.field.items()}
+    if not bool(finite.all()):  # else a large field would be copied for nothing
+        values = {name: value[finite] for name, value in values.items()}
+    return Field(values, scene.field.encoding)
 
 
 def _middle_and_reach(field: Field) -> tuple[Tensor, float]:

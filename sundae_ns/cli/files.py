@@ -150,7 +150,8 @@ def prune_file(
 ) -> int:
     """Prune a scene of any program, without its photos and without training.
 
-    Kept are the primitives that virtual cameras see most of; the others are merged into them.
+    Kept are the primitives that virtual cameras see most of; the others are merged into them. A million primitives take
+    half a gigabyte of memory; a prune of more than a minute states its cost first.
 
     Args:
         source: a 3DGS .ply, .spz or .sog, a packed scene, or a run.
@@ -176,20 +177,35 @@ def prune_file(
         overwrite: replace an existing file, once the new one is complete.
     """
     from sundae_ns.api import opening, pruning, saving
+    from sundae_ns.api.cost import prune_cost, require_memory, state
+    from sundae_ns.api.virtual import VIRTUAL_SIZE
     from sundae_ns.errors import ConfigError
     from sundae_ns.gaussians import finite_mask
     from sundae_ns.pruning import PruneRule
     from sundae_ns.storage.kinds import kind_of
-    from sundae_ns.storage.ply import keep_vertices
+    from sundae_ns.storage.ply import keep_vertices, stated_size
 
     amounts = {"--keep": keep, "--count": count, "--target-drop": target_drop}
     check_one(amounts)
+    if target_drop is None:
+        keep = 0.1 if keep is None and count is None else keep
+        pruning.check_amount(keep, count)
     if out.suffix.lower() not in saving.SUFFIXES:
         raise ConfigError(f"{out} has no supported suffix; name it {', '.join(saving.SUFFIXES)}")
     check_file(out, reads=[source, cameras], overwrite=overwrite)
     redistribution: Literal["merge", "none"] = "merge" if merge else "none"
     rule = PruneRule(selection, score, signal, redistribution=redistribution, gamma=gamma, seed=seed)
     rule.validate()
+    stated = False
+    if kind_of(source) == "ply":  # its header has the size; reading takes minutes
+        n, numbers = stated_size(source)
+        share = keep if keep is not None else (count or 0) / max(n, 1)
+        looks = views if rule.uses_contribution and cameras is None else 0
+        cost = prune_cost(n, numbers, rule, share, looks, looks * VIRTUAL_SIZE**2)
+        require_memory(cost, n, loaded=False)
+        if cameras is None and target_drop is None:
+            stated = True
+            state(cost, n, looks)
     scene = opening.load(source)
     seen = None
     if rule.uses_contribution or target_drop is not None:
@@ -202,9 +218,7 @@ def prune_file(
         count = found.kept
         for number, psnr in found.curve:
             print(f"{number:12,} primitives: {psnr:.2f} dB against the full field, on held-out cameras")
-    if keep is None and count is None:
-        keep = 0.1
-    pruned = pruning.prune_with_mask(scene, keep=keep, count=count, views=seen, rule=rule, progress=True)
+    pruned = pruning.prune_with_mask(scene, keep=keep, count=count, views=seen, rule=rule, progress=True, stated=stated)
     if kind_of(source) == "ply" and out.suffix.lower() == ".ply":
         keep_vertices(source, out, pruned.mask, pruned.scene.field if merge else None)
     else:

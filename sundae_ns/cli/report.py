@@ -90,7 +90,7 @@ def report(
     if lpips is None:
         notes.append(f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them.")
     done: list[Measured] = []
-    files: dict[str, bytes] = {}
+    files: dict[Path, bytes] = {}
     curves: dict[str, Curves] = {}
     counts: dict[str, CountCurve] = {}
     comparisons: dict[str, list[tuple[str, str]]] = {}
@@ -128,7 +128,7 @@ def report(
                     out.mkdir(parents=True, exist_ok=True)
                 kind = "png" if opened.truths[0].shape[1] <= PNG_WIDTH else "jpeg"
                 name = f"errors-{number}.{kind.replace('jpeg', 'jpg')}"
-                files[name] = _errors(opened, measured, kind)
+                files[out / name] = _errors(opened, measured, kind)
                 title = f"{label}: worst and median test view by PSNR"
                 comparisons.setdefault(measured.scene, []).append((title, name))
                 found = read_curves(opened.source) if opened.packed_bytes is None else None
@@ -146,7 +146,7 @@ def report(
                 if video is not None:
                     views = len(opened.datamanager.train_dataset) + len(opened.cameras)
                     progress.update(task, description="Rendering the video", completed=0, total=views)
-                    _save_video(video, opened, advance)
+                    files[video] = _video(opened, advance)
             progress.remove_task(task)
             progress.advance(scenes_done)
         if not done:
@@ -161,11 +161,11 @@ def report(
         ]
     images = {scene: [*plots[scene], *comparisons[scene]] for scene in scenes}
     rows = [run.as_json() for run in done]
-    files |= figures
-    files["report.json"] = (json.dumps(rows, indent=1) + "\n").encode()
-    files["report.csv"] = csv_text(rows).encode()
-    files["report.md"] = document(scenes, images, notes, command).encode()
-    write_files({out / name: content for name, content in files.items()})
+    files |= {out / name: content for name, content in figures.items()}
+    files[out / "report.json"] = (json.dumps(rows, indent=1) + "\n").encode()
+    files[out / "report.csv"] = csv_text(rows).encode()
+    files[out / "report.md"] = document(scenes, images, notes, command).encode()
+    write_files(files)
     for note in notes:
         console.print(f"[yellow]Left out: {escape(note)}", highlight=False)
     if video is not None:
@@ -203,11 +203,10 @@ def _errors(opened: Opened, measured: Measured, kind: str) -> bytes:
     return file.getvalue()
 
 
-def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> None:
-    """Write every view of a scene beside its photograph; ``progress`` is called after each."""
+def _video(opened: Opened, progress: Callable[[], object]) -> bytes:
+    """A video of every view of a scene beside its photograph; ``progress`` is called after each."""
     from sundae_ns.evaluation.video import side_by_side, write_video
     from sundae_ns.scenes.measure import largest_view, walk
-    from sundae_ns.storage.atomic import replacing
 
     head = opened.model.state.head_enabled
     with redirect_stdout(StringIO()):  # nerfstudio says that it loads the training images
@@ -218,8 +217,9 @@ def _save_video(path: Path, opened: Opened, progress: Callable[[], object]) -> N
             yield side_by_side(row, tile, head=head)
             progress()
 
-    with replacing(path) as partial:
-        write_video(partial, frames())
+    file = BytesIO()
+    write_video(file, frames())
+    return file.getvalue()
 
 
 def _plot(

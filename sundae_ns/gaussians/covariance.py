@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -11,6 +13,9 @@ SURFACE_EXPONENT = 1.6075
 
 PAIRS = 1 << 18
 """Pairs of primitives whose overlap is computed at once; they take about 50 MiB."""
+
+ROWS = 1 << 16
+"""Primitives whose matrices are computed at once; the steps between take some 600 bytes a primitive."""
 
 _LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
 """Rows and columns of the six entries of a symmetric matrix, diagonal first."""
@@ -33,6 +38,21 @@ def covariances(scales: Tensor, quats: Tensor) -> Tensor:
     """Covariances ``R S S^T R^T`` ``[N, 3, 3]`` of standard deviations ``[N, 3]`` and wxyz quaternions ``[N, 4]``."""
     half = rotation_matrices(quats) * scales[:, None, :]
     return half @ half.transpose(1, 2)
+
+
+def covariances_of(params: Mapping[str, Tensor]) -> Tensor:
+    """Covariances of the primitives of a field, float64 on its device ``[N, 3, 3]``."""
+    scales, quats = params["scales"].detach(), params["quats"].detach()
+    result = torch.empty(len(scales), 3, 3, dtype=torch.float64, device=scales.device)
+    for rows in chunks(len(scales)):
+        result[rows] = covariances(scales[rows].double().exp(), quats[rows].double())
+    return result
+
+
+def chunks(n: int, size: int | None = None) -> Iterator[slice]:
+    """Consecutive slices of at most ``size`` of ``n`` rows, to bound the memory of steps between; by default `ROWS`."""
+    size = size or ROWS
+    return (slice(first, min(first + size, n)) for first in range(0, n, size))
 
 
 def quaternions(matrices: Tensor) -> Tensor:
@@ -89,14 +109,14 @@ def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: 
     """
     indices = indices.to(means.device)
     least_variance = least_width**2
-    entries = covariance.double()[:, _LOWER[0], _LOWER[1]] + least_variance * torch.tensor(
-        _DIAGONAL, dtype=torch.float64, device=means.device
-    )
-    log_det = 2 * torch.stack(_cholesky(entries, least_variance)[:3], dim=1).log().sum(dim=1)
+    added = least_variance * torch.tensor(_DIAGONAL, dtype=torch.float64, device=means.device)
     points = means.double()
+    entries, log_det = points.new_empty(len(means), 6), points.new_empty(len(means))
+    for own in chunks(len(means)):
+        entries[own] = covariance[own].double()[:, _LOWER[0], _LOWER[1]] + added
+        log_det[own] = 2 * torch.stack(_cholesky(entries[own], least_variance)[:3], dim=1).log().sum(dim=1)
     result = torch.empty(indices.shape, dtype=means.dtype, device=means.device)
-    # Process rows in chunks to bound the memory of all pairs.
-    for rows in torch.arange(len(means), device=means.device).split(max(1, PAIRS // max(1, indices.shape[1]))):
+    for rows in chunks(len(means), max(1, PAIRS // max(1, indices.shape[1]))):
         columns = indices[rows]
         middle = (entries[rows, None] + entries[columns]) / 2
         a, b, c, ba, ca, cb = _cholesky(middle, least_variance)

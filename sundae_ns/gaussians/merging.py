@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from sundae_ns.gaussians.covariance import covariances, mean_projected_area, scales_and_quaternions
+from sundae_ns.gaussians.covariance import chunks, covariances, mean_projected_area, scales_and_quaternions
 
 MAX_OPACITY = 0.99
 """Upper limit of merged opacities, at which the logit still has a gradient."""
-
-ROWS = 1 << 16
-"""Primitives whose coefficients are converted to float64 at once."""
 
 
 @torch.no_grad()
@@ -49,42 +46,57 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     group = place[label[members]]
     count = int(stays.sum())
 
-    def total(values: Tensor) -> Tensor:
-        return torch.zeros(count, *values.shape[1:], dtype=torch.float64).index_add_(0, group, values)
+    def total(values: Callable[[slice], Tensor], *shape: int) -> Tensor:
+        # In chunks: values of all members in float64 would take several times the memory of the field.
+        result = torch.zeros(count, *shape, dtype=torch.float64)
+        for some in chunks(len(members)):
+            result.index_add_(0, group[some], values(some))
+        return result
+
+    def of(name: str, some: slice) -> Tensor:
+        return source[name][members[some]].double()
 
     w = w[members]
     # Divide by the largest weight of the group first, so that no sum underflows.
     largest = torch.zeros(count, dtype=torch.float64).scatter_reduce_(0, group, w, "amax")
     w = torch.where(largest[group] > 0, w / largest[group], 0.0)
-    normalized = w / total(w)[group].clamp_min(torch.finfo(torch.float64).tiny)
+    normalized = w / total(lambda some: w[some])[group].clamp_min(torch.finfo(torch.float64).tiny)
 
-    def mean(values: Tensor) -> Tensor:
-        result = torch.zeros(count, values[0].numel(), dtype=torch.float64)
-        # In chunks: all coefficients in float64 would take twice the memory of the field.
-        for chunk in torch.arange(len(members)).split(ROWS):
-            flat = values[members[chunk]].double().reshape(len(chunk), -1)
-            result.index_add_(0, group[chunk], normalized[chunk, None] * flat)
-        return result.reshape(count, *values.shape[1:])
+    def mean(name: str) -> Tensor:
+        shape = source[name].shape[1:]
+        flat = total(lambda some: normalized[some, None] * of(name, some).flatten(1), shape.numel())
+        return flat.reshape(count, *shape)
 
     kept = {name: value[stays] for name, value in source.items()}
     origin = kept["means"].double()
-    offset = source["means"][members].double() - origin[group]
-    shift = total(normalized[:, None] * offset)
-    spread = offset - shift[group]
-    scales = source["scales"][members].double().exp()
-    covariance = covariances(scales, source["quats"][members].double()) + spread[:, :, None] * spread[:, None, :]
-    covariance = total(normalized[:, None, None] * covariance)
+
+    def offset(some: slice) -> Tensor:
+        return of("means", some) - origin[group[some]]
+
+    shift = total(lambda some: normalized[some, None] * offset(some), 3)
+
+    def moments(some: slice) -> Tensor:
+        spread = offset(some) - shift[group[some]]
+        own = covariances(of("scales", some).exp(), of("quats", some)) + spread[:, :, None] * spread[:, None, :]
+        return normalized[some, None, None] * own
+
+    covariance = total(moments, 3, 3)
     # A covariance that overflows has no axes; its primitive stays unchanged.
     bounded = covariance.isfinite().all(dim=2).all(dim=1)
     deviations, quats = scales_and_quaternions(torch.where(bounded[:, None, None], covariance, 0.0))
     # A width of zero has no logarithm; limit each axis to the thinnest axis of the members.
     thinnest = torch.full((count,), torch.inf, dtype=torch.float64)
-    thinnest = thinnest.scatter_reduce_(0, group, scales.amin(dim=1), "amin")
+    for some in chunks(len(members)):
+        thinnest.scatter_reduce_(0, group[some], of("scales", some).exp().amin(dim=1), "amin")
     deviations = deviations.maximum(thinnest[:, None])
-    depth = softplus(source["opacities"][members].double().squeeze(1), threshold=40.0)
-    merged_depth = total(depth * mean_projected_area(scales)) / mean_projected_area(deviations)
 
-    merged = {name: mean(value) for name, value in source.items() if name not in _WITH_MOMENTS}
+    def cover(some: slice) -> Tensor:
+        depth = softplus(of("opacities", some).squeeze(1), threshold=40.0)
+        return depth * mean_projected_area(of("scales", some).exp())
+
+    merged_depth = total(cover) / mean_projected_area(deviations)
+
+    merged = {name: mean(name) for name in source if name not in _WITH_MOMENTS}
     merged["means"] = origin + shift
     merged["scales"] = deviations.log()
     merged["quats"] = quats

@@ -85,12 +85,13 @@ def build_graph(
     neighbors = knn(points, num_neighbors)
     distances = neighbors.distances
     tau, sigma = bandwidth(distances, rule, tau=tau, sigma=sigma)
+    beyond = distances >= tau**0.5
     if sigma > 0:
-        # Divide before squaring: the square of a small distance could underflow.
-        weights = (distances / sigma).square_().mul_(-0.5).exp_()
+        # Divide before squaring: the square of a small distance could underflow. In place: these are gigabytes.
+        weights = distances.div_(sigma).square_().mul_(-0.5).exp_()
     else:
         weights = (distances == 0).to(distances.dtype)
-    weights.masked_fill_(distances >= tau**0.5, 0)
+    weights.masked_fill_(beyond, 0)
     return NeighborGraph(neighbors.indices, weights, weights.sum(dim=1), tau, sigma)
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from sundae_ns.gaussians.covariance import covariances, overlap
+from sundae_ns.gaussians.covariance import covariances_of, overlap
 from sundae_ns.gaussians.field import as_field
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
@@ -58,18 +58,19 @@ def field_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGraph:
     )
     if rule.edges == "centres":
         return graph
-    weights = graph.weights * _color_affinity(sh_to_rgb(params["features_dc"].detach()), graph)
-    covariance = covariances(params["scales"].detach().double().exp(), params["quats"].detach().double())
-    weights *= overlap(means, covariance, graph.indices, least_width=LEAST_WIDTH * graph.sigma)
+    # In place: of a large field, each value per edge takes gigabytes.
+    weights = graph.weights.mul_(_color_affinity(sh_to_rgb(params["features_dc"].detach()), graph))
+    weights *= overlap(means, covariances_of(params), graph.indices, least_width=LEAST_WIDTH * graph.sigma)
     return replace(graph, weights=weights, dw=weights.sum(dim=1))
 
 
 def _color_affinity(colors: Tensor, graph: NeighborGraph) -> Tensor:
     squares = torch.empty_like(graph.weights)
-    for column, neighbor in enumerate(graph.indices.unbind(dim=1)):
+    total = torch.zeros((), dtype=torch.float64, device=squares.device)
+    for column, (neighbor, weight) in enumerate(zip(graph.indices.unbind(dim=1), graph.weights.unbind(dim=1))):
         squares[:, column] = (colors - colors[neighbor]).square().sum(dim=1)
-    present = graph.weights > 0
-    typical = (squares * present).sum(dtype=torch.float64) / present.sum().clamp_min(1)
+        total += (squares[:, column] * (weight > 0)).sum(dtype=torch.float64)
+    typical = total / (graph.weights > 0).sum().clamp_min(1)
     if not typical > 0:
         return torch.ones_like(squares)
-    return (squares / typical.to(squares.dtype)).clamp_max_(MOST_UNLIKE**2).mul_(-0.5).exp_()
+    return squares.div_(typical.to(squares.dtype)).clamp_max_(MOST_UNLIKE**2).mul_(-0.5).exp_()

@@ -7,10 +7,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from sundae_ns.gaussians.covariance import chunks
 from sundae_ns.gaussians.field import as_field
 from sundae_ns.gaussians.merging import merge
 from sundae_ns.gaussians.parameters import rgb_to_logit
 from sundae_ns.graphs import NeighborGraph
+
+ROWS = 1 << 17
+"""Primitives whose edges are followed at once; they take about 100 MiB."""
 
 MOST_HOPS = 64
 """Most edges between a dropped primitive and its kept one; keep ratios from 0.001 on need about a dozen."""
@@ -38,30 +42,40 @@ def voronoi_labels(graph: NeighborGraph, mask: Tensor) -> Tensor:
     mask = mask.to(device)
     own = torch.arange(graph.N, device=device)
     label = torch.where(mask, own, -1)
-    lengths = torch.where(graph.weights > 0, -graph.weights.double().log(), torch.inf).clamp_min(0)
     distance = torch.where(mask, 0.0, torch.inf).double()
     changed = mask
     for _ in range(MOST_HOPS):
-        # A distance can only shrink if that of a neighbour has shrunk.
-        rows = changed[graph.indices].any(dim=1).nonzero().squeeze(1)
-        near = graph.indices[rows]
-        reached, over = (distance[near] + lengths[rows]).min(dim=1)
-        nearer = reached < distance[rows]
-        if not bool(nearer.any()):
+        found = [_nearer(graph, rows, changed, distance) for rows in chunks(graph.N, ROWS)]
+        rows, through, reached = (torch.cat(parts) for parts in zip(*found, strict=True))
+        if not len(rows):
             break
-        rows, through = rows[nearer], near.gather(1, over[:, None]).squeeze(1)[nearer]
         label[rows] = label[through]
-        distance[rows] = reached[nearer]
+        distance[rows] = reached
         changed = torch.zeros_like(mask)
         changed[rows] = True
-    return _label_either_way(graph, label, distance, lengths)
+    return _label_either_way(graph, label, distance)
 
 
-def _label_either_way(graph: NeighborGraph, label: Tensor, distance: Tensor, lengths: Tensor) -> Tensor:
+def _nearer(graph: NeighborGraph, among: slice, changed: Tensor, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Primitives that one hop brings nearer to a kept one, the neighbours that lead there, and the new distances."""
+    # A distance can only shrink if that of a neighbour has shrunk.
+    rows = changed[graph.indices[among]].any(dim=1).nonzero().squeeze(1).add_(among.start)
+    near = graph.indices[rows]
+    reached, over = (distance[near] + _lengths(graph.weights[rows])).min(dim=1)
+    nearer = reached < distance[rows]
+    return rows[nearer], near.gather(1, over[:, None]).squeeze(1)[nearer], reached[nearer]
+
+
+def _lengths(weights: Tensor) -> Tensor:
+    """Lengths of edges, float64; infinite without an edge."""
+    return torch.where(weights > 0, -weights.double().log(), torch.inf).clamp_min_(0)
+
+
+def _label_either_way(graph: NeighborGraph, label: Tensor, distance: Tensor) -> Tensor:
     """Label the primitives without a label, along edges in both directions."""
     unlabelled = label < 0
     rows, slots = ((unlabelled[:, None] | unlabelled[graph.indices]) & (graph.weights > 0)).nonzero(as_tuple=True)
-    ends, length = graph.indices[rows, slots], lengths[rows, slots]
+    ends, length = graph.indices[rows, slots], _lengths(graph.weights[rows, slots])
     source, target, length = torch.cat([rows, ends]), torch.cat([ends, rows]), torch.cat([length, length])
     wanted = unlabelled[target]
     source, target, length = source[wanted], target[wanted], length[wanted]

@@ -123,6 +123,20 @@ def _check_header(path: Path, primitives: bool) -> None:
             )
 
 
+def stated_size(path: Path) -> tuple[int, int]:
+    """Number of primitives in a 3DGS .ply, and of the numbers that :func:`read_ply` keeps of each; reads the header.
+
+    Raises:
+        DataError: the file is missing, not a binary .ply, or shorter than its header states.
+    """
+    with reading(path, "a complete .ply file"):
+        _check_header(path, primitives=True)
+        with path.open("rb") as file:
+            header = file.read(_MAX_HEADER).partition(b"end_header")[0]
+    counts = [int(words[2]) for words in map(bytes.split, header.splitlines()) if words[:2] == [b"element", b"vertex"]]
+    return sum(counts), sum(map(len, _COLUMNS.values())) + header.count(b" f_rest_")
+
+
 def _incomplete(path: Path, reason: str) -> DataError:
     return DataError(f"{path} is not a complete .ply file ({reason}); export it again.")
 
@@ -171,8 +185,9 @@ def read_ply(path: Path) -> dict[str, Tensor]:
         raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
 
     params = {name: _stacked(vertex, columns) for name, columns in _COLUMNS.items()}
-    by_channel = _stacked(vertex, _rest_columns(rest)).reshape(vertex.count, 3, rest // 3)
-    params["features_rest"] = by_channel.transpose(1, 2).contiguous()
+    # The file has all coefficients of red, then green, then blue.
+    order = [f"f_rest_{channel * (rest // 3) + i}" for i in range(rest // 3) for channel in range(3)]
+    params["features_rest"] = _stacked(vertex, order).reshape(vertex.count, rest // 3, 3)
     return {name: params[name] for name in SPLAT_NAMES}
 
 

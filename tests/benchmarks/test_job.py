@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import runpy
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -13,7 +12,6 @@ import torch
 
 from harness import job as jobs
 from harness.plan import Job, done_file, job_folder
-from harness.run import JOB
 from sundae_ns.errors import BackendError, CheckpointError, DataError
 
 
@@ -66,6 +64,6 @@ def test_its_process_ends_with_one_line(
     monkeypatch.setattr(jobs, "perform", broken)
     monkeypatch.setattr(sys, "argv", ["job.py", str(tmp_path), "a"])
     with pytest.raises(SystemExit) as raised:
-        runpy.run_path(str(JOB), run_name="__main__")
+        jobs.main()
     assert raised.value.code == 2
     assert capsys.readouterr().err == "sundae: the capture is gone; say where it is\n"

@@ -181,7 +181,7 @@ def test_chunks_of_rows_give_the_same_result(monkeypatch: pytest.MonkeyPatch) ->
     label = torch.arange(50) // 5 * 5
     merged = merge(params, label, torch.rand(50, generator=torch.Generator().manual_seed(0)))
     monkeypatch.setattr("sundae_ns.gaussians.covariance.PAIRS", 30)
-    monkeypatch.setattr("sundae_ns.gaussians.merging.ROWS", 7)
+    monkeypatch.setattr("sundae_ns.gaussians.covariance.ROWS", 7)
     assert torch.equal(overlap(params["means"], covariance_of(params), indices, least_width=0.1), whole)
     again = merge(params, label, torch.rand(50, generator=torch.Generator().manual_seed(0)))
     assert all(torch.equal(again[name], merged[name]) for name in merged)

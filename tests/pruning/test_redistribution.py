@@ -20,7 +20,7 @@ from sundae_ns.errors import ConfigError
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gaussians.parameters import rgb_to_sh, sh_to_rgb
 from sundae_ns.graphs import NeighborGraph, build_graph
-from sundae_ns.pruning import PruneRule, field_graph
+from sundae_ns.pruning import PruneRule, field_graph, redistribution
 from sundae_ns.pruning.redistribution import voronoi_labels
 from sundae_ns.training.schedulers import Decay, notify_pruned
 
@@ -37,7 +37,7 @@ def weights(n: int = 300) -> Tensor:
     return torch.linspace(0.1, 1, n)
 
 
-def test_labels_are_the_nearest_along_the_edges() -> None:
+def test_labels_are_the_nearest_along_the_edges(monkeypatch: pytest.MonkeyPatch) -> None:
     graph = build_graph(field()["means"].double(), num_neighbors=3)
     mask = torch.rand(300, generator=torch.Generator().manual_seed(1)) < 0.05
     found = voronoi_labels(graph, mask)
@@ -52,6 +52,8 @@ def test_labels_are_the_nearest_along_the_edges() -> None:
     assert not reached.all()
     assert len(expected[reached].unique()) > 5
     assert torch.equal(found[reached], expected[reached])
+    monkeypatch.setattr(redistribution, "ROWS", 7)
+    assert torch.equal(voronoi_labels(graph, mask), found)
     # The others follow edges in both directions; primitives in a component without a kept one have no label.
     _, component = connected_components(backwards, directed=False)
     joined = torch.from_numpy(np.isin(component, component[kept]))
