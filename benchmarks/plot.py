@@ -1,7 +1,7 @@
 """Draw the plots of docs/results.md from benchmarks/results, into docs/figures.
 
-python benchmarks/plot.py            # curve.png, runs.png, heads.png, rules.png
-python benchmarks/plot.py runs       # one of them
+python benchmarks/plot.py            # curve.png, heads.png, rules.png
+python benchmarks/plot.py curve      # one of them
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import NullFormatter
-from tables import MB, default_runs, lines_of
+from tables import MB, lines_of
 
 FIGURES = Path(__file__).parents[1] / "docs" / "figures"
 MARKERS = {"bonsai": "o", "fox": "s"}
@@ -32,54 +32,9 @@ KEPT_RULES = {
 """Rules of the plot, by the names that readers see."""
 
 
-SHORT = {
-    "splatfacto": "splatfacto",
-    "sundae-warm-up": "full field",
-    "sundae": "10%",
-    "sundae-fast": "fast",
-    "sundae-auto": "sundae",
-    "sundae-with-head": "with head",
-    "sundae-no-head": "no head",
-    "sundae-no-head-bytes": "13%, no head",
-    "mcmc": "3DGS-MCMC",
-}
-"""Methods of the plot of runs, by the names beside their points."""
-
-
-def plot_runs() -> Any:
-    """PSNR of methods against their bytes, for the captures on which all of them were trained."""
-    by_scene: dict[str, list[Any]] = {}
-    for row in default_runs():
-        if row["variant"] in SHORT:
-            by_scene.setdefault(row["scene"], []).append(row)
-    scenes = [scene for scene, rows in by_scene.items() if len(rows) > 3]
-    figure, panels = plt.subplots(1, len(scenes), figsize=(5.5 * len(scenes), 4), layout="constrained")
-    for panel, scene in zip(panels, scenes, strict=True):
-        for row in by_scene[scene]:
-            place, full = (row["bytes_total"] / MB, row["psnr"]), row["bytes_total"] > 30 * MB
-            ours = row["variant"] == "sundae"
-            color = "tab:red" if ours else "gray" if full else "tab:blue"
-            panel.plot(*place, "o", color=color, markerfacecolor=color if row["of_today"] else "white")
-            # Where sundae takes the head or none, it lies on that point.
-            left = full or row["variant"] in ("sundae-with-head", "sundae-no-head")
-            side, shift = ("center", (0, 9)) if ours else ("right", (-7, -3)) if left else ("left", (7, -3))
-            panel.annotate(SHORT[row["variant"]], place, shift, textcoords="offset points", fontsize=9, ha=side)
-        panel.margins(y=0.1)
-        panel.set_xscale("log")
-        panel.set_xlim(2, 300)
-        panel.set_xticks([3, 10, 30, 100, 300])
-        panel.xaxis.set_major_formatter("{x:g}")
-        panel.xaxis.set_minor_formatter(NullFormatter())
-        panel.set_title(f"{scene}: 10% of the primitives (gray: all; hollow: earlier default)", fontsize=10)
-        panel.set_xlabel("MB in fp32, head included (smaller is better)")
-        panel.set_ylabel("test PSNR, dB (higher is better)")
-        panel.grid(alpha=0.3)
-    return figure
-
-
 def plot_curve() -> Any:
     """PSNR and SSIM of packed scenes against their size: fixed shares as a line, and what the default has chosen."""
-    rows = [row for row in lines_of("curve.csv") if row["seed"] == "42"]
+    rows = [row for row in lines_of("curve.csv") if row["seed"] == "42" and row["packed_psnr"]]
     stock = {row["capture"]: row for row in lines_of("formats.csv") if row["method"] == "splatfacto"}
     stock = {row["capture"]: row for row in stock.values() if row["format"] == ".sundae"}
     captures = list(dict.fromkeys(row["capture"] for row in rows))
@@ -172,7 +127,6 @@ def plot_rules() -> Any:
 
 PLOTS: dict[str, Callable[[], Any]] = {
     "curve": plot_curve,
-    "runs": plot_runs,
     "heads": plot_heads,
     "rules": plot_rules,
 }
@@ -180,7 +134,7 @@ PLOTS: dict[str, Callable[[], Any]] = {
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("plots", nargs="*", default=list(PLOTS), help="curve, runs, heads, rules; by default all")
+    parser.add_argument("plots", nargs="*", default=list(PLOTS), help="curve, heads, rules; by default all")
     parser.add_argument("-o", "--out", type=Path, default=FIGURES, help="folder")
     options = parser.parse_args()
     odd = [name for name in options.plots if name not in PLOTS]

@@ -6,7 +6,7 @@
 
 A run of sundae or splatfacto is a full field, and its capture has the test views. ``psnr_to_field`` compares them
 with the full field's own images, ``psnr`` and ``ssim`` with the photographs, and ``psnr_virtual`` compares virtual
-views that no tool was given with the full field. Tools and rules: ``sundae_ns`` by virtual views (``detail-merge``, the
+views that no tool was given with the full field. Tools and rules: ``sundae_ns`` by virtual views (``pairs``, the
 default) or by the highest opacities, which needs no view, and ``splat-transform`` by ``--decimate`` and
 ``--decimate-adaptive``, on its CPU path. Training is none, or that of ``sundae distill``: ``distill`` with a head where
 it pays, ``distill-no-head`` without. ``bytes`` are those of the
@@ -45,7 +45,7 @@ PLACE = ("capture", "tool", "rule", "training", "share", "device", "seed", "step
 """Columns that name a row."""
 OURS, OTHER = "sundae_ns", "splat-transform"
 RULES = {
-    "detail-merge": sn.PruneRule(selection="pairs"),
+    "pairs": sn.PruneRule(selection="pairs"),
     "opacity": sn.PruneRule(score="opacity", selection="top", redistribution="none"),
 }
 OTHER_RULES = ("decimate", "decimate-adaptive")
@@ -88,7 +88,7 @@ def jobs(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         for training in options.training:
             if training != "none":
                 yield {
-                    **{"tool": OURS, "rule": "detail-merge", "training": training, "share": share},
+                    **{"tool": OURS, "rule": "pairs", "training": training, "share": share},
                     "steps": options.steps,
                 }
         if options.splat_transform:

@@ -48,7 +48,6 @@ METHODS = {
     "contribution-no-head": "highest contribution, as LightGaussian",
 }
 """Arms of runs.csv in the order of a table, by the names that readers see."""
-HEADLINE = ("splatfacto", "sundae")
 FORMATS = {".spz": ".spz", ".sog": ".sog", ".sog theirs": ".sog by splat-transform", ".sundae": ".sundae"}
 """Packed formats in the order of a table, by the heads that readers see."""
 
@@ -110,13 +109,6 @@ def first_of_each(rows: Sequence[Sequence[str]]) -> list[list[str]]:
         shown.append([first if first != seen else "", *others])
         seen = first
     return shown
-
-
-def headline() -> list[str]:
-    """README's table: today's default beside stock splatfacto."""
-    heads = ["capture", "method", "primitives", "PSNR", "SSIM", "PSNR head off", "MB"]
-    rows = [cells_of(row) for row in default_runs() if row["variant"] in HEADLINE]
-    return table(heads, first_of_each(rows))
 
 
 def quality() -> list[str]:
@@ -335,8 +327,30 @@ def gpu(name: str) -> str:
     return name.replace("NVIDIA ", "").replace(" 80GB HBM3", "")
 
 
+PRUNES = {
+    ("opacity", "none"): "highest opacity",
+    ("decimate", "none"): "`--decimate`",
+    ("decimate-adaptive", "none"): "`--decimate-adaptive`",
+    ("pairs", "none"): "`sundae prune`",
+    ("pairs", "distill"): "`sundae distill`",
+}
+"""Rules and trainings of prune.csv in the order of a table, by the heads that readers see."""
+
+
+def prune() -> list[str]:
+    """PSNR against the full field, and against the photographs, of scenes that were made small without photographs."""
+    cells: dict[tuple[str, float], dict[tuple[str, str], str]] = {}
+    for row in lines_of("prune.csv"):
+        pair = f"{float(row['psnr_to_field']):.1f}, {float(row['psnr']):.1f}"
+        cells.setdefault((row["capture"], float(row["share"])), {})[row["rule"], row["training"]] = pair
+    made = [
+        [f"{capture}, {share:.0%}", *(found.get(name, "") for name in PRUNES)]
+        for (capture, share), found in cells.items()
+    ]
+    return table(["capture, kept", *PRUNES.values()], made)
+
+
 TABLES: dict[str, Callable[[], list[str]]] = {
-    "headline": headline,
     "quality": quality,
     "shares": shares,
     "speed": speed,
@@ -347,6 +361,7 @@ TABLES: dict[str, Callable[[], list[str]]] = {
     "packed-headline": packed_headline,
     "multi-gpu": multi_gpu,
     "rules": rules,
+    "prune": prune,
     "trials": trials,
 }
 

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "benchmarks"
 RESULTS = FOLDER / "results"
 SCRIPTS = sorted(path.name for path in FOLDER.glob("*.py"))
-TABLE = "<!-- table: headline -->\n| old |\n<!-- end of table -->"
+TABLE = "<!-- table: rules -->\n| old |\n<!-- end of table -->"
 
 
 def run(monkeypatch: pytest.MonkeyPatch, name: str, *arguments: str) -> int:
@@ -109,13 +109,12 @@ def test_every_table_can_be_made(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_page_changes_between_its_markers_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     tables = loaded(monkeypatch, "tables.py")
     made = tables["with_tables"](f"before\n{TABLE}\nbetween\n{TABLE}\nafter\n")
-    headline = "\n".join(tables["headline"]())
-    block = TABLE.replace("| old |", headline)
+    block = TABLE.replace("| old |", "\n".join(tables["rules"]()))
     assert made == f"before\n{block}\nbetween\n{block}\nafter\n"
     assert tables["with_tables"](made) == made
     assert tables["with_tables"]("| a |\n") == "| a |\n"
     with pytest.raises(KeyError, match="no-such-table"):
-        tables["with_tables"](TABLE.replace("headline", "no-such-table"))
+        tables["with_tables"](TABLE.replace("rules", "no-such-table"))
 
 
 def today_of(row: dict[str, Any], arm: str) -> bool:
@@ -138,7 +137,6 @@ def test_rows_of_earlier_defaults_say_so(monkeypatch: pytest.MonkeyPatch) -> Non
     # Of a training that was timed twice, the last line is shown.
     lines["training_time"] = list({(line["scene"], line["arm"]): line for line in lines["training_time"]}.values())
     shown = {
-        "headline": [today for (_, variant), today in runs.items() if variant in tables["HEADLINE"]],
         "quality": list(runs.values()),
         "speed": [today_of(line, "") for line in lines["frames"]],
         "training-time": [today_of(line, line["arm"]) for line in lines["training_time"]],
@@ -154,7 +152,7 @@ def test_rows_of_earlier_defaults_say_so(monkeypatch: pytest.MonkeyPatch) -> Non
         for row in tables["TABLES"][name]()[2:]:
             # An empty first cell is the one above.
             first = row.split("|")[1].strip() or first
-            unmarked.append("earlier default" not in (row if name in ("headline", "quality") else row + first))
+            unmarked.append("earlier default" not in (row if name == "quality" else row + first))
         assert sorted(unmarked) == sorted(of_today), name
         marked += of_today.count(False)
     assert marked < sum(map(len, shown.values()))
@@ -167,7 +165,7 @@ def test_pages_are_not_current_after_a_default_changes(monkeypatch: pytest.Monke
     assert tables["with_tables"](readme) == readme
     monkeypatch.setattr(today, "fingerprints", lambda arm, keep_ratio: frozenset())
     assert tables["with_tables"](readme) != readme
-    assert all("earlier default" in row for row in tables["headline"]()[2:])
+    assert all("earlier default" in row for row in tables["quality"]()[2:])
 
 
 def test_a_suite_is_taken_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

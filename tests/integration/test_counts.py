@@ -164,7 +164,7 @@ def test_a_head_that_gains_at_a_tenth_is_kept_with_more(make: Make, judge: Any, 
 
 
 def test_where_a_tenth_is_kept_the_head_has_its_usual_trials(make: Make, judge: Any) -> None:
-    judge(dict.fromkeys(count_trials.SHARES, 0.0))
+    judge(dict.fromkeys(count_trials.SHARES, 0.0), 0.2)
     trainer = make(head="auto")
     trainer.train()
     record, verdict = record_of(trainer), json.loads((trainer.base_dir / "trials.json").read_text())

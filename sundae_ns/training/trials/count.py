@@ -44,6 +44,7 @@ from sundae_ns.training.trials.curve import (
     curve_of,
     is_lost,
     still_climbs,
+    with_head,
 )
 from sundae_ns.training.trials.engine import Trial, TrialEngine
 from sundae_ns.training.trials.head import (
@@ -106,9 +107,16 @@ class CountTrialProgress:
         return pays(plain, head)
 
     def curve(self) -> list[CurvePoint]:
-        """The points of the finished trials, largest count first; none if masks leave no pixel of the views."""
+        """The points of the finished trials, largest count first, with a head if it pays.
+
+        There are none if masks leave no pixel of the views.
+        """
         done = len(self.measured)
-        return curve_of(self.counts[:done], self.measured, self.sizes) if done and self.measured[0] else []
+        curve = curve_of(self.counts[:done], self.measured, self.sizes) if done and self.measured[0] else []
+        if not curve or not self.head_pays:
+            return curve
+        plain, head = (mean_quality(from_values(trial)) for trial in self.head)
+        return with_head(curve, kept_count(USUAL_SHARE, self.full), head[0] - plain[0], head[1] - plain[1])
 
 
 class CountTrials(Extension):

@@ -3,13 +3,15 @@
 A trial is far shorter than the training that follows, so its images do not show what that training reaches. Two things
 foretell it: the quality at the end of the trial, of which differences shrink later, and the count itself, since each
 halving gains more in the steps that follow. The weights of both were fitted to trainings of six captures at up to six
-counts each (``docs/decisions.md``).
+counts each. A head gains more at the end than in its trial, and the less, the more primitives there are; what it gains
+was fitted to trainings of two captures (``docs/decisions.md``).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +22,10 @@ from sundae_ns.evaluation.count_curve import CurvePoint
 PSNR_WEIGHTS = (0.75, 0.1)
 """Weight of the PSNR at the end of a trial, and dB that each halving of the count gains after it."""
 SSIM_WEIGHTS = (0.75, 0.003)
+"""The same for SSIM."""
+HEAD_PSNR = (3.0, 0.4)
+"""Gain of a head at the end as a multiple of that in its trial, and the power of the count by which it falls."""
+HEAD_SSIM = (2.0, 1.0)
 """The same for SSIM."""
 LOST = 4.0
 """A count that loses this many times the tolerance, beyond two standard errors, is clearly too small."""
@@ -78,6 +84,32 @@ def curve_of(
     (psnr, psnr_loss, psnr_error), (ssim, ssim_loss, ssim_error) = columns
     rows = zip(counts, sizes, psnr, ssim, psnr_loss, ssim_loss, psnr_error, ssim_error, strict=True)
     return [CurvePoint(*row) for row in rows]
+
+
+def with_head(curve: Sequence[CurvePoint], count: int, psnr: float, ssim: float) -> list[CurvePoint]:
+    """The curve of a field with a head.
+
+    Args:
+        curve: without one.
+        count: number of primitives of the head's trials.
+        psnr: what the head has gained in them, dB.
+        ssim: the same for SSIM.
+    """
+    gains = []
+    for gain, (factor, power) in ((psnr, HEAD_PSNR), (ssim, HEAD_SSIM)):
+        # Fewer primitives than in its trials were not tried with a head.
+        gains.append([factor * gain * (count / max(point.count, count)) ** power for point in curve])
+    figures = []
+    for values, losses, more in (
+        ([point.psnr for point in curve], [point.psnr_loss for point in curve], gains[0]),
+        ([point.ssim for point in curve], [point.ssim_loss for point in curve], gains[1]),
+    ):
+        lost = [loss - gain for loss, gain in zip(losses, more, strict=True)]
+        figures += [[value + gain for value, gain in zip(values, more, strict=True)], [one - min(lost) for one in lost]]
+    names = ("psnr", "psnr_loss", "ssim", "ssim_loss")
+    return [
+        replace(point, **dict(zip(names, values, strict=True))) for point, *values in zip(curve, *figures, strict=True)
+    ]
 
 
 def _paired(differences: NDArray[np.float64], pixels: NDArray[np.float64]) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -17,6 +18,7 @@ from sundae_ns.training.trials.curve import (
     curve_of,
     is_lost,
     still_climbs,
+    with_head,
 )
 
 COUNTS = (1000, 400, 200, 100)
@@ -106,6 +108,20 @@ def test_a_count_is_lost_only_beyond_doubt() -> None:
     assert is_lost(point(400, 0.9), Tolerance())
     assert not is_lost(point(400, 0.9, error=0.3), Tolerance())
     assert is_lost(point(400, 0, 0.02), Tolerance())
+
+
+def test_a_head_gains_less_the_more_primitives_there_are() -> None:
+    curve = [point(1000), point(400, 0.1, 0.003), point(200, 0.5, 0.02), point(100, 1.5, 0.05), point(50, 3.0, 0.1)]
+    found = with_head(curve, 100, 0.5, 0.02)
+    gained = [b.psnr - a.psnr for a, b in zip(curve, found, strict=True)]
+    assert gained == pytest.approx([1.5 * share**0.4 for share in (0.1, 0.25, 0.5, 1, 1)])  # no less than was tried
+    assert [b.ssim - a.ssim for a, b in zip(curve, found, strict=True)] == pytest.approx(
+        [0.004, 0.01, 0.02, 0.04, 0.04]
+    )
+    assert min(one.psnr_loss for one in found) == min(one.ssim_loss for one in found) == 0
+    for a, b in itertools.pairwise(found):
+        assert b.psnr - a.psnr == pytest.approx(a.psnr_loss - b.psnr_loss)
+    assert choose(found, Tolerance()) < choose(curve, Tolerance())
 
 
 def test_a_budget_in_bytes_is_a_count_between_the_tried_ones() -> None:
