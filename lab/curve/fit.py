@@ -1,66 +1,40 @@
-import json, glob, itertools, sys
+"""Weights of the trials' end and of log2(count), from fixed shares without a head; the choice by them, one capture left out."""
+import json, csv, itertools, sys
 import numpy as np
 from pathlib import Path
-D = Path(__file__).parent / "data"
-rows = [r for r in json.load(open(D / "oracle.json")) if r["seed"] == 42 and r["share"]]
-real = {}
-for r in rows: real.setdefault(r["capture"], {})[r["share"]] = r
-rec = {json.load(open(f))["scene"]: dict(json.load(open(f)), shares=[1.0, .4, .2, .1, .05, .025]) for f in D.glob("whole-*-42.json")}
-mean = lambda w, k: sum(v[k] for v in w) / len(w)
-caps = sorted(real)
-S = [1.0, .4, .2, .1, .05, .025]
-def feats(c, s, k, L):   # value at window L, log slope
-    t = rec[c]["measured"][rec[c]["shares"].index(s)]
-    q = [mean(w, k) for w in t]
-    hi, lo = L, max(L // 2, 1)
-    return q[hi - 1], (q[hi - 1] - q[lo - 1]) / np.log(hi / lo)
-def truth(c, s, key):
-    r = real[c].get(s)
-    return None if r is None else r[key]
-for L in (2,):
-    for key, k in (("psnr", 3), ("ssim", 2)):
-        X, y, who = [], [], []
-        for c in caps:
-            have = [s for s in S if truth(c, s, key) is not None]
-            for a, b in zip(have, have[1:]):
-                # skip pairs in which the head differs
-                if bool(real[c][a]["bytes_head"]) != bool(real[c][b]["bytes_head"]): continue
-                fa, fb = feats(c, a, k, L), feats(c, b, k, L)
-                o = np.log2(a / b)
-                X.append([fa[0] - fb[0], fa[1] - fb[1], o]); y.append(truth(c, a, key) - truth(c, b, key)); who.append((c, a, b))
-        X, y = np.array(X), np.array(y)
-        for cols in ([0], [0, 1], [0, 1, 2], [0, 2]):
-            err = []
-            for c in caps:
-                tr = np.array([w[0] != c for w in who]); te = ~tr
-                if te.sum() == 0: continue
-                w = np.linalg.lstsq(X[tr][:, cols], y[tr], rcond=None)[0]
-                err += list(X[te][:, cols] @ w - y[te])
-            w = np.linalg.lstsq(X[:, cols], y, rcond=None)[0]
-            print(L, key, cols, "w", np.round(w, 3), "LOO rmse %.4f" % np.sqrt(np.mean(np.square(err))), "std y %.4f" % y.std(), len(y))
-print("affine-fitted PSNR as the predictor of PSNR")
-for L in (2,):
-    for k in (3,):
-        X, y, who = [], [], []
-        for c in caps:
-            have = [s for s in S if truth(c, s, "psnr") is not None]
-            for a, b in zip(have, have[1:]):
-                if bool(real[c][a]["bytes_head"]) != bool(real[c][b]["bytes_head"]): continue
-                fa, fb = feats(c, a, k, L), feats(c, b, k, L)
-                X.append([fa[0] - fb[0], fa[1] - fb[1]]); y.append(truth(c, a, "psnr") - truth(c, b, "psnr")); who.append((c, a, b))
-        X, y = np.array(X), np.array(y)
+D = Path(__file__).parent / "data"; S = [1.0, .4, .2, .1, .05, .025]
+plain = {}
+for r in json.load(open(D / "oracle.json")):
+    if r["seed"] == 42 and r["share"] and not r["bytes_head"]: plain.setdefault(r["capture"], {})[r["share"]] = (r["psnr"], r["ssim"])
+for r in csv.DictReader(open(D.parents[2] / "benchmarks/results/runs.csv")):
+    if r["variant"] == "sundae-no-head" and r["seed"] == "42": plain.setdefault(r["scene"], {}).setdefault(float(r["keep_ratio"]), (float(r["psnr"]), float(r["ssim"])))
+rec = {json.load(open(f))["scene"]: np.array(json.load(open(f))["measured"]) for f in sorted(D.glob("whole-*-42.json"))}
+caps = sorted(rec)
+def val(c, s, k, w=-1):
+    M = rec[c]; px = M[0, 0, :, 0] / M[0, 0, :, 0].sum(); return float(M[S.index(s), w, :, k] @ px)
+for name, k, j in (("psnr", 3, 0), ("ssim", 2, 1)):
+    X, y, who = [], [], []
+    for c in caps:
+        have = [s for s in S if s in plain[c]]
+        for a, b in zip(have, have[1:]):
+            X.append([val(c, a, k) - val(c, b, k), np.log2(a / b), (val(c, a, k) - val(c, a, k, 0)) - (val(c, b, k) - val(c, b, k, 0))]); y.append(plain[c][a][j] - plain[c][b][j]); who.append(c)
+    X, y, who = np.array(X), np.array(y), np.array(who)
+    for cols in ([0], [0, 1], [0, 2], [0, 1, 2]):
         err = []
         for c in caps:
-            tr = np.array([w[0] != c for w in who])
-            if (~tr).sum(): err += list(X[~tr] @ np.linalg.lstsq(X[tr], y[tr], rcond=None)[0] - y[~tr])
-        print(L, k, "LOO rmse %.3f" % np.sqrt(np.mean(np.square(err))))
-w = {"psnr": (0.8, 1.5), "ssim": (0.85, 2.0)}
-for L in (2,):
-  for c in caps:
-    P = {s: [w[key][0] * feats(c, s, k, L)[0] + w[key][1] * feats(c, s, k, L)[1] for key, k in (("psnr", 3), ("ssim", 2))] for s in S}
-    bp, bs = max(v[0] for v in P.values()), max(v[1] for v in P.values())
-    ok = [s for s in S if P[s][0] >= bp - .1 and P[s][1] >= bs - .003]
-    print(L, c, "chosen", ok, {s: "%.2f %.4f" % (v[0] - bp, v[1] - bs) for s, v in P.items()})
-    if L == 2:
-        T = {s: (real[c][s]["psnr"], real[c][s]["ssim"]) for s in S if s in real[c]}; bp, bs = max(v[0] for v in T.values()), max(v[1] for v in T.values())
-        print("      truth", {s: "%.2f %.4f%s" % (v[0] - bp, v[1] - bs, "h" if real[c][s]["bytes_head"] else "") for s, v in T.items()})
+            t = who != c; w = np.linalg.lstsq(X[t][:, cols], y[t], rcond=None)[0]; err += list(X[~t][:, cols] @ w - y[~t])
+        print(name, cols, np.round(np.linalg.lstsq(X[:, cols], y, rcond=None)[0], 4), "LOO rmse %.4f" % np.sqrt(np.mean(np.square(err))), "std %.4f n %d" % (y.std(), len(y)))
+def choice(c, wp, ws, tol=(.1, .003), se=1.0):
+    M = rec[c]; px = M[0, 0, :, 0] / M[0, 0, :, 0].sum(); ex = []
+    for k, (a, b), t in ((3, wp, tol[0]), (2, ws, tol[1])):
+        e = a * M[:, -1, :, k] - b * np.log2(np.array(S))[:, None]
+        best = (e @ px).argmax(); d = e[best] - e; m = d @ px; V = len(px); s = np.sqrt(((px**2) * (d - m[:, None])**2).sum(1) * V / (V - 1)); ex.append((m - se * s) / t)
+    x = np.maximum(*ex); good = np.flatnonzero(x <= 1)
+    if not len(good): return S[int(x.argmin())], x
+    g = good[-1]
+    if g + 1 == len(S): return S[g], x
+    t = (1 - x[g]) / (x[g + 1] - x[g]); return float(np.exp(np.log(S[g]) + t * np.log(S[g + 1] / S[g]))), x
+for wp, ws in (((.85, .15), (.7, .003)), ((.75, 0), (.65, 0)), ((.85, .2), (.7, .004)), ((.9, .2), (.75, .005)), ((1, .2), (.8, .005))):
+    for se in (0, .5, 1):
+        print(wp, ws, "se", se, {c[:6]: "%.3f" % choice(c, wp, ws, se=se)[0] for c in caps})
+for c in caps: print(c, {s: "%.2f %.4f" % v for s, v in sorted(plain[c].items())}, np.round(choice(c, (.85, .15), (.7, .003))[1], 1))

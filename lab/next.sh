@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# bash lab/curve/lease7.sh PART [LIMIT] on two H100s: the default on six captures; full fields made small without photos on three; kills.
+# bash lab/next.sh PART [LIMIT] on two H100s: the default on six captures, full fields made small without photos, kills.
 set -u
 export PYTHONPATH=/opt/site PATH=/opt/site/bin:$PATH OMP_NUM_THREADS=4 SLOTS=4
 R=/tmp/repo; J=/tmp/jobs
@@ -13,12 +13,14 @@ case $1 in
   cd /tmp || exit; python3 -c "import sundae_ns; print(sundae_ns.__file__)"
   auto south_building 10; setsid nohup python3 $R/lab/curve/slots.py > /tmp/logs/q.out 2>&1 & sleep 2 ;;
 2) cp -r .gpu/scenes/* /tmp/scenes/; auto bonsai 11; auto garden 12; auto fox 13; sleep 1 ;;
-3) cp -r .gpu/scenes/* /tmp/scenes/; mv .gpu/packed/* /tmp/packed/; auto dinosaur 14; auto stone_horse 15; prune bonsai; prune fox; prune stone_horse
-  echo "timeout 200 python3 $R/benchmarks/kill_and_resume.py --kinds training --device cuda --kills 2" > $J/30-kills1.sh
-  echo "CUDA_VISIBLE_DEVICES=0,1 timeout 200 python3 $R/benchmarks/kill_and_resume.py --kinds training --device cuda --gpus 2 --kills 2" > $J/31-kills2.sh
-  echo "METHOD=sundae python3 $R/lab/curve/whole.py /tmp/scenes/stone_horse /tmp/out/pairs-stone_horse.json 42 --pipeline.model.pruning.keep-ratio 0.1 --pipeline.model.head.mode off --pipeline.model.pruning.selection pairs" > $J/40-pairs-stone_horse.sh
-  echo "METHOD=sundae python3 $R/lab/curve/whole.py /tmp/scenes/bonsai /tmp/out/pairs-bonsai.json 42 --pipeline.model.pruning.keep-ratio 0.1 --pipeline.model.head.mode off --pipeline.model.pruning.selection pairs" > $J/41-pairs-bonsai.sh
+3) cp -r .gpu/scenes/* /tmp/scenes/; cp .gpu/packed/* /tmp/packed/; auto dinosaur 14; auto stone_horse 15; prune bonsai; prune fox; prune stone_horse
+  for k in 0 1; do
+    echo "timeout 300 python3 $R/benchmarks/kill_and_resume.py --kinds training --device cuda --kills 3 --seed $k" > $J/3$k-kills.sh
+    echo "timeout 300 python3 $R/benchmarks/kill_and_resume.py --kinds trials --device cuda --kills 2 --seed $k" > $J/4$k-kills.sh
+    echo "CUDA_VISIBLE_DEVICES=0,1 timeout 300 python3 $R/benchmarks/kill_and_resume.py --kinds training --device cuda --gpus 2 --kills 3 --seed $k" > $J/5$k-kills.sh
+  done
+  echo "timeout 200 python3 $R/benchmarks/full_disk.py --only 'pack --finetune'" > $J/60-disk.sh
   touch $J/END
   until grep -q "all done" /tmp/logs/queue.log || [ $SECONDS -gt "${2:-300}" ]; do sleep 1; done
-  tar -czf "$OUT/out.tgz" -C /tmp out logs; cat /tmp/logs/queue.log; tail -n 3 /tmp/logs/3*.log | cut -c1-400 ;;
+  tar -czf "$OUT/out.tgz" -C /tmp out logs; cat /tmp/logs/queue.log; tail -n 1 /tmp/logs/[3456]*.log | cut -c1-400 ;;
 esac
