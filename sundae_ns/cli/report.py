@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
@@ -217,9 +218,10 @@ def _video(opened: Opened, progress: Callable[[], object]) -> bytes:
             yield side_by_side(row, tile, head=head)
             progress()
 
-    file = BytesIO()
-    write_video(file, frames())
-    return file.getvalue()
+    with tempfile.TemporaryDirectory() as folder:  # the index moves to the front of a file, not of a stream
+        path = Path(folder) / "views.mp4"
+        write_video(path, frames())
+        return path.read_bytes()
 
 
 def _plot(

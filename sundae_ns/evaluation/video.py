@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
-from typing import BinaryIO
 
 import torch
 from PIL import Image, ImageDraw, ImageFont, ImageOps
@@ -57,17 +56,15 @@ def side_by_side(row: ComparisonRow, tile: tuple[int, int], *, head: bool) -> Im
     return frame
 
 
-def write_video(file: Path | BinaryIO, frames: Iterable[Image.Image], *, frames_per_second: float = 6) -> int:
+def write_video(path: Path, frames: Iterable[Image.Image], *, frames_per_second: float = 6) -> int:
     """Write RGB frames of one size with even sides as an MP4 (H.264), which browsers play; returns their number.
 
-    PyAV brings its own encoder, so no ffmpeg is needed. A path may have any suffix.
+    PyAV brings its own encoder, so no ffmpeg is needed. The path may have any suffix.
     """
     import av
 
     count = 0
-    with av.open(
-        str(file) if isinstance(file, Path) else file, "w", format="mp4", options={"movflags": "faststart"}
-    ) as container:
+    with av.open(str(path), "w", format="mp4", options={"movflags": "faststart"}) as container:
         stream = container.add_stream(
             "libx264", rate=Fraction(frames_per_second).limit_denominator(1001), options={"crf": "18"}
         )
