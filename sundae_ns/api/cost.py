@@ -36,6 +36,8 @@ class PruneCost(NamedTuple):
     """Memory of the field alone, bytes."""
     seconds: float
     """Time with the threads that torch uses now."""
+    drawn: int
+    """Most memory if primitives are drawn, not merged in pairs, bytes."""
 
     def __str__(self) -> str:
         minutes = round(self.seconds / 60)
@@ -57,13 +59,15 @@ def prune_cost(
         pixels: number of pixels of all of them.
     """
     field = _FLOAT * numbers * primitives
-    added, seconds = _VIEWED, 0.0
+    added, drawn, seconds = _VIEWED, _VIEWED, 0.0
     if rule.uses_graph:
-        merge = _INDEX * rule.num_neighbors + _MERGE + keep * numbers * _MERGED
-        edge = _PAIR if rule.selection == "pairs" else _EDGE
-        added, seconds = max(edge * rule.num_neighbors + _GRAPH, round(merge)), primitives * _SECONDS
+        merge = round(_INDEX * rule.num_neighbors + _MERGE + keep * numbers * _MERGED)
+        drawn = max(_EDGE * rule.num_neighbors + _GRAPH, merge)
+        added = max(_PAIR * rule.num_neighbors + _GRAPH, merge) if rule.selection == "pairs" else drawn
+        seconds = primitives * _SECONDS
     seen = primitives * views * _SECONDS_OF_VIEW + pixels * _SECONDS_OF_PIXEL
-    return PruneCost(field + added * primitives, field, seconds + seen / torch.get_num_threads())
+    seconds += seen / torch.get_num_threads()
+    return PruneCost(field + added * primitives, field, seconds, field + drawn * primitives)
 
 
 def state(cost: PruneCost, primitives: int, views: int) -> None:
@@ -83,11 +87,16 @@ def require_memory(cost: PruneCost, primitives: int, *, loaded: bool) -> None:
     Raises:
         MemoryExhaustedError: less memory is free.
     """
-    needed, free = cost.memory - (cost.field if loaded else 0), free_memory()
+    there, free = cost.field if loaded else 0, free_memory()
+    needed = cost.memory - there
     if free is None or needed <= free:
         return
-    least = cost.field + _VIEWED * primitives - (cost.field if loaded else 0)
-    cheap = f"; score opacity, selection top and no merge take {_gigabytes(least)}" if least <= free else ""
+    ways = {
+        "selection systematic takes": cost.drawn - there,
+        "score opacity, selection top and no merge take": cost.field + _VIEWED * primitives - there,
+    }
+    fits = (f"; {way} {_gigabytes(size)}" for way, size in ways.items() if size <= free and size < needed)
+    cheap = next(fits, "")
     raise MemoryExhaustedError(
         f"a prune of {primitives:,} primitives takes about {_gigabytes(needed)} of memory, and {_gigabytes(free)} are "
         f"free; close other programs, or use a machine with more{cheap}"

@@ -42,6 +42,9 @@ def test_a_prune_that_does_not_fit_is_refused_before_it_starts(file: Path, monke
     with pytest.raises(MemoryExhaustedError, match=r"2,000 primitives .* GB are free.*top and no merge take") as caught:
         sn.prune(scene, keep=0.1)
     assert "\n" not in str(caught.value)
+    monkeypatch.setattr(cost, "free_memory", lambda: 1_000_000)  # for draws, not for pairs
+    with pytest.raises(MemoryExhaustedError, match="with more; selection systematic takes"):
+        sn.prune(scene, keep=0.1)
     monkeypatch.setattr(cost, "free_memory", lambda: 100_000)
     with pytest.raises(MemoryExhaustedError, match="with more$"):
         sn.prune(scene, keep=0.1)
