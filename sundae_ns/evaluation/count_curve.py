@@ -25,7 +25,7 @@ class CurvePoint:
     count: int
     """Number of primitives."""
     bytes: int | None
-    """Bytes of the packed field without a head, estimated; None if unknown."""
+    """Bytes of the packed scene, with a head if trials have found that it pays, estimated; None if unknown."""
     psnr: float
     """Expected PSNR after a fit of colours to each photo, dB. Differences to other points are more certain."""
     ssim: float

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -38,6 +38,7 @@ from sundae_ns.training.report import write_record
 from sundae_ns.training.schedulers import limit_rise, notify_pruned
 from sundae_ns.training.schedules import COUNT, prune_to
 from sundae_ns.training.trials.curve import (
+    HeadGain,
     Tolerance,
     affordable,
     choose,
@@ -95,6 +96,8 @@ class CountTrialProgress:
     """Whether the trials of counts have ended, and the present one is for the head."""
     head: list[list[list[float]]] = field(default_factory=list)
     """The same as in ``measured`` for the finished trials without and with a head."""
+    head_bytes: list[list[int] | None] = field(default_factory=list)
+    """Estimated bytes of both packed fields, and of the head of each; None if they cannot be packed."""
     chosen: int = 0
     """The chosen number; 0 before the decision."""
 
@@ -116,7 +119,11 @@ class CountTrialProgress:
         if not curve or not self.head_pays:
             return curve
         plain, head = (mean_quality(from_values(trial)) for trial in self.head)
-        return with_head(curve, kept_count(USUAL_SHARE, self.full), head[0] - plain[0], head[1] - plain[1])
+        gain = HeadGain(kept_count(USUAL_SHARE, self.full), head[0] - plain[0], head[1] - plain[1])
+        if None not in self.head_bytes:
+            (fewer, _), (more, fixed) = self.head_bytes  # type: ignore[misc]
+            gain = gain._replace(features=more - fewer, head=fixed)
+        return with_head(curve, gain)
 
 
 class CountTrials(Extension):
@@ -264,9 +271,12 @@ class CountTrials(Extension):
         progress, state = self.progress, run.state
         if progress.tries_head:
             progress.head.append([list(view) for view in self._engine.measure(run)])
+            size = packed_size(state.field, state.head if state.head_enabled else None)
+            progress.head_bytes.append(None if size is None else list(size))
         else:
             progress.measured.append([list(view) for view in self._engine.measure(run, with_fitted=True)])
-            progress.sizes.append(packed_size(state.field))
+            size = packed_size(state.field)
+            progress.sizes.append(None if size is None else size.field)
         self._engine.go_back(FULL, state)
         self._engine.enable_head(state, False)
         curve = progress.curve()
@@ -352,21 +362,33 @@ class CountTrials(Extension):
             self._engine.enable_head(state, True)
 
 
-def packed_size(field: Mapping[str, Tensor]) -> int | None:
-    """Bytes of the packed field without features, estimated by packing neighbouring primitives; None if it cannot be.
+class PackedSize(NamedTuple):
+    """Estimated bytes of a packed scene."""
+
+    field: int
+    """Of the primitives, with features if there is a head."""
+    head: int
+    """Of the head; 0 without one."""
+
+
+def packed_size(field: Mapping[str, Tensor], head: torch.nn.Module | None = None) -> PackedSize | None:
+    """Estimate the bytes of a packed scene by packing neighbouring primitives; None if it cannot be packed.
 
     Args:
         field: parameters by name ``[N, ...]``.
+        head: the head that reads the features; None leaves them out.
     """
     n = len(field["means"])
-    plain = {name: value.detach() for name, value in field.items() if name != FEATURES}
+    packed = {name: value.detach() for name, value in field.items() if head is not None or name != FEATURES}
     if n > SAMPLE:
-        order = scene_order(plain["means"].float().cpu().numpy())
+        order = scene_order(packed["means"].float().cpu().numpy())
         middle = torch.from_numpy(order[(n - SAMPLE) // 2 :][:SAMPLE])
-        plain = {name: value[middle.to(value.device)] for name, value in plain.items()}
+        packed = {name: value[middle.to(value.device)] for name, value in packed.items()}
+    weights = {} if head is None else {name: value.float().cpu() for name, value in head.state_dict().items()}
     try:
-        sample = PackedScene({name: value.float().cpu() for name, value in plain.items()})
-        size = len(pack_bytes(*fit_scene(sample))[0])
+        sample = PackedScene({name: value.float().cpu() for name, value in packed.items()}, weights)
+        data, sections = pack_bytes(*fit_scene(sample))
     except PackError:
         return None
-    return round(size * n / min(n, SAMPLE))
+    fixed = sum(size for name, size in sections.items() if name.startswith("head/"))
+    return PackedSize(round((len(data) - fixed) * n / min(n, SAMPLE)), fixed)

@@ -45,6 +45,21 @@ class Tolerance(NamedTuple):
         return cls() if psnr is None else cls(psnr, psnr * cls().ssim / cls().psnr)
 
 
+class HeadGain(NamedTuple):
+    """What trials of a head have shown."""
+
+    primitives: int
+    """Number of primitives of the trials."""
+    psnr: float
+    """What the head has gained, dB."""
+    ssim: float
+    """The same for SSIM."""
+    features: int | None = None
+    """Estimated bytes of the packed features of so many primitives; None if unknown."""
+    head: int = 0
+    """Bytes of the packed head."""
+
+
 def excess(point: CurvePoint, tolerance: Tolerance) -> float:
     """The larger of both losses in units of its tolerance; at most 1 is as good as the best."""
     return max(point.psnr_loss / tolerance.psnr, point.ssim_loss / tolerance.ssim)
@@ -86,30 +101,23 @@ def curve_of(
     return [CurvePoint(*row) for row in rows]
 
 
-def with_head(curve: Sequence[CurvePoint], count: int, psnr: float, ssim: float) -> list[CurvePoint]:
-    """The curve of a field with a head.
-
-    Args:
-        curve: without one.
-        count: number of primitives of the head's trials.
-        psnr: what the head has gained in them, dB.
-        ssim: the same for SSIM.
-    """
-    gains = []
-    for gain, (factor, power) in ((psnr, HEAD_PSNR), (ssim, HEAD_SSIM)):
+def with_head(curve: Sequence[CurvePoint], gain: HeadGain) -> list[CurvePoint]:
+    """The curve of a field with a head, from one without."""
+    found = []
+    for point in curve:
         # Fewer primitives than in its trials were not tried with a head.
-        gains.append([factor * gain * (count / max(point.count, count)) ** power for point in curve])
-    figures = []
-    for values, losses, more in (
-        ([point.psnr for point in curve], [point.psnr_loss for point in curve], gains[0]),
-        ([point.ssim for point in curve], [point.ssim_loss for point in curve], gains[1]),
-    ):
-        lost = [loss - gain for loss, gain in zip(losses, more, strict=True)]
-        figures += [[value + gain for value, gain in zip(values, more, strict=True)], [one - min(lost) for one in lost]]
-    names = ("psnr", "psnr_loss", "ssim", "ssim_loss")
-    return [
-        replace(point, **dict(zip(names, values, strict=True))) for point, *values in zip(curve, *figures, strict=True)
-    ]
+        share = gain.primitives / max(point.count, gain.primitives)
+        psnr, ssim = (
+            factor * gained * share**power
+            for gained, (factor, power) in ((gain.psnr, HEAD_PSNR), (gain.ssim, HEAD_SSIM))
+        )
+        size = None
+        if point.bytes is not None and gain.features is not None:
+            size = point.bytes + round(gain.features * point.count / gain.primitives) + gain.head
+        more = {"psnr": point.psnr + psnr, "ssim": point.ssim + ssim, "bytes": size}
+        found.append(replace(point, psnr_loss=point.psnr_loss - psnr, ssim_loss=point.ssim_loss - ssim, **more))
+    psnr, ssim = min(point.psnr_loss for point in found), min(point.ssim_loss for point in found)
+    return [replace(one, psnr_loss=one.psnr_loss - psnr, ssim_loss=one.ssim_loss - ssim) for one in found]
 
 
 def _paired(differences: NDArray[np.float64], pixels: NDArray[np.float64]) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from sundae_ns.evaluation.count_curve import CurvePoint
 from sundae_ns.training.trials.curve import (
     PSNR_WEIGHTS,
     SSIM_WEIGHTS,
+    HeadGain,
     Tolerance,
     affordable,
     choose,
@@ -111,8 +112,11 @@ def test_a_count_is_lost_only_beyond_doubt() -> None:
 
 
 def test_a_head_gains_less_the_more_primitives_there_are() -> None:
-    curve = [point(1000), point(400, 0.1, 0.003), point(200, 0.5, 0.02), point(100, 1.5, 0.05), point(50, 3.0, 0.1)]
-    found = with_head(curve, 100, 0.5, 0.02)
+    curve = [point(1000, size=9000), point(400, 0.1, 0.003), point(200, 0.5, 0.02), point(100, 1.5, 0.05)]
+    curve.append(point(50, 3.0, 0.1, size=500))
+    found = with_head(curve, HeadGain(100, 0.5, 0.02, features=200, head=70))
+    assert [one.bytes for one in found] == [9000 + 2000 + 70, None, None, None, 500 + 100 + 70]
+    assert with_head(curve, HeadGain(100, 0.5, 0.02))[0].bytes is None
     gained = [b.psnr - a.psnr for a, b in zip(curve, found, strict=True)]
     assert gained == pytest.approx([1.5 * share**0.4 for share in (0.1, 0.25, 0.5, 1, 1)])  # no less than was tried
     assert [b.ssim - a.ssim for a, b in zip(curve, found, strict=True)] == pytest.approx(
