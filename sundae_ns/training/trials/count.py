@@ -120,7 +120,7 @@ class CountTrialProgress:
             return curve
         plain, head = (mean_quality(from_values(trial)) for trial in self.head)
         gain = HeadGain(kept_count(USUAL_SHARE, self.full), head[0] - plain[0], head[1] - plain[1])
-        if None not in self.head_bytes:
+        if len(self.head_bytes) == 2 and None not in self.head_bytes:
             (fewer, _), (more, fixed) = self.head_bytes  # type: ignore[misc]
             gain = gain._replace(features=more - fewer, head=fixed)
         return with_head(curve, gain)
@@ -159,6 +159,10 @@ class CountTrials(Extension):
         """
         known, numbers = {one.name for one in fields(CountTrialProgress)}, saved.get("numbers", {})
         self.progress = CountTrialProgress(**{name: value for name, value in numbers.items() if name in known})
+        measured = self.progress.measured
+        if measured and measured[0] and isinstance(measured[0][0][0], list):
+            # Earlier versions measured a trial in the middle, too, and noted the trial when it began.
+            self.progress.measured = [trial[-1] for trial in measured[: len(self.progress.sizes)]]  # type: ignore[misc]
         if self._alone and "engine" in saved:
             self._engine.load_state_dict(state, saved["engine"])
         if self.progress.phase == "trials" and self._alone:
