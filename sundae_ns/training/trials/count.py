@@ -68,7 +68,7 @@ LEAST_VIEWS = 32
 """With fewer training views, those that could be held out are too few to compare counts."""
 MOST_VIEWS = 32
 """Most training views that the prune of a trial looks at."""
-MOST_TRIALS = 0.4
+MOST_TRIALS = 0.45
 """Largest share of the steps after the prune that all trials may take."""
 SAMPLE = 1 << 13
 """Neighbouring primitives that are packed to estimate the bytes of a field."""
