@@ -17,9 +17,7 @@ ELSEWHERE = {
     "cli/process.py": ["open(log, 'w', encoding='utf-8')"],
     "cli/distill.py": ["saving.save(result, out)"],
     "cli/files.py": ["saving.save(pruned.scene, out)"],  # the public function, which renames
-    "evaluation/video.py": [  # a file that cli/ renames, or one in memory
-        "av.open(str(file) if isinstance(file, Path) else file, 'w', format='mp4', options={'movflags': 'faststart'})"
-    ],
+    "evaluation/video.py": ["av.open(str(path), 'w', format='mp4', options={'movflags': 'faststart'})"],  # in cli/
     "storage/runs/folder.py": ["(run / LOCK).open('a+', encoding='utf-8')"],  # a lock stays
     "training/pruning.py": ["run.save()"],  # checkpoints
 }
