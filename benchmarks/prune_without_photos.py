@@ -105,8 +105,8 @@ def made(full: Full, job: dict[str, Any], options: argparse.Namespace, folder: P
             sn.save(scene, source)
         began = time.monotonic()
         words = [*shlex.split(options.splat_transform), "--gpu", "cpu", "-w"]
-        words += [source, f"--{job['rule']}", f"{100 * share:g}%", out]
-        subprocess.run([str(word) for word in words], check=True, stdout=sys.stderr)
+        words += [str(source), f"--{job['rule']}", f"{100 * share:g}%", str(out)]
+        subprocess.run(words, check=True, stdout=sys.stderr)
         seconds = time.monotonic() - began
         found = sn.load(out, device=scene.device)
         return dataclasses.replace(scene, field=found.field), seconds
