@@ -155,7 +155,8 @@ def tried(disk: Disk, words: list[object], exact: bool) -> Counter[str]:
         )
         code, output = call("sundae", *words, "--overwrite")
         again = disk.files()
-        tally["succeeds with room"] += code == 0 and (again == fresh if exact else again.keys() == fresh.keys())
+        same = exact and not str(words[-1]).endswith(".mp4")  # threads of the encoder have no fixed order
+        tally["succeeds with room"] += code == 0 and (again == fresh if same else again.keys() == fresh.keys())
         if code != 0 or again != fresh:
             changed = [path for path in fresh if again.get(path) != fresh[path]]
             print(f"not as before: {', '.join(changed)}\n{output[-2000:]}", file=sys.stderr)
