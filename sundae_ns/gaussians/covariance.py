@@ -119,14 +119,8 @@ def overlap(means: Tensor, covariance: Tensor, indices: Tensor, *, least_width: 
     for rows in chunks(len(means), max(1, PAIRS // max(1, indices.shape[1]))):
         columns = indices[rows]
         middle = (entries[rows, None] + entries[columns]) / 2
-        a, b, c, ba, ca, cb = _cholesky(middle, least_variance)
-        x, y, z = (points[rows, None] - points[columns]).unbind(dim=-1)
-        x = x / a
-        y = (y - ba * x) / b
-        z = (z - ca * x - cb * y) / c
-        log_middle = 2 * (a.log() + b.log() + c.log())
-        exponent = -(x * x + y * y + z * z) / 8 + (log_det[rows, None] + log_det[columns]) / 4 - log_middle / 2
-        result[rows] = exponent.clamp_max(0).exp().nan_to_num(0.0).to(means.dtype)
+        offset, log_dets = points[rows, None] - points[columns], log_det[rows, None] + log_det[columns]
+        result[rows] = _coefficient(middle, offset, log_dets / 4, least_variance).to(means.dtype)
     return result
 
 
@@ -152,19 +146,31 @@ def pair_overlap(means: Tensor, entries: Tensor, first: Tensor, second: Tensor) 
         ``[P]``, dtype of ``means``.
     """
     result = means.new_empty(len(first))
-    for chunk in torch.arange(len(first), device=first.device).split(PAIRS):
+    for chunk in chunks(len(first), PAIRS):
         i, j = first[chunk], second[chunk]
         log_dets = [_cholesky(entries[ends], 0.0)[:3] for ends in (i, j)]
         middle = (entries[i] + entries[j]) / 2
-        a, b, c, ba, ca, cb = _cholesky(middle, 0.0)
-        x, y, z = (means[i] - means[j]).unbind(dim=-1)
-        x = x / a
-        y = (y - ba * x) / b
-        z = (z - ca * x - cb * y) / c
-        log_det = sum(pivot.log() for pivots in log_dets for pivot in pivots)
-        exponent = -(x * x + y * y + z * z) / 8 + log_det / 2 - (a.log() + b.log() + c.log())
-        result[chunk] = exponent.clamp_max(0).exp().nan_to_num(0.0)
+        log_det = sum((pivot.log() for pivots in log_dets for pivot in pivots), means.new_zeros(len(i)))
+        result[chunk] = _coefficient(middle, means[i] - means[j], log_det / 2, 0.0)
     return result
+
+
+def _coefficient(middle: Tensor, offset: Tensor, log_numerator: Tensor, least_variance: float) -> Tensor:
+    """Bhattacharyya coefficient; 0 for one that overflows.
+
+    Args:
+        middle: entries of the mean of both covariances ``[..., 6]``.
+        offset: from one centre to the other ``[..., 3]``.
+        log_numerator: ``log (|A| |B|)^(1/4)`` ``[...]``.
+        least_variance: of ``middle``.
+    """
+    a, b, c, ba, ca, cb = _cholesky(middle, least_variance)
+    x, y, z = offset.unbind(dim=-1)
+    x = x / a
+    y = (y - ba * x) / b
+    z = (z - ca * x - cb * y) / c
+    exponent = -(x * x + y * y + z * z) / 8 + log_numerator - (a.log() + b.log() + c.log())
+    return exponent.clamp_max(0).exp().nan_to_num(0.0)
 
 
 def _cholesky(entries: Tensor, least_variance: float) -> tuple[Tensor, ...]:
