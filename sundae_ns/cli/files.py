@@ -150,8 +150,8 @@ def prune_file(
 ) -> int:
     """Prune a scene of any program, without its photos and without training.
 
-    Kept are the primitives that virtual cameras see most of; the others are merged into them. A million primitives take
-    half a gigabyte of memory; a prune of more than a minute states its cost first.
+    Kept are the primitives that virtual cameras see most of; the others are merged into them. A million primitives with
+    three bands of harmonics take about 1.7 GB; a prune of more than a minute states its cost first.
 
     Args:
         source: a 3DGS .ply, .spz or .sog, a packed scene, or a run.

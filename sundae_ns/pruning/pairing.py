@@ -20,7 +20,6 @@ WIDTH = 0.01
 """Variance added to each axis, as a share of the sum of all three: two parallel flat primitives are alike too."""
 PART = 0.5
 """Share of the possible merges of a round that happen; the others wait for what the better ones leave."""
-
 MOST_ROUNDS = 256
 """Most rounds; a field needs about 60. Thousands of clones that share their neighbours would need many more."""
 

@@ -1,10 +1,10 @@
 """Expected quality as a function of the number of primitives, and the choice of a number by it.
 
-A trial is far shorter than the training that follows, so its images do not show what that training reaches. Two things
-foretell it: the quality at the end of the trial, of which differences shrink later, and the count itself, since each
-halving gains more in the steps that follow. The weights of both were fitted to trainings of six captures at up to six
-counts each. A head gains more at the end than in its trial, and the less, the more primitives there are; what it gains
-was fitted to trainings of two captures (``docs/decisions.md``).
+A trial is far shorter than the training that follows, so its images do not show what that training reaches. The
+expected quality is a weighted sum of two numbers. One is the quality at the end of the trial: after it, the counts
+differ by less. The other is the logarithm of the count: after the trial, smaller fields gain more. The weights were
+fitted to trainings of six captures at up to six counts each. A head gains more by the end of the training than in its
+trial, and it gains less in larger fields. How much was fitted to trainings of two captures (``docs/decisions.md``).
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ class HeadGain(NamedTuple):
     """What trials of a head have shown."""
 
     primitives: int
-    """Number of primitives of the trials."""
+    """Number of primitives in these trials."""
     psnr: float
     """What the head has gained, dB."""
     ssim: float
     """The same for SSIM."""
     features: int | None = None
-    """Estimated bytes of the packed features of so many primitives; None if unknown."""
+    """Estimated bytes of the features of these primitives in a packed scene; None if unknown."""
     head: int = 0
     """Bytes of the packed head."""
 
