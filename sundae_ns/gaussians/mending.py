@@ -50,11 +50,11 @@ class Mended(NamedTuple):
     def summary(self) -> str:
         """What was clamped and dropped, as part of a sentence; empty if nothing was."""
         kinds = {"opacity 0 or 1": self.limits, "width 0": self.flat, "rotation 0": self.unrotated}
-        named = ", ".join(f"{name} of {number:,}" for name, number in kinds.items() if number)
-        parts = [f"clamped to finite values: {named}"] if named else []
+        named = " and ".join(f"{number:,} with {name}" for name, number in kinds.items() if number)
+        parts = [f"clamped {named} to finite values"] if named else []
         if self.dropped:
             parts.append(f"dropped {self.dropped:,} that were not finite (NaN or infinite)")
-        return f"{len(self.mask):,} primitives, {'; '.join(parts)}" if parts else ""
+        return f"{len(self.mask):,} primitives: {', '.join(parts)}" if parts else ""
 
 
 @torch.no_grad()

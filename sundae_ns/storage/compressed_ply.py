@@ -18,6 +18,8 @@ from sundae_ns.gaussians.parameters import rgb_to_sh, sh_degree_of
 
 PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 """Properties of the vertices of a compressed .ply."""
+LEAST_OPACITY = 1e-6
+"""Opacity of a byte of 0, and what one of 255 lacks to 1: their logits stay finite."""
 _CHUNK = 256
 _HARMONICS_RANGE = 8.0
 
@@ -56,8 +58,7 @@ def decompressed(chunks: Rows, vertices: Rows, harmonics: Rows | None) -> dict[s
     }
     field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in values.items()}
     field["features_dc"] = rgb_to_sh(field["features_dc"])
-    # A byte of 0 or 255 is an infinite logit; see gaussians.mend.
-    return {**field, "opacities": torch.logit(torch.from_numpy(color[:, 3:].copy()))}
+    return {**field, "opacities": torch.logit(torch.from_numpy(color[:, 3:].copy()), eps=LEAST_OPACITY)}
 
 
 def _bounds(chunks: Rows, end: str, names: str) -> NDArray[np.float32]:

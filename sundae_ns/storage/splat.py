@@ -15,6 +15,7 @@ from torch import Tensor
 from sundae_ns.errors import DataError, reading, regular
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes, rgb_to_sh
 from sundae_ns.storage.archive import damage_of, load_tensors
+from sundae_ns.storage.compressed_ply import LEAST_OPACITY
 
 _SPLAT = np.dtype([("means", "<f4", 3), ("widths", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 _GSPLAT_NAMES = ("means", "scales", "quats", "opacities", "sh0", "shN")
@@ -26,7 +27,7 @@ def read_splat(path: Path) -> dict[str, Tensor]:
 
     Returns:
         A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU, in the file's
-        coordinates. Opacities of 0 and 1 and widths of 0 are infinite; see ``gaussians.mend``.
+        coordinates. Log-scales of widths of 0 are infinite; see ``gaussians.mend``.
 
     Raises:
         DataError: the file is missing or empty, or has no whole number of primitives.
@@ -43,7 +44,7 @@ def read_splat(path: Path) -> dict[str, Tensor]:
         "quats": torch.from_numpy((rows["quats"].astype(np.float32) - 128) / 128),
         "features_dc": rgb_to_sh(colors[:, :3]),
         "features_rest": torch.zeros(len(rows), 0, 3),
-        "opacities": torch.logit(colors[:, 3:]),
+        "opacities": torch.logit(colors[:, 3:], eps=LEAST_OPACITY),
     }
 
 

@@ -83,7 +83,7 @@ def test_export_of_a_ply_of_any_program(
     mode = ", antialiased" if comments else ""
     assert f"a{kind}: 199 primitives, degree 1{mode}, {out.stat().st_size:,} bytes" in output
     (line,) = caplog.messages
-    assert line.endswith("unnamed.bin: 200 primitives, dropped 1 that were not finite (NaN or infinite)")
+    assert line.endswith("unnamed.bin: 200 primitives: dropped 1 that were not finite (NaN or infinite)")
     finite = {name: value[torch.arange(200) != 3] for name, value in given.items()}
     write_for_viewers(same, finite, antialiased=bool(comments))
     assert out.read_bytes() == same.read_bytes()
