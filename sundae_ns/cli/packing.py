@@ -219,6 +219,7 @@ def unpack(
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs"),
     name: str | None = None,
     data: Path | None = None,
+    overwrite: Overwrite = False,
 ) -> int:
     """Unpack a scene into a run for ns-viewer, ns-render and ns-eval. No code in the file is executed.
 
@@ -227,6 +228,7 @@ def unpack(
         out: folder of runs, like ns-train's --output-dir.
         name: name of the experiment; by default the file's name.
         data: folder of the capture on which the scene was trained; ns-eval needs its images.
+        overwrite: replace a run that was unpacked under this name.
     """
     from rich.progress import Progress
 
@@ -236,7 +238,7 @@ def unpack(
 
     name = name or scene.stem
     with writing(f"cannot write to {out}"):
-        unpacked_folder(out, name)
+        unpacked_folder(out, name, overwrite=overwrite)
     with Progress(transient=True) as progress:
         task = progress.add_task("Unpacking", total=2)
         found = read_scene(scene)
@@ -245,7 +247,7 @@ def unpack(
 
         progress.update(task, advance=1, description="Writing the run")
         with writing(f"cannot write to {out}"):
-            path = write_run(found, out, name, data=data)
+            path = write_run(found, out, name, data=data, overwrite=overwrite)
     print(f"{len(found.field['means']):,} primitives, {'with' if found.head else 'without'} a head")
     print(f"View: ns-viewer --load-config {quoted(path)}")
     if data is not None:

@@ -286,7 +286,8 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
     with replacing(out) as partial, partial.open("wb") as file:
         file.write(header)
         for element in data.elements:
-            (rows if element.name == "vertex" else np.asarray(element.data)).tofile(file)
+            values = rows if element.name == "vertex" else np.ascontiguousarray(element.data)
+            file.write(values.view(np.uint8).data if len(values) else b"")  # tofile hides why it fails
 
 
 def has_own_columns(path: Path) -> bool:

@@ -131,8 +131,11 @@ def test_saving_refuses_what_it_cannot(tmp_path: Path) -> None:
         sn.save(scene(), tmp_path / "a.png")
     with pytest.raises(ConfigError, match="leave out upright"):
         sn.save(scene(), tmp_path / "a.sundae", upright=True)
-    with pytest.raises(sn.SundaeError):
-        sn.save(scene(), tmp_path / "no" / "a.ply")
+    (tmp_path / "file").touch()
+    with pytest.raises(sn.SundaeError, match="a file stands where a folder should be"):
+        sn.save(scene(), tmp_path / "file" / "a.ply")
+    sn.save(scene(), tmp_path / "new" / "folder" / "a.ply")
+    assert sn.load(tmp_path / "new" / "folder" / "a.ply").num_primitives == scene().num_primitives
 
 
 def test_a_page_holds_the_scene(tmp_path: Path) -> None:

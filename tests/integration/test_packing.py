@@ -85,7 +85,7 @@ def test_grey_is_no_truth(
     tiny: Any, packed: Packed, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     run, out = packed.blind.parent, str(tmp_path / "out")
-    words = ["report", str(run), "-o", out] if command == "report" else ["bench", "frame", "--load-config", str(run)]
+    words = ["report", str(run), "-o", out] if command == "report" else ["bench", "frame", str(run)]
     # Naming a capture makes no run of it: the cameras of the two do not agree.
     for more in ([], ["--data", str(tiny.scene)] if command == "report" else []):
         with pytest.raises(SystemExit, match="2"):
