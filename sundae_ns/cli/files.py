@@ -28,10 +28,10 @@ def export(
     """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz or .sog.
 
     The page needs no network and no server. The other formats hold no features and no head; antialiased scenes are
-    marked as such, and primitives with NaN or infinite values are left out.
+    marked as such.
 
     Args:
-        scene: a run (its folder or config.yml), a packed scene, or, for .spz and .sog, a 3DGS .ply of any program.
+        scene: a run (its folder or config.yml), a packed scene, or a .ply, .spz, .sog, .splat or gsplat's .pt.
         out: file to write; its suffix selects the format: .html, .ply (exact), .spz or .sog (quantised, much smaller).
             A name without a suffix is a folder of page and scene, for a web server.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
@@ -153,7 +153,7 @@ def prune_file(
     three bands of harmonics take about 1.7 GB; a prune of more than a minute states its cost first.
 
     Args:
-        source: a 3DGS .ply, .spz or .sog, a packed scene, or a run.
+        source: a .ply, .spz, .sog, .splat or gsplat's .pt, a packed scene, or a run.
         out: file to write, in the format of its suffix: .ply, .spz, .sog or .sundae. A .ply of a .ply keeps all
             properties and comments.
         keep: share of the primitives to keep, in (0, 1]; by default 0.1.
