@@ -81,10 +81,10 @@ def export(
 
 def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     """A scene, and the packed file that holds it; a run, whose capture may have moved, is packed in memory."""
-    from sundae_ns.storage.kinds import kind_of
+    from sundae_ns.storage.kinds import kind_of, kind_of_primitives
     from sundae_ns.storage.runs.config_file import check_run
 
-    if kind_of(path) is not None or path.suffix == ".sundae":
+    if kind_of(path) == "packed" or kind_of_primitives(path) is not None or path.suffix == ".sundae":
         from sundae_ns.api.saving import packed_file
 
         return packed_file(path)

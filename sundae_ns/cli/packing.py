@@ -162,9 +162,9 @@ def pack(
 def _has_photos(source: Path, options: Mapping[str, object]) -> bool:
     """Whether a scene is a run; ``ConfigError`` for a file of primitives with one of the options that need photos."""
     from sundae_ns.errors import ConfigError
-    from sundae_ns.storage.kinds import PRIMITIVES, kind_of, kind_of_primitives
+    from sundae_ns.storage.kinds import PRIMITIVES, kind_of_primitives
 
-    kind = kind_of_primitives(source) if kind_of(source) is not None else None
+    kind = kind_of_primitives(source)
     if kind is None:
         return True
     for name, value in options.items():

@@ -54,7 +54,12 @@ def kind_of(path: Path) -> Kind | None:
 
 
 def kind_of_primitives(path: Path) -> Kind | None:
-    """Kind of a file of primitives, of a missing or damaged one by its suffix; None for all others."""
+    """Kind of a file of primitives, of a missing or damaged one by its suffix; None for all others.
+
+    A .sog may be a folder of images, or the ``meta.json`` in it.
+    """
+    if path.name == "meta.json" or ((path / "meta.json").is_file() and not (path / "config.yml").exists()):
+        return "sog"
     kind = kind_of(path)
     if kind is None and not path.is_dir():
         kind = _BY_SUFFIX.get(path.suffix.lower())

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,15 +15,19 @@ import pytest
 import torch
 from foreign_files import FOREIGN, colors_of, small_field, write_colored_ply, write_compressed_ply, write_gsplat
 from foreign_files import write_splat as write_small_splat
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 
+import sundae_ns as sn
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
-from sundae_ns.storage import ply_comments, read_ply, write_ply
+from sundae_ns.storage import ply_comments, read_ply, read_point_cloud, write_ply
 from sundae_ns.storage.kinds import kind_of, unread
 from sundae_ns.storage.primitives import read_primitives
+from sundae_ns.storage.sog import write_sog
 
 FIELD = small_field()
+RGB = ("red", "green", "blue")
 
 
 def found(path: Path) -> dict[str, Tensor]:
@@ -194,6 +200,49 @@ def test_damaged_files_are_refused_in_one_line(tmp_path: Path, monkeypatch: pyte
         read_primitives(tmp_path / name)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "harm").exists()
+
+
+def unbundled(folder: Path) -> Path:
+    """A .sog as splat-transform and SuperSplat write it for a web page."""
+    write_sog(folder.with_suffix(".sog"), FIELD)
+    with zipfile.ZipFile(folder.with_suffix(".sog")) as bundle:
+        bundle.extractall(folder)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["", "meta.json"])
+def test_a_sog_that_is_a_folder(tmp_path: Path, name: str) -> None:
+    folder = unbundled(tmp_path / "scene")
+    whole, parts = found(tmp_path / "scene.sog"), found(folder / name)
+    assert all(torch.equal(parts[each], whole[each]) for each in SPLAT_NAMES)
+    assert sn.load(folder / name).num_primitives == 300
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"version": None}, "has version 1 of the format; convert it with splat-transform"),
+        ({"version": 3}, "has version 3 of the format"),
+        ({"means": {"mins": [0] * 3, "maxs": [1] * 3, "files": ["../x.webp"] * 2}}, "../x.webp lies elsewhere"),
+        ({"scales": {"codebook": [0.0], "files": ["gone.webp"]}}, "cannot be read"),
+    ],
+)
+def test_other_folders_are_refused(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    meta = unbundled(tmp_path / "scene") / "meta.json"
+    content = {name: value for name, value in {**json.loads(meta.read_text()), **change}.items() if value is not None}
+    meta.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=re.escape(message)):
+        read_primitives(meta)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_a_cloud_with_a_comment_in_utf_8(tmp_path: Path, text: bool) -> None:
+    rows = np.array([(0.5, -1.25, 2.0, 10, 20, 30)], [(n, "f4") for n in "xyz"] + [(n, "u1") for n in RGB])
+    PlyData([PlyElement.describe(rows, "vertex")], text=text).write(str(tmp_path / "a.ply"))
+    content = (tmp_path / "a.ply").read_bytes().replace(b"element", "comment Küche 東京\nelement".encode(), 1)
+    (tmp_path / "b.ply").write_bytes(content)
+    points, colors = read_point_cloud(tmp_path / "b.ply")
+    assert (points.tolist(), colors.tolist()) == ([[0.5, -1.25, 2.0]], [[10, 20, 30]])
 
 
 def test_kinds(tmp_path: Path) -> None:
