@@ -109,12 +109,12 @@ def test_harmonics_come_before_colours(tmp_path: Path) -> None:
 def test_a_header_with_other_letters(tmp_path: Path, newline: bytes) -> None:
     write_ply(tmp_path / "a.ply", FIELD)
     header, end, rows = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
-    comment = "comment Aufnahme: Küche, end_header, 東京\n".encode()
+    comment = "comment Aufnahme: Küche, 東京, end_header\n".encode()
     changed = header.replace(b"element", comment + b"comment \xff\xe9\nelement", 1) + end
     (tmp_path / "b.ply").write_bytes(changed.replace(b"\n", newline) + rows)
     values = read_ply(tmp_path / "b.ply")
     assert all(torch.equal(values[name], FIELD[name]) for name in SPLAT_NAMES)
-    assert ply_comments(tmp_path / "b.ply")[0] == "Aufnahme: Küche, end_header, 東京"
+    assert ply_comments(tmp_path / "b.ply")[0] == "Aufnahme: Küche, 東京, end_header"
 
 
 def test_gsplat(tmp_path: Path) -> None:
