@@ -446,6 +446,7 @@ def check_pruning(shards: Shards, **options: Any) -> None:
     config = PruningConfig(prune_at=1, keep_ratio=0.3, num_neighbors=6, **options)
     whole = a_field(200)
     whole["scales"][150, 1] = torch.nan
+    whole["opacities"][[20, 170]], whole["scales"][160, 0] = torch.inf, -torch.inf  # opaque and flat ones stay
     weights = torch.rand(200, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     start, end = ((0, 120), (120, 200))[shards.rank]
     params = shard_of(whole, start, end)
@@ -473,6 +474,7 @@ def check_pruning(shards: Shards, **options: Any) -> None:
     assert report.step == 2
     assert (report.tau, report.sigma, report.peak) == (expected.tau, expected.sigma, expected.peak)
     assert state == own_state
+    assert all(bool(value.isfinite().all()) for value in params.values())
     assert sum(shards.counts) == report.after
     here = slice(sum(shards.counts[: shards.rank]), sum(shards.counts[: shards.rank + 1]))
     assert torch.equal(counts["grad2d"], own_counts["grad2d"][here])
