@@ -485,6 +485,18 @@ def check_pruning(shards: Shards, **options: Any) -> None:
             assert torch.equal(optimizers[name].state[value][kind], theirs), (name, kind)
 
 
+def check_mending(shards: Shards) -> None:
+    """Opaque primitives of one rank become finite, and NaN goes, before primitives move between ranks."""
+    params = own_half(shards)
+    shards.recount(params)
+    if shards.rank == 1:
+        with torch.no_grad():
+            params["opacities"][:5], params["means"][7] = torch.inf, torch.nan
+    assert RankPruner(params, {}, shards=shards).drop_nonfinite() == 1
+    assert shards.total == 89
+    assert all(bool(value.isfinite().all()) for value in params.values())
+
+
 def check_refusal(shards: Shards) -> None:
     """All ranks raise the error that rank 0 finds."""
     params = own_half(shards)
@@ -565,7 +577,10 @@ def checks(_: Path) -> dict[str, Callable[[Shards], None]]:
     return {
         **{check.__name__: check for check in plain},
         "check_pruningresponse-contribution": by_response,
-        **{check.__name__: check for check in (check_refusal, check_averages, check_batches, check_taking_a_shard)},
+        **{
+            check.__name__: check
+            for check in (check_mending, check_refusal, check_averages, check_batches, check_taking_a_shard)
+        },
     }
 
 
