@@ -71,6 +71,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Coordinates of the warm start: nerfstudio's model, or the capture (COLMAP). auto decides by the kind of file."""
     warmup: Literal["densify", "mcmc"] = "densify"
     """Growth of the field: by gradients (3DGS), or as a Markov chain with an exact cap (3DGS-MCMC)."""
+    stop_split_at: int = 12000
+    """Step at which densification ends, that of the prune; longer growth gains nothing that the prune keeps."""
     mcmc_cap: int = 1_000_000
     """Highest number of primitives in a warm-up by mcmc."""
     evaluate_prune: bool = True

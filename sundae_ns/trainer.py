@@ -37,6 +37,7 @@ from sundae_ns.training.progress import long_on_cpu
 from sundae_ns.training.recorded import RecordedStep
 from sundae_ns.training.run_length import schedule_table, set_schedule
 from sundae_ns.training.warning import warn
+from sundae_ns.viewer import stop_rendering
 
 
 @dataclass
@@ -196,7 +197,10 @@ class SundaeTrainer(Trainer):
             writing(f"cannot write to the run's folder {self.base_dir}"),
             self._interruption,
         ):
-            super().train()
+            try:
+                super().train()
+            finally:
+                stop_rendering(self.viewer_state)
 
     def train_iteration(self, step: int) -> Any:
         """Train one step; several ranks agree on whether to stop after it."""

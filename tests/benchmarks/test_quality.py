@@ -104,7 +104,7 @@ def test_every_arm_of_a_seed_starts_from_its_warm_up_and_trains_as_long(arms: li
             warm_up = jobs[place[job.needs]]
             assert place[warm_up.key] < place[job.key]
             assert (warm_up.kind, warm_up.seed) == ("warm-up", job.seed)
-            total, steps = (18_000, 12_000) if job.arm == "sundae-fast" else (30_000, 15_000)
+            total, steps = (18_000, 12_000) if job.arm == "sundae-fast" else (30_000, 18_000)
             assert job.steps == (total if job.kind == "mcmc" else steps)
             assert (job.steps if job.kind == "mcmc" else warm_up.steps + job.steps) == total
 
