@@ -39,7 +39,7 @@ METHODS = {
     "sundae": "**sundae**, fixed share",
     "sundae-fast": "sundae-fast",
     "sundae-auto": "**sundae**",
-    "sundae-with-head": "sundae, with a head always",
+    "sundae-with-head": "sundae, with a head in any case",
     "sundae-no-head": "the same primitives, no head",
     "sundae-no-head-bytes": "more primitives in place of a head",
     "mcmc": "3DGS-MCMC",
