@@ -9,8 +9,8 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 
-from sundae_ns.datamanager import LightNerfstudioParser, check_capture
 from sundae_ns.errors import DataError, SundaeError
+from sundae_ns.parsing import LightNerfstudioParser, check_capture
 from sundae_ns.storage.runs.config_file import load_config
 
 

@@ -228,7 +228,7 @@ def run(
 
 def _check_input(photos: Path) -> None:
     """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos."""
-    from sundae_ns.data.capture import no_transforms
+    from sundae_ns.data.advice import no_transforms
 
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, or a capture")

@@ -18,7 +18,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.errors import DataError, SundaeError, reading, regular
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, sh_degree_of
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, sh_degree_of, sh_to_rgb
 from sundae_ns.storage.atomic import replacing
 
 MODEL_FRAME = "Coordinates: nerfstudio model"
@@ -35,6 +35,16 @@ _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 _MAX_HEADER = 1 << 16  # bytes
 _GREY = 128
+_COLOURS = (
+    ("red", "green", "blue"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("r", "g", "b"),
+    ("scalar_red", "scalar_green", "scalar_blue"),
+    ("f_dc_0", "f_dc_1", "f_dc_2"),
+)
+"""Names of the colours of points, in lower case."""
+_BRIGHTEST = 2.0
+"""Largest channel of a cloud whose floats have 1 for white; some programs overshoot."""
 
 
 def _rest_columns(count: int) -> tuple[str, ...]:
@@ -191,11 +201,13 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     return {name: params[name] for name in SPLAT_NAMES}
 
 
-def read_point_cloud(path: Path) -> tuple[Tensor, Tensor]:
+def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tensor]:
     """Read the points and colours of a .ply, binary or ascii.
 
     Args:
-        path: vertices with ``x y z`` and, optionally, ``red green blue``: integers to 255 or floats to 1.
+        path: vertices with ``x y z`` and, optionally, colours under a name in use: ``red green blue``, ``r g b``,
+            ``diffuse_red ...``, or ``f_dc_0 ...`` of a field. Integers of 8 or 16 bits, floats to 1, 255 or 65,535.
+        precise: positions as float64, for coordinates far from the origin.
 
     Returns:
         Positions ``[N, 3]`` float32 and colours ``[N, 3]`` uint8, on the CPU; points without a colour are mid-grey.
@@ -204,15 +216,31 @@ def read_point_cloud(path: Path) -> tuple[Tensor, Tensor]:
         DataError: the file is missing, not a .ply, truncated, or its vertices have no position.
     """
     vertex = _load(path)["vertex"]
-    kinds = {prop.name: vertex[prop.name].dtype.kind for prop in vertex.properties}
-    if not kinds.keys() >= {"x", "y", "z"}:
+    names = {prop.name.lower(): prop.name for prop in vertex.properties}
+    if not names.keys() >= {"x", "y", "z"}:
         raise DataError(f"{path} has vertices without x, y and z; give a .ply of points.")
-    points = _stacked(vertex, ("x", "y", "z"))
-    channels = ("red", "green", "blue")
-    if not kinds.keys() >= set(channels):
-        return points, torch.full_like(points, _GREY, dtype=torch.uint8)
-    scale = 255 if kinds["red"] == "f" else 1
-    return points, (_stacked(vertex, channels) * scale).round().clamp(0, 255).to(torch.uint8)
+    positions = [np.asarray(vertex[names[axis]], np.float64) for axis in "xyz"]
+    with np.errstate(over="ignore"):  # values beyond float32 become infinite; callers drop them
+        points = torch.from_numpy(np.stack(positions, axis=1).astype(np.float64 if precise else np.float32))
+    channels = next((found for found in _COLOURS if names.keys() >= set(found)), None)
+    if channels is None:
+        return points, torch.full((len(points), 3), _GREY, dtype=torch.uint8)
+    columns = [vertex[names[name]] for name in channels]
+    colours: NDArray[np.float64] = np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+    if channels[0].startswith("f_dc"):
+        colours = np.asarray(255 * sh_to_rgb(torch.from_numpy(colours)), np.float64)
+    else:
+        colours *= 255 / _full_scale(columns[0].dtype, colours)
+    whole = np.nan_to_num(colours, nan=0.0).round().clip(0, 255)
+    return points, torch.from_numpy(whole.astype(np.uint8))
+
+
+def _full_scale(kind: np.dtype[np.generic], colours: NDArray[np.float64]) -> float:
+    """The value of a full colour channel: 1, 255 or 65,535, by the type of the numbers and the largest of them."""
+    largest = float(np.nanmax(colours, initial=0.0, where=np.isfinite(colours)))
+    if kind.kind == "f" and largest <= _BRIGHTEST:
+        return 1.0
+    return 65535.0 if largest > 255 else 255.0
 
 
 def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Tensor] | None = None) -> None:

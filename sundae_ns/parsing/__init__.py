@@ -1,0 +1,16 @@
+"""nerfstudio's parsers of captures, with their wrong steps replaced, and the checks of what they make."""
+
+from sundae_ns.parsing.cameras import check_cameras, check_capture, check_projection, warn_of_cloud
+from sundae_ns.parsing.colmap import CarefulColmapParser
+from sundae_ns.parsing.nerfstudio import LightNerfstudioParser
+from sundae_ns.parsing.targets import set_parser
+
+__all__ = [
+    "CarefulColmapParser",
+    "LightNerfstudioParser",
+    "check_cameras",
+    "check_capture",
+    "check_projection",
+    "set_parser",
+    "warn_of_cloud",
+]
