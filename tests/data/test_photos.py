@@ -114,7 +114,9 @@ def test_photos_of_other_formats_are_named(photos: Path) -> None:
     assert "convert them to JPEG" in remark
     for path in photos.glob("*.png"):
         path.unlink()
-    with pytest.raises(DataError, match=r"only photos that cannot be read \(2 \.heic files and 1 \.webp file\); convert"):
+    with pytest.raises(
+        DataError, match=r"only photos that cannot be read \(2 \.heic files and 1 \.webp file\); convert"
+    ):
         find_photos(photos)
 
 

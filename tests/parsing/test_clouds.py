@@ -25,9 +25,7 @@ def cloud_of(made: Any) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("scale", [0.1, 25.0])
-def test_applied_scale_leaves_the_cloud_beside_its_cameras(
-    capture: Path, load: Load, edit: Edit, scale: float
-) -> None:
+def test_applied_scale_leaves_the_cloud_beside_its_cameras(capture: Path, load: Load, edit: Edit, scale: float) -> None:
     plain = load(capture)
     edit(capture, applied_scale=scale)
     made = load(capture)
@@ -43,7 +41,14 @@ def test_applied_scale_leaves_the_cloud_beside_its_cameras(
 def test_colours_of_a_cloud_reach_the_model(capture: Path, load: Load) -> None:
     _, expected = cloud_of(load(capture))
     vertex = PlyData.read(str(capture / "sparse_pc.ply"))["vertex"].data
-    kinds = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("diffuse_red", "f4"), ("diffuse_green", "f4"), ("diffuse_blue", "f4")]
+    kinds = [
+        ("x", "f4"),
+        ("y", "f4"),
+        ("z", "f4"),
+        ("diffuse_red", "f4"),
+        ("diffuse_green", "f4"),
+        ("diffuse_blue", "f4"),
+    ]
     names = ("x", "y", "z", "red", "green", "blue")
     rows = np.array([tuple(float(row[name]) for name in names) for row in vertex], dtype=kinds)
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(capture / "sparse_pc.ply"))
