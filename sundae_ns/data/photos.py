@@ -79,8 +79,8 @@ def left_out(folder: Path, photos: Sequence[Path]) -> list[str]:
         odd = sorted(path for size, paths in sizes.items() if size != usual for path in paths)
         shown = ", ".join(path.name for path in odd[:3]) + (", ..." if len(odd) > 3 else "")
         remarks.append(
-            f"{len(odd)} of {len(photos)} photos ({shown}) are not {usual[0]} x {usual[1]} px as the others, and COLMAP "
-            "leaves them out, because it estimates one camera for all; crop or scale them to this size"
+            f"{len(odd)} of {len(photos)} photos ({shown}) are not {usual[0]} x {usual[1]} px as the others. COLMAP "
+            "leaves them out, as it estimates one camera for all; crop or scale them to this size"
         )
     for place, folders, _ in os.walk(folder):
         for name in sorted(folders):

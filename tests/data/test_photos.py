@@ -123,7 +123,7 @@ def test_photos_of_other_formats_are_named(photos: Path) -> None:
 def test_photos_of_an_odd_size_are_named(photos: Path) -> None:
     Image.new("RGB", (12, 16)).save(photos / "upright.png")
     (remark,) = left_out(photos, find_photos(photos)[0])
-    assert remark.startswith("1 of 4 photos (upright.png) are not 16 x 12 px as the others, and COLMAP leaves them out")
+    assert remark.startswith("1 of 4 photos (upright.png) are not 16 x 12 px as the others. COLMAP leaves them out")
 
 
 def test_masks_are_no_photos(photos: Path) -> None:
