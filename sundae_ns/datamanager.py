@@ -25,7 +25,7 @@ from sundae_ns.data.beside import unused_masks
 from sundae_ns.data.capture import check_image, undecodable
 from sundae_ns.data.orientation import TURNED, exif_orientation, turn, wrong_size
 from sundae_ns.errors import ConfigError, DataError, SundaeError, one_line
-from sundae_ns.parsing import check_cameras, check_capture, set_parser, warn_of_cloud
+from sundae_ns.parsing import check_cameras, check_capture, rebound, set_parser, undistorting, warn_of_cloud
 from sundae_ns.training.warning import warn
 
 DATASET_FRAME = "sundae_dataset_frame"
@@ -253,8 +253,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         The mask is bool ``[H, W, 1]``, True for pixels to train on; None for all pixels.
         """
         outputs = self.train_dataparser_outputs
-        # nerfstudio masks the border of this lens by itself.
-        round_lens = (outputs.cameras.camera_type == CameraType.FISHEYE624.value).any()
+        # Undistortion masks what a fisheye lens has not seen.
+        round_lens = (outputs.cameras.camera_type != CameraType.PERSPECTIVE.value).any()
         masked = self.config.images and (outputs.mask_filenames is not None or bool(round_lens))
         for index in self.train_indices:
             # Read the mask first: undistortion changes the camera.
@@ -306,7 +306,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             )
             cache_images_device = "cpu"
         with dataset.as_photographed():
-            loaded = super()._load_images(split, cache_images_device)
+            load = rebound(FullImageDatamanager._load_images, _undistort_image=undistorting(dataset.image_filenames))
+            loaded: list[dict[str, torch.Tensor]] = load(self, split, cache_images_device)
         if split == "train" and loaded and not any(map(_shows_something, loaded)):
             raise DataError(
                 f"all {len(loaded)} training images are fully transparent or masked, so there is nothing to train on; "

@@ -3,7 +3,9 @@
 from sundae_ns.parsing.cameras import check_cameras, check_capture, check_projection, warn_of_cloud
 from sundae_ns.parsing.colmap import CarefulColmapParser
 from sundae_ns.parsing.nerfstudio import LightNerfstudioParser
+from sundae_ns.parsing.placing import rebound
 from sundae_ns.parsing.targets import set_parser
+from sundae_ns.parsing.undistortion import undistorting
 
 __all__ = [
     "CarefulColmapParser",
@@ -11,6 +13,8 @@ __all__ = [
     "check_cameras",
     "check_capture",
     "check_projection",
+    "rebound",
     "set_parser",
+    "undistorting",
     "warn_of_cloud",
 ]

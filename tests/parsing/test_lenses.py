@@ -132,6 +132,50 @@ def test_a_fisheye_lens_is_undistorted_as_one(
     assert float(cameras.fx[0]) != pytest.approx(FOCAL, abs=0.2)
 
 
+@pytest.mark.parametrize("focal", [6.0, 14.0, 15.5])
+@pytest.mark.parametrize("k1", [0.0, -0.02, 0.05])
+def test_a_lens_that_sees_the_half_space(capture: Path, load: Load, edit: Edit, focal: float, k1: float) -> None:
+    """Its photos show the direction of each ray; the perspective images of their middles must show the same."""
+    size = 48
+    y, x = (np.mgrid[:size, :size] + 0.5 - size / 2) / focal
+    radius = np.hypot(x, y)
+    table = np.linspace(0, np.pi, 4000)
+    theta = np.interp(radius, table * (1 + k1 * table**2), table)
+    ray = np.stack([x / radius * np.sin(theta), y / radius * np.sin(theta), np.cos(theta)], axis=2)
+    photo = Image.fromarray((127.5 * (1 + ray)).round().astype(np.uint8))
+    for path in (capture / "images").iterdir():
+        photo.save(path)
+    fisheye(capture, edit, fl_x=focal, fl_y=focal, cx=size / 2, cy=size / 2, w=size, h=size, k1=k1)
+    made = load(capture)
+    image = made.cached_train[0]["image"].numpy().astype(float)
+    cameras = made.train_dataset.cameras
+    fx, fy, cx, cy = (float(value[0]) for value in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
+    assert 45 < math.degrees(math.atan(cx / fx)) < 80
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    expected = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], axis=2)
+    expected = 127.5 * (1 + expected / np.linalg.norm(expected, axis=2, keepdims=True))
+    inner = made.cached_train[0]["mask"].numpy()[..., 0] if "mask" in made.cached_train[0] else np.ones_like(u, bool)
+    assert inner.mean() > 0.6
+    assert np.abs(image - expected)[inner].max() < 6  # half a pixel of the smallest photo turns a ray by 3 levels
+    assert not made.train_dataset.cameras.distortion_params[0, 1:].any()
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [{"p1": 1.0}, {"camera_model": "OPENCV_FISHEYE", "k1": -3.0}, {"k1": 300.0, "k2": 1e9}],
+)
+def test_a_distortion_that_leaves_no_image_is_refused(
+    capture: Path, load: Load, edit: Edit, entries: dict[str, Any]
+) -> None:
+    edit(capture, **entries)
+    with pytest.raises(
+        DataError, match=r"frame_\d+\.png (has a distortion that leaves no image|cannot be undist)"
+    ) as caught:
+        load(capture).next_train(0)
+    assert "not in pixels" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 def test_the_lens_of_each_frame(capture: Path, load: Load, edit: Edit) -> None:
     """As ns-process-data writes it for several cameras: model and distortion in the frames alone."""
     meta = meta_of(capture)
