@@ -51,18 +51,20 @@ def _options(data: Path, model: str) -> str:
 def models_in(data: Path) -> dict[str, int]:
     """COLMAP models in the usual places of a folder: their paths in it, and their numbers of images."""
     found: dict[str, int] = {}
-    for place in _MODELS:
-        folders = [data / place, *(path for path in entries(data / place) if path.name.isdigit())]
-        for folder in folders:
-            if not any((folder / name).is_file() for name in _FILES):
-                continue
-            try:
-                text = (folder / "cameras.txt").is_file()
-                count = len(images_of(folder)) if text else num_images(folder)
-            except DataError:
-                count = 0
-            found[folder.relative_to(data).as_posix()] = count
+    for folder in _model_folders(data):
+        try:
+            text = (folder / "cameras.txt").is_file()
+            count = len(images_of(folder)) if text else num_images(folder)
+        except DataError:
+            count = 0
+        found[folder.relative_to(data).as_posix()] = count
     return found
+
+
+def _model_folders(data: Path) -> list[Path]:
+    places = [data / place for place in _MODELS]
+    numbered = [path for place in places for path in entries(place) if path.name.isdigit()]
+    return [folder for folder in (*places, *numbered) if any((folder / name).is_file() for name in _FILES)]
 
 
 def no_model(data: Path, model: Path) -> DataError:
@@ -78,7 +80,7 @@ def no_model(data: Path, model: Path) -> DataError:
 
 def larger_model(data: Path, model: Path) -> str | None:
     """A remark on a COLMAP model beside ``model`` that has placed more images; None if there is none."""
-    found = models_in(data)
+    found = models_in(data) if len(_model_folders(data)) > 1 else {}  # counting may take long
     own = found.get(model.as_posix())
     if own is None:
         return None

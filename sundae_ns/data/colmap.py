@@ -18,7 +18,7 @@ from typing import NamedTuple
 from sundae_ns.data.beside import beside
 from sundae_ns.data.capture import finite, read_bytes, side
 from sundae_ns.data.lenses import COLMAP_LENSES, Lens, check_colmap_model, colmap_lens
-from sundae_ns.errors import DataError, one_line, reading
+from sundae_ns.errors import DataError, one_line, reading, regular
 
 _SHELL = set('"$`\\\n')
 """Characters that end a quoted word: nerfstudio passes paths of images to a shell when it scales images down."""
@@ -154,7 +154,12 @@ def cameras_of(model: Path) -> dict[int, StatedCamera]:
 
 def num_images(model: Path) -> int:
     """Number of images that a binary COLMAP model states; ``DataError`` if its ``images.bin`` cannot be read."""
-    return _BinaryFile(model / "images.bin").count(_IMAGE_BYTES, "images")
+    path = model / "images.bin"
+    with reading(path, "a complete images.bin"), regular(path).open("rb") as file:
+        (count,) = _COUNT.unpack(file.read(_COUNT.size))
+    if count * _IMAGE_BYTES > path.stat().st_size:
+        raise DataError(f"{path.name} states {count:,} images, more than it can hold; copy or export it again")
+    return int(count)
 
 
 def _check_camera(model: str, width: float, height: float, params: Sequence[float], where: str) -> StatedCamera:

@@ -119,10 +119,6 @@ def _in_order(kind: str, values: tuple[float, ...], where: str) -> tuple[float, 
         )
     if len(values) != 6:
         raise DataError(f"{where}: {kind} needs distortion_params of 6 numbers (k1, k2, k3, k4, p1, p2)")
-    if kind == PERSPECTIVE and values[3]:
-        raise DataError(
-            f"{where}: k4 of a perspective lens cannot be undistorted; calibrate without it, or undistort the images"
-        )
     return values
 
 

@@ -148,12 +148,12 @@ def views_of_points(points: Tensor, cameras: Cameras) -> Tensor:
     points = points[torch.isfinite(points).all(dim=1)].cpu()
     chosen = torch.linspace(0, max(len(points) - 1, 0), min(_LOOKED_FOR, len(points))).long()
     seen = []
-    for index in range(len(cameras)):
-        camera = cameras[index].to("cpu")
-        pose = camera.camera_to_worlds
+    parts = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
+    lenses = torch.cat([part.float() for part in parts], dim=-1).cpu()
+    for pose, (fx, fy, cx, cy, width, height) in zip(cameras.camera_to_worlds.cpu(), lenses.tolist(), strict=True):
         x, y, z = ((points[chosen] - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)
-        across = (x * camera.fx / -z + camera.cx) / camera.width
-        down = (-y * camera.fy / -z + camera.cy) / camera.height
+        across = (x * fx / -z + cx) / width
+        down = (-y * fy / -z + cy) / height
         inside = (across > -_MARGIN) & (across < 1 + _MARGIN) & (down > -_MARGIN) & (down < 1 + _MARGIN)
         seen.append(((z < 0) & inside).any())
     return torch.stack(seen)

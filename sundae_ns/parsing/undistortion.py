@@ -36,6 +36,11 @@ def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
 
     def undistort(camera: Any, distortion_params: Any, data: Any, image: Any, K: Any) -> Result:
         path, intrinsics = paths[int(data["image_idx"])], K.copy()
+        if int(camera.camera_type) == CameraType.PERSPECTIVE.value and distortion_params[3]:
+            found = _of_brown(intrinsics, distortion_params, image, data.get("mask"))
+            if found is None:
+                raise DataError(f"{path.name} has a distortion that leaves no image; {_check(distortion_params)}")
+            return found
         try:
             new, result, mask = full_images_datamanager._undistort_image(camera, distortion_params, data, image, K)
         except (AssertionError, LookupError, TypeError, ValueError, cv2.error) as error:
@@ -56,6 +61,48 @@ def undistorting(paths: Sequence[Path]) -> Callable[..., Result]:
 def _check(distortion: Any) -> str:
     values = ", ".join(f"{float(value):.3g}" for value in distortion)
     return f"check its k1 ... p2 ({values}), which are of coordinates in focal lengths, not in pixels"
+
+
+def _brown(x: NDArray[Any], y: NDArray[Any], distortion: Any) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Distorted coordinates, in focal lengths, by the model of Brown with k1 ... k4, p1, p2; as OpenCV's for k4 = 0."""
+    k1, k2, k3, k4, p1, p2 = map(float, distortion)
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
+    across = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    return across, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+
+
+def _of_brown(K: NDArray[Any], distortion: Any, image: NDArray[Any], mask: Any) -> Result | None:
+    """The largest perspective image that a photo fills, by all four radial coefficients; OpenCV has three of them.
+
+    None if no image of a quarter of the focal length to three times it is filled.
+    """
+    height, width = image.shape[:2]
+    fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    # OpenCV's pixels have whole numbers at their middles.
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+
+    def maps(zoom: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        x, y = _brown((u - cx) / (zoom * fx), (v - cy) / (zoom * fy), distortion)
+        return (x * fx + cx - 0.5).astype(np.float32), (y * fy + cy - 0.5).astype(np.float32)
+
+    def filled(zoom: float) -> bool:
+        across, down = maps(zoom)
+        inside = (across >= 0) & (across <= width - 1) & (down >= 0) & (down <= height - 1)
+        # Where the lens turns rays back, coordinates fall again.
+        return bool(inside.all() and (np.diff(across, axis=1) > 0).all() and (np.diff(down, axis=0) > 0).all())
+
+    zooms = np.geomspace(0.25, 3, 85)  # steps of 3%
+    fits = next((zoom for zoom in zooms if filled(zoom)), None)
+    if fits is None:
+        return None
+    chosen = maps(fits)
+    drawn = cv2.remap(image, *chosen, interpolation=cv2.INTER_LINEAR)
+    if mask is not None:
+        stored = mask.numpy().astype(np.uint8).reshape(height, width) * 255
+        mask = torch.from_numpy(cv2.remap(stored, *chosen, interpolation=cv2.INTER_LINEAR)).bool()[..., None]
+    new = np.array([[fits * fx, 0, cx], [0, fits * fy, cy], [0, 0, 1]], dtype=np.float32)
+    return new, drawn, mask
 
 
 def _is_lens(distortion: Any, K: NDArray[Any], image: NDArray[Any]) -> bool:

@@ -162,7 +162,7 @@ def test_a_lens_that_sees_the_half_space(capture: Path, load: Load, edit: Edit, 
 
 @pytest.mark.parametrize(
     "entries",
-    [{"p1": 1.0}, {"camera_model": "OPENCV_FISHEYE", "k1": -3.0}, {"k1": 300.0, "k2": 1e9}],
+    [{"p1": 1.0}, {"k4": -90000.0}, {"camera_model": "OPENCV_FISHEYE", "k1": -3.0}, {"k1": 300.0, "k2": 1e9}],
 )
 def test_a_distortion_that_leaves_no_image_is_refused(
     capture: Path, load: Load, edit: Edit, entries: dict[str, Any]
@@ -244,12 +244,46 @@ def test_four_numbers_of_a_perspective_lens(capture: Path, load: Load, edit: Edi
         load(capture)
 
 
-@pytest.mark.parametrize("changes", [{"k4": 0.01}, {"distortion_params": [0, 0, 0, 0.01, 0, 0]}])
-def test_k4_of_a_perspective_lens_is_refused(capture: Path, load: Load, edit: Edit, changes: dict[str, Any]) -> None:
-    edit(capture, **changes)
-    with pytest.raises(DataError, match="k4 of a perspective lens cannot be undistorted") as caught:
-        load(capture)
-    assert "\n" not in str(caught.value)
+@pytest.mark.parametrize("place", ["top", "frames", "params"])
+@pytest.mark.parametrize(
+    "distortion",
+    [(0.0, 0.0, 0.0, 0.05, 0.0, 0.0), (-0.2, 0.08, -0.02, 0.004, 0.0, 0.0), (0.1, -0.05, 0.02, 0.01, 0.01, -0.02)],
+)
+def test_four_radial_coefficients(
+    capture: Path, load: Load, edit: Edit, distortion: tuple[float, ...], place: str
+) -> None:
+    """As Metashape and RealityScan write them; the photo's colours are its own pixel coordinates."""
+    width, height, focal = 60, 40, 40.0
+    v, u = np.mgrid[:height, :width]
+    for path in (capture / "images").iterdir():
+        Image.fromarray(np.stack([4 * u, 6 * v, 0 * u], axis=2).astype(np.uint8)).save(path)
+    named = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), distortion, strict=True))
+    entries: dict[str, Any] = {"distortion_params": list(distortion)} if place == "params" else named
+    lens = {"fl_x": focal, "fl_y": focal, "cx": 29.0, "cy": 21.0, "w": width, "h": height}
+    frames = meta_of(capture)["frames"]
+    gone: dict[str, Any] = dict.fromkeys(named)
+    if place == "frames":
+        edit(capture, frames=[{**frame, **lens, **entries} for frame in frames], **gone)
+    else:
+        edit(capture, **{**gone, **lens, **entries})
+    made = load(capture)
+    image = made.cached_train[0]["image"].numpy().astype(float)
+    cameras = made.train_dataset.cameras
+    fx, fy, cx, cy = (float(value[0]) for value in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+    x, y = (u - cx) / fx, (v - cy) / fy
+    k1, k2, k3, k4, p1, p2 = distortion
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+    across = focal * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + 29.0 - 0.5
+    down = focal * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + 21.0 - 0.5
+    assert np.abs(image[..., 0] - 4 * across).max() < 1
+    assert np.abs(image[..., 1] - 6 * down).max() < 1
+    # The photo fills the image, up to a step of 3%.
+    assert across.min() > -0.01
+    assert across.max() < width - 0.99
+    least = min(across.min(), down.min(), width - 1 - across.max(), height - 1 - down.max())
+    assert least < 2
 
 
 def test_twelve_numbers_are_for_one_lens_only(capture: Path, load: Load, edit: Edit) -> None:
