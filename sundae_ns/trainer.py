@@ -28,6 +28,7 @@ from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError, one_line
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
+from sundae_ns.parsing import other_frame
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
 from sundae_ns.storage.runs.config_file import find_capture
@@ -364,6 +365,10 @@ class SundaeTrainer(Trainer):
                 f"{path} does not fit this run ({one_line(error)}); load it with the options that it was trained with"
             ) from error
         CONSOLE.print(f"Resuming after step {loaded['step']} from {path}")
+        outputs = cast(SundaeDatamanager, self.pipeline.datamanager).train_dataparser_outputs
+        other = other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale)
+        if other is not None:
+            warn(other)
 
     def _source(self) -> Path | None:
         """The checkpoint to resume from; None for a new run."""

@@ -1,6 +1,6 @@
 """nerfstudio's parsers of captures, with their wrong steps replaced, and the checks of what they make."""
 
-from sundae_ns.parsing.cameras import check_cameras, check_capture, check_projection, warn_of_cloud
+from sundae_ns.parsing.cameras import check_cameras, check_capture, check_projection, other_frame, warn_of_cloud
 from sundae_ns.parsing.colmap import CarefulColmapParser
 from sundae_ns.parsing.nerfstudio import LightNerfstudioParser
 from sundae_ns.parsing.placing import rebound
@@ -13,6 +13,7 @@ __all__ = [
     "check_cameras",
     "check_capture",
     "check_projection",
+    "other_frame",
     "rebound",
     "set_parser",
     "undistorting",

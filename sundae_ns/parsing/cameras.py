@@ -12,6 +12,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
+from sundae_ns.api.opening import FRAME_FILE
 from sundae_ns.data.advice import no_model, no_transforms
 from sundae_ns.data.beside import beside
 from sundae_ns.data.capture import check_transforms, read_json
@@ -167,3 +168,25 @@ def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
             f"{int((~seen).sum())} of {len(seen)} views show no point of the sparse cloud, so cloud and cameras are "
             "probably in different coordinates; export both together, or train without the cloud (remove ply_file_path)"
         )
+
+
+def other_frame(run: Path, transform: Tensor, scale: float) -> str | None:
+    """A warning if a run was trained in other coordinates than its capture is parsed to now; None if it was not.
+
+    Args:
+        run: the run's folder; None without its ``dataparser_transforms.json``.
+        transform: from the capture's coordinates ``[3, 4]``.
+        scale: after the transform.
+    """
+    try:
+        stated = read_json(run / FRAME_FILE)
+        before, size = torch.tensor(stated["transform"], dtype=torch.float64), float(stated["scale"])
+        same = torch.allclose(before * size, transform.double() * scale, rtol=1e-3, atol=1e-3)
+    except (DataError, KeyError, TypeError, ValueError, RuntimeError):
+        return None
+    if same:
+        return None
+    return (
+        f"{run} was trained in other coordinates: its capture has changed, or another version scaled it; if cameras "
+        "stand far apart, resume it with --pipeline.datamanager.robust-frame False"
+    )

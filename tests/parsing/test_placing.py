@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,16 @@ import numpy as np
 import pytest
 import torch
 from colmap_models import write_model
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from plyfile import PlyData, PlyElement
 
-from sundae_ns.datamanager import DATASET_FRAME
+from sundae_ns.api.scene import Scene
+from sundae_ns.api.views import views_of
+from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanagerConfig
 from sundae_ns.errors import DataError
+from sundae_ns.parsing import other_frame
+from sundae_ns.scenes.packed import _describe, datamanager_of
+from sundae_ns.storage.packing import PackedScene
 
 Load = Callable[..., Any]
 Edit = Callable[..., None]
@@ -102,6 +109,55 @@ def test_earlier_runs_keep_the_frame_that_they_were_trained_in(capture: Path, lo
     everywhere = made.train_dataset.cameras.camera_to_worlds[:, :, 3]
     assert float(everywhere.abs().max()) == pytest.approx(1.0)  # as nerfstudio scales
     assert float(everywhere.norm(dim=1).median()) < 0.2
+
+
+def test_a_run_that_is_resumed_in_other_coordinates_is_named(
+    capture: Path, load: Load, edit: Edit, tmp_path: Path
+) -> None:
+    stray(capture, 100.0, edit)
+    before = load(capture, robust=False).train_dataparser_outputs
+    before.save_dataparser_transform(tmp_path / "run" / "dataparser_transforms.json")
+    assert other_frame(tmp_path / "run", before.dataparser_transform, before.dataparser_scale) is None
+    now = load(capture).train_dataparser_outputs
+    said = other_frame(tmp_path / "run", now.dataparser_transform, now.dataparser_scale)
+    assert said is not None
+    assert "resume it with --pipeline.datamanager.robust-frame False" in said
+    assert other_frame(tmp_path / "none", now.dataparser_transform, now.dataparser_scale) is None
+
+
+@pytest.mark.parametrize("offset", [np.zeros(3), SURVEY])
+@pytest.mark.parametrize("times", [1.0, 300.0])
+def test_cameras_of_a_capture_in_the_coordinates_of_a_run(
+    capture: Path, load: Load, edit: Edit, tmp_path: Path, times: float, offset: np.ndarray
+) -> None:
+    """``views_of`` finds them by the transform that the run states."""
+    if times > 1:
+        stray(capture, times, edit)
+    moved(capture, offset, edit)
+    made = load(capture)
+    outputs = made.train_dataparser_outputs
+    frame = {"transform": outputs.dataparser_transform.tolist(), "scale": outputs.dataparser_scale}
+    points = torch.zeros(3, 3)
+    scene = Scene.from_points(points, points)
+    scene = replace(scene, in_model_frame=True, meta={"frame": json.loads(json.dumps(frame))})
+    seen = {tuple(view.center.tolist()) for view in views_of(capture, scene)}
+    nearest = torch.cdist(made.train_dataset.cameras.camera_to_worlds[:, :, 3], torch.tensor(sorted(seen)))
+    limit = 1e-5 * max(1.0, float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].abs().max()))
+    assert float(nearest.min(dim=1).values.max()) < limit
+
+
+def test_a_packed_scene_is_measured_in_the_frame_of_its_training(capture: Path, edit: Edit) -> None:
+    stray(capture, 100.0, edit)
+    parser = NerfstudioDataParserConfig(load_3D_points=True)
+    places = {}
+    for robust in (True, False):
+        manager = SundaeDatamanagerConfig(data=capture, dataparser=parser, robust_frame=robust)
+        stated = json.loads(json.dumps(_describe(manager)))
+        again = datamanager_of(PackedScene({}, None, None, {"capture": stated}), capture)
+        assert again.robust_frame is robust
+        made = again.setup(device="cpu", test_mode="test").train_dataset.cameras.camera_to_worlds
+        places[robust] = float(made[:, :, 3].norm(dim=1).median())
+    assert places[True] > 5 * places[False]
 
 
 def test_a_panorama_with_one_step_aside_keeps_its_scale(capture: Path, load: Load, edit: Edit, capsys: Any) -> None:
