@@ -118,9 +118,12 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
         far = (distances > FARTHEST * usual) & (distances > STRAY * reach)
     if far.any():
         first = _first(far)
+        times = (
+            f"{float(distances[first] / usual):,.0f} times as far away as most" if usual > 0 else "far from all others"
+        )
         return (
-            f"the camera of {names[first].name} is {float(distances[first] / usual):,.0f} times as far away as most "
-            f"({int(far.sum())} of {len(names)} are); check its pose, or remove the view"
+            f"the camera of {names[first].name} is {times} ({int(far.sum())} of {len(names)} are); check its pose, or "
+            "remove the view"
         )
     return None
 

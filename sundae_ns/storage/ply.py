@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -165,9 +166,9 @@ def _load(path: Path, *, primitives: bool = False) -> PlyData:
     return data
 
 
-def _stacked(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
-    """Properties of all vertices as columns: ``[N, len(columns)]`` float32."""
-    table = np.empty((vertex.count, len(columns)), np.float32)
+def _stacked(vertex: PlyElement, columns: Sequence[str], kind: type[np.floating[Any]] = np.float32) -> Tensor:
+    """Properties of all vertices as columns: ``[N, len(columns)]`` floats."""
+    table = np.empty((vertex.count, len(columns)), kind)
     for i, name in enumerate(columns):
         with np.errstate(over="ignore"):  # values beyond float32 become infinite; callers drop them
             table[:, i] = vertex[name]
@@ -219,25 +220,22 @@ def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tens
     names = {prop.name.lower(): prop.name for prop in vertex.properties}
     if not names.keys() >= {"x", "y", "z"}:
         raise DataError(f"{path} has vertices without x, y and z; give a .ply of points.")
-    positions = [np.asarray(vertex[names[axis]], np.float64) for axis in "xyz"]
-    with np.errstate(over="ignore"):  # values beyond float32 become infinite; callers drop them
-        points = torch.from_numpy(np.stack(positions, axis=1).astype(np.float64 if precise else np.float32))
+    points = _stacked(vertex, [names[axis] for axis in "xyz"], np.float64 if precise else np.float32)
     channels = next((found for found in _COLOURS if names.keys() >= set(found)), None)
     if channels is None:
         return points, torch.full((len(points), 3), _GREY, dtype=torch.uint8)
-    columns = [vertex[names[name]] for name in channels]
-    colours: NDArray[np.float64] = np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+    colours = _stacked(vertex, [names[name] for name in channels])
     if channels[0].startswith("f_dc"):
-        colours = np.asarray(255 * sh_to_rgb(torch.from_numpy(colours)), np.float64)
+        colours = 255 * sh_to_rgb(colours)
     else:
-        colours *= 255 / _full_scale(columns[0].dtype, colours)
-    whole = np.nan_to_num(colours, nan=0.0).round().clip(0, 255)
-    return points, torch.from_numpy(whole.astype(np.uint8))
+        colours *= 255 / _full_scale(vertex[names[channels[0]]].dtype, colours)
+    return points, colours.nan_to_num_(nan=0.0).round_().clamp_(0, 255).to(torch.uint8)
 
 
-def _full_scale(kind: np.dtype[np.generic], colours: NDArray[np.float64]) -> float:
+def _full_scale(kind: np.dtype[np.generic], colours: Tensor) -> float:
     """The value of a full colour channel: 1, 255 or 65,535, by the type of the numbers and the largest of them."""
-    largest = float(np.nanmax(colours, initial=0.0, where=np.isfinite(colours)))
+    finite = colours[colours.isfinite()]
+    largest = float(finite.max()) if len(finite) else 0.0
     if kind.kind == "f" and largest <= _BRIGHTEST:
         return 1.0
     return 65535.0 if largest > 255 else 255.0

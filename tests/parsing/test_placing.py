@@ -13,8 +13,10 @@ import pytest
 import torch
 from colmap_models import write_model
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.plugins.types import MethodSpecification
 from plyfile import PlyData, PlyElement
 
+from sundae_ns import method_configs
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import views_of
 from sundae_ns.datamanager import DATASET_FRAME, SundaeDatamanagerConfig
@@ -101,6 +103,12 @@ def test_a_stray_camera_does_not_shrink_the_scene(
     torch.testing.assert_close(transform, alone.train_dataset.metadata[DATASET_FRAME][0], atol=2e-6, rtol=0)
     assert scale == pytest.approx(alone.train_dataset.metadata[DATASET_FRAME][1], rel=1e-6)
     assert float(found[name][:, 3].norm()) > 0.5 * times
+
+
+def test_every_method_takes_the_robust_frame() -> None:
+    methods = [value.config for value in vars(method_configs).values() if isinstance(value, MethodSpecification)]
+    assert methods
+    assert all(config.pipeline.datamanager.robust_frame for config in methods)
 
 
 def test_earlier_runs_keep_the_frame_that_they_were_trained_in(capture: Path, load: Load, edit: Edit) -> None:
