@@ -12,7 +12,7 @@ import torch
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.data.camera_axes import OPENGL_TO_OPENCV
-from sundae_ns.data.capture import finite, matrix, read_json, side
+from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
 from sundae_ns.data.colmap import images_of
 from sundae_ns.data.lenses import kind_of_frame, size_of_first_image, with_focal_lengths
 from sundae_ns.errors import DataError
@@ -85,7 +85,7 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
         where = f"{path.name}, frame {i}"
         stated = {**content, **entry} if isinstance(entry, dict) else {}
         kind_of_frame(stated, where)
-        pose = matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where)
+        pose = rigid(matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where), where)
         intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in _INTRINSICS]
         size = [side(stated.get(name), name, where) for name in ("w", "h")]
         views.append(_moved(pose, transform, scale, intrinsics, *size))

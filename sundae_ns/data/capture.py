@@ -36,6 +36,10 @@ _PIXELS_PER_BYTE = 4096
 """Pixels per byte that no image format reaches, even for one flat colour."""
 _SMALL_IMAGE = 1 << 20
 """Images of up to this many pixels pass, for any size of the file."""
+_CROOKED = 0.1
+"""Error of lengths and of cosines above which three axes are no rotation."""
+_ROUNDED = 1e-3
+"""Error of the lengths of axes that is left as it is."""
 _ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 
@@ -75,6 +79,23 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
     if abs(np.linalg.det(array[:3, :3])) < 1e-9:
         raise DataError(f"{where}: {name} is singular, so it is not a camera pose; remove this view")
     return array
+
+
+def rigid(pose: np.ndarray, where: str) -> np.ndarray:
+    """A camera pose ``[3 or 4, 4]`` whose rotation has no scale; programs that scale a scene may leave theirs in it.
+
+    Raises:
+        DataError: the axes of the camera differ in length, or are not at right angles.
+    """
+    axes = pose[:3, :3]
+    scale = abs(float(np.linalg.det(axes))) ** (1 / 3)
+    if np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > _CROOKED:
+        raise DataError(f"{where}: transform_matrix is no camera pose, as its first three columns are not a rotation")
+    if abs(scale - 1) <= _ROUNDED:
+        return pose
+    pose = pose.copy()
+    pose[:3, :3] /= scale
+    return pose
 
 
 def read_bytes(path: Path) -> bytes:
@@ -127,7 +148,7 @@ def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> None:
         _check_camera(frame, [key for key in INTRINSICS if key in frame], where)
         if "camera_model" in frame:
             models.add(kind_of_model(frame["camera_model"], where))
-        matrix(frame.get("transform_matrix"), (4,), "transform_matrix", where)
+        rigid(matrix(frame.get("transform_matrix"), (4,), "transform_matrix", where), where)
         for key in extras:
             if key in frame:
                 _path(frame[key], key, where)

@@ -69,7 +69,8 @@ def left_out(folder: Path, photos: Sequence[Path]) -> list[str]:
     """
     remarks = []
     if others := _other_formats(folder):
-        remarks.append(f"{_counted(others)} are left out, as only {', '.join(SUFFIXES)} are read; {_CONVERT}")
+        verb = "is" if sum(others.values()) == 1 else "are"
+        remarks.append(f"{_counted(others)} {verb} left out, as only {', '.join(SUFFIXES)} are read; {_CONVERT}")
     sizes: dict[tuple[int, int], list[Path]] = {}
     for path in photos:
         if path.suffix.lower() != _RAW:

@@ -18,6 +18,7 @@ from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from torch import Tensor
 
+from sundae_ns.data.capture import rigid
 from sundae_ns.data.frame import COARSE_STEP, Array, far_offset, float32_step, stray_cameras
 from sundae_ns.data.lenses import FISHEYE, FISHEYE624, PERSPECTIVE, Lens
 from sundae_ns.errors import DataError
@@ -81,7 +82,7 @@ class Placing:
         Raises:
             DataError: float32 is too coarse, and the parser is not to centre the poses.
         """
-        matrices = [np.array(pose, dtype=np.float64) for pose in poses]
+        matrices = [rigid(np.array(pose, dtype=np.float64), where) for pose in poses]
         centres = np.array([matrix[:3, 3] for matrix in matrices])
         offset = far_offset(centres) if self.robust else None
         if offset is not None and center_method == "none":

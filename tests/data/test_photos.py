@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from sundae_ns.cli.poses import Poses
 from sundae_ns.data.photos import find_photos, left_out
 from sundae_ns.errors import DataError
 
@@ -118,6 +119,12 @@ def test_photos_of_other_formats_are_named(photos: Path) -> None:
         DataError, match=r"only photos that cannot be read \(2 \.heic files and 1 \.webp file\); convert"
     ):
         find_photos(photos)
+
+
+def test_a_run_says_which_photos_it_leaves_out(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (photos / "a.heic").touch()
+    Poses(photos, photos.parent / "capture", "exhaustive").check()
+    assert capsys.readouterr().out.startswith("# warning: 1 .heic file is left out")
 
 
 def test_photos_of_an_odd_size_are_named(photos: Path) -> None:

@@ -168,6 +168,35 @@ def test_a_packed_scene_is_measured_in_the_frame_of_its_training(capture: Path, 
     assert places[True] > 5 * places[False]
 
 
+@pytest.mark.parametrize("scale", [0.01, 7.5])
+def test_a_scale_in_the_rotations_is_none_of_the_cameras(
+    capture: Path, still_life: Path, load: Load, edit: Edit, scale: float
+) -> None:
+    frames = meta_of(capture)["frames"]
+    for frame in frames:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, :3] *= scale
+        frame["transform_matrix"] = pose.tolist()
+    edit(capture, frames=frames)
+    found, expected = (load(data).train_dataset.cameras.camera_to_worlds for data in (capture, still_life))
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(views_of(capture)[2].viewmat, views_of(still_life)[2].viewmat, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("change", [{(0, 0): 2.0}, {(0, 1): 0.5}], ids=["stretched", "sheared"])
+def test_axes_that_are_no_rotation_are_refused(
+    capture: Path, load: Load, edit: Edit, change: dict[tuple[int, int], float]
+) -> None:
+    frames = meta_of(capture)["frames"]
+    spoilt = np.eye(4)
+    for place, value in change.items():
+        spoilt[place] = value
+    frames[1]["transform_matrix"] = (np.array(frames[1]["transform_matrix"]) @ spoilt).tolist()
+    edit(capture, frames=frames)
+    with pytest.raises(DataError, match="frame 1 .*its first three columns are not a rotation"):
+        load(capture)
+
+
 def test_a_panorama_with_one_step_aside_keeps_its_scale(capture: Path, load: Load, edit: Edit, capsys: Any) -> None:
     """All cameras but one stand within centimetres; the points are as far as that one, so it is no stray."""
     meta = meta_of(capture)
