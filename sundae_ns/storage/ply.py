@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -19,8 +18,9 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.errors import DataError, SundaeError, reading, regular
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, sh_degree_of, sh_to_rgb
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, sh_degree_of
 from sundae_ns.storage.atomic import replacing
+from sundae_ns.storage.point_cloud import points_of
 
 MODEL_FRAME = "Coordinates: nerfstudio model"
 """Header comment of files in the coordinates of nerfstudio's model, not of the capture."""
@@ -35,17 +35,6 @@ _NORMALS = ("nx", "ny", "nz")
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 _MAX_HEADER = 1 << 16  # bytes
-_GREY = 128
-_COLOURS = (
-    ("red", "green", "blue"),
-    ("diffuse_red", "diffuse_green", "diffuse_blue"),
-    ("r", "g", "b"),
-    ("scalar_red", "scalar_green", "scalar_blue"),
-    ("f_dc_0", "f_dc_1", "f_dc_2"),
-)
-"""Names of the colours of points, in lower case."""
-_BRIGHTEST = 2.0
-"""Largest channel of a cloud whose floats have 1 for white; some programs overshoot."""
 
 
 def _rest_columns(count: int) -> tuple[str, ...]:
@@ -166,9 +155,9 @@ def _load(path: Path, *, primitives: bool = False) -> PlyData:
     return data
 
 
-def _stacked(vertex: PlyElement, columns: Sequence[str], kind: type[np.floating[Any]] = np.float32) -> Tensor:
-    """Properties of all vertices as columns: ``[N, len(columns)]`` floats."""
-    table = np.empty((vertex.count, len(columns)), kind)
+def _stacked(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
+    """Properties of all vertices as columns: ``[N, len(columns)]`` float32."""
+    table = np.empty((vertex.count, len(columns)), np.float32)
     for i, name in enumerate(columns):
         with np.errstate(over="ignore"):  # values beyond float32 become infinite; callers drop them
             table[:, i] = vertex[name]
@@ -216,29 +205,10 @@ def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tens
     Raises:
         DataError: the file is missing, not a .ply, truncated, or its vertices have no position.
     """
-    vertex = _load(path)["vertex"]
-    names = {prop.name.lower(): prop.name for prop in vertex.properties}
-    if not names.keys() >= {"x", "y", "z"}:
+    points = points_of(_load(path)["vertex"], precise)
+    if points is None:
         raise DataError(f"{path} has vertices without x, y and z; give a .ply of points.")
-    points = _stacked(vertex, [names[axis] for axis in "xyz"], np.float64 if precise else np.float32)
-    channels = next((found for found in _COLOURS if names.keys() >= set(found)), None)
-    if channels is None:
-        return points, torch.full((len(points), 3), _GREY, dtype=torch.uint8)
-    colours = _stacked(vertex, [names[name] for name in channels])
-    if channels[0].startswith("f_dc"):
-        colours = 255 * sh_to_rgb(colours)
-    else:
-        colours *= 255 / _full_scale(vertex[names[channels[0]]].dtype, colours)
-    return points, colours.nan_to_num_(nan=0.0).round_().clamp_(0, 255).to(torch.uint8)
-
-
-def _full_scale(kind: np.dtype[np.generic], colours: Tensor) -> float:
-    """The value of a full colour channel: 1, 255 or 65,535, by the type of the numbers and the largest of them."""
-    finite = colours[colours.isfinite()]
-    largest = float(finite.max()) if len(finite) else 0.0
-    if kind.kind == "f" and largest <= _BRIGHTEST:
-        return 1.0
-    return 65535.0 if largest > 255 else 255.0
+    return points
 
 
 def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Tensor] | None = None) -> None:
