@@ -25,8 +25,19 @@ from sundae_ns.data.beside import unused_masks
 from sundae_ns.data.capture import check_image, undecodable
 from sundae_ns.data.orientation import TURNED, exif_orientation, turn, wrong_size
 from sundae_ns.errors import ConfigError, DataError, SundaeError, one_line
-from sundae_ns.parsing import check_cameras, check_capture, rebound, set_parser, undistorting, warn_of_cloud
+from sundae_ns.parsing import (
+    LightNerfstudioParser,
+    check_cameras,
+    check_capture,
+    rebound,
+    set_parser,
+    stray_tests,
+    undistorting,
+    warn_of_cloud,
+)
 from sundae_ns.training.warning import warn
+
+__all__ = ["LightNerfstudioParser", "SundaeDatamanager", "SundaeDatamanagerConfig"]  # a config.yml may name these here
 
 DATASET_FRAME = "sundae_dataset_frame"
 """Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""
@@ -214,7 +225,12 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
 
     def create_eval_dataset(self) -> CheckedDataset:
         """Test set."""
-        return self._marked(super().create_eval_dataset())
+        dataset = self._marked(super().create_eval_dataset())
+        names = dataset.image_filenames
+        warning = stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names) if names else None
+        if warning is not None:
+            warn(warning)
+        return dataset
 
     def _marked(self, dataset: CheckedDataset) -> CheckedDataset:
         if not self.config.images:

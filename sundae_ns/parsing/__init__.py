@@ -1,6 +1,13 @@
 """nerfstudio's parsers of captures, with their wrong steps replaced, and the checks of what they make."""
 
-from sundae_ns.parsing.cameras import check_cameras, check_capture, check_projection, other_frame, warn_of_cloud
+from sundae_ns.parsing.cameras import (
+    check_cameras,
+    check_capture,
+    check_projection,
+    other_frame,
+    stray_tests,
+    warn_of_cloud,
+)
 from sundae_ns.parsing.colmap import CarefulColmapParser
 from sundae_ns.parsing.nerfstudio import LightNerfstudioParser
 from sundae_ns.parsing.placing import rebound
@@ -16,6 +23,7 @@ __all__ = [
     "other_frame",
     "rebound",
     "set_parser",
+    "stray_tests",
     "undistorting",
     "warn_of_cloud",
 ]

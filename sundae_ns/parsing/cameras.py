@@ -128,6 +128,18 @@ def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None
     return None
 
 
+def stray_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> str | None:
+    """A warning on test cameras ``[M]``, of images with these names, that stand far from all others; None without."""
+    centres = torch.cat([train.camera_to_worlds[:, :, 3], test.camera_to_worlds[:, :, 3]]).double().cpu()
+    far = torch.from_numpy(stray_cameras(centres.numpy()))[len(train) :]
+    if not far.any():
+        return None
+    return (
+        f"the camera of {names[_first(far)].name}, a test view, stands far from all others ({int(far.sum())} of "
+        f"{len(names)} do); check its pose, or remove the view"
+    )
+
+
 def _first(flags: Tensor) -> int:
     """Index of the first True."""
     return int(flags.nonzero()[0])

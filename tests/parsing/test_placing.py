@@ -105,6 +105,17 @@ def test_a_stray_camera_does_not_shrink_the_scene(
     assert float(found[name][:, 3].norm()) > 0.5 * times
 
 
+def test_a_stray_test_view_is_named(capture: Path, load: Load, edit: Edit, capsys: Any) -> None:
+    held_out = {Path(name).name for name in meta_of(capture)["val_filenames"]}
+    name = stray(capture, 100.0, edit, index=3)
+    assert name in held_out
+    made = load(capture)
+    assert f"the camera of {name}, a test view, stands far from all others (1 of 2 do)" in " ".join(
+        capsys.readouterr().out.split()
+    )
+    assert float(made.train_dataset.cameras.camera_to_worlds[:, :, 3].abs().max()) == pytest.approx(1.0, abs=1e-5)
+
+
 def test_every_method_takes_the_robust_frame() -> None:
     methods = [value.config for value in vars(method_configs).values() if isinstance(value, MethodSpecification)]
     assert methods
