@@ -92,6 +92,7 @@ def method(
             datamanager=SundaeDatamanagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
                 cache_images_type="uint8",
+                robust_frame=True,
             ),
             model=SundaeModelConfig(
                 pruning=pruning,
