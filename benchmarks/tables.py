@@ -40,7 +40,7 @@ METHODS = {
     "sundae-fast": "sundae-fast",
     "sundae-auto": "**sundae**",
     "sundae-with-head": "sundae, with a head in any case",
-    "sundae-no-head": "the same primitives, trained without a head",
+    "sundae-no-head": "the same primitives, no head",
     "sundae-no-head-bytes": "more primitives in place of a head",
     "mcmc": "3DGS-MCMC",
     "band": "the paper's band rule",

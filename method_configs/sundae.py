@@ -92,6 +92,7 @@ def method(
             datamanager=SundaeDatamanagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True),
                 cache_images_type="uint8",
+                robust_frame=True,
             ),
             model=SundaeModelConfig(
                 pruning=pruning,
@@ -134,6 +135,7 @@ sundae_continuous = method(
     "sundae-continuous",
     "SUNDAE with continuous pruning during densification: a lower peak of memory, an optional cap and final number.",
     pruning=PruningConfig(mode="continuous", keep_ratio=0.5, start=2000, stop=15000, every=2000),
+    stop_split_at=15000,
 )
 
 sundae_auto = method(
@@ -161,6 +163,7 @@ sundae_paper = method(
     "SUNDAE as the paper's text has it: band rule on positions, feature splatting, 30 MB U-Net, 60,000 steps.",
     pruning=PruningConfig(
         keep_ratio=0.1,
+        prune_at=15000,
         selection="band",
         score="response",
         signal="positions",
@@ -173,6 +176,7 @@ sundae_paper = method(
     ),
     steps=60000,
     plain_optimizers=True,
+    stop_split_at=15000,
     base_loss_weight=0.0,
     average_share=0.0,
     loss_after_prune="l1",

@@ -4,36 +4,46 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
-from nerfstudio.cameras.cameras import CAMERA_MODEL_TO_TYPE, Cameras, CameraType
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
-from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
+from numpy.typing import NDArray
 from torch import Tensor
 
-from sundae_ns.data.capture import check_image, check_transforms, no_transforms, undecodable
-from sundae_ns.data.colmap import check_colmap
+from sundae_ns.data.advice import larger_model
+from sundae_ns.data.beside import unused_masks
+from sundae_ns.data.capture import check_image, undecodable
+from sundae_ns.data.orientation import TURNED, exif_orientation, turn, wrong_size
 from sundae_ns.errors import ConfigError, DataError, SundaeError, one_line
-from sundae_ns.storage import read_point_cloud
+from sundae_ns.parsing import (
+    LightNerfstudioParser,
+    check_cameras,
+    check_capture,
+    rebound,
+    set_parser,
+    stray_tests,
+    undistorting,
+    warn_of_cloud,
+)
 from sundae_ns.training.warning import warn
+
+__all__ = ["LightNerfstudioParser", "SundaeDatamanager", "SundaeDatamanagerConfig"]  # a config.yml may name these here
 
 DATASET_FRAME = "sundae_dataset_frame"
 """Metadata key of the training set: transform ``[3, 4]`` and scale from the capture's coordinates to the model's."""
 
 NO_IMAGES = "sundae_no_images"
 """Key of a dataset's metadata and of a batch: cameras without images, which are grey."""
-
-LEAST_FOCAL, MOST_FOCAL = 0.01, 1000.0
-"""Shortest and longest focal length in widths of the image: views of 178 and of 0.06 degrees."""
-FARTHEST = 10_000
-"""Distance of a camera, in median distances, above which its pose is doubted."""
 
 
 def no_images_error(run: object = "this run") -> DataError:
@@ -44,92 +54,9 @@ def no_images_error(run: object = "this run") -> DataError:
     )
 
 
-class LightNerfstudioParser(Nerfstudio):
-    """The ``nerfstudio-data`` parser without open3d, which needs system libraries of a desktop."""
-
-    def _load_3D_points(
-        self, ply_file_path: Path, transform_matrix: Tensor, scale_factor: float
-    ) -> dict[str, Tensor] | None:
-        if not ply_file_path.exists():
-            raise DataError(f"{ply_file_path} does not exist; mend ply_file_path in transforms.json, or remove it")
-        points, rgb = read_point_cloud(ply_file_path)
-        if len(points) == 0:
-            return None
-        moved = (points @ transform_matrix[:3, :3].T + transform_matrix[:3, 3]) * scale_factor
-        return {"points3D_xyz": moved, "points3D_rgb": rgb}
-
-
-def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, images: bool = True) -> None:
-    """Check a capture in nerfstudio's or COLMAP's layout before its parser reads it.
-
-    Args:
-        parser: configuration of the parser; captures of other parsers are not checked.
-        data: the capture: a folder, or a ``transforms.json``.
-        splits: splits that will be read.
-        images: whether the images will be needed; a viewer needs the cameras only.
-
-    Raises:
-        DataError: the first thing that cannot be used, and where it stands.
-    """
-    if not data.exists():
-        raise DataError(f"{data} does not exist; give the folder of a capture with --data")
-    if isinstance(parser, ColmapDataParserConfig):
-        if parser.load_3D_points and not any((data / parser.colmap_path).glob("points3D.*")):
-            parser.load_3D_points = False  # the model then warns, and starts from random points
-        folder = data / parser.images_path if images else None
-        check_colmap(data / parser.colmap_path, folder, points=parser.load_3D_points)
-    elif isinstance(parser, NerfstudioDataParserConfig):
-        path = data if data.suffix == ".json" else data / "transforms.json"
-        if not path.is_file():
-            raise no_transforms(data)
-        check_transforms(path, splits=splits, camera_models=CAMERA_MODEL_TO_TYPE)
-
-
 def view_index(camera: Cameras) -> int | None:
     """Index of the training view that :meth:`SundaeDatamanager.next_train` gave; None for other cameras."""
     return (camera.metadata or {}).get("cam_idx")
-
-
-def check_cameras(cameras: Cameras, names: Sequence[Path]) -> str | None:
-    """Check the poses and focal lengths of cameras ``[N]`` of training images with these names, in any units.
-
-    Returns:
-        A warning on poses that are possible, but make no good scene; None without one.
-
-    Raises:
-        DataError: an axis is mirrored, or a focal length belongs to no lens.
-    """
-    mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
-    if mirrored.any():
-        raise DataError(
-            f"the pose of {names[_first(mirrored)].name} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses "
-            "do); negate one column of its rotation"
-        )
-    shares = cameras.fx / cameras.width.clamp_min(1)
-    wrong = ((shares < LEAST_FOCAL) | (shares > MOST_FOCAL)).flatten()
-    if wrong.any():
-        at = _first(wrong)
-        raise DataError(
-            f"the focal length of {names[at].name} is {float(cameras.fx[at]):.3g} px and the image is "
-            f"{int(cameras.width[at])} px wide, which no lens has; give the focal length in pixels"
-        )
-    centres = cameras.camera_to_worlds[:, :, 3]
-    distances = (centres - centres.median(dim=0).values).norm(dim=1)
-    if len(names) > 1 and distances.max() == 0:
-        return "all cameras stand at one place, so nothing says how far things are; check the poses"
-    usual = distances.median()
-    far = distances > FARTHEST * usual.clamp_min(torch.finfo(usual.dtype).tiny)
-    if usual > 0 and far.any():
-        return (
-            f"the camera of {names[_first(far)].name} is more than {FARTHEST:,} times as far away as most "
-            f"({int(far.sum())} of {len(names)} are); check the poses"
-        )
-    return None
-
-
-def _first(flags: Tensor) -> int:
-    """Index of the first True."""
-    return int(flags.nonzero()[0])
 
 
 def _shows_something(batch: Mapping[str, Tensor]) -> bool:
@@ -151,7 +78,32 @@ def _fits(cameras: Cameras, device: torch.device) -> bool:
 
 
 class CheckedDataset(InputDataset):
-    """nerfstudio's dataset; it names an image that cannot be decoded, and gives grey images if there is no capture."""
+    """nerfstudio's dataset; it names an image that cannot be decoded, and gives grey images if there is no capture.
+
+    Its cameras are perspective ones, as their images are once they are loaded.
+    """
+
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        super().__init__(dataparser_outputs, scale_factor)
+        self.lenses = self.cameras.camera_type
+        """Camera types of the files, by which images are undistorted."""
+        self.cameras.camera_type = torch.full_like(self.lenses, CameraType.PERSPECTIVE.value)
+        self.turned: dict[int, int] = {}
+        """EXIF orientations of images that their cameras see turned."""
+
+    @contextmanager
+    def as_photographed(self) -> Iterator[None]:
+        """Cameras with the types of their files, while nerfstudio loads and undistorts images."""
+        drawn, self.cameras.camera_type = self.cameras.camera_type, self.lenses
+        try:
+            yield
+        finally:
+            self.cameras.camera_type = drawn
+
+    def get_numpy_image(self, image_idx: int) -> NDArray[np.uint8]:
+        """Pixels ``[H, W, 3 or 4]``, turned as the camera sees them."""
+        pixels: NDArray[np.uint8] = super().get_numpy_image(image_idx)
+        return turn(pixels, self.turned[image_idx]) if image_idx in self.turned else pixels
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
         """Image, and mask if the capture has masks.
@@ -177,6 +129,9 @@ class SundaeDatamanagerConfig(FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: SundaeDatamanager)
     holdout_every: int = 0
     """Hold out every n-th training view, for decisions that must not use test views. 0 holds out none."""
+    robust_frame: bool = False
+    """Centre and scale the scene by the cameras that stand near each other, and shift survey coordinates in float64.
+    False takes all cameras, as nerfstudio does."""
     images: bool = True
     """False for cameras without images, as sundae unpack writes them without a capture: for the viewer only."""
 
@@ -213,9 +168,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             )
         if config.holdout_every < 0 or config.holdout_every == 1:
             raise ConfigError(f"holdout-every is {config.holdout_every}; give 0 (none) or at least 2")
-        if config.dataparser._target is Nerfstudio:
-            config.dataparser._target = LightNerfstudioParser
-        self._checked: list[InputDataset] = []
+        set_parser(config.dataparser, config.robust_frame)
+        self._checked: list[CheckedDataset] = []
         data = config.capture
         check_capture(
             config.dataparser,
@@ -245,15 +199,38 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         outputs = self.train_dataparser_outputs
         if len(outputs.image_filenames) == 0:
             raise DataError(f"no training images in {self.config.dataparser.data}; check the path and the split")
-        warning = check_cameras(outputs.cameras, outputs.image_filenames)
+        points = outputs.metadata.get("points3D_xyz")
+        warning = check_cameras(outputs.cameras, outputs.image_filenames, points)
         if warning is not None:
             warn(warning)
-        outputs.metadata[DATASET_FRAME] = (outputs.dataparser_transform, float(outputs.dataparser_scale))
+        if points is not None:
+            warn_of_cloud(points, outputs.cameras)
+        self._remark(outputs)
+        transform = outputs.dataparser_transform.clone()
+        # nerfstudio states the translation after the scale that a capture has been given.
+        transform[:, 3] /= getattr(self.dataparser, "applied_scale", 1.0)
+        outputs.metadata[DATASET_FRAME] = (transform, float(outputs.dataparser_scale))
         return self._marked(super().create_train_dataset())
+
+    def _remark(self, outputs: DataparserOutputs) -> None:
+        """Name what lies in the capture and is not used."""
+        parser: Any = self.config.dataparser
+        folder, is_colmap = self.config.capture, isinstance(parser, ColmapDataParserConfig)
+        folder = folder.parent if folder.is_file() else folder
+        if outputs.mask_filenames is None and (masks := unused_masks(folder)) is not None:
+            how = f"colmap --masks-path {masks}" if is_colmap else "mask_path in each frame of transforms.json"
+            warn(f"{folder / masks} is not used; to leave out what its masks hide, give {how}")
+        if is_colmap and (larger := larger_model(folder, parser.colmap_path)) is not None:
+            warn(larger)
 
     def create_eval_dataset(self) -> CheckedDataset:
         """Test set."""
-        return self._marked(super().create_eval_dataset())
+        dataset = self._marked(super().create_eval_dataset())
+        names = dataset.image_filenames
+        warning = stray_tests(self.train_dataparser_outputs.cameras, dataset.cameras, names) if names else None
+        if warning is not None:
+            warn(warning)
+        return dataset
 
     def _marked(self, dataset: CheckedDataset) -> CheckedDataset:
         if not self.config.images:
@@ -292,8 +269,8 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
         The mask is bool ``[H, W, 1]``, True for pixels to train on; None for all pixels.
         """
         outputs = self.train_dataparser_outputs
-        # nerfstudio masks the border of this lens by itself.
-        round_lens = (outputs.cameras.camera_type == CameraType.FISHEYE624.value).any()
+        # Undistortion masks what a fisheye lens has not seen.
+        round_lens = (outputs.cameras.camera_type != CameraType.PERSPECTIVE.value).any()
         masked = self.config.images and (outputs.mask_filenames is not None or bool(round_lens))
         for index in self.train_indices:
             # Read the mask first: undistortion changes the camera.
@@ -344,7 +321,9 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
                 soft_wrap=True,
             )
             cache_images_device = "cpu"
-        loaded = super()._load_images(split, cache_images_device)
+        with dataset.as_photographed():
+            load = rebound(FullImageDatamanager._load_images, _undistort_image=undistorting(dataset.image_filenames))
+            loaded: list[dict[str, torch.Tensor]] = load(self, split, cache_images_device)
         if split == "train" and loaded and not any(map(_shows_something, loaded)):
             raise DataError(
                 f"all {len(loaded)} training images are fully transparent or masked, so there is nothing to train on; "
@@ -359,21 +338,21 @@ class SundaeDatamanager(FullImageDatamanager[CheckedDataset]):
             )
         return loaded
 
-    def _check_images(self, dataset: InputDataset) -> None:
+    def _check_images(self, dataset: CheckedDataset) -> None:
         """Check the files of a dataset once, because undistortion, which comes with loading, crops the cameras."""
         if any(checked is dataset for checked in self._checked):
             return
         scale = dataset.scale_factor
         masks: Sequence[Path | None] = dataset._dataparser_outputs.mask_filenames or [None] * len(dataset)
         widths, heights = dataset.cameras.width.flatten().tolist(), dataset.cameras.height.flatten().tolist()
-        for path, mask, *expected in zip(dataset.image_filenames, masks, widths, heights):
+        for index, (path, mask, *expected) in enumerate(zip(dataset.image_filenames, masks, widths, heights)):
             full = check_image(path)
-            size = [int(side * scale) for side in full]
-            if size != expected:
-                raise DataError(
-                    f"{path.name} is {size[0]} x {size[1]} px but its camera says {expected[0]} x {expected[1]}; "
-                    "give each size its own camera, or resize the images"
-                )
+            if [int(side * scale) for side in full] != expected:
+                orientation = exif_orientation(path)
+                full = full[::-1]
+                if orientation not in TURNED or [int(side * scale) for side in full] != expected:
+                    raise wrong_size(path, full[::-1], (expected[0], expected[1]), orientation)
+                dataset.turned[index] = orientation
             if mask is not None and check_image(mask, mask=True) != full:
                 raise DataError(f"{mask} differs in size from its image {path.name}; make it {full[0]} x {full[1]} px")
         self._checked.append(dataset)

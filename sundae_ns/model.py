@@ -27,6 +27,7 @@ from sundae_ns.datamanager import DATASET_FRAME, NO_IMAGES, SundaeDatamanager, n
 from sundae_ns.evaluation import Lpips, psnr, ssim
 from sundae_ns.evaluation.count_curve import CurvePoint
 from sundae_ns.gpu.memory import naming_full_memory
+from sundae_ns.parsing import check_projection
 from sundae_ns.rasterization import Backend, select_backend
 from sundae_ns.rendering.contribution import contribution
 from sundae_ns.rendering.outputs import Later, LazyOutputs, ShownResponse, empty_outputs, late_outputs
@@ -43,7 +44,7 @@ from sundae_ns.training.losses import StepLosses
 from sundae_ns.training.pruning_config import PruningConfig
 from sundae_ns.training.step import StepInputs, TrainingStep, training_part
 from sundae_ns.training.trials.count import CountTrials
-from sundae_ns.viewer import ViewerControls
+from sundae_ns.viewer import ViewerControls, in_viewer
 
 
 @dataclass
@@ -71,6 +72,8 @@ class SundaeModelConfig(SplatfactoModelConfig):
     """Coordinates of the warm start: nerfstudio's model, or the capture (COLMAP). auto decides by the kind of file."""
     warmup: Literal["densify", "mcmc"] = "densify"
     """Growth of the field: by gradients (3DGS), or as a Markov chain with an exact cap (3DGS-MCMC)."""
+    stop_split_at: int = 12000
+    """Step at which densification ends, that of the prune; longer growth gains nothing that the prune keeps."""
     mcmc_cap: int = 1_000_000
     """Highest number of primitives in a warm-up by mcmc."""
     evaluate_prune: bool = True
@@ -228,6 +231,8 @@ class SundaeModel(SplatfactoModel):
         self, camera: Cameras, obb_box: OrientedBox | None = None
     ) -> MutableMapping[str, Any]:
         """Render a camera, or the primitives in a box; unlike splatfacto's, this leaves the camera on its device."""
+        if not in_viewer():  # an error would end the viewer
+            check_projection(camera)
         self.set_crop(obb_box)
         return self.get_outputs(camera)
 

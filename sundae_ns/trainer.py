@@ -28,15 +28,19 @@ from sundae_ns.datamanager import SundaeDatamanager, SundaeDatamanagerConfig
 from sundae_ns.errors import NOTHING_SAVED, BackendError, CheckpointError, StorageError, SundaeError, one_line
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModel
+from sundae_ns.parsing import other_frame
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.runs import checkpoint, folder
+from sundae_ns.storage.runs.config_file import find_capture
 from sundae_ns.storage.runs.random_state import random_state, set_random_state
 from sundae_ns.training.interruption import Interruption, resume_command
+from sundae_ns.training.loaded_run import loaded_run
 from sundae_ns.training.optimizers import FusedAdamConfig
 from sundae_ns.training.progress import long_on_cpu
 from sundae_ns.training.recorded import RecordedStep
 from sundae_ns.training.run_length import schedule_table, set_schedule
 from sundae_ns.training.warning import warn
+from sundae_ns.viewer import stop_rendering
 
 
 @dataclass
@@ -87,6 +91,15 @@ class SundaeTrainerConfig(TrainerConfig):
         # An unset path is nerfstudio's example.
         if datamanager.data is None and isinstance(getattr(parser, "data", None), Path):
             parser.data = parser.data.absolute()
+
+    def get_base_dir(self) -> Path:
+        """Folder of the run: where a command of nerfstudio has found it, for a run that was copied or moved."""
+        found = loaded_run(sys.argv)
+        if found is None or not (found / self.relative_model_dir).is_dir():
+            base: Path = super().get_base_dir()
+            return base
+        find_capture(self, found)
+        return found
 
     def set_timestamp(self) -> None:
         """Name the run, unless ``--timestamp`` did; runs that start in the same second get different names."""
@@ -196,7 +209,10 @@ class SundaeTrainer(Trainer):
             writing(f"cannot write to the run's folder {self.base_dir}"),
             self._interruption,
         ):
-            super().train()
+            try:
+                super().train()
+            finally:
+                stop_rendering(self.viewer_state)
 
     def train_iteration(self, step: int) -> Any:
         """Train one step; several ranks agree on whether to stop after it."""
@@ -353,6 +369,10 @@ class SundaeTrainer(Trainer):
                 f"{path} does not fit this run ({one_line(error)}); load it with the options that it was trained with"
             ) from error
         CONSOLE.print(f"Resuming after step {loaded['step']} from {path}")
+        outputs = cast(SundaeDatamanager, self.pipeline.datamanager).train_dataparser_outputs
+        other = other_frame(path.parent.parent, outputs.dataparser_transform, outputs.dataparser_scale)
+        if other is not None:
+            warn(other)
 
     def _source(self) -> Path | None:
         """The checkpoint to resume from; None for a new run."""

@@ -54,6 +54,21 @@ def in_viewer() -> bool:
     return isinstance(threading.current_thread(), RenderStateMachine)
 
 
+def stop_rendering(viewer: Any) -> None:
+    """End the threads that render for browsers.
+
+    A thread that still renders when Python exits aborts the process (seen on CUDA, after everything was saved).
+
+    Args:
+        viewer: nerfstudio's; None without one.
+    """
+    machines = [] if viewer is None else list(getattr(viewer, "render_statemachines", {}).values())
+    for machine in machines:
+        machine.running = False
+    for machine in machines:
+        machine.join()
+
+
 def previewed_rule(configured: PruneRule, name: RuleName) -> PruneRule:
     """The rule of a name in the menu; everything that the name does not say is as configured.
 

@@ -11,6 +11,7 @@ import sys
 import zipfile
 from copy import deepcopy
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ import tyro
 from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from ray_tracing import write_still_life
 
 from sundae_ns import method_configs
@@ -232,8 +234,13 @@ def test_faults_while_training(
     monkeypatch.setattr(Trainer, "train", fail)
     made = SundaeTrainer.__new__(SundaeTrainer)
     made.base_dir, made._interruption = tmp_path, Interruption(lambda: None)
+    viewer: Any = SimpleNamespace(ready=False, render_statemachines={})
+    machine = viewer.render_statemachines[0] = RenderStateMachine(viewer, 1.0, None)  # type: ignore[arg-type]
+    machine.start()
+    made.viewer_state = viewer
     with pytest.raises(kind, match=cause):
         made.train()
+    assert not machine.is_alive(), "a thread that renders when Python exits aborts the process"
 
 
 HOOK = """
@@ -299,9 +306,9 @@ def test_the_number_of_steps_alone_sets_the_schedule(tmp_path: Path) -> None:
     words = ("--max-num-iterations", "3000", "--pipeline.model.stop-split-at", "15000")
     config = configured(tmp_path, *words)
     model = config.pipeline.model
-    assert (config.schedule_length, model.pruning.prune_at, model.stop_split_at) == (3000, 1500, 15000)
+    assert (config.schedule_length, model.pruning.prune_at, model.stop_split_at) == (3000, 1200, 15000)
     first_part = configured(tmp_path, *words, "--schedule-length=30000")
-    assert (first_part.schedule_length, first_part.pipeline.model.pruning.prune_at) == (30000, 15000)
+    assert (first_part.schedule_length, first_part.pipeline.model.pruning.prune_at) == (30000, 12000)
     for option in ("--max-num-iterations", "--schedule-length"):
         with pytest.raises(ConfigError, match="length of the run is 0; give"):
             configured(tmp_path, option, "0")
@@ -330,7 +337,7 @@ def test_a_resumed_run_has_the_schedule_of_its_config(tmp_path: Path) -> None:
         configured(tmp_path, "--load-dir", str(folder))
     (folder / "config.yml").write_text("damaged: [")
     alone = configured(tmp_path, "--load-dir", str(folder), "--max-num-iterations", "700")
-    assert alone.pipeline.model.pruning.prune_at == 15000, "nothing says how long the run was meant to be"
+    assert alone.pipeline.model.pruning.prune_at == 12000, "nothing says how long the run was meant to be"
 
 
 def test_the_schedule_is_logged_and_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
@@ -348,8 +355,8 @@ def test_the_schedule_is_logged_and_saved(tmp_path: Path, monkeypatch: pytest.Mo
     shown = capsys.readouterr().out
     assert len(shown.splitlines()) <= 20
     assert re.search(r"3,000 steps", shown)
-    assert re.search(r"prune .* after 1,500", shown)
+    assert re.search(r"prune .* after 1,200", shown)
     saved = load_config(tmp_path / "outputs" / "e" / "sundae" / "t" / "config.yml")
     assert saved.pipeline.datamanager.data == tmp_path / "capture"
     assert saved.get_base_dir() == tmp_path / "outputs" / "e" / "sundae" / "t"
-    assert (saved.pipeline.model.pruning.prune_at, saved.schedule_length) == (1500, 3000)
+    assert (saved.pipeline.model.pruning.prune_at, saved.schedule_length) == (1200, 3000)

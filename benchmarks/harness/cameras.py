@@ -7,10 +7,10 @@ from typing import Any
 
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import Nerfstudio, NerfstudioDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from sundae_ns.datamanager import LightNerfstudioParser, check_capture
 from sundae_ns.errors import DataError, SundaeError
+from sundae_ns.parsing import check_capture, set_parser
 from sundae_ns.storage.runs.config_file import load_config
 
 
@@ -33,8 +33,7 @@ def training_cameras(config: Path) -> Cameras:
     data = next((place for place in places if isinstance(place, Path) and place != Path()), None)
     if data is None:
         raise DataError("the run does not say where its capture is")
-    if parser._target is Nerfstudio:
-        parser._target = LightNerfstudioParser
+    set_parser(parser, getattr(manager, "robust_frame", False))
     parser.data, parser.load_3D_points = data, False
     try:
         check_capture(parser, data, ("train",), images=False)

@@ -132,7 +132,7 @@ def pack(opened: Opened, path: Path) -> dict[str, Any] | None:
         print(f"not packed: {error}")
         return None
     model = model_of(load(path)).to(opened.model.device).eval()
-    found = measure_scene(replace(opened, model=model, packed_bytes=report.bytes), label="", repeats=0, with_flip=False)
+    found = measure_scene(replace(opened, model=model, packed_bytes=report.bytes), label="", repeats=0, visible=False)
     errors = {name: found.full.mean(name) for name in ("psnr", "ssim")}
     return {"bytes": report.bytes, **errors, **{f"{name}_base": found.base.mean(name) for name in ("psnr", "ssim")}}
 

@@ -100,7 +100,7 @@ def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -
         "",
         *_described(arms),
     ]
-    heads = ["arm", "rendered with", "keep", "seeds", "primitives", "PSNR, dB", "SSIM", "FLIP", "LPIPS", "MB"]
+    heads = ["arm", "rendered with", "keep", "seeds", "primitives", "PSNR, dB", "SSIM", "FLIP", "LPIPS", "JOD", "MB"]
     heads += ["ms a frame", "training, s"]
     for scene in dict.fromkeys(result["job"]["scene"] for result in results):
         rows = []
@@ -113,7 +113,7 @@ def quality_page(results: Sequence[Result], arms: Sequence[Arm], command: str) -
                     [
                         *(arm, head, percent(ratio), str(len(own))),
                         spread([r["measured"]["primitives"] for r in own], 0),
-                        *(spread([c["mean"][metric] for c in chosen], digits) for metric, digits in METRICS),
+                        *(spread([c["mean"].get(metric) for c in chosen], digits) for metric, digits in METRICS),
                         spread([c["bytes"] / MEGABYTE for c in chosen], 1),
                         spread([c["ms"] for c in chosen], 2),
                         spread([r["measured"]["train_s"] for r in own], 0) if place == 0 else "",

@@ -12,8 +12,9 @@ import torch
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.data.camera_axes import OPENGL_TO_OPENCV
-from sundae_ns.data.capture import finite, matrix, read_json, side
+from sundae_ns.data.capture import finite, matrix, read_json, rigid, side
 from sundae_ns.data.colmap import images_of
+from sundae_ns.data.lenses import kind_of_frame, size_of_first_image, with_focal_lengths
 from sundae_ns.errors import DataError
 from sundae_ns.gaussians.covariance import rotation_matrices
 from sundae_ns.rendering import View
@@ -76,12 +77,15 @@ def read_cameras(path: Path, scene: Scene | None = None) -> CameraFile:
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path} holds neither frames nor a camera_path; give a transforms.json or a camera path")
+    if "fl_x" not in content:
+        content = with_focal_lengths(content, size_of_first_image(content, path.parent))
     transform, scale = _to_model(scene, content, path.name)
     views = []
     for i, entry in enumerate(frames):
         where = f"{path.name}, frame {i}"
         stated = {**content, **entry} if isinstance(entry, dict) else {}
-        pose = matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where)
+        kind_of_frame(stated, where)
+        pose = rigid(matrix(stated.get("transform_matrix"), (3, 4), "transform_matrix", where), where)
         intrinsics = [finite(stated.get(name), name, where, positive=name.startswith("fl")) for name in _INTRINSICS]
         size = [side(stated.get(name), name, where) for name in ("w", "h")]
         views.append(_moved(pose, transform, scale, intrinsics, *size))

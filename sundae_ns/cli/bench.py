@@ -74,7 +74,7 @@ def bench(
             line = {"config": str(scene), "device": device, "primitives": run.model.num_points, "factor": factor}
             with rendered_as(run, factor=factor, precision=precision, phases=count) as shown:
                 measured = measure_scene(
-                    shown, label="", repeats=repeats, with_flip=False, progress=lambda: progress.advance(task)
+                    shown, label="", repeats=repeats, visible=False, progress=lambda: progress.advance(task)
                 )
                 line |= {"repeats": repeats, **_figures(shown, measured)}
             found.append(line)

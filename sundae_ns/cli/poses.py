@@ -46,10 +46,11 @@ class Poses:
         return is_capture(self.capture)
 
     def check(self) -> None:
-        """Raise ``DataError`` if the photos cannot be used."""
-        from sundae_ns.data.photos import find_photos
+        """Name the photos that are left out; ``DataError`` if the others cannot be used."""
+        from sundae_ns.data.photos import find_photos, left_out
 
-        find_photos(self.photos)
+        for remark in left_out(self.photos, find_photos(self.photos)[0]):
+            print(f"# warning: {remark}", flush=True)
 
     def find(self) -> list[str]:
         """Fill the working folder with the photos; the command that finds their poses.

@@ -76,6 +76,7 @@ def report(
         from sundae_ns.evaluation.count_curve import read_count_curve
         from sundae_ns.evaluation.curves import read_curves
         from sundae_ns.evaluation.document import document
+        from sundae_ns.evaluation.jod import INSTALL_JOD, jod_available
         from sundae_ns.evaluation.metrics import INSTALL_FLIP
         from sundae_ns.scenes.measure import measure_scene
         from sundae_ns.scenes.opening import open_scene
@@ -88,6 +89,8 @@ def report(
     notes = []
     if not flip_available():
         notes.append(f"FLIP: the package is not installed; run {INSTALL_FLIP}.")
+    if not jod_available():
+        notes.append(f"JOD: the package is not installed; run {INSTALL_JOD}.")
     if lpips is None:
         notes.append(f"LPIPS: the weights of its net ({lpips_net}) are missing; sundae doctor says where to put them.")
     done: list[Measured] = []

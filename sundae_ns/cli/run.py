@@ -228,9 +228,12 @@ def run(
 
 def _check_input(photos: Path) -> None:
     """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos."""
-    from sundae_ns.data.capture import no_transforms
+    from sundae_ns.data.advice import models_in, no_transforms
 
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, or a capture")
-    if not (photos / "transforms.json").is_file() and (photos.is_file() or (photos / "sparse").is_dir()):
-        raise no_transforms(photos)  # says how to use a video, or a capture in COLMAP layout
+    if (photos / "transforms.json").is_file():
+        return
+    posed = (photos / "sparse").is_dir() or (photos / "transforms_train.json").is_file()
+    if photos.is_file() or posed or models_in(photos):
+        raise no_transforms(photos)  # says how to use a video, or a capture in another layout

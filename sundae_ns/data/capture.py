@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 from collections.abc import Collection, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -17,6 +16,16 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from sundae_ns.data.beside import beside
+from sundae_ns.data.lenses import (
+    DISTORTION,
+    FISHEYE624,
+    INTRINSICS,
+    kind_of_model,
+    lens_of,
+    size_of_first_image,
+    with_focal_lengths,
+)
 from sundae_ns.errors import DataError, one_line, reading, regular
 
 _MAX_SIDE = 65535
@@ -27,8 +36,10 @@ _PIXELS_PER_BYTE = 4096
 """Pixels per byte that no image format reaches, even for one flat colour."""
 _SMALL_IMAGE = 1 << 20
 """Images of up to this many pixels pass, for any size of the file."""
-_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
-_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_CROOKED = 0.1
+"""Error of lengths and of cosines above which three axes are no rotation."""
+_ROUNDED = 1e-3
+"""Error of the lengths of axes that is left as it is."""
 _ORIENTATIONS = ("pca", "up", "vertical", "none")
 
 
@@ -70,6 +81,23 @@ def matrix(value: Any, rows: Sequence[int], name: str, where: str) -> np.ndarray
     return array
 
 
+def rigid(pose: np.ndarray, where: str) -> np.ndarray:
+    """A camera pose ``[3 or 4, 4]`` whose rotation has no scale; programs that scale a scene may leave theirs in it.
+
+    Raises:
+        DataError: the axes of the camera differ in length, or are not at right angles.
+    """
+    axes = pose[:3, :3]
+    scale = abs(float(np.linalg.det(axes))) ** (1 / 3)
+    if np.abs(axes.T @ axes / scale**2 - np.eye(3)).max() > _CROOKED:
+        raise DataError(f"{where}: transform_matrix is no camera pose, as its first three columns are not a rotation")
+    if abs(scale - 1) <= _ROUNDED:
+        return pose
+    pose = pose.copy()
+    pose[:3, :3] /= scale
+    return pose
+
+
 def read_bytes(path: Path) -> bytes:
     """Contents of a file; ``DataError`` if it cannot be read."""
     with reading(path, "a file"):
@@ -85,31 +113,12 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def no_transforms(data: Path) -> DataError:
-    """The error for a path without a ``transforms.json``, with advice that fits its contents."""
-    if data.is_file():
-        return DataError(f"{data} is a file, not a capture; ns-process-data video makes a capture of a video")
-    for model in ("sparse/0", "colmap/sparse/0", "sparse"):
-        if any((data / model / name).is_file() for name in ("cameras.bin", "cameras.txt")):
-            return DataError(
-                f"{data} has no transforms.json; it is in COLMAP layout: add `colmap --colmap-path {model}` to ns-train"
-            )
-    return DataError(f"{data} has no transforms.json; {how_to_make_one(data)}")
-
-
-def how_to_make_one(images: Path) -> str:
-    """Advice with the command that makes a capture of a folder of images."""
-    folder = shlex.quote(str(images))
-    return f"make a capture of images with `ns-process-data images --data {folder} --output-dir CAPTURE`"
-
-
-def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: Collection[str] = ()) -> None:
+def check_transforms(path: Path, *, splits: Sequence[str] = ()) -> None:
     """Check the ``transforms.json`` of a capture.
 
     Args:
         path: the file.
         splits: splits that will be read, such as ``"train"``; checked if the file lists images by split.
-        camera_models: supported values of ``camera_model``; empty for any.
 
     Raises:
         DataError: names the first unusable entry, its frame, and what it must be.
@@ -118,13 +127,12 @@ def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: C
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames:
         raise DataError(f"{path} lists no frames; a capture needs at least one image with its pose")
-    shared = [name for name in _INTRINSICS if name in meta]
+    _check_angles(meta, path.name)
+    if "fl_x" not in meta:
+        meta = with_focal_lengths(meta, size_of_first_image(meta, path.parent))
+    shared = [name for name in INTRINSICS if name in meta]
     _check_camera(meta, shared, path.name)
-    models = {meta["camera_model"]} if isinstance(meta.get("camera_model"), str) else set()
-    if "camera_model" in meta and (not models or (camera_models and not models <= set(camera_models))):
-        raise DataError(
-            f"{path.name}: camera_model is {_short(meta['camera_model'])}; use one of {', '.join(camera_models)}"
-        )
+    models = {kind_of_model(meta["camera_model"], path.name)} if "camera_model" in meta else set()
     extras: dict[str, int] = {"mask_path": 0, "depth_file_path": 0}
     names = set()
     for index, frame in enumerate(frames):
@@ -134,11 +142,13 @@ def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: C
         name = _path(frame.get("file_path"), "file_path", where)
         names.add(name)
         where = f"{where} ({_short(name)})"
-        missing = [key for key in _INTRINSICS if key not in shared and key not in frame]
+        missing = [key for key in INTRINSICS if key not in shared and key not in frame]
         if missing:
             raise DataError(f"{where}: {', '.join(missing)} missing; give them in each frame, or for all at the top")
-        _check_camera(frame, [key for key in _INTRINSICS if key not in shared], where)
-        matrix(frame.get("transform_matrix"), (4,), "transform_matrix", where)
+        _check_camera(frame, [key for key in INTRINSICS if key in frame], where)
+        if "camera_model" in frame:
+            models.add(kind_of_model(frame["camera_model"], where))
+        rigid(matrix(frame.get("transform_matrix"), (4,), "transform_matrix", where), where)
         for key in extras:
             if key in frame:
                 _path(frame[key], key, where)
@@ -146,8 +156,10 @@ def check_transforms(path: Path, *, splits: Sequence[str] = (), camera_models: C
     for key, count in extras.items():
         if count not in (0, len(frames)):
             raise DataError(f"{path.name}: {count} of {len(frames)} frames have a {key}; give it in all or in none")
-    if models == {"FISHEYE624"}:
+    if models == {FISHEYE624}:
         _check_round_lens(meta, extras["mask_path"] > 0, path.name)
+    for index, frame in enumerate(frames):
+        lens_of(meta, frame, f"{path.name}, frame {index} ({_short(frame['file_path'])})")
     _check_splits(meta, names, splits, path.name)
     _check_frame_of_capture(meta, path.name)
 
@@ -159,7 +171,7 @@ def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -
             side(entry[key], key, where)
         else:
             finite(entry[key], key, where, positive=key.startswith("fl"))
-    for key in _DISTORTION:
+    for key in DISTORTION:
         if key in entry:
             finite(entry[key], key, where)
     if "distortion_params" in entry:
@@ -168,6 +180,12 @@ def _check_camera(entry: Mapping[str, Any], keys: Collection[str], where: str) -
             raise DataError(f"{where}: distortion_params must be a list of 4, 6 or 12 numbers")
         for value in values:
             finite(value, "distortion_params", where)
+
+
+def _check_angles(meta: Mapping[str, Any], where: str) -> None:
+    for key in ("camera_angle_x", "camera_angle_y"):
+        if key in meta and not 0 < finite(meta[key], key, where) < math.pi:
+            raise DataError(f"{where}: {key} is {_short(meta[key])}; it must be an angle of view in radians, below pi")
 
 
 def _check_round_lens(meta: Mapping[str, Any], masked: bool, where: str) -> None:
@@ -233,7 +251,7 @@ def check_image(path: Path, *, mask: bool = False) -> tuple[int, int]:
         length = path.stat().st_size
     except OSError as error:
         reason = error.strerror or ("it is not an image" if isinstance(error, Image.UnidentifiedImageError) else error)
-        raise DataError(f"{path} cannot be read ({reason}); repair it or remove the view") from error
+        raise DataError(f"{path} cannot be read ({reason}){beside(path)}; repair it or remove the view") from error
     except Exception as error:  # decoders raise many types; each means the same to the user
         raise DataError(f"{path} is not a complete image ({one_line(error)}); repair it or remove the view") from error
     modes = ("1", "L") if mask else ("L", "RGB", "RGBA")

@@ -15,19 +15,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from sundae_ns.data.beside import beside
 from sundae_ns.data.capture import finite, read_bytes, side
-from sundae_ns.errors import DataError, one_line, reading
+from sundae_ns.data.lenses import COLMAP_LENSES, Lens, check_colmap_model, colmap_lens
+from sundae_ns.errors import DataError, one_line, reading, regular
 
-# Identifier: name, number of parameters, number of focal lengths; only models that nerfstudio supports.
-_MODELS = {
-    0: ("SIMPLE_PINHOLE", 3, 1),
-    1: ("PINHOLE", 4, 2),
-    2: ("SIMPLE_RADIAL", 4, 1),
-    3: ("RADIAL", 5, 1),
-    4: ("OPENCV", 8, 2),
-    5: ("OPENCV_FISHEYE", 8, 2),
-}
-_CONVERT = "undistort the capture (colmap image_undistorter), or calibrate it with OPENCV"
 _SHELL = set('"$`\\\n')
 """Characters that end a quoted word: nerfstudio passes paths of images to a shell when it scales images down."""
 _CAMERA, _IMAGE, _POINT, _COUNT = map(struct.Struct, ("<iiQQ", "<i7di", "<Q3d3Bd", "<Q"))
@@ -36,13 +28,14 @@ _OBSERVATION, _TRACK = 24, 8
 _MAX_NAME = 4096
 
 
-class ColmapCamera(NamedTuple):
-    """A camera of a model; distortion is left out."""
+class StatedCamera(NamedTuple):
+    """A camera of a model."""
 
     width: int
     height: int
     intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy, pixels."""
+    lens: Lens
 
 
 class ColmapImage(NamedTuple):
@@ -51,7 +44,7 @@ class ColmapImage(NamedTuple):
     name: str
     pose: tuple[float, ...]
     """World-to-camera with OpenCV axes: a quaternion wxyz of length 1, and a translation."""
-    camera: ColmapCamera
+    camera: StatedCamera
 
 
 class _BinaryFile:
@@ -108,20 +101,39 @@ def check_colmap(model: Path, images: Path | None, *, points: bool = True) -> No
         if _SHELL & set(name):
             raise DataError(f"{model.name} has an image named {name!r}; rename it without quotes, $, ` and backslashes")
         if images is not None and not (images / name).is_file():
-            raise DataError(f"{images / name} does not exist; check --images-path, or remove the view from the model")
-    if points:
-        if (model / "points3D.bin").exists():
-            count = _points_binary(model / "points3D.bin")
-        elif (model / "points3D.txt").exists():
-            count = _points_text(model / "points3D.txt")
-        else:
-            raise DataError(f"{model} has no points3D.bin or .txt; add it, or start with colmap --load-3D-points False")
-        if count == 0:
-            raise DataError(f"{model} has no points; start without them with colmap --load-3D-points False")
+            raise DataError(
+                f"{images / name} does not exist{beside(images / name)}; check --images-path, or remove the view from "
+                "the model"
+            )
+    if points and check_points(model) == 0:
+        raise DataError(f"{model} has no points; start without them with colmap --load-3D-points False")
+
+
+def check_points(model: Path) -> int:
+    """Number of points of a model, after a check of their file; ``DataError`` if there is none, or it is damaged."""
+    if (model / "points3D.bin").exists():
+        return _points_binary(model / "points3D.bin")
+    if (model / "points3D.txt").exists():
+        return _points_text(model / "points3D.txt")
+    raise DataError(f"{model} has no points3D.bin or .txt; add it, or start with colmap --load-3D-points False")
 
 
 def images_of(model: Path) -> list[ColmapImage]:
     """The images of a model with their cameras, checked; text before binary, as nerfstudio reads them.
+
+    Raises:
+        DataError: names the first unusable entry and its place.
+    """
+    cameras = cameras_of(model)
+    text = (model / "cameras.txt").exists()
+    images = _images_text(model / "images.txt", cameras) if text else _images_binary(model / "images.bin", cameras)
+    if not images:
+        raise DataError(f"{model} has no images; the reconstruction failed, run it again")
+    return images
+
+
+def cameras_of(model: Path) -> dict[int, StatedCamera]:
+    """The cameras of a model by their numbers, checked; text before binary, as nerfstudio reads them.
 
     Raises:
         DataError: names the first unusable entry and its place.
@@ -131,34 +143,34 @@ def images_of(model: Path) -> list[ColmapImage]:
             f"{model} is not a folder; give the folder of the model with colmap --colmap-path (usually sparse/0)"
         )
     if (model / "cameras.txt").exists():
-        images = _images_text(model / "images.txt", _cameras_text(model / "cameras.txt"))
-    elif (model / "cameras.bin").exists():
-        images = _images_binary(model / "images.bin", _cameras_binary(model / "cameras.bin"))
-    else:
-        raise DataError(
-            f"{model} holds neither cameras.bin nor cameras.txt; give the folder of the model with --colmap-path"
-        )
-    if not images:
-        raise DataError(f"{model} has no images; the reconstruction failed, run it again")
-    return images
+        return _cameras_text(model / "cameras.txt")
+    if (model / "cameras.bin").exists():
+        return _cameras_binary(model / "cameras.bin")
+    raise DataError(
+        f"{model} holds neither cameras.bin nor cameras.txt{beside(model / 'cameras.bin')}; give the folder of the "
+        "model with --colmap-path"
+    )
 
 
 def num_images(model: Path) -> int:
     """Number of images that a binary COLMAP model states; ``DataError`` if its ``images.bin`` cannot be read."""
-    return _BinaryFile(model / "images.bin").count(_IMAGE_BYTES, "images")
+    path = model / "images.bin"
+    with reading(path, "a complete images.bin"), regular(path).open("rb") as file:
+        (count,) = _COUNT.unpack(file.read(_COUNT.size))
+    if count * _IMAGE_BYTES > path.stat().st_size:
+        raise DataError(f"{path.name} states {count:,} images, more than it can hold; copy or export it again")
+    return int(count)
 
 
-def _check_camera(
-    model: tuple[str, int, int], width: float, height: float, params: Sequence[float], where: str
-) -> ColmapCamera:
+def _check_camera(model: str, width: float, height: float, params: Sequence[float], where: str) -> StatedCamera:
     side(width, "width", where)
     side(height, "height", where)
-    if len(params) != model[1]:
-        raise DataError(f"{where}: {model[0]} has {model[1]} parameters, not {len(params)}; export it again")
-    for index, value in enumerate(params):
-        finite(value, f"parameter {index}", where, positive=index < model[2])
-    focal, center = params[: model[2]], params[model[2] : model[2] + 2]
-    return ColmapCamera(int(width), int(height), (focal[0], focal[-1], center[0], center[1]))
+    names = COLMAP_LENSES[model][1].split()
+    if len(params) != len(names):
+        raise DataError(f"{where}: {model} has {len(names)} parameters, not {len(params)}; export it again")
+    for name, value in zip(names, params, strict=True):
+        finite(value, f"parameter {name}", where, positive=name.startswith("f"))
+    return StatedCamera(int(width), int(height), *colmap_lens(model, params, where))
 
 
 def _check_pose(pose: Sequence[float], camera: int, cameras: Collection[int], where: str) -> None:
@@ -170,22 +182,21 @@ def _check_pose(pose: Sequence[float], camera: int, cameras: Collection[int], wh
         raise DataError(f"{where}: its camera {camera} is not in the model; export it again")
 
 
-def _cameras_binary(path: Path) -> dict[int, ColmapCamera]:
-    file, cameras = _BinaryFile(path), dict[int, ColmapCamera]()
+def _cameras_binary(path: Path) -> dict[int, StatedCamera]:
+    file, cameras = _BinaryFile(path), dict[int, StatedCamera]()
     for _ in range(file.count(_CAMERA.size, "cameras")):
         identifier, kind, width, height = file.take(_CAMERA)
         where = f"{path.name}, camera {identifier}"
-        if kind not in _MODELS:
-            raise DataError(f"{where}: nerfstudio does not support camera model {kind}; {_CONVERT}")
-        model = _MODELS[int(kind)]
-        camera = _check_camera(model, width, height, file.take(struct.Struct(f"<{model[1]}d")), where)
+        model = check_colmap_model(int(kind), where)
+        number = len(COLMAP_LENSES[model][1].split())
+        camera = _check_camera(model, width, height, file.take(struct.Struct(f"<{number}d")), where)
         if identifier in cameras:
             raise DataError(f"{where}: it is listed twice; export it again")
         cameras[int(identifier)] = camera
     return cameras
 
 
-def _images_binary(path: Path, cameras: Mapping[int, ColmapCamera]) -> list[ColmapImage]:
+def _images_binary(path: Path, cameras: Mapping[int, StatedCamera]) -> list[ColmapImage]:
     file, images = _BinaryFile(path), []
     for _ in range(file.count(_IMAGE_BYTES, "images")):
         identifier, *pose, camera = file.take(_IMAGE)
@@ -234,23 +245,21 @@ def _check_count(path: Path, found: int) -> None:
             raise DataError(f"{path.name} states {int(stated[1]):,} entries and has {found:,}; copy or export it again")
 
 
-def _cameras_text(path: Path) -> dict[int, ColmapCamera]:
-    models = {model[0]: model for model in _MODELS.values()}
-    cameras: dict[int, ColmapCamera] = {}
+def _cameras_text(path: Path) -> dict[int, StatedCamera]:
+    cameras: dict[int, StatedCamera] = {}
     for index, line in _lines(path):
         with _errors_in_line(path, index):
             identifier, name, *numbers = line.split()
             where = f"{path.name}, camera {identifier}"
-            if name not in models:
-                raise DataError(f"{where}: nerfstudio does not support camera model {name}; {_CONVERT}")
+            name = check_colmap_model(name, where)
             width, height = int(numbers[0]), int(numbers[1])
             parameters = [float(value) for value in numbers[2:]]
-            cameras[int(identifier)] = _check_camera(models[name], width, height, parameters, where)
+            cameras[int(identifier)] = _check_camera(name, width, height, parameters, where)
     _check_count(path, len(cameras))
     return cameras
 
 
-def _images_text(path: Path, cameras: Mapping[int, ColmapCamera]) -> list[ColmapImage]:
+def _images_text(path: Path, cameras: Mapping[int, StatedCamera]) -> list[ColmapImage]:
     lines, images, index = _all_lines(path), list[ColmapImage](), 0
     while index < len(lines):
         line = lines[index].strip()

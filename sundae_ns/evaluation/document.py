@@ -10,10 +10,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from sundae_ns.evaluation.jod import JOD_VARIANT
 from sundae_ns.evaluation.measured import MEGABYTE, Configuration, Measured
 from sundae_ns.evaluation.metrics import FLIP_VARIANT
 
-METRICS = (("psnr", 2), ("ssim", 4), ("flip", 4), ("lpips", 4))
+METRICS = (("psnr", 2), ("ssim", 4), ("flip", 4), ("lpips", 4), ("jod", 3))
 """Metrics in the order of a table's columns, with their number of decimals."""
 Stage = tuple[str, int, Mapping[str, float] | None]
 """Name of a stage of a run, number of primitives, and means over the test views by name; None for a skipped stage."""
@@ -73,7 +74,8 @@ def document(
         "- Each row is one configuration of rendering a field. Its time and its metrics come from the same calls.",
         "- Metrics are means over the test views. PSNR is over all pixels and channels, SSIM is pytorch_msssim's",
         f"  (11 x 11 window, no padding), FLIP is {FLIP_VARIANT}, and LPIPS names its net.",
-        "- Higher PSNR and SSIM are better; lower FLIP, LPIPS, ms and MB are better.",
+        f"- JOD is {JOD_VARIANT}: 10 for equal images, and three of four viewers see 1 less.",
+        "- Higher PSNR, SSIM and JOD are better; lower FLIP, LPIPS, ms and MB are better.",
         "- ms per frame is the median over the test views, synchronised with the device.",
         "- MB are 1e6 bytes in fp32 of all that the configuration needs: no network or features if the head is off.",
         "  For a packed scene it is the whole file.",
@@ -81,7 +83,7 @@ def document(
     ]
     nets = sorted({run.lpips_net for run in runs if run.full.mean("lpips") is not None})
     heads = ["run", "rendered with", "primitives", "MB", "ms per frame", "PSNR, dB", "SSIM", "FLIP"]
-    heads.append(f"LPIPS ({', '.join(nets)})" if nets else "LPIPS")
+    heads += [f"LPIPS ({', '.join(nets)})" if nets else "LPIPS", "JOD"]
     for scene, own in scenes.items():
         views = sorted({len(run.full.views) for run in own})
         sizes = sorted({run.resolution for run in own})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from statistics import fmean
 from typing import Any
 
@@ -22,6 +22,8 @@ class ViewQuality:
     """pytorch_msssim's variant, without padding; NaN for images smaller than its window."""
     flip: float | None = None
     lpips: float | None = None
+    jod: float | None = None
+    """Visibility of the difference, 10 for none (:func:`sundae_ns.evaluation.jod.jod`)."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +109,7 @@ class Measured:
         plain = asdict(self)
         plain["bytes_total"] = self.bytes_total
         for configuration, entry in zip(self.configurations, plain["configurations"], strict=True):
-            entry["mean"] = {metric: configuration.mean(metric) for metric in ("psnr", "ssim", "flip", "lpips")}
+            entry["mean"] = {metric.name: configuration.mean(metric.name) for metric in fields(ViewQuality)}
         return without_nan(plain)
 
 

@@ -31,6 +31,7 @@ from sundae_ns.evaluation import (
     ssim,
     without_nan,
 )
+from sundae_ns.evaluation.jod import jod
 from sundae_ns.gaussians import FEATURES
 from sundae_ns.model import SundaeModel
 from sundae_ns.rendering import compensate, draw, scale_plan, zoomed
@@ -153,7 +154,7 @@ def measure_scene(
     *,
     label: str,
     lpips: Lpips | None = None,
-    with_flip: bool = True,
+    visible: bool = True,
     warmup: int = 3,
     repeats: int = 5,
     progress: Callable[[], object] | None = None,
@@ -167,7 +168,7 @@ def measure_scene(
         opened: the scene.
         label: its name in tables.
         lpips: LPIPS; None leaves it out.
-        with_flip: whether to compute FLIP, which takes about a second per image, if its package is installed.
+        visible: whether to compute FLIP and JOD, which take seconds for an image, if their packages are installed.
         warmup: untimed renders of each view.
         repeats: timed renders of each view; 0 leaves times out.
         progress: called after each view.
@@ -182,7 +183,7 @@ def measure_scene(
         for name, on in ways.items():
             with compensation(model, on):
                 image = model.get_outputs_for_camera(camera)["rgb"]
-            views[name].append(quality(image, truth, lpips, with_flip=with_flip))
+            views[name].append(quality(image, truth, lpips, visible=visible))
         if repeats:
             found = frame_times(model, [camera], warmup=warmup, repeats=repeats)
             for name, on in ways.items():
@@ -254,11 +255,12 @@ def evaluation(run: Path, *, data: Path | None = None) -> dict[str, Any]:
     return plain
 
 
-def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None, *, with_flip: bool = True) -> ViewQuality:
-    """Every metric of one image ``[H, W, 3]`` against its truth."""
-    errors = (flip(image, truth) if with_flip else None, None if lpips is None else lpips(image, truth))
+def quality(image: Tensor, truth: Tensor, lpips: Lpips | None = None, *, visible: bool = True) -> ViewQuality:
+    """Every metric of one image ``[H, W, 3]`` against its truth; ``visible`` is that of :func:`measure_scene`."""
+    learned = None if lpips is None else lpips(image, truth)
+    others = (flip(image, truth) if visible else None, learned, jod(image, truth) if visible else None)
     return ViewQuality(
-        float(psnr(image, truth)), float(ssim(image, truth)), *(None if e is None else float(e) for e in errors)
+        float(psnr(image, truth)), float(ssim(image, truth)), *(None if one is None else float(one) for one in others)
     )
 
 

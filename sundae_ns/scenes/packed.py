@@ -30,9 +30,10 @@ from sundae_ns.api.packing import contents_of, refusal, scene_of, stored_cameras
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.views import is_frame, is_number
 from sundae_ns.compensation import HeadConfig
-from sundae_ns.datamanager import SundaeDatamanagerConfig, check_capture, no_images_error
+from sundae_ns.datamanager import SundaeDatamanagerConfig, no_images_error
 from sundae_ns.errors import PackError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
+from sundae_ns.parsing import check_capture
 from sundae_ns.scenes import stock
 from sundae_ns.storage.atomic import write_text, writing
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
@@ -114,7 +115,8 @@ def _describe(manager: SundaeDatamanagerConfig) -> dict[str, Any] | None:
         if isinstance(value, str) and isinstance(default, Path) and not _FOLDER.fullmatch(value):
             return None  # outside of the capture
         options[name] = value
-    return {"parser": kind, "options": options, "scale": manager.camera_res_scale_factor}
+    stated = {"parser": kind, "options": options, "scale": manager.camera_res_scale_factor}
+    return {**stated, "robust_frame": True} if manager.robust_frame else stated
 
 
 def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
@@ -238,10 +240,15 @@ def datamanager_of(packed: PackedScene, data: Path) -> SundaeDatamanagerConfig:
         DataError: the capture is missing, or cannot be used.
         PackError: the scene does not say how its capture is read, or states something impossible.
     """
-    parser, scale = _capture(packed.meta.get("capture"))
+    stated: Any = packed.meta.get("capture")
+    parser, scale = _capture(stated)
     check_capture(parser, data, ("train", "test"))
     return SundaeDatamanagerConfig(
-        dataparser=parser, camera_res_scale_factor=scale, data=data.resolve(), cache_images_type="uint8"
+        dataparser=parser,
+        camera_res_scale_factor=scale,
+        data=data.resolve(),
+        cache_images_type="uint8",
+        robust_frame=stated.get("robust_frame") is True,
     )
 
 

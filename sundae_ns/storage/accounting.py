@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import chain
 from typing import NamedTuple
 
@@ -36,18 +35,6 @@ def bytes_of_head(head: HeadConfig | None) -> int:
 def stored_bytes(params: Mapping[str, Tensor], head: HeadConfig | None) -> int:
     """Bytes of a field and its head. The one place where a decision of training counts bytes."""
     return bytes_of(params) + bytes_of_head(head)
-
-
-def rows_within(params: Mapping[str, Tensor], limit: int, count_bytes: Callable[[Mapping[str, Tensor]], int]) -> int:
-    """Largest n, maybe 0, for which the first n primitives of a field take at most ``limit`` bytes.
-
-    ``count_bytes`` gives the bytes of a field; they must not decrease with the number of primitives.
-    """
-
-    def taken(n: int) -> int:
-        return count_bytes({name: value[:n] for name, value in params.items()})
-
-    return bisect_right(range(1, len(params["means"]) + 1), limit, key=taken)
 
 
 def megabytes(count: int) -> str:

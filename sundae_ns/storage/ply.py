@@ -24,6 +24,7 @@ from sundae_ns.errors import DataError, SundaeError, reading, regular
 from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, rgb_to_sh, sh_degree_of
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.compressed_ply import PACKED, decompressed
+from sundae_ns.storage.point_cloud import points_of
 
 MODEL_FRAME = "Coordinates: nerfstudio model"
 """Header comment of files in the coordinates of nerfstudio's model, not of the capture."""
@@ -39,7 +40,6 @@ _RGB = ("red", "green", "blue")
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 _MAX_HEADER = 1 << 16  # bytes
-_GREY = 128
 
 
 def _rest_columns(count: int) -> tuple[str, ...]:
@@ -236,11 +236,13 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     return {name: params[name] for name in SPLAT_NAMES}
 
 
-def read_point_cloud(path: Path) -> tuple[Tensor, Tensor]:
+def read_point_cloud(path: Path, *, precise: bool = False) -> tuple[Tensor, Tensor]:
     """Read the points and colours of a .ply, binary or ascii.
 
     Args:
-        path: vertices with ``x y z`` and, optionally, ``red green blue``: integers to 255 or floats to 1.
+        path: vertices with ``x y z`` and, optionally, colours under a name in use: ``red green blue``, ``r g b``,
+            ``diffuse_red ...``, or ``f_dc_0 ...`` of a field. Integers of 8 or 16 bits, floats to 1, 255 or 65,535.
+        precise: positions as float64, for coordinates far from the origin.
 
     Returns:
         Positions ``[N, 3]`` float32 and colours ``[N, 3]`` uint8, on the CPU; points without a colour are mid-grey.
@@ -248,16 +250,10 @@ def read_point_cloud(path: Path) -> tuple[Tensor, Tensor]:
     Raises:
         DataError: the file is missing, not a .ply, truncated, or its vertices have no position.
     """
-    vertex = _load(path)["vertex"]
-    kinds = {prop.name: vertex[prop.name].dtype.kind for prop in vertex.properties}
-    if not kinds.keys() >= {"x", "y", "z"}:
+    points = points_of(_load(path)["vertex"], precise)
+    if points is None:
         raise DataError(f"{path} has vertices without x, y and z; give a .ply of points.")
-    points = _stacked(vertex, ("x", "y", "z"))
-    channels = ("red", "green", "blue")
-    if not kinds.keys() >= set(channels):
-        return points, torch.full_like(points, _GREY, dtype=torch.uint8)
-    scale = 255 if kinds["red"] == "f" else 1
-    return points, (_stacked(vertex, channels) * scale).round().clamp(0, 255).to(torch.uint8)
+    return points
 
 
 def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Tensor] | None = None) -> None:

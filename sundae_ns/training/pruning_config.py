@@ -27,7 +27,7 @@ class PruningConfig(PruneRule):
     keep_ratio: float | None = USUAL_SHARE
     """Share of the N primitives that one prune keeps, in (0, 1]: exactly round(keep_ratio * N). One-shot: None lets
     trials on held-out training views decide the number."""
-    prune_at: int = 15000
+    prune_at: int = 12000
     """Step after which the one-shot prune happens."""
     start: int = 2000
     """First step of continuous pruning."""

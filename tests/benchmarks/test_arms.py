@@ -169,15 +169,15 @@ def test_lengths_come_from_the_method_times_a_factor(tmp_path: Path) -> None:
     path = written(tmp_path, MINE)
     lengths = {name: (arm.kind, arm.warmup, arm.steps) for name, arm in chosen(path).items()}
     assert lengths == {
-        "gentle": ("branch", 15_000, 15_000),
-        "listed": ("branch", 15_000, 15_000),
+        "gentle": ("branch", 12_000, 18_000),
+        "listed": ("branch", 12_000, 18_000),
         "stock": ("whole", 0, 1000),
         "steady": ("whole", 0, 30_000),
     }
     half = {name: (arm.warmup, arm.steps) for name, arm in chosen(path, 0.5).items()}
-    assert half == {"gentle": (7500, 7500), "listed": (7500, 7500), "stock": (0, 500), "steady": (0, 15_000)}
+    assert half == {"gentle": (6000, 9000), "listed": (6000, 9000), "stock": (0, 500), "steady": (0, 15_000)}
     (mcmc,) = choose_arms(["mcmc"], "sundae", 0.001)
-    assert (mcmc.warmup, mcmc.steps) == (15, 30)
+    assert (mcmc.warmup, mcmc.steps) == (12, 30)
     for method, scale in (("nerfacto", 1.0), ("sundae-continuous", 1.0), ("sundae", 0.0)):
         with pytest.raises(ConfigError):
             choose_arms(["sundae"], method, scale)
@@ -223,6 +223,6 @@ def test_each_method_has_a_warm_up_of_its_own(tmp_path: Path) -> None:
     assert (jobs["a"].needs, jobs["b"].needs) == ("fox-sundae-warm-up-s42",) * 2
     assert jobs["c"].needs == "fox-sundae-tiny-warm-up-s42"
     warm_up = jobs["sundae-warm-up"]
-    assert (warm_up.method, warm_up.steps) == ("sundae", 15_000)
+    assert (warm_up.method, warm_up.steps) == ("sundae", 12_000)
     assert warm_up.options[-1] == "30000"
     assert jobs["sundae-tiny-warm-up"].steps < 15_000

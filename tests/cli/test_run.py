@@ -299,6 +299,8 @@ def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.Captur
         (["empty", "-o", "out"], "holds no photos"),
         (["video.mp4", "-o", "out"], "ns-process-data video"),
         (["model", "-o", "out"], "colmap --colmap-path sparse/0"),
+        (["undistorted", "-o", "out"], "colmap --colmap-path dense/sparse --images-path dense/images"),
+        (["blender", "-o", "out"], "add `blender-data` to ns-train"),
         (["photos", "-o", "photos/out"], "lies in photos"),
         (["photos", "-o", "."], "holds what the command reads"),
         (["photos", "-o", "used"], "holds files"),
@@ -313,6 +315,11 @@ def test_refusals_come_before_anything_is_written(
     (tmp_path / "video.mp4").touch()
     (tmp_path / "model" / "sparse" / "0").mkdir(parents=True)
     (tmp_path / "model" / "sparse" / "0" / "cameras.bin").touch()
+    (tmp_path / "undistorted" / "dense" / "sparse").mkdir(parents=True)
+    (tmp_path / "undistorted" / "dense" / "sparse" / "cameras.bin").touch()
+    (tmp_path / "undistorted" / "dense" / "images").mkdir()
+    (tmp_path / "blender").mkdir()
+    (tmp_path / "blender" / "transforms_train.json").touch()
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "thesis.txt").touch()
     before = sorted(tmp_path.rglob("*"))

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from sundae_ns.data.photos import find_photos
+from sundae_ns.cli.poses import Poses
+from sundae_ns.data.photos import find_photos, left_out
 from sundae_ns.errors import DataError
 
 
@@ -102,3 +103,40 @@ def test_a_folder_that_is_none(tmp_path: Path) -> None:
     for name, cause in (("pipe", "Not a directory"), ("gone", "No such file")):
         with pytest.raises(DataError, match=f"{name} cannot be read .{cause}"):
             find_photos(tmp_path / name)
+
+
+def test_photos_of_other_formats_are_named(photos: Path) -> None:
+    assert left_out(photos, find_photos(photos)[0]) == []
+    for name in ("a.HEIC", "sub/b.heic", "c.webp", ".hidden.heic"):
+        (photos / name).parent.mkdir(exist_ok=True)
+        (photos / name).touch()
+    (remark,) = left_out(photos, find_photos(photos)[0])
+    assert remark.startswith("2 .heic files and 1 .webp file are left out")
+    assert "convert them to JPEG" in remark
+    for path in photos.glob("*.png"):
+        path.unlink()
+    with pytest.raises(
+        DataError, match=r"only photos that cannot be read \(2 \.heic files and 1 \.webp file\); convert"
+    ):
+        find_photos(photos)
+
+
+def test_a_run_says_which_photos_it_leaves_out(photos: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (photos / "a.heic").touch()
+    Poses(photos, photos.parent / "capture", "exhaustive").check()
+    assert capsys.readouterr().out.startswith("# warning: 1 .heic file is left out")
+
+
+def test_photos_of_an_odd_size_are_named(photos: Path) -> None:
+    Image.new("RGB", (12, 16)).save(photos / "upright.png")
+    (remark,) = left_out(photos, find_photos(photos)[0])
+    assert remark.startswith("1 of 4 photos (upright.png) are not 16 x 12 px as the others. COLMAP leaves them out")
+
+
+def test_masks_are_no_photos(photos: Path) -> None:
+    photo(photos / "masks" / "0.png")
+    found, _ = find_photos(photos)
+    assert [path.name for path in found] == ["0.png", "1.png", "2.png"]
+    (remark,) = left_out(photos, found)
+    assert f"{photos / 'masks'} is left out" in remark
+    assert "mask_path" in remark

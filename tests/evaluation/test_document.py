@@ -16,7 +16,18 @@ def lines_of(text: str, start: str) -> list[list[str]]:
 def test_each_configuration_has_a_row(measured: Callable[..., Measured]) -> None:
     own = [measured("ours"), measured("theirs", head=False)]
     text = document({"bicycle": own}, {"bicycle": [("A plot", "a.png")]}, ["this and that"], "sundae report x")
-    assert lines_of(text, "| ours")[0] == ["ours", "head on", "4,000", "3.00", "3.50", "25.50", "0.8500", "0.2000", "-"]
+    assert lines_of(text, "| ours")[0] == [
+        "ours",
+        "head on",
+        "4,000",
+        "3.00",
+        "3.50",
+        "25.50",
+        "0.8500",
+        "0.2000",
+        "-",
+        "-",
+    ]
     assert lines_of(text, "| ours")[1] == [
         "ours",
         "head off",
@@ -26,6 +37,7 @@ def test_each_configuration_has_a_row(measured: Callable[..., Measured]) -> None
         "25.00",
         "0.8000",
         "0.2000",
+        "-",
         "-",
     ]
     assert [line[:2] for line in lines_of(text, "| theirs")] == [["theirs", "no head"]]

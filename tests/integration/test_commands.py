@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from PIL import Image
 
+from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import SPLAT_NAMES
 from sundae_ns.storage import is_nerfstudio_ply, read_ply
 
@@ -41,6 +43,20 @@ def test_ns_eval(tiny: Any, call_here: Any, tmp_path: Path) -> None:
         for name in timed:
             del each[name]
     assert ours == result
+
+
+def test_a_copied_run_is_evaluated_by_its_own_checkpoint(tiny: Any, call_here: Any, tmp_path: Path) -> None:
+    """The original is still there, with another checkpoint."""
+    copy = Path(shutil.copytree(tiny.folder, tmp_path / "copy"))
+    for path in (copy / "nerfstudio_models").iterdir():
+        if path.name != f"step-{2 * tiny.save_every:09d}.ckpt":
+            path.unlink()
+    (kept,) = (copy / "nerfstudio_models").iterdir()
+    call_here("ns-eval", "--load-config", copy / "config.yml", "--output-path", tmp_path / "eval.json")
+    result = json.loads((tmp_path / "eval.json").read_text())
+    assert Path(result["checkpoint"]) == kept
+    call_here("sundae", "eval", copy, "-o", tmp_path / "ours.json")
+    assert json.loads((tmp_path / "ours.json").read_text())["results"]["psnr"] == result["results"]["psnr"]
 
 
 def test_a_single_test_view_has_no_deviation(
@@ -96,6 +112,22 @@ def test_ns_render_camera_path(tiny: Any, call_here: Any, tmp_path: Path) -> Non
     frames = pictures(tmp_path / "out")
     assert [frame.shape for frame in frames] == [(31, 45, 3)] * 2
     assert not np.array_equal(*frames)
+
+
+@pytest.mark.parametrize("kind", ["equirectangular", "fisheye", "vr180", "omnidirectional"])
+def test_other_projections_of_a_camera_path_are_refused(tiny: Any, call_here: Any, tmp_path: Path, kind: str) -> None:
+    pose = torch.eye(4).flatten().tolist()
+    path = {
+        **{"camera_type": kind, "render_height": 32, "render_width": 64, "seconds": 1},
+        "camera_path": [{"camera_to_world": pose, "fov": 70, "aspect": 1}],
+    }
+    (tmp_path / "path.json").write_text(json.dumps(path))
+    with pytest.raises(DataError, match="only perspective images can be drawn; set camera_type to perspective"):
+        call_here(
+            *("ns-render", "camera-path", "--load-config", tiny.config, "--output-path", tmp_path / "out"),
+            *("--output-format", "images", "--camera-path-filename", tmp_path / "path.json"),
+        )
+    assert not list((tmp_path / "out").glob("*.jpg"))
 
 
 def test_ns_export(tiny: Any, exported: Path) -> None:

@@ -87,7 +87,7 @@ def test_stopped_and_continued(tiny: Any, tmp_path: Path, monkeypatch: pytest.Mo
     for arm in arms:
         packed, key = results[arm]["packed"], results[arm]["job"]["key"]
         scene = open_scene(out / "jobs" / key / "scene.sundae", data=tiny.scene)
-        found = measure_scene(scene, label="", repeats=0, with_flip=False)
+        found = measure_scene(scene, label="", repeats=0, visible=False)
         assert packed["bytes"] == scene.packed_bytes == found.bytes_total
         assert (packed["psnr"], packed["psnr_base"]) == pytest.approx(
             (found.full.mean("psnr"), found.base.mean("psnr"))

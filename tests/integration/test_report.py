@@ -19,6 +19,7 @@ from PIL import Image
 
 from sundae_ns.cli import main
 from sundae_ns.evaluation import COLUMNS, flip_available
+from sundae_ns.evaluation.jod import jod_available
 from sundae_ns.rendering import render_view
 from sundae_ns.scenes.measure import quality, walk
 from sundae_ns.scenes.opening import open_scene
@@ -99,6 +100,7 @@ def test_times_come_with_the_error_of_the_same_rendering(report: Path, tiny: Any
         found = way["views"][1]
         assert (found["psnr"], found["ssim"]) == (pytest.approx(expected.psnr), pytest.approx(expected.ssim))
         assert (found["flip"] is not None) == flip_available()
+        assert (found["jod"] is not None) == jod_available()
     without = sum(4 * value.numel() for name, value in model.gauss_params.items() if name != "features")
     assert ours["configurations"][1]["bytes"] == without
 

@@ -25,6 +25,46 @@ def test_points_and_colours(tmp_path, dtype, scale, text):
     assert torch.equal(rgb, torch.from_numpy(RGB))
 
 
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(
+    ("dtype", "scale"),
+    [("f4", 1), ("f8", 1), ("f4", 1 / 257), ("u2", 1 / 257), ("i4", 1 / 257), ("i4", 1), ("u2", 1), ("f8", 255)],
+)
+def test_colours_of_other_ranges(tmp_path, dtype, scale, text):
+    _write(tmp_path / "a.ply", RGB / scale if dtype[0] == "f" else (RGB / scale).round(), dtype, text)
+    assert torch.equal(read_point_cloud(tmp_path / "a.ply")[1], torch.from_numpy(RGB))
+
+
+@pytest.mark.parametrize("names", ["r g b", "diffuse_red diffuse_green diffuse_blue", "Red Green Blue", "R G B"])
+@pytest.mark.parametrize("dtype", ["u1", "f4"])
+def test_colours_of_other_names(tmp_path, names, dtype):
+    kinds = [(name, "f4") for name in "xyz"] + [(name, dtype) for name in names.split()]
+    rows = [(*xyz, *rgb) for xyz, rgb in zip(XYZ.tolist(), RGB.tolist(), strict=True)]
+    PlyData([PlyElement.describe(np.array(rows, dtype=kinds), "vertex")]).write(str(tmp_path / "a.ply"))
+    assert torch.equal(read_point_cloud(tmp_path / "a.ply")[1], torch.from_numpy(RGB))
+
+
+def test_colours_of_a_field(tmp_path):
+    kinds = [(name, "f4") for name in ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2")]
+    harmonics = (RGB / 255 - 0.5) / 0.28209479177387814
+    rows = [(*xyz, *dc) for xyz, dc in zip(XYZ.tolist(), harmonics.tolist(), strict=True)]
+    PlyData([PlyElement.describe(np.array(rows, dtype=kinds), "vertex")]).write(str(tmp_path / "a.ply"))
+    assert torch.equal(read_point_cloud(tmp_path / "a.ply")[1], torch.from_numpy(RGB))
+
+
+def test_floats_slightly_above_white(tmp_path):
+    _write(tmp_path / "a.ply", np.array([[1.01, 0.5, 0.0], [0.2, 1.0, 0.1]]), "f4")
+    assert read_point_cloud(tmp_path / "a.ply")[1].tolist() == [[255, 128, 0], [51, 255, 26]]
+
+
+def test_precise_positions(tmp_path):
+    far = [(5_412_330.123, 1e-9, -4e6 - 0.1)]
+    vertices = np.array(far, dtype=[(name, "f8") for name in "xyz"])
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "a.ply"))
+    points, _ = read_point_cloud(tmp_path / "a.ply", precise=True)
+    assert points.tolist() == [list(far[0])]
+
+
 def test_no_colours_are_grey(tmp_path):
     vertices = np.array([tuple(xyz) for xyz in XYZ.tolist()], dtype=[(name, "f8") for name in "xyz"])
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "a.ply"))

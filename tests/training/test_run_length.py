@@ -74,18 +74,18 @@ def test_a_twentieth_of_the_steps() -> None:
     """The run of a user that stayed at a quarter of the resolution to its end."""
     config = fitted("sundae", 1500)
     model = config.pipeline.model
-    assert (model.resolution_schedule * model.num_downscales, model.pruning.prune_at) == (300, 750)
-    assert (model.stop_split_at, model.sh_degree_interval) == (750, 50)
+    assert (model.resolution_schedule * model.num_downscales, model.pruning.prune_at) == (300, 600)
+    assert (model.stop_split_at, model.sh_degree_interval) == (600, 50)
     assert {parts["scheduler"].max_steps for parts in config.optimizers.values() if parts["scheduler"]} == {1500}
     # Densification needs images for its statistics, and opacities need time to recover.
     assert model.refine_every == LEAST_IMAGES
     assert model.reset_alpha_every * model.refine_every > model.stop_split_at
     assert dict(schedule_table(config)) == {
         "images": "1/4 until 150, 1/2 until 300, then full size",
-        "densification": "25 to 750, every 50; opacities never reset",
+        "densification": "25 to 600, every 50; opacities never reset",
         "SH degree": "+1 every 50 steps",
-        "prune": "after 750, to as many as trials choose",
-        "head": "after 750, if trials favour it",
+        "prune": "after 600, to as many as trials choose",
+        "head": "after 600, if trials favour it",
         "learning rates": "decay until 1,500",
     }
 
@@ -94,24 +94,24 @@ def test_resets_keep_their_share_of_a_run_that_has_time_for_them() -> None:
     model = fitted("sundae", 15000).pipeline.model
     assert model.reset_alpha_every * model.refine_every == 1500 >= LEAST_RECOVERY
     resets = dict(schedule_table(fitted("sundae", 15000)))["densification"]
-    assert resets == "250 to 7,500, every 50; opacities reset every 1,500"
+    assert resets == "250 to 6,000, every 50; opacities reset every 1,500"
 
 
 def test_options_set_by_hand_keep_their_value() -> None:
-    words = ("--pipeline.model.pruning.prune-at", "15000", "--optimizers.means.scheduler.max_steps=30000")
+    words = ("--pipeline.model.pruning.prune-at", "12000", "--optimizers.means.scheduler.max_steps=30000")
     config = fitted("sundae", 20000, *words, resolution_schedule=77)
-    assert config.pipeline.model.pruning.prune_at == 15000, "also where it equals the default"
+    assert config.pipeline.model.pruning.prune_at == 12000, "also where it equals the default"
     assert config.optimizers["means"]["scheduler"].max_steps == 30000
     assert config.optimizers["compensation"]["scheduler"].max_steps == 20000
     assert config.pipeline.model.resolution_schedule == 77
-    assert config.pipeline.model.stop_split_at == 10000
+    assert config.pipeline.model.stop_split_at == 8000
 
 
 def test_a_chain_keeps_its_number_of_rounds() -> None:
     model = fitted("sundae", 3000, warmup="mcmc").pipeline.model
-    assert (model.refine_every, model.stop_split_at) == (10, 1500)
+    assert (model.refine_every, model.stop_split_at) == (10, 1200)
     assert (
-        dict(schedule_table(fitted("sundae", 3000, warmup="mcmc")))["densification"] == "50 to 1,500, every 10 (MCMC)"
+        dict(schedule_table(fitted("sundae", 3000, warmup="mcmc")))["densification"] == "50 to 1,200, every 10 (MCMC)"
     )
 
 
@@ -147,12 +147,12 @@ def test_a_resumed_run_keeps_its_schedule() -> None:
     assert config.pipeline.model.head.size == "tiny"
     assert lines == [
         "--pipeline.model.sh-degree-interval is 9; the run to resume has 200",
-        "--pipeline.model.pruning.prune-at is 15000; the run to resume has 3000",
+        "--pipeline.model.pruning.prune-at is 12000; the run to resume has 2400",
         "--pipeline.model.pruning.keep-ratio is 0.2; the run to resume has 0.3",
     ]
     assert config.pipeline.model.resolution_schedule == run.pipeline.model.resolution_schedule == 600
     assert config.optimizers["means"]["scheduler"].max_steps == 6000
-    assert (config.pipeline.model.pruning.prune_at, config.pipeline.model.sh_degree_interval) == (15000, 9)
+    assert (config.pipeline.model.pruning.prune_at, config.pipeline.model.sh_degree_interval) == (12000, 9)
     assert all_methods["sundae"] == usual
 
 
@@ -184,10 +184,10 @@ def test_tables_of_other_kinds() -> None:
     late.pipeline.model.head.start_at, late.pipeline.model.warm_start = 25000, "field.ply"
     rows = dict(schedule_table(late))
     assert (rows["prune"], rows["densification"]) == ("at once", "none: warm start")
-    assert rows["head"] == "after 10,000, if trials favour it"
+    assert rows["head"] == "after 13,000, if trials favour it"
     assert dict(schedule_table(all_methods["sundae-tiny"]))["head"] == "after 600"
     assert dict(schedule_table(all_methods["sundae-continuous"]))["prune"] == "2,000 to 15,000, every 2,000"
     deciding = deepcopy(all_methods["sundae-auto"])
-    assert dict(schedule_table(deciding))["prune"] == "after 15,000, to as many as trials choose"
+    assert dict(schedule_table(deciding))["prune"] == "after 12,000, to as many as trials choose"
     deciding.pipeline.model.warm_start = "field.ply"
     assert dict(schedule_table(deciding))["prune"] == "at once"

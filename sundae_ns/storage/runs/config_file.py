@@ -84,7 +84,7 @@ _ConfigLoader.add_multi_constructor(_PYTHON + "object:", _make_object)
 _ConfigLoader.add_multi_constructor(_PYTHON + "object/apply:", _make_value)
 
 
-def _find_capture(config: Any, folder: Path) -> None:
+def find_capture(config: Any, folder: Path) -> None:
     """If a run's capture is gone, look for it at the same place relative to the run, which may have moved too."""
     datamanager: Any = getattr(getattr(config, "pipeline", None), "datamanager", None)
     data = getattr(datamanager, "data", None)
@@ -119,7 +119,7 @@ def load_config(path: Path) -> Any:
         CheckpointError: it cannot be read, is no configuration, or asks for something else.
     """
     config = _load(path, lambda text: yaml.load(text, Loader=_ConfigLoader))
-    _find_capture(config, path.absolute().parent)
+    find_capture(config, path.absolute().parent)
     return config
 
 

@@ -1,0 +1,207 @@
+"""Checks of a capture before and after it is parsed: files, cameras, projections, and where the cloud lies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig
+from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from torch import Tensor
+
+from sundae_ns.api.opening import FRAME_FILE
+from sundae_ns.data.advice import no_model, no_transforms
+from sundae_ns.data.beside import beside
+from sundae_ns.data.capture import check_transforms, read_json
+from sundae_ns.data.colmap import check_colmap
+from sundae_ns.data.frame import STRAY, stray_cameras
+from sundae_ns.errors import DataError
+from sundae_ns.parsing.placing import TYPES
+from sundae_ns.training.warning import warn
+
+LEAST_FOCAL, MOST_FOCAL = 0.01, 1000.0
+"""Shortest and longest focal length in widths of the image: views of 178 and of 0.06 degrees."""
+FARTHEST = 20
+"""Distance of a camera, in median distances, above which its pose is doubted."""
+_LOOKED_FOR = 2000
+"""Points of a cloud that are looked for in the views."""
+_MARGIN = 0.1
+"""Margin of an image in which points count as seen, as a share of its size."""
+_LEAST_SEEING = 0.5
+"""Share of the views that see points, if cloud and cameras are in the same coordinates."""
+
+
+def check_capture(parser: DataParserConfig, data: Path, splits: Sequence[str], *, images: bool = True) -> None:
+    """Check a capture in nerfstudio's or COLMAP's layout before its parser reads it.
+
+    Args:
+        parser: configuration of the parser; captures of other parsers are not checked.
+        data: the capture: a folder, or a ``transforms.json``.
+        splits: splits that will be read.
+        images: whether the images will be needed; a viewer needs the cameras only.
+
+    Raises:
+        DataError: the first thing that cannot be used, and where it stands.
+    """
+    if not data.exists():
+        raise DataError(
+            f"{data} does not exist; give the folder of the capture with --data, or, for a command of nerfstudio that "
+            "has no --data, correct data in the run's config.yml"
+        )
+    if isinstance(parser, ColmapDataParserConfig):
+        if parser.load_3D_points and not any((data / parser.colmap_path).glob("points3D.*")):
+            parser.load_3D_points = False  # the model then warns, and starts from random points
+        if not (data / parser.colmap_path).is_dir():
+            raise no_model(data, parser.colmap_path)
+        folder = data / parser.images_path if images else None
+        check_colmap(data / parser.colmap_path, folder, points=parser.load_3D_points)
+    elif isinstance(parser, NerfstudioDataParserConfig):
+        path = data if data.suffix == ".json" else data / "transforms.json"
+        if not path.is_file():
+            raise no_transforms(data)
+        check_transforms(path, splits=splits)
+        if images and parser.downscale_factor in (None, 1):
+            first = path.parent / read_json(path)["frames"][0]["file_path"]  # nerfstudio looks at its size
+            if not first.exists():
+                raise DataError(f"{first} does not exist{beside(first)}; correct file_path in {path.name}")
+
+
+def check_cameras(cameras: Cameras, names: Sequence[Path], points: Tensor | None = None) -> str | None:
+    """Check the poses and focal lengths of cameras ``[N]`` of training images with these names, in any units.
+
+    Args:
+        cameras: of the images.
+        names: of the images.
+        points: of the scene ``[M, 3]``, in the same coordinates, if any.
+
+    Returns:
+        A warning on poses that are possible, but make no good scene; None without one.
+
+    Raises:
+        DataError: a projection is none of a lens, an axis is mirrored, or a focal length belongs to no lens.
+    """
+    kinds = cameras.camera_type.flatten()
+    other = ~torch.isin(kinds, torch.tensor(list(TYPES.values()), dtype=kinds.dtype))
+    if other.any():
+        at = _first(other)
+        raise DataError(
+            f"the camera of {names[at].name} is of type {CameraType(int(kinds[at])).name}, which no perspective image "
+            "can be made of; cut its images into perspective ones, such as cube faces"
+        )
+    mirrored = torch.linalg.det(cameras.camera_to_worlds[:, :, :3]) < 0
+    if mirrored.any():
+        raise DataError(
+            f"the pose of {names[_first(mirrored)].name} mirrors an axis ({int(mirrored.sum())} of {len(names)} poses "
+            "do); negate one column of its rotation"
+        )
+    shares = cameras.fx / cameras.width.clamp_min(1)
+    wrong = ((shares < LEAST_FOCAL) | (shares > MOST_FOCAL)).flatten()
+    if wrong.any():
+        at = _first(wrong)
+        raise DataError(
+            f"the focal length of {names[at].name} is {float(cameras.fx[at]):.3g} px and the image is "
+            f"{int(cameras.width[at])} px wide, which no lens has; give the focal length in pixels"
+        )
+    centres = cameras.camera_to_worlds[:, :, 3]
+    middle = centres.median(dim=0).values
+    distances = (centres - middle).norm(dim=1)
+    if len(names) > 1 and distances.max() == 0:
+        return "all cameras stand at one place, so nothing says how far things are; check the poses"
+    usual = distances.median()
+    known = None if points is None or not len(points) else points.double().cpu().numpy()
+    far = torch.from_numpy(stray_cameras(centres.double().numpy(), lambda: known))
+    if not far.any() and usual > 0:
+        reach = 0.0 if points is None or not len(points) else float((points - middle).norm(dim=1).median())
+        far = (distances > FARTHEST * usual) & (distances > STRAY * reach)
+    if far.any():
+        first = _first(far)
+        times = (
+            f"{float(distances[first] / usual):,.0f} times as far away as most" if usual > 0 else "far from all others"
+        )
+        return (
+            f"the camera of {names[first].name} is {times} ({int(far.sum())} of {len(names)} are); check its pose, or "
+            "remove the view"
+        )
+    return None
+
+
+def stray_tests(train: Cameras, test: Cameras, names: Sequence[Path]) -> str | None:
+    """A warning on test cameras ``[M]``, of images with these names, that stand far from all others; None without."""
+    centres = torch.cat([train.camera_to_worlds[:, :, 3], test.camera_to_worlds[:, :, 3]]).double().cpu()
+    far = torch.from_numpy(stray_cameras(centres.numpy()))[len(train) :]
+    if not far.any():
+        return None
+    return (
+        f"the camera of {names[_first(far)].name}, a test view, stands far from all others ({int(far.sum())} of "
+        f"{len(names)} do); check its pose, or remove the view"
+    )
+
+
+def _first(flags: Tensor) -> int:
+    """Index of the first True."""
+    return int(flags.nonzero()[0])
+
+
+def check_projection(camera: Cameras) -> None:
+    """Raise ``DataError`` for a camera that asks for another projection, as a camera path may; ours are perspective."""
+    kind = CameraType(int(camera.camera_type.flatten()[0]))
+    if kind != CameraType.PERSPECTIVE:
+        raise DataError(
+            f"the camera is of type {kind.name.lower()}, and only perspective images can be drawn; set camera_type to "
+            "perspective in the camera path, for a panorama render the six faces of a cube"
+        )
+
+
+@torch.no_grad()
+def views_of_points(points: Tensor, cameras: Cameras) -> Tensor:
+    """For cameras ``[M]``, whether each sees one of points ``[N, 3]`` or more, bool ``[M]``.
+
+    Distortion is left out; images count with a margin of a tenth of their size on each side.
+    """
+    points = points[torch.isfinite(points).all(dim=1)].cpu()
+    chosen = torch.linspace(0, max(len(points) - 1, 0), min(_LOOKED_FOR, len(points))).long()
+    seen = []
+    parts = (cameras.fx, cameras.fy, cameras.cx, cameras.cy, cameras.width, cameras.height)
+    lenses = torch.cat([part.float() for part in parts], dim=-1).cpu()
+    for pose, (fx, fy, cx, cy, width, height) in zip(cameras.camera_to_worlds.cpu(), lenses.tolist(), strict=True):
+        x, y, z = ((points[chosen] - pose[:, 3]) @ pose[:, :3]).unbind(dim=1)
+        across = (x * fx / -z + cx) / width
+        down = (-y * fy / -z + cy) / height
+        inside = (across > -_MARGIN) & (across < 1 + _MARGIN) & (down > -_MARGIN) & (down < 1 + _MARGIN)
+        seen.append(((z < 0) & inside).any())
+    return torch.stack(seen)
+
+
+def warn_of_cloud(points: Tensor, cameras: Cameras) -> None:
+    """Warn of a cloud ``[N, 3]`` that most views do not show: it and the cameras are in different coordinates."""
+    seen = views_of_points(points, cameras)
+    if seen.float().mean() < _LEAST_SEEING:
+        warn(
+            f"{int((~seen).sum())} of {len(seen)} views show no point of the sparse cloud, so cloud and cameras are "
+            "probably in different coordinates; export both together, or train without the cloud (remove ply_file_path)"
+        )
+
+
+def other_frame(run: Path, transform: Tensor, scale: float) -> str | None:
+    """A warning if a run was trained in other coordinates than its capture is parsed to now; None if it was not.
+
+    Args:
+        run: the run's folder; None without its ``dataparser_transforms.json``.
+        transform: from the capture's coordinates ``[3, 4]``.
+        scale: after the transform.
+    """
+    try:
+        stated = read_json(run / FRAME_FILE)
+        before, size = torch.tensor(stated["transform"], dtype=torch.float64), float(stated["scale"])
+        same = torch.allclose(before * size, transform.double() * scale, rtol=1e-3, atol=1e-3)
+    except (DataError, KeyError, TypeError, ValueError, RuntimeError):
+        return None
+    if same:
+        return None
+    return (
+        f"{run} was trained in other coordinates: its capture has changed, or another version scaled it; if cameras "
+        "stand far apart, resume it with --pipeline.datamanager.robust-frame False"
+    )
