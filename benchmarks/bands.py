@@ -29,7 +29,6 @@ from harness.points import (
 from harness.script import run_script
 from sundae_ns.cli.outputs import Overwrite, check_folder
 from sundae_ns.errors import ConfigError, DataError, SundaeError
-from sundae_ns.gaussians import finite_mask
 from sundae_ns.gaussians.parameters import sh_to_rgb
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import PruneRule, band_rule, check_share, decide, field_graph, kept_count, response
@@ -219,9 +218,7 @@ def run_bands(
         def next_is(description: str) -> None:
             progress.update(task, advance=1, description=description)
 
-        field, _ = read_field(run)
-        finite = finite_mask(field)
-        params = {name: value[finite] for name, value in field.items()}
+        params, _, dropped = read_field(run)
         colors = base_colors(params["features_dc"])
         next_is("Graph and response")
         rule = band_rule(rule, rule.gamma)
@@ -263,8 +260,8 @@ def run_bands(
 
     result = {
         "field": str(run),
-        "primitives": len(finite),
-        "not_finite": len(finite) - len(params["means"]),
+        "primitives": len(params["means"]) + dropped,
+        "not_finite": dropped,
         "isolated": int(graph.isolated.sum()),
         "signal": rule.signal,
         "num_neighbors": rule.num_neighbors,

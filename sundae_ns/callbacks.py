@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -9,10 +10,12 @@ from typing import Any, cast
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.utils import writer
+from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from sundae_ns.datamanager import SundaeDatamanager
 from sundae_ns.rendering import FieldSource, RenderSettings, TrainingView
+from sundae_ns.storage.accounting import BYTES_PER_FLOAT, bytes_of_module, megabytes
 from sundae_ns.storage.runs.folder import find_config, take_records
 from sundae_ns.training.extension import Extension, HeldOutView
 from sundae_ns.training.field_state import FieldState
@@ -152,7 +155,28 @@ class NerfstudioRun:
     def _finish(self, step: int) -> None:
         for extension in self.model.extensions:
             extension.finish(self)
+        self._summarize()
         writer.write_out_storage()
+
+    def _summarize(self) -> None:
+        """Print quality, size and the next command, on the first rank."""
+        if self._trainer is None:
+            return
+        results = self.evaluate()  # every rank takes part
+        if self.folder is None:
+            return
+        state, views = self.state, len(self._datamanager.eval_dataset)
+        numbers = sum(value[:1].numel() for value in state.field.values())
+        size = BYTES_PER_FLOAT * self.source.total * numbers
+        size += bytes_of_module(state.head) if state.head is not None and state.head_enabled else 0
+        head = "with" if state.head is not None and state.head_enabled else "without"
+        lines = [f"{self.source.total:,} primitives, {head} a head: {megabytes(size)} before packing"]
+        if results:
+            quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
+            lines.insert(0, f"trained: {quality} on {views} test views")
+        lines.append(f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}")
+        for line in lines:
+            CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def training_views(model: Any, datamanager: SundaeDatamanager) -> list[TrainingView]:

@@ -28,7 +28,7 @@ from torch import Tensor
 from sundae_ns.compensation import PHASES
 from sundae_ns.errors import ConfigError, SundaeError, one_line
 from sundae_ns.evaluation.count_curve import CurvePoint, expected_change
-from sundae_ns.gaussians import finite_mask
+from sundae_ns.gaussians import mend
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import Pruned, PruneRule, band_rule, field_graph, kept_count, prune_field
 from sundae_ns.rendering.outputs import FieldKey
@@ -223,11 +223,11 @@ class ViewerControls(torch.nn.Module):
     @torch.no_grad()
     def _prune(self, rule: PruneRule, share: float) -> Pruned:
         field = self._state.field
-        finite = finite_mask(field)
-        n = int(finite.sum())
+        usable = mend(field).field
+        n = usable.num_primitives
         count = kept_count(share, n)
         if rule.uses_graph and rule.edges not in self._graphs:
-            self._graphs[rule.edges] = field_graph(field.rows(finite), rule)
+            self._graphs[rule.edges] = field_graph(usable, rule)
         needed = rule.uses_contribution and count < n
         weights = self._contribution_of(count if rule.uses_detail else None) if needed else None
         return prune_field(field, rule, count, weights, self._graphs.get(rule.edges))

@@ -15,17 +15,13 @@ from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.compensation.head import SIZES
 from sundae_ns.data.capture import read_json
 from sundae_ns.errors import CheckpointError, DataError
-from sundae_ns.gaussians import FEATURES, finite_mask
-from sundae_ns.gaussians.field import Field
+from sundae_ns.gaussians import FEATURES
 from sundae_ns.rendering.source import degree_in_use
-from sundae_ns.storage import is_nerfstudio_ply, ply_comments, read_ply
-from sundae_ns.storage.kinds import kind_of
+from sundae_ns.storage.kinds import kind_of, kind_of_primitives, unread
+from sundae_ns.storage.primitives import mended_of, read_primitives
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.config_file import model_options
 from sundae_ns.storage.runs.folder import find_config
-from sundae_ns.storage.sog import read_sog
-from sundae_ns.storage.spz import read_spz
-from sundae_ns.storage.viewers import ANTIALIASED
 
 _HEAD = "networks.head."
 FRAME_FILE = "dataparser_transforms.json"
@@ -35,9 +31,13 @@ FRAME_FILE = "dataparser_transforms.json"
 def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     """Open a finished scene. Nothing in its files is executed, and nerfstudio is not needed.
 
+    Opacities of exactly 0 or 1 and widths of 0, which files store as infinite, become finite. Primitives that are NaN,
+    or infinite without a meaning, are left out. A warning says how many.
+
     Args:
-        path: a ``.ply``, ``.spz`` or ``.sog`` of any program, a packed ``.sundae``, or a run of ``ns-train`` with
-            sundae or splatfacto: its folder, its ``config.yml`` or one of its checkpoints.
+        path: a ``.ply``, also a compressed one, a ``.spz``, ``.sog`` or ``.splat`` of any program, a checkpoint of
+            gsplat (``.pt``), a packed ``.sundae``, or a run of ``ns-train`` with sundae or splatfacto: its folder, its
+            ``config.yml`` or one of its checkpoints.
         device: of the scene.
 
     Raises:
@@ -51,31 +51,30 @@ def load(path: Path | str, *, device: torch.device | str = "cpu") -> Scene:
     >>> sn.load(path)
     Scene(50 primitives, SH degree 0, no head, cpu)
     """
-    path = Path(path)
-    kind, suffix = kind_of(path), path.suffix.lower()
-    if kind == "packed" or suffix == ".sundae":
+    return load_with_mask(Path(path), device)[0]
+
+
+def load_with_mask(path: Path, device: torch.device | str = "cpu") -> tuple[Scene, Tensor | None]:
+    """As :func:`load`, with True for the primitives of a file that the scene has, bool ``[N]``; None for others."""
+    kind = kind_of(path)
+    if kind == "packed" or (kind is None and path.suffix.lower() == ".sundae"):
         from sundae_ns.api.packing import scene_of  # its decoder needs a compiler, which other files do not
         from sundae_ns.storage.packing import read_scene
 
-        return scene_of(read_scene(path)).to(device)
-    in_model_frame = False
-    if kind == "ply" or suffix == ".ply":
-        params, antialiased = read_ply(path), ANTIALIASED in ply_comments(path)
-        in_model_frame = is_nerfstudio_ply(path)
-    elif kind in ("spz", "sog") or suffix in (".spz", ".sog"):
-        params, antialiased = (read_spz if kind == "spz" or suffix == ".spz" else read_sog)(path)
-    else:
-        return _of_run(path).to(device)
-    if not finite_mask(params).any():
-        raise DataError(f"{path} has {len(params['means']):,} primitives, and none is finite; export it again")
-    return Scene(Field(params), antialiased=antialiased, in_model_frame=in_model_frame).to(device)
+        return scene_of(read_scene(path)).to(device), None
+    if kind_of_primitives(path) is None:
+        return _of_run(path).to(device), None
+    found = read_primitives(path)
+    scene = Scene(found.mended.field, antialiased=found.antialiased, in_model_frame=found.in_model_frame)
+    return scene.to(device), found.mended.mask
 
 
 def _of_run(path: Path) -> Scene:
     config = find_config(path)
     if config is None:
         reason = "is no run" if path.exists() else "does not exist"
-        raise CheckpointError(f"{path} {reason}; give a run, its config.yml, or a .sundae, .ply, .spz or .sog file")
+        wanted = "give a run, its config.yml, or a .sundae, .ply, .spz, .sog, .splat or .pt file"
+        raise CheckpointError(f"{path} {unread(path) or f'{reason}; {wanted}'}")
     if path.suffix == ".ckpt":
         return scene_of_checkpoint(path, checkpoint.read(path), config)
     return scene_of_checkpoint(*checkpoint.read_newest(config.parent), config)
@@ -102,6 +101,7 @@ def scene_of_checkpoint(source: Path, loaded: Mapping[str, Any], config: Path) -
         # Coefficients of degrees that training has not reached are not in use.
         degree = degree_in_use(degree, int(loaded["step"]) // max(interval, 1))
     field["features_rest"] = field["features_rest"][:, : (degree + 1) ** 2 - 1]
+    field = mended_of(field, source)
     frame = _frame_of(config.parent)
     return Scene(
         field,

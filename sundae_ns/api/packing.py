@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from sundae_ns.api.sensitivity import sensitivity_of
 from sundae_ns.api.views import is_frame, view_in_front
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import PackError
-from sundae_ns.gaussians import FEATURES
+from sundae_ns.gaussians import FEATURES, mend
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rendering.views import View
 from sundae_ns.storage.packing import PackedScene
@@ -59,11 +60,12 @@ def contents_of(scene: Scene, cameras: Mapping[str, Tensor] | None = None) -> Pa
     """The contents of a packed file for a scene, with how much errors are seen in its cameras.
 
     Args:
-        scene: any device; its primitives must be finite.
+        scene: any device; primitives that are not finite are left out (``gaussians.mend``).
         cameras: arrays by the names of :data:`sundae_ns.storage.packing.scene.CAMERAS`; by default those of the
             scene's views.
     """
     scene = scene.to("cpu")
+    scene = replace(scene, field=mend(scene.field).field)
     head = {} if scene.head is None else dict(scene.head.state_dict())
     field = {name: value.detach() for name, value in scene.field.items() if name != FEATURES or head}
     if cameras is None and scene.views:

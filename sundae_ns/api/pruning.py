@@ -13,7 +13,7 @@ from sundae_ns.api.cost import prune_cost, require_memory, state
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.virtual import of_unit_size, virtual_views
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.gaussians import finite_mask
+from sundae_ns.gaussians import mend
 from sundae_ns.pruning import PruneRule, kept_count, prune_field
 from sundae_ns.rendering import LocalField, TrainingView, View, contribution
 
@@ -42,7 +42,8 @@ def prune(
 ) -> Scene:
     """Keep the primitives that matter most to the views, and merge the others into them.
 
-    Primitives with NaN or infinite values are dropped first.
+    Primitives with NaN, or infinite values without a meaning, are dropped first. An opacity of 1, a width of 0 and the
+    like become finite.
 
     Args:
         scene: to prune; it does not change.
@@ -94,8 +95,8 @@ def prune_with_mask(
     """As :func:`prune`, with the mask of the kept primitives; ``stated`` if its cost was stated already."""
     check_amount(keep, count)
     rule = rule or DEFAULT_RULE
-    finite = finite_mask(scene.field)
-    field = scene.field if bool(finite.all()) else scene.field.rows(finite)
+    mended = mend(scene.field)
+    field, finite = mended.field, mended.mask
     if keep is not None:
         count = kept_count(keep, field.num_primitives)
     assert count is not None

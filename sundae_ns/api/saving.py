@@ -7,7 +7,7 @@ from pathlib import Path
 from sundae_ns.api.opening import load
 from sundae_ns.api.page import write_page
 from sundae_ns.api.scene import Scene
-from sundae_ns.errors import ConfigError, StorageError, writing
+from sundae_ns.errors import ConfigError, writing
 from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.kinds import kind_of
 from sundae_ns.storage.viewers import FORMATS, ViewerFile, write_for_viewers
@@ -24,7 +24,7 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
 
     Args:
         scene: any device.
-        path: file to write; its folder must exist.
+        path: file to write; a missing folder of it is made.
         upright: turn from nerfstudio's z-up axes to the -y-up axes of viewers; ``.ply``, ``.spz`` and ``.sog`` only.
 
     Raises:
@@ -45,8 +45,6 @@ def save(scene: Scene, path: Path | str, *, upright: bool = False) -> None:
         raise ConfigError(f"{path} has no supported suffix; name it {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     if upright and suffix not in FORMATS:
         raise ConfigError(f"{suffix} files keep their coordinates; leave out upright")
-    if not path.parent.is_dir():
-        raise StorageError(f"{path.parent} is no folder; create it first, or choose another")
     with writing(f"cannot write {path}"):
         if suffix in FORMATS:
             save_for_viewers(scene, path, upright=upright)

@@ -11,7 +11,7 @@ from sundae_ns.api.pruning import prune_with_mask
 from sundae_ns.api.scene import Scene
 from sundae_ns.api.virtual import of_unit_size
 from sundae_ns.errors import ConfigError
-from sundae_ns.gaussians import finite_mask
+from sundae_ns.gaussians import mend
 from sundae_ns.pruning import PruneRule
 from sundae_ns.rendering import View
 
@@ -58,7 +58,7 @@ def count_for_drop(
     scene, seen = of_unit_size(scene, views)
     shown, held_out = split(seen)
     tolerated = tolerated_error(drop)
-    count = int(finite_mask(scene.field).sum())
+    count = mend(scene.field).field.num_primitives
     curve: list[tuple[int, float]] = []
     before = count, 0.0
     while count > _FEWEST:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.api.scene import Scene
 from sundae_ns.errors import ConfigError, DataError
-from sundae_ns.gaussians import finite_mask
+from sundae_ns.gaussians import mend
 from sundae_ns.gaussians.field import Field
 from sundae_ns.rasterization import rasterize
 from sundae_ns.rendering import View
@@ -126,13 +126,10 @@ def resized(scene: Scene, factor: float) -> Scene:
 
 def _usable(scene: Scene) -> Field:
     """The finite primitives, detached."""
-    finite = finite_mask(scene.field)
-    if not bool(finite.any()):
+    field = mend(scene.field).field
+    if not field.num_primitives:
         raise DataError(f"none of {scene.num_primitives:,} primitives is finite, so no camera sees the scene")
-    values = {name: value.detach() for name, value in scene.field.items()}
-    if not bool(finite.all()):  # else a large field would be copied for nothing
-        values = {name: value[finite] for name, value in values.items()}
-    return Field(values, scene.field.encoding)
+    return Field({name: value.detach() for name, value in field.items()}, field.encoding)
 
 
 def _middle_and_reach(field: Field) -> tuple[Tensor, float]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def bench(
     measurement: Annotated[Literal["frame"], tyro.conf.Positional],
-    load_config: Path,
+    scene: Annotated[Path, tyro.conf.Positional],
     factors: tuple[float, ...] = (1.0,),
     precisions: tuple[Literal["fp32", "bf16", "fp16"], ...] = (),
     phases: tuple[Literal[1, 2, 4], ...] = (),
@@ -35,7 +35,7 @@ def bench(
 
     Args:
         measurement: frame.
-        load_config: the run's folder, its config.yml, or a packed scene.
+        scene: a run (its folder or config.yml), or a packed scene.
         factors: on the sides of the images; the test images are resized alike.
         precisions: arithmetic of the head; by default all three on CUDA, and fp32 on a CPU, the only one there.
         phases: passes of the head for a frame, at as many offsets of its grid; by default those of the run.
@@ -60,7 +60,7 @@ def bench(
 
     console = Console(stderr=True)
     with console.status("Opening the run"), redirect_stdout(StringIO()):  # nerfstudio prints while it loads
-        run = open_scene(load_config, data=data)
+        run = open_scene(scene, data=data)
     run = replace(run, cameras=run.cameras[:views], truths=run.truths[:views])
     on_gpu, has_head = run.model.device.type == "cuda", run.model.head is not None
     device = torch.cuda.get_device_name() if on_gpu else "cpu"
@@ -71,7 +71,7 @@ def bench(
     with Progress(console=console, transient=True) as progress:
         task = progress.add_task("Timing frames", total=len(jobs) * len(run.cameras))
         for factor, precision, count in jobs:
-            line = {"config": str(load_config), "device": device, "primitives": run.model.num_points, "factor": factor}
+            line = {"config": str(scene), "device": device, "primitives": run.model.num_points, "factor": factor}
             with rendered_as(run, factor=factor, precision=precision, phases=count) as shown:
                 measured = measure_scene(
                     shown, label="", repeats=repeats, visible=False, progress=lambda: progress.advance(task)

@@ -28,10 +28,10 @@ def export(
     """Write a scene as a web page with its head (.html or a folder), or its base colours as .ply, .spz or .sog.
 
     The page needs no network and no server. The other formats hold no features and no head; antialiased scenes are
-    marked as such, and primitives with NaN or infinite values are left out.
+    marked as such.
 
     Args:
-        scene: a run (its folder or config.yml), a packed scene, or, for .spz and .sog, a 3DGS .ply of any program.
+        scene: a run (its folder or config.yml), a packed scene, or a .ply, .spz, .sog, .splat or gsplat's .pt.
         out: file to write; its suffix selects the format: .html, .ply (exact), .spz or .sog (quantised, much smaller).
             A name without a suffix is a folder of page and scene, for a web server.
         upright: rotate the scene from nerfstudio's z-up axes to the -y-up axes of viewers.
@@ -43,6 +43,7 @@ def export(
 
     from sundae_ns.errors import ConfigError
     from sundae_ns.storage.kinds import kind_of
+    from sundae_ns.storage.ply import has_own_columns
     from sundae_ns.storage.runs.folder import files_of
     from sundae_ns.storage.viewers import check_format
 
@@ -59,7 +60,7 @@ def export(
         size = write_page(out, *open_packed_file(scene, data), title=out.resolve().stem)
         print(f"{out}: {size:,} bytes; {'open it in a browser' if out.suffix else 'serve it'}")
         return 0
-    if kind_of(scene) == "ply" and out.suffix.lower() == ".ply":
+    if kind_of(scene) == "ply" and out.suffix.lower() == ".ply" and has_own_columns(scene):
         raise ConfigError(f"{scene} is a .ply already; give an output name that ends in .spz or .sog")
     from sundae_ns.api.opening import load
     from sundae_ns.api.saving import save_for_viewers
@@ -71,8 +72,6 @@ def export(
         written = save_for_viewers(found, out, upright=upright)
     mode = ", antialiased" if found.antialiased else ""
     print(f"{out}: {written.primitives:,} primitives, degree {written.degree}{mode}, {written.bytes:,} bytes")
-    if written.dropped:
-        print(f"left out {written.dropped:,} primitives that were not finite (NaN or infinite)")
     if written.clamped:
         print(f"clamped scales or colours of {written.clamped:,} primitives to the range of a .spz; a .sog has none")
     if written.cut:
@@ -82,10 +81,10 @@ def export(
 
 def open_packed_file(path: Path, data: Path | None) -> tuple[Scene, bytes]:
     """A scene, and the packed file that holds it; a run, whose capture may have moved, is packed in memory."""
-    from sundae_ns.storage.kinds import kind_of
+    from sundae_ns.storage.kinds import kind_of, kind_of_primitives
     from sundae_ns.storage.runs.config_file import check_run
 
-    if kind_of(path) is not None or path.suffix == ".sundae":
+    if kind_of(path) == "packed" or kind_of_primitives(path) is not None or path.suffix == ".sundae":
         from sundae_ns.api.saving import packed_file
 
         return packed_file(path)
@@ -154,7 +153,7 @@ def prune_file(
     three bands of harmonics take about 1.7 GB; a prune of more than a minute states its cost first.
 
     Args:
-        source: a 3DGS .ply, .spz or .sog, a packed scene, or a run.
+        source: a .ply, .spz, .sog, .splat or gsplat's .pt, a packed scene, or a run.
         out: file to write, in the format of its suffix: .ply, .spz, .sog or .sundae. A .ply of a .ply keeps all
             properties and comments.
         keep: share of the primitives to keep, in (0, 1]; by default 0.1.
@@ -180,10 +179,9 @@ def prune_file(
     from sundae_ns.api.cost import prune_cost, require_memory, state
     from sundae_ns.api.virtual import VIRTUAL_SIZE
     from sundae_ns.errors import ConfigError
-    from sundae_ns.gaussians import finite_mask
     from sundae_ns.pruning import PruneRule
     from sundae_ns.storage.kinds import kind_of
-    from sundae_ns.storage.ply import keep_vertices, stated_size
+    from sundae_ns.storage.ply import has_own_columns, keep_vertices, stated_size
 
     amounts = {"--keep": keep, "--count": count, "--target-drop": target_drop}
     check_one(amounts)
@@ -206,7 +204,7 @@ def prune_file(
         if cameras is None and target_drop is None:
             stated = True
             state(cost, n, looks)
-    scene = opening.load(source)
+    scene, usable = opening.load_with_mask(source)
     seen = None
     if rule.uses_contribution or target_drop is not None:
         seen = cameras_for(scene, cameras, views, seed)
@@ -219,13 +217,14 @@ def prune_file(
         for number, psnr in found.curve:
             print(f"{number:12,} primitives: {psnr:.2f} dB against the full field, on held-out cameras")
     pruned = pruning.prune_with_mask(scene, keep=keep, count=count, views=seen, rule=rule, progress=True, stated=stated)
-    if kind_of(source) == "ply" and out.suffix.lower() == ".ply":
-        keep_vertices(source, out, pruned.mask, pruned.scene.field if merge else None)
+    if usable is not None and out.suffix.lower() == ".ply" and kind_of(source) == "ply" and has_own_columns(source):
+        rows = usable.clone()
+        rows[usable] = pruned.mask.cpu()
+        keep_vertices(source, out, rows, pruned.scene.field if merge else None)
     else:
         saving.save(pruned.scene, out)
-    print(f"{out}: {pruned.scene.num_primitives:,} of {scene.num_primitives:,} primitives")
+    total = scene.num_primitives if usable is None else len(usable)
+    print(f"{out}: {pruned.scene.num_primitives:,} of {total:,} primitives")
     if pruned.seen is not None and seen:
         print(f"{len(seen)} cameras see {pruned.seen:.1%} of the primitives")
-    if broken := int((~finite_mask(scene.field)).sum()):
-        print(f"dropped {broken:,} primitives that were not finite (NaN or infinite)")
     return 0

@@ -56,7 +56,7 @@ COMMANDS: dict[str, tuple[Callable[..., int], str]] = {
     "train": (train, "train by ns-train, with short options"),
     "prune": (prune_file, "make any splat scene smaller, without its photos"),
     "distill": (distill_file, "prune, then train on the full scene's own images, without photos"),
-    "pack": (pack, "pack a finished run into one file"),
+    "pack": (pack, "pack a scene into one file; says what that costs"),
     "unpack": (unpack, "unpack a scene into a run, for the commands of nerfstudio"),
     "export": (export, "write a scene as a web page, .ply, .spz or .sog"),
     "view": (view, "show a scene with its head in the browser"),

@@ -18,15 +18,18 @@ def check_file(out: Path, *, reads: Iterable[Path | None], overwrite: bool) -> N
     """Refuse an output file that exists, unless ``overwrite`` is set, and always one that the command reads.
 
     Args:
-        out: file to write.
+        out: file to write; a missing folder of it is made when the file is written.
         reads: files and folders that the command reads; None for an option that was not given.
         overwrite: whether a file that the command does not read may be replaced.
 
     Raises:
         StorageError: the file may not be written.
     """
-    if not out.parent.is_dir():
-        raise StorageError(f"{out.parent} is no folder; create it first, or choose another")
+    above = out.parent
+    while not above.exists() and above != above.parent:
+        above = above.parent
+    if not above.is_dir():
+        raise StorageError(f"{above} is no folder; choose another")
     if not out.exists():
         return
     if not out.is_file():

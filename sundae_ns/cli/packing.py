@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import sys
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
+from functools import cache
 from io import StringIO
 from json import dumps
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from sundae_ns.cli.outputs import Overwrite, check_file
 from sundae_ns.cli.process import quoted
+
+if TYPE_CHECKING:
+    from sundae_ns.scenes.targets import Judge
+    from sundae_ns.storage.packing import Codecs, PackedScene
 
 
 @dataclass(frozen=True)
@@ -41,30 +48,30 @@ class Precision:
 def pack(
     run: Annotated[Path, tyro.conf.Positional],
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
-    max_cameras: int = 100,
-    finetune: int = 0,
-    data: Path | None = None,
     target_bytes: int | None = None,
     target_drop: float | None = None,
-    block: int = 1024,
-    precision: Annotated[Precision, tyro.conf.arg(name="")] = Precision(),  # noqa: B008
+    finetune: int = 0,
+    max_cameras: int = 100,
+    data: Path | None = None,
     json: bool = False,
     overwrite: Overwrite = False,
+    block: int = 1024,
+    precision: Annotated[Precision, tyro.conf.arg(name="")] = Precision(),  # noqa: B008
 ) -> int:
-    """Pack a finished run into one file that can be rendered, and print the size of each part.
+    """Pack a scene into one file that can be rendered; print the size of each part, and the quality before and after.
 
     Args:
-        run: a run of sundae or splatfacto (its folder or config.yml).
+        run: a run of sundae or splatfacto (its folder or config.yml), or a .ply, .spz, .sog, .splat or gsplat's .pt.
         out: file to write, for example scene.sundae.
-        max_cameras: maximum number of training cameras to store for viewers; with 0, the capture is not needed.
-        finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
-            The defaults then quantise more coarsely, for a smaller file.
-        data: folder of the capture, if it moved.
         target_bytes: find the finest steps whose file has at most this many bytes.
         target_drop: find the coarsest steps that lose at most this PSNR on some test views, dB.
-        block: number of primitives per block of positions; smaller blocks are more exact and larger on disk.
+        finetune: training steps with quantisation in the loop before packing, for example 1000; the run is not changed.
+            The defaults then quantise more coarsely, for a smaller file.
+        max_cameras: maximum number of training cameras to store for viewers; with 0, the capture is not needed.
+        data: folder of the capture, if it moved.
         json: print one JSON object in place of the table.
         overwrite: replace an existing file, once the new one is complete.
+        block: number of primitives per block of positions; smaller blocks are more exact and larger on disk.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -84,42 +91,127 @@ def pack(
         raise ConfigError(f"target-bytes is {target_bytes}; give 1 or more")
     if target_drop is not None and not 0 < target_drop < 100:
         raise ConfigError(f"target-drop is {target_drop}; give a positive number of dB")
-    chosen = {name: value for name, value in asdict(precision).items() if value is not None}
-    config = PackConfig(**{**(FINETUNED if finetune else {}), **chosen, "block": block})  # type: ignore[arg-type]
+    chosen = {name: value for name, value in {**asdict(precision), "block": block}.items() if value is not None}
+    plain = PackConfig(**chosen)  # type: ignore[arg-type]
+    config = PackConfig(**{**FINETUNED, **chosen}) if finetune else plain  # type: ignore[arg-type]
     config.validate()
     check_file(out, reads=[*files_of(run), data], overwrite=overwrite)
-    check_run(run)
+    has_photos = _has_photos(run, {"--finetune": finetune, "--target-drop": target_drop, "--data": data})
+    if has_photos:
+        check_run(run)
+    quality, notes = "", list[str]()
+    figures: dict[str, Any] = {}
     # The bar writes to the real stdout while nerfstudio's messages are suppressed.
     with Progress(console=Console(file=sys.stdout), transient=True, disable=json) as progress:
-        task = progress.add_task("Reading the run", total=2 + finetune)
+        task = progress.add_task("Reading the run", total=3 + finetune)
         with redirect_stdout(StringIO()):  # nerfstudio prints messages while it reads a capture
-            from sundae_ns.scenes.packed import contents_of_run  # takes seconds
+            if has_photos:
+                from sundae_ns.scenes.packed import contents_of_run  # takes seconds
 
-            scene = contents_of_run(run, max_cameras=max_cameras, data=data)
+                source = contents_of_run(run, max_cameras=max_cameras, data=data)
+            else:
+                from sundae_ns.api.opening import load
+                from sundae_ns.api.packing import contents_of
+
+                source = contents_of(load(run))
             progress.update(task, advance=1, description="Fine-tuning" if finetune else "Packing")
+            judge = _judge_of(run, data)
             if finetune:
                 from sundae_ns.scenes.finetune import finetune as tune
 
-                scene, codecs = tune(run, scene, config, finetune, data=data, progress=lambda _: progress.advance(task))
+                scene, codecs = tune(
+                    run, source, config, finetune, data=data, progress=lambda _: progress.advance(task)
+                )
             else:
-                scene, codecs = fit_scene(scene, config)
+                scene, codecs = fit_scene(source, config)
             progress.update(task, description="Packing")
             if target_bytes is not None or target_drop is not None:
                 from sundae_ns.scenes.targets import Search
 
-                search = Search(run, scene, config, data=data)
-                found = search.smaller_than(target_bytes) if target_bytes else search.better_than(target_drop or 0.0)
+                # Not what is fitted already: its positions are rounded.
+                search, without = Search(scene if finetune else source, config, judge), Search(source, plain, judge)
+                if target_bytes is not None:
+                    found = search.smaller_than(target_bytes)
+                else:
+                    tuned = search.better_unless(target_drop or 0.0, without) if finetune else None
+                    found = tuned or without.better_than(target_drop or 0.0)
+                    if finetune and tuned is None:
+                        notes.append("the fine-tune loses too much for the target; packed without it, try more steps")
+                        finetune = 0
                 scene, codecs = found.scene, found.codecs
-        report = write_fitted(out, scene, codecs)
+            report = write_fitted(out, scene, codecs)
+            progress.update(task, advance=1, description="Measuring")
+            if has_photos:
+                packs = [(scene, codecs), *([fit_scene(source, plain)] if finetune else [])]
+                quality, figures = _measured(judge, packs, finetune, notes)
+    for note in notes:
+        print(note, file=sys.stderr)
     if json:
-        print(dumps({"file": str(out), **report.summary()}))
+        print(dumps({"file": str(out), **report.summary(), **figures}))
         return 0
     print(f"{out}: {report.primitives:,} primitives in {report.bytes:,} bytes ({report.bytes / 1e6:.2f} MB)")
     print(f"{'':14}{'bytes':>12}{'bits per primitive':>20}")
     for name, bits in report.bits.items():
         print(f"{name:14}{round(bits * report.primitives / 8):12,}{bits:20.2f}")
     print(f"{'all':14}{report.bytes:12,}{8 * report.bytes / report.primitives:20.2f}")
+    if quality:
+        print(quality)
     return 0
+
+
+def _has_photos(source: Path, options: Mapping[str, object]) -> bool:
+    """Whether a scene is a run; ``ConfigError`` for a file of primitives with one of the options that need photos."""
+    from sundae_ns.errors import ConfigError
+    from sundae_ns.storage.kinds import PRIMITIVES, kind_of_primitives
+
+    kind = kind_of_primitives(source)
+    if kind is None:
+        return True
+    for name, value in options.items():
+        if value:
+            raise ConfigError(f"{source} is a {PRIMITIVES[kind]} without photos; leave out {name}, or give a run")
+    return False
+
+
+def _judge_of(run: Path, data: Path | None) -> Callable[[], Judge]:
+    """Opens the test views of a run, once."""
+
+    @cache
+    def judge() -> Judge:
+        from sundae_ns.scenes.targets import Judge
+
+        return Judge(run, data)
+
+    return judge
+
+
+def _measured(
+    judge: Callable[[], Judge], packs: Sequence[tuple[PackedScene, Codecs]], finetune: int, notes: list[str]
+) -> tuple[str, dict[str, Any]]:
+    """A line and figures of the quality of a pack; a second pack is that without the fine-tune. Adds to the notes."""
+    from sundae_ns.errors import SundaeError
+    from sundae_ns.storage.packing import pack_bytes
+
+    try:
+        opened = judge()
+        before, after = opened.before, opened.quality(*packs[0])
+    except SundaeError as error:
+        notes.append(f"the quality is not measured: {error}")
+        return "", {}
+    figures: dict[str, Any] = {"psnr": [before.psnr, after.psnr], "views": opened.views}
+    shown = f"PSNR {before.psnr:.2f} -> {after.psnr:.2f} dB"
+    if math.isfinite(before.ssim + after.ssim):  # not for images smaller than its window
+        figures["ssim"] = [before.ssim, after.ssim]
+        shown += f", SSIM {before.ssim:.4f} -> {after.ssim:.4f}"
+    for plain in packs[1:]:
+        without = opened.quality(*plain).psnr
+        if after.psnr < without:
+            notes.append(
+                f"the fine-tune of {finetune:,} steps loses {before.psnr - after.psnr:.2f} dB; a pack without it has "
+                f"{len(pack_bytes(*plain)[0]):,} bytes and loses {before.psnr - without:.2f} dB: give more steps, "
+                "or leave out --finetune"
+            )
+    return f"{shown}, before and after, on {opened.views} of {opened.all_views} test views", figures
 
 
 def unpack(
@@ -127,6 +219,7 @@ def unpack(
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("outputs"),
     name: str | None = None,
     data: Path | None = None,
+    overwrite: Overwrite = False,
 ) -> int:
     """Unpack a scene into a run for ns-viewer, ns-render and ns-eval. No code in the file is executed.
 
@@ -135,6 +228,7 @@ def unpack(
         out: folder of runs, like ns-train's --output-dir.
         name: name of the experiment; by default the file's name.
         data: folder of the capture on which the scene was trained; ns-eval needs its images.
+        overwrite: replace a run that was unpacked under this name.
     """
     from rich.progress import Progress
 
@@ -144,7 +238,7 @@ def unpack(
 
     name = name or scene.stem
     with writing(f"cannot write to {out}"):
-        unpacked_folder(out, name)
+        unpacked_folder(out, name, overwrite=overwrite)
     with Progress(transient=True) as progress:
         task = progress.add_task("Unpacking", total=2)
         found = read_scene(scene)
@@ -153,7 +247,7 @@ def unpack(
 
         progress.update(task, advance=1, description="Writing the run")
         with writing(f"cannot write to {out}"):
-            path = write_run(found, out, name, data=data)
+            path = write_run(found, out, name, data=data, overwrite=overwrite)
     print(f"{len(found.field['means']):,} primitives, {'with' if found.head else 'without'} a head")
     print(f"View: ns-viewer --load-config {quoted(path)}")
     if data is not None:

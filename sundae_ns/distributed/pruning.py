@@ -12,7 +12,8 @@ from torch import Tensor
 from sundae_ns.distributed.shards import Shards
 from sundae_ns.errors import SundaeError
 from sundae_ns.gaussians.field import Field, as_field
-from sundae_ns.gaussians.parameters import finite_mask, num_primitives
+from sundae_ns.gaussians.mending import mend
+from sundae_ns.gaussians.parameters import num_primitives
 from sundae_ns.gaussians.surgery import rewrite
 from sundae_ns.pruning import Decision, PruneRule, decide
 from sundae_ns.pruning.cutting import FieldPruner
@@ -31,17 +32,23 @@ class RankPruner(FieldPruner):
         return self.shards.total
 
     def drop_nonfinite(self) -> int:
-        """Remove the primitives of all ranks with a NaN or infinite parameter; returns their number. Collective.
+        """As :meth:`FieldPruner.drop_nonfinite`, for the primitives of all ranks. Collective.
 
         Raises:
             DataError: no primitive is finite.
         """
-        finite, before = finite_mask(self.params), self.total
-        dropped = before - sum(count for (count,) in self.shards.numbers(int(finite.sum())))
+        mended, before = mend(self.params), self.total
+        dropped = before - sum(count for (count,) in self.shards.numbers(mended.field.num_primitives))
         if dropped == before:
             raise diverged(before)
+        if mended.clamped:
+            # Before primitives move between ranks.
+            whole = {name: value.detach().clone() for name, value in self.params.items()}
+            for name, value in mended.field.items():
+                whole[name][mended.mask] = value
+            rewrite(self.params, self.optimizers, whole)
         if dropped:
-            self.shards.level(self.params, self.optimizers, self.states, finite)
+            self.shards.level(self.params, self.optimizers, self.states, mended.mask)
         return dropped
 
     @torch.no_grad()

@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
 
-from sundae_ns.gaussians.parameters import finite_mask, num_primitives
+from sundae_ns.gaussians.mending import mend
+from sundae_ns.gaussians.parameters import num_primitives
 from sundae_ns.gaussians.relocation import grow
 from sundae_ns.gaussians.surgery import keep, per_primitive, rewrite
 from sundae_ns.pruning.decision import Decision, decide, diverged
@@ -35,7 +36,7 @@ class FieldPruner:
         return num_primitives(self.params)
 
     def drop_nonfinite(self) -> int:
-        """Remove the primitives with a NaN or infinite parameter.
+        """Remove the primitives with a NaN, or an infinite parameter without a meaning; clamp the others (``mend``).
 
         Call it before the contribution, which renders the field: one NaN spreads over the image.
 
@@ -45,13 +46,14 @@ class FieldPruner:
         Raises:
             DataError: no primitive is finite; the field is unchanged.
         """
-        finite = finite_mask(self.params)
-        dropped = int((~finite).sum())
-        if dropped == len(finite):
-            raise diverged(dropped)
-        if dropped:
-            keep(self.params, self.optimizers, self.states, finite)
-        return dropped
+        mended = mend(self.params)
+        if not mended.field.num_primitives:
+            raise diverged(mended.dropped)
+        if mended.dropped:
+            keep(self.params, self.optimizers, self.states, mended.mask)
+        if mended.clamped:
+            rewrite(self.params, self.optimizers, mended.field)
+        return mended.dropped
 
     @torch.no_grad()
     def cut(self, rule: PruneRule, count: int, contribution: Tensor | None = None) -> Decision:

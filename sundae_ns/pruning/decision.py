@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians.field import Field, as_field
-from sundae_ns.gaussians.parameters import finite_mask
+from sundae_ns.gaussians.mending import mend
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning.edges import field_graph
 from sundae_ns.pruning.pairing import pair_labels
@@ -73,9 +73,9 @@ def decide(
 ) -> Decision:
     """Decide which primitives of a field to keep.
 
-    Primitives with a NaN or infinite parameter are dropped first; of the others exactly ``count`` stay. If that is all
-    of them, nothing is scored. In a field of at most ``num_neighbors`` primitives each is a neighbour of all others
-    within reach.
+    Primitives with a NaN, or an infinite parameter without a meaning, are dropped first (``gaussians.mend``); of the
+    others exactly ``count`` stay. If that is all of them, nothing is scored. In a field of at most ``num_neighbors``
+    primitives each is a neighbour of all others within reach.
 
     Args:
         params: the field, N primitives.
@@ -90,19 +90,19 @@ def decide(
         DataError: no primitive is finite, or the contribution does not have one value per primitive.
     """
     rule.validate()
-    field, finite = as_field(params), finite_mask(params)
-    n, n_finite = len(finite), int(finite.sum())
+    mended = mend(params)
+    usable, finite = mended.field, mended.mask
+    n, n_finite = len(finite), usable.num_primitives
     if n_finite == 0:
         raise diverged(n)
     count = min(count, n_finite)
     if count == n_finite:
-        return Decision(finite, n_finite, n - n_finite)
+        return Decision(finite, n_finite, n - n_finite, values=dict(usable) if mended.clamped else None)
 
     if contribution is not None:
         if contribution.shape != finite.shape:
             raise DataError(f"contribution has shape {list(contribution.shape)} for {n} primitives: return [{n}]")
         contribution = contribution.detach()[finite.to(contribution.device)].to(finite.device)
-    usable = field if n_finite == n else field.rows(finite)
     if not rule.uses_graph:
         graph = None
     elif graph is None:
@@ -117,7 +117,7 @@ def decide(
         selected = _select(scores, rule, count, usable["means"])
     mask = finite.clone()
     mask[finite] = selected.to(mask.device)
-    values = None
+    values = dict(usable.rows(selected.to(finite.device))) if mended.clamped else None
     if rule.redistribution == "merge":
         assert graph is not None
         if contribution is None:

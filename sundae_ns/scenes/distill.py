@@ -25,7 +25,7 @@ from sundae_ns.api.target import split
 from sundae_ns.api.virtual import of_unit_size, resized, size_of, virtual_views
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.errors import BackendError, CheckpointError, ConfigError, reading
-from sundae_ns.gaussians import FEATURES, finite_mask, initial_features
+from sundae_ns.gaussians import FEATURES, initial_features, mend
 from sundae_ns.gaussians.field import Field
 from sundae_ns.gpu.memory import naming_full_memory
 from sundae_ns.model import SundaeModelConfig
@@ -103,8 +103,7 @@ class Distillation:
             raise ConfigError(f"steps is {steps}; give 1 or more")
         if keep is None and count is None:
             keep = 0.1
-        finite = finite_mask(teacher.field)
-        teacher = dataclasses.replace(teacher, field=teacher.field.rows(finite)) if finite.any() else teacher
+        teacher = dataclasses.replace(teacher, field=mend(teacher.field).field)
         side = size or SIDES.get(teacher.device.type, SIDES["cpu"])
         if views:
             shown, held_out = split(views)

@@ -20,7 +20,7 @@ from sundae_ns.errors import CheckpointError, DataError
 from sundae_ns.model import SundaeModel, SundaeModelConfig
 from sundae_ns.scenes import stock
 from sundae_ns.scenes.packed import datamanager_of, model_of, put_scene
-from sundae_ns.storage.kinds import kind_of, refuse
+from sundae_ns.storage.kinds import kind_of, refuse, unread
 from sundae_ns.storage.packing import read_scene
 from sundae_ns.storage.runs import checkpoint
 from sundae_ns.storage.runs.fingerprint import fingerprint
@@ -76,14 +76,13 @@ def open_scene(path: Path, *, data: Path | None = None) -> Opened:
     """
     if kind_of(path) == "packed":
         return _open_packed(path, data)
-    refuse(
-        path, ply="it comes without test views; give the folder of a finished run, its config.yml, or a packed scene"
-    )
+    wanted = "give the folder of a finished run, its config.yml, or a packed scene"
+    refuse(path, primitives=f"it comes without test views; {wanted}")
     config = config_of(path)
     if config.name == "config.yml" and config.is_file():
         return _open_run(config, data)
     reason = "is no run" if path.exists() else "does not exist"
-    raise CheckpointError(f"{path} {reason}; give the folder of a finished run, its config.yml, or a packed scene")
+    raise CheckpointError(f"{path} {unread(path) or f'{reason}; {wanted}'}")
 
 
 def _open_packed(path: Path, data: Path | None) -> Opened:

@@ -128,7 +128,9 @@ def _options(kind: type[DataParserConfig]) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------------------ unpacking
 
 
-def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | None = None) -> Path:
+def write_run(
+    packed: PackedScene, output_dir: Path, name: str, *, data: Path | None = None, overwrite: bool = False
+) -> Path:
     """Write a packed scene as a run for ``ns-viewer``, ``ns-render``, ``ns-export`` and, with its capture, ``ns-eval``.
 
     Args:
@@ -136,6 +138,7 @@ def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | 
         output_dir: folder of runs; the run is ``output_dir/name/sundae/unpacked``.
         name: of the experiment: letters, digits, ``_``, ``.``, ``-``.
         data: the capture; without it the run has cameras without images.
+        overwrite: replace a run that was unpacked there; files of other names in its folder stay.
 
     Returns:
         The run's ``config.yml``, which is written last.
@@ -148,7 +151,7 @@ def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | 
     from nerfstudio.configs.method_configs import all_methods
 
     config: TrainerConfig = copy.deepcopy(all_methods["sundae"])  # type: ignore[assignment]
-    folder = unpacked_folder(output_dir, name)
+    folder = unpacked_folder(output_dir, name, overwrite=overwrite)
     config.output_dir, (config.experiment_name, _, config.timestamp) = output_dir.resolve(), folder.parts[-3:]
     model = model_of(scene_of(packed))
     config.pipeline.model = model.config
@@ -162,11 +165,15 @@ def write_run(packed: PackedScene, output_dir: Path, name: str, *, data: Path | 
             write_text(cameras / "transforms.json", json.dumps(_transforms(packed), indent=1))
         if is_frame(frame := packed.meta.get("frame")):
             write_text(folder / FRAME_FILE, json.dumps(frame, indent=4))
+        else:
+            (folder / FRAME_FILE).unlink(missing_ok=True)
     state = {f"_model.{name}": value for name, value in model.state_dict().items()}
-    checkpoint.write(
-        {"step": model.step, "pipeline": state}, config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"
-    )
+    path = config.get_checkpoint_dir() / f"step-{model.step:09d}.ckpt"
+    checkpoint.write({"step": model.step, "pipeline": state}, path)
     write_text(folder / "config.yml", yaml.dump(config))
+    for other in checkpoint.checkpoints(path.parent):  # of a replaced run
+        if other != path:
+            other.unlink()
     return folder / "config.yml"
 
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import torch
 
-from sundae_ns.errors import DataError, PackError
-from sundae_ns.evaluation import psnr
+from sundae_ns.errors import DataError, PackError, SundaeError
+from sundae_ns.evaluation import psnr, ssim
 from sundae_ns.scenes.opening import open_pipeline, views_to_test
 from sundae_ns.scenes.packed import place
 from sundae_ns.storage.packing import Codecs, PackConfig, PackedScene, fit_scene, pack_bytes
@@ -25,7 +25,65 @@ from sundae_ns.storage.runs.folder import config_of
 FINEST, COARSEST = -3.0, 4.0
 """Ends of the search: powers of two of the factor."""
 _TRIES = 7
-_VIEWS = 4
+_VIEWS = 8
+
+
+class Quality(NamedTuple):
+    """Means over the same test views."""
+
+    psnr: float
+    """dB."""
+    ssim: float
+    """NaN for images smaller than its window."""
+
+
+class Judge:
+    """Measures a run, and packs of it, on some of its test views.
+
+    Args:
+        run: folder of a run of sundae or splatfacto, or its ``config.yml``.
+        data: the capture, if it has moved.
+
+    Raises:
+        CheckpointError: the run cannot be opened.
+        DataError: the capture is missing, cannot be used, or has no test views.
+    """
+
+    @torch.no_grad()
+    def __init__(self, run: Path, data: Path | None) -> None:
+        opened = open_pipeline(config_of(run), data=data, test_mode="test")
+        opened.pipeline.eval()
+        self._model = opened.model
+        cameras, truths = views_to_test(self._model, opened.pipeline.datamanager)
+        if not cameras:
+            raise DataError(f"{run} has no test views; give --target-bytes, or train with an eval-interval")
+        chosen = torch.linspace(0, len(cameras) - 1, min(_VIEWS, len(cameras))).round().long().unique().tolist()
+        self._views = [(cameras[i], truths[i]) for i in chosen]
+        self.all_views = len(cameras)
+        """Number of test views of the capture."""
+        self.before = self._shown()
+        """Of the run itself."""
+
+    @property
+    def views(self) -> int:
+        """Number of test views that are measured."""
+        return len(self._views)
+
+    def quality(self, scene: PackedScene, codecs: Codecs) -> Quality:
+        """Of a pack."""
+        model = self._model
+        place(model, codecs.rounded(scene.field))
+        if model.head is not None and scene.head:
+            model.head.load_state_dict(codecs.rounded_head(scene.head))
+        return self._shown()
+
+    @torch.no_grad()
+    def _shown(self) -> Quality:
+        found = []
+        for camera, truth in self._views:
+            image = self._model.get_outputs_for_camera(camera)["rgb"].clamp(0, 1)
+            found.append((float(psnr(image, truth)), float(ssim(image, truth))))
+        return Quality(*(sum(values) / len(found) for values in zip(*found, strict=True)))
 
 
 class Try(NamedTuple):
@@ -36,44 +94,57 @@ class Try(NamedTuple):
     bytes: int
 
 
-def scaled(config: PackConfig, power: float) -> PackConfig:
+def scaled(config: PackConfig, power: float, *, with_positions: bool = True) -> PackConfig:
     """Options with all steps larger by 2^power, and as many fewer bits of positions, but at least 10."""
     steps = {name: min(max(getattr(config, name) * 2**power, 1e-4), 1.0) for name in STEPS}
-    position_bits = min(max(round(config.position_bits - power), 10), 16)
-    return replace(config, **steps, position_bits=position_bits)  # type: ignore[arg-type]
+    if with_positions:
+        steps["position_bits"] = min(max(round(config.position_bits - power), 10), 16)
+    return replace(config, **steps)  # type: ignore[arg-type]
 
 
 class Search:
-    """Packs of one scene at several factors."""
+    """Packs of one scene at several factors.
 
-    def __init__(self, run: Path, scene: PackedScene, config: PackConfig, *, data: Path | None = None) -> None:
-        self.run, self.scene, self.config, self.data = run, scene, config, data
+    Args:
+        scene: exact, or fine-tuned with the rounding of ``config``.
+        config: the options at the factor 1.
+        judge: opens the run's test views when they are first needed.
+    """
+
+    def __init__(self, scene: PackedScene, config: PackConfig, judge: Callable[[], Judge]) -> None:
+        self.scene, self.config, self._open = scene, config, judge
+        # A fine-tune has rounded the positions: another grid would only add an error.
+        self._with_positions = "finetuned" not in (scene.meta.get("source") or {})
 
     @cached_property
-    def _drop(self) -> Callable[[PackedScene, Codecs], float]:
-        return _drop_of(self.run, self.data)
+    def _judge(self) -> Judge:
+        return self._open()
 
     def drop(self, tried: Try) -> float:
-        """PSNR of a pack below the unpacked run on some test views, dB.
+        """PSNR of a pack below the unpacked run on some test views, dB; infinite for images that are not finite.
 
         Raises:
             DataError: the capture is missing, or cannot be used.
         """
-        return self._drop(tried.scene, tried.codecs)
+        lost = self._judge.before.psnr - self._judge.quality(tried.scene, tried.codecs).psnr
+        return lost if math.isfinite(lost) else math.inf
 
     def smaller_than(self, limit: int) -> Try:
-        """The finest pack of at most ``limit`` bytes.
+        """The finest pack of at most ``limit`` bytes; that at the factor 1 if it fits too and, by chance, loses less.
 
         Raises:
             PackError: even the coarsest is larger.
         """
         found, fits = self._bisected(lambda tried: tried.bytes <= limit, first=COARSEST, last=FINEST)
-        if fits:
-            return found
+        default = self._tried(0.0)
         try:
             lost = f" and loses {self.drop(found):.2f} dB"
-        except DataError:
+            if fits and default.bytes <= limit and self.drop(default) < self.drop(found):
+                return default
+        except SundaeError:  # sizes need no capture
             lost = ""
+        if fits:
+            return found
         raise PackError(
             f"the smallest pack has {found.bytes:,} bytes{lost}; give a larger --target-bytes, or prune the run"
         )
@@ -81,21 +152,45 @@ class Search:
     def better_than(self, limit: float) -> Try:
         """The coarsest pack that loses at most ``limit`` dB on the test views.
 
+        The search begins at the factor 1: its result is smaller than that pack, or loses less.
+
         Raises:
             PackError: even the finest loses more.
             DataError: the capture is missing, or cannot be used.
         """
-        found, fits = self._bisected(lambda tried: self.drop(tried) <= limit, first=FINEST, last=COARSEST)
-        if fits:
+
+        def fits(tried: Try) -> bool:
+            return self.drop(tried) <= limit
+
+        default = self._tried(0.0)
+        if fits(default):
+            found, _ = self._bisected(fits, first=0.0, last=COARSEST, known=default)
+            return found
+        found, fitting = self._bisected(fits, first=FINEST, last=0.0)
+        if fitting:
             return found
         raise PackError(
             f"the finest pack loses {self.drop(found):.3f} dB at {found.bytes:,} bytes; give a larger --target-drop"
         )
 
-    def _bisected(self, fits: Callable[[Try], bool], *, first: float, last: float) -> tuple[Try, bool]:
-        """The fitting pack nearest to ``last``; that of ``first`` and False if even this one does not fit."""
-        best = self._tried(first)
-        if not fits(best):
+    def better_unless(self, limit: float, plain: Search) -> Try | None:
+        """As :meth:`better_than` of a fine-tuned scene; None if it loses more, or if ``plain`` has a smaller pack.
+
+        ``plain`` is the search without the fine-tune.
+        """
+        try:
+            found = self.better_than(limit)
+        except PackError:
+            return None
+        default = plain._tried(0.0)
+        return None if default.bytes < found.bytes and plain.drop(default) <= limit else found
+
+    def _bisected(
+        self, fits: Callable[[Try], bool], *, first: float, last: float, known: Try | None = None
+    ) -> tuple[Try, bool]:
+        """The fitting pack nearest to ``last``; that of ``first``, unless ``known`` to fit, and False if none does."""
+        best = known or self._tried(first)
+        if known is None and not fits(best):
             return best, False
         for _ in range(_TRIES):
             middle = (first + last) / 2
@@ -107,33 +202,6 @@ class Search:
         return best, True
 
     def _tried(self, power: float) -> Try:
-        scene, codecs = fit_scene(self.scene, scaled(self.config, power))
+        config = scaled(self.config, power, with_positions=self._with_positions)
+        scene, codecs = fit_scene(self.scene, config)
         return Try(scene, codecs, len(pack_bytes(scene, codecs)[0]))
-
-
-@torch.no_grad()
-def _drop_of(run: Path, data: Path | None) -> Callable[[PackedScene, Codecs], float]:
-    """A function that measures the PSNR of a pack below that of the run, on some test views, dB."""
-    opened = open_pipeline(config_of(run), data=data, test_mode="test")
-    opened.pipeline.eval()
-    model = opened.model
-    cameras, truths = views_to_test(model, opened.pipeline.datamanager)
-    if not cameras:
-        raise DataError(f"{run} has no test views; give --target-bytes, or train with an eval-interval")
-    chosen = torch.linspace(0, len(cameras) - 1, min(_VIEWS, len(cameras))).round().long().unique().tolist()
-
-    @torch.no_grad()
-    def quality() -> float:
-        images = [model.get_outputs_for_camera(cameras[i])["rgb"].clamp(0, 1) for i in chosen]
-        return sum(float(psnr(image, truths[i])) for image, i in zip(images, chosen, strict=True)) / len(chosen)
-
-    before = quality()
-
-    def drop(scene: PackedScene, codecs: Codecs) -> float:
-        place(model, codecs.rounded(scene.field))
-        if model.head is not None and scene.head:
-            model.head.load_state_dict(codecs.rounded_head(scene.head))
-        after = quality()
-        return before - after if math.isfinite(after) else math.inf
-
-    return drop

@@ -27,7 +27,7 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     the block raises, its file is removed and ``path`` is unchanged.
 
     Args:
-        path: the file to write; its folder must exist.
+        path: the file to write; a missing folder of it is made.
         partial: temporary file in the same folder. By default named after this process, and such files of killed
             processes are removed.
 
@@ -37,6 +37,8 @@ def replacing(path: Path, partial: Path | None = None) -> Iterator[Path]:
     owned = partial is None
     partial = partial or path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
     try:
+        with writing(f"cannot write {path}"):
+            path.parent.mkdir(parents=True, exist_ok=True)
         with writing(f"cannot write {path}"), _reserved(path, partial) if owned else nullcontext():
             yield partial
             flush(partial)

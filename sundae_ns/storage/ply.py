@@ -3,12 +3,15 @@
 One binary vertex per primitive, all properties float32, values before activation as in
 :mod:`sundae_ns.gaussians.parameters`: ``x y z  nx ny nz  f_dc_0..2  f_rest_*  opacity  scale_0..2  rot_0..3``. Normals
 are zero. ``f_rest`` is channel-major: all coefficients of red, then green, then blue. The format stores base colours
-only: no feature vectors and no head.
+only: no feature vectors and no head. Read are also colours in place of SH coefficients (``ns-export`` writes them), and
+the compressed .ply of PlayCanvas.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
+from io import BufferedReader, FileIO
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +21,9 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from sundae_ns.errors import DataError, SundaeError, reading, regular
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, sh_degree_of
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, num_primitives, odd_shapes, rgb_to_sh, sh_degree_of
 from sundae_ns.storage.atomic import replacing
+from sundae_ns.storage.compressed_ply import PACKED, decompressed
 from sundae_ns.storage.point_cloud import points_of
 
 MODEL_FRAME = "Coordinates: nerfstudio model"
@@ -32,6 +36,7 @@ _COLUMNS = {
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
 _NORMALS = ("nx", "ny", "nz")
+_RGB = ("red", "green", "blue")
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 _MAX_HEADER = 1 << 16  # bytes
@@ -86,12 +91,21 @@ def _table(params: Mapping[str, Tensor]) -> list[tuple[tuple[str, ...], NDArray[
     return [*blocks[:2], (_rest_columns(rest.shape[1]), rest), *blocks[2:]]
 
 
+def _header(path: Path) -> bytes:
+    """The header of a .ply with the end of its last line; nothing if it has none. ``OSError`` if it cannot be read."""
+    with regular(path).open("rb") as file:
+        begin = file.read(_MAX_HEADER)
+    newline = b"\r\n" if begin[3:5] == b"\r\n" else begin[3:4]
+    # A comment may contain the word.
+    content, end, _ = begin.partition(newline + b"end_header" + newline)
+    return content + end if end and newline in (b"\n", b"\r", b"\r\n") else b""
+
+
 def _check_header(path: Path, primitives: bool) -> None:
     """Check the header alone: plyfile allocates by it, and reads lists and text row by row, in minutes."""
-    with regular(path).open("rb") as file:
-        header, end, _ = file.read(_MAX_HEADER).partition(b"end_header")
+    header = _header(path)
     lines = [line.split() for line in header.splitlines()]
-    if not end or lines[:1] != [[b"ply"]]:
+    if lines[:1] != [[b"ply"]]:
         raise _incomplete(path, "it has no .ply header")
     text = [b"format", b"ascii", b"1.0"] in lines
     # In ascii, each value takes at least a digit and a space.
@@ -124,15 +138,14 @@ def _check_header(path: Path, primitives: bool) -> None:
 
 
 def stated_size(path: Path) -> tuple[int, int]:
-    """Number of primitives in a 3DGS .ply, and of the numbers that :func:`read_ply` keeps of each; reads the header.
+    """Number of primitives in a 3DGS .ply, and of the numbers that :func:`read_ply` returns of each; reads the header.
 
     Raises:
         DataError: the file is missing, not a binary .ply, or shorter than its header states.
     """
     with reading(path, "a complete .ply file"):
         _check_header(path, primitives=True)
-        with path.open("rb") as file:
-            header = file.read(_MAX_HEADER).partition(b"end_header")[0]
+        header = _header(path)
     counts = [int(words[2]) for words in map(bytes.split, header.splitlines()) if words[:2] == [b"element", b"vertex"]]
     return sum(counts), sum(map(len, _COLUMNS.values())) + header.count(b" f_rest_")
 
@@ -148,11 +161,30 @@ def _load(path: Path, *, primitives: bool = False) -> PlyData:
     """
     with reading(path, "a complete .ply file"):
         _check_header(path, primitives)
-        # plyfile maps the file given a path; from a stream it reads single vertices (90 s per million instead of 1 s).
-        data = PlyData.read(str(path))
+        with _AsciiHeader(FileIO(path), len(_header(path))) as file:
+            data = PlyData.read(file)
     if "vertex" not in data:
         raise DataError(f"{path} has no vertices; give a .ply of points or of Gaussian primitives.")
     return data
+
+
+class _AsciiHeader(BufferedReader):
+    """A .ply whose header plyfile can decode: a comment in UTF-8 reads as question marks.
+
+    A file, because plyfile maps it; from other streams it reads single vertices (90 s per million instead of 1 s).
+    """
+
+    def __init__(self, raw: FileIO, header_size: int) -> None:
+        super().__init__(raw)
+        self._left = header_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """As of any file; plyfile reads the header byte by byte."""
+        found = super().read(size)
+        if self._left > 0 and found:
+            self._left -= len(found)
+            found = found if found.isascii() else b"?" * len(found)
+        return found
 
 
 def _stacked(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
@@ -165,18 +197,26 @@ def _stacked(vertex: PlyElement, columns: Sequence[str]) -> Tensor:
 
 
 def read_ply(path: Path) -> dict[str, Tensor]:
-    """Read a binary 3DGS .ply; further properties and elements are ignored.
+    """Read a binary 3DGS .ply, with SH coefficients or with colours, or a compressed one; ignores other properties.
 
     Returns:
         A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU. The SH degree
-        follows from the number of ``f_rest_*``; without any, ``features_rest`` is ``[N, 0, 3]``.
+        follows from the number of ``f_rest_*``; without any, ``features_rest`` is ``[N, 0, 3]``. Values may be
+        infinite, where that is how the file states an opacity of 1; see ``gaussians.mend``.
 
     Raises:
         DataError: the file is missing, not a binary .ply, truncated, or does not hold Gaussian primitives.
     """
-    vertex = _load(path, primitives=True)["vertex"]
+    data = _load(path, primitives=True)
+    vertex = data["vertex"]
     present = {prop.name for prop in vertex.properties}
-    missing = [name for columns in _COLUMNS.values() for name in columns if name not in present]
+    if present.issuperset(PACKED):
+        with reading(path, "a complete compressed .ply"):
+            return decompressed(data["chunk"].data, vertex.data, data["sh"].data if "sh" in data else None)
+    columns = dict(_COLUMNS)
+    if present.issuperset(_RGB) and not present & set(_COLUMNS["features_dc"]):
+        columns["features_dc"] = _RGB
+    missing = [name for names in columns.values() for name in names if name not in present]
     if missing:
         raise DataError(f"{path} lacks {', '.join(missing)}; give a .ply of 3D Gaussian primitives with SH colours.")
     rest = sum(name.startswith("f_rest_") for name in present)
@@ -184,7 +224,12 @@ def read_ply(path: Path) -> dict[str, Tensor]:
     if degree is None or not present.issuperset(_rest_columns(rest)):
         raise DataError(f"{path} has {rest} f_rest properties, which fit no SH degree; export it again.")
 
-    params = {name: _stacked(vertex, columns) for name, columns in _COLUMNS.items()}
+    params = {name: _stacked(vertex, names) for name, names in columns.items()}
+    if columns["features_dc"] == _RGB:
+        kind = vertex["red"].dtype
+        # Bytes, 16-bit numbers, or floats to 1, which some programs write to 255.
+        most = float(np.iinfo(kind).max) if kind.kind in "iu" else 255.0 if (params["features_dc"] > 2).any() else 1.0
+        params["features_dc"] = rgb_to_sh(params["features_dc"] / most)
     # The file has all coefficients of red, then green, then blue.
     order = [f"f_rest_{channel * (rest // 3) + i}" for i in range(rest // 3) for channel in range(3)]
     params["features_rest"] = _stacked(vertex, order).reshape(vertex.count, rest // 3, 3)
@@ -215,7 +260,7 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
     """Copy a .ply with only some of its vertices; properties, comments and other elements are unchanged.
 
     Args:
-        source: any .ply.
+        source: a .ply that has its values as :func:`has_own_columns` says.
         out: the file to write atomically.
         mask: True for vertices to keep, bool ``[N]``.
         params: new parameters of the kept primitives ``[M, ...]``; None to keep their values.
@@ -224,7 +269,7 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
         DataError: the file cannot be read, or has another number of vertices.
         StorageError: the disk is full or not writable.
     """
-    data = _load(source)
+    data = _load(source, primitives=True)
     vertex = data["vertex"]
     if vertex.count != len(mask):
         raise DataError(f"{source} has {vertex.count} vertices, not {len(mask)}: it was changed meanwhile; run again.")
@@ -232,23 +277,30 @@ def keep_vertices(source: Path, out: Path, mask: Tensor, params: Mapping[str, Te
     for names, values in _table(params) if params is not None else ():
         for name, column in zip(names, values.T, strict=True):
             rows[name] = column
-    kept = PlyElement.describe(rows, "vertex", comments=vertex.comments)
-    elements = [kept if element.name == "vertex" else element for element in data.elements]
-    copy = PlyData(elements, text=data.text, byte_order=data.byte_order, comments=data.comments, obj_info=data.obj_info)
-    with replacing(out) as partial:
-        copy.write(str(partial))
+    # The header's own bytes, because plyfile writes no comment in UTF-8.
+    header = re.sub(rb"(?<=[\r\n])(element\s+vertex\s+)\d+", rb"\g<1>%d" % len(rows), _header(source), count=1)
+    with replacing(out) as partial, partial.open("wb") as file:
+        file.write(header)
+        for element in data.elements:
+            values = rows if element.name == "vertex" else np.ascontiguousarray(element.data)
+            file.write(values.view(np.uint8).data if len(values) else b"")  # tofile hides why it fails
+
+
+def has_own_columns(path: Path) -> bool:
+    """Whether a .ply that :func:`read_ply` reads has the values of a field as they are, so that rows can be copied."""
+    names = {prop.name for prop in _load(path, primitives=True)["vertex"].properties}
+    return all(names.issuperset(columns) for columns in _COLUMNS.values())
 
 
 def ply_comments(path: Path) -> list[str]:
     """Comments in the header of a .ply; an empty list for any other file or an unreadable one."""
     try:
-        with regular(path).open("rb") as file:
-            header = file.read(_MAX_HEADER).partition(b"end_header")[0]
+        header = _header(path)
     except OSError:
         return []
     mark = b"comment "
     comments = [line[len(mark) :].strip() for line in header.splitlines() if line.startswith(mark)]
-    return [comment.decode("latin-1") for comment in comments] if header.startswith(b"ply") else []
+    return [comment.decode("utf-8", "replace") for comment in comments] if header.startswith(b"ply") else []
 
 
 def is_nerfstudio_ply(path: Path) -> bool:

@@ -18,7 +18,9 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +34,8 @@ from sundae_ns.storage.atomic import replacing
 from sundae_ns.storage.morton import scene_order
 from sundae_ns.storage.spz import MAX_SH_DEGREE, checked
 
+META = "meta.json"
+"""Name of the file that describes the others."""
 MAX_PALETTE = 1 << 16
 """Palette rows that two bytes can index."""
 _ROW_ENTRIES = 64  # palette rows in a row of the palette's image
@@ -105,28 +109,40 @@ def write_sog(path: Path, params: Mapping[str, Tensor], *, antialiased: bool = F
             "codebook": values.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
-    with replacing(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as bundle:
+    with replacing(path) as unfinished, zipfile.ZipFile(unfinished, "w", zipfile.ZIP_STORED) as bundle:
         # ZipInfo has a fixed date, so that equal fields give equal bytes.
-        bundle.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
+        bundle.writestr(zipfile.ZipInfo(META), json.dumps(meta))
         for name, pixels in images.items():
             bundle.writestr(zipfile.ZipInfo(f"{name}.webp"), _webp(pixels))
 
 
 def read_sog(path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Read a bundled .sog of version 2.
+    """Read a .sog of version 2: bundled, or as a folder of images with a ``meta.json``.
+
+    Args:
+        path: the bundle, the folder, or its ``meta.json``.
 
     Returns:
         A field by the names of :data:`sundae_ns.gaussians.parameters.SPLAT_NAMES`, float32 on the CPU, in the file's
         coordinates; and whether it is marked as trained with antialiasing.
 
     Raises:
-        DataError: the file is missing, damaged, no bundled .sog, or of another version.
+        DataError: a file is missing, damaged, no .sog, or of another version.
     """
-    with reading(path, "a complete .sog"), zipfile.ZipFile(regular(path)) as bundle:
-        meta = json.loads(_entry(bundle, "meta.json"))
-        if meta["version"] != 2:
-            raise DataError(f"{path} has version {meta['version']} of the format; this program reads 2")
-        arrays = _decoded(bundle, meta)
+    with reading(path, "a complete .sog"), ExitStack() as stack:
+        if path.is_dir() or path.name == META:
+            folder = path if path.is_dir() else path.parent
+
+            def entry(name: str) -> bytes:
+                if Path(name).name != name:
+                    raise ValueError(f"{name} lies elsewhere")
+                return regular(folder / name).read_bytes()
+        else:
+            entry = partial(_entry, stack.enter_context(zipfile.ZipFile(regular(path))))
+        meta = json.loads(entry(META))
+        if (version := meta.get("version", 1)) != 2:
+            raise DataError(f"{path} has version {version} of the format; convert it with splat-transform to version 2")
+        arrays = _decoded(entry, meta)
     field = {name: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for name, value in arrays.items()}
     return field, bool(meta.get("antialias")) or meta.get("model") == "antialiased"
 
@@ -139,12 +155,12 @@ def _entry(bundle: zipfile.ZipFile, name: str) -> bytes:
     return bundle.read(name)
 
 
-def _decoded(bundle: zipfile.ZipFile, meta: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
-    """The arrays of a field; the inverse of :func:`write_sog`."""
+def _decoded(file: Callable[[str], bytes], meta: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+    """The arrays of a field, from the files by their names; the inverse of :func:`write_sog`."""
     n = int(meta["count"])
 
     def pixels(entry: Mapping[str, Any], index: int, channels: int) -> NDArray[np.uint8]:
-        return _pixels(_entry(bundle, entry["files"][index])).reshape(-1, 4)[:n, :channels]
+        return _pixels(file(entry["files"][index])).reshape(-1, 4)[:n, :channels]
 
     low, high = (np.asarray(meta["means"][end], np.float64) for end in ("mins", "maxs"))
     levels = pixels(meta["means"], 0, 3) + 256.0 * pixels(meta["means"], 1, 3)
@@ -157,7 +173,7 @@ def _decoded(bundle: zipfile.ZipFile, meta: Mapping[str, Any]) -> dict[str, NDAr
         coefficients = (int(entry["bands"]) + 1) ** 2 - 1
         if not 0 < coefficients <= (MAX_SH_DEGREE + 1) ** 2 - 1:
             raise ValueError(f"{entry['bands']} bands of harmonics")
-        centres = _pixels(_entry(bundle, entry["files"][0]))[..., :3].reshape(-1, coefficients, 3)
+        centres = _pixels(file(entry["files"][0]))[..., :3].reshape(-1, coefficients, 3)
         label = pixels(entry, 1, 2).astype(np.int64)
         rest = np.asarray(entry["codebook"], np.float32)[centres[label[:, 0] + 256 * label[:, 1]]]
     field = {

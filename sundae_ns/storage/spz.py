@@ -42,6 +42,7 @@ _LARGEST = (1 << 23) - 1  # largest coordinate in steps, 24 bits with a sign
 _MOST_BITS = 24  # fractional bits of a coordinate
 _FEWEST_BITS = 8
 _SCALES = (-10.0, 5.9375)  # log-scales that fit
+_MOST_LOGIT = 30.0
 _COLOR, _HARMONIC = 0.5 / 0.15, 1.0  # largest SH coefficients of degree 0, and of higher degrees
 
 
@@ -169,6 +170,8 @@ def checked(path: Path, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
         raise DataError("some values are NaN or infinite; drop those primitives first (finite_mask)")
     if field["features_rest"].shape[1] > (MAX_SH_DEGREE + 1) ** 2 - 1:
         raise DataError(f"a {path.suffix} stores SH degrees up to {MAX_SH_DEGREE}; cut features_rest, or write a .ply")
+    # Opacities beyond these logits are 0 and 1 in every format, and would overflow before they are.
+    field["opacities"] = field["opacities"].clamp(-_MOST_LOGIT, _MOST_LOGIT)
     # Normalise in float64: the square of 1e-30 is 0 in float32.
     quats = field["quats"].double()
     norms = quats.norm(dim=1, keepdim=True)

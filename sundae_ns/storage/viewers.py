@@ -10,17 +10,15 @@ import torch
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError
-from sundae_ns.gaussians import finite_mask
-from sundae_ns.gaussians.field import as_field
+from sundae_ns.gaussians import mend
 from sundae_ns.gaussians.parameters import sh_degree_of
 from sundae_ns.storage.ply import MODEL_FRAME, write_ply
+from sundae_ns.storage.primitives import ANTIALIASED
 from sundae_ns.storage.sog import write_sog
 from sundae_ns.storage.spz import MAX_SH_DEGREE, clamped, write_spz
 from sundae_ns.storage.transform import similarity
 
 FORMATS = (".ply", ".spz", ".sog")
-ANTIALIASED = "SplatRenderMode: mip"
-"""Header comment of a .ply whose scene was trained with antialiasing."""
 
 # In nerfstudio, z points up; in a 3DGS .ply, -y does.
 _UPRIGHT = torch.tensor([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
@@ -57,7 +55,7 @@ def write_for_viewers(
 ) -> ViewerFile:
     """Write the base colours of a field in the format of the file's suffix, atomically.
 
-    Drops primitives that are not finite, and SH coefficients above the format's degree.
+    Drops primitives without a meaning (``gaussians.mend``), and SH coefficients above the format's degree.
 
     Args:
         path: its folder must exist.
@@ -72,8 +70,8 @@ def write_for_viewers(
         StorageError: the disk is full or not writable.
     """
     check_format(path)
-    finite = finite_mask(params)
-    field = {name: value.detach()[finite].cpu() for name, value in as_field(params).as_harmonics().items()}
+    mended = mend(params)
+    field = {name: value.detach().cpu() for name, value in mended.field.as_harmonics().items()}
     if upright:
         field = similarity(field, _UPRIGHT, 1.0)
     coefficients = field["features_rest"].shape[1]
@@ -87,7 +85,7 @@ def write_for_viewers(
     kept = field["features_rest"].shape[1]
     return ViewerFile(
         primitives=len(field["means"]),
-        dropped=int((~finite).sum()),
+        dropped=mended.dropped,
         degree=sh_degree_of(kept) or 0,
         clamped=clamped(field) if kind == ".spz" else 0,
         cut=kept < coefficients,

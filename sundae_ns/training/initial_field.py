@@ -13,6 +13,7 @@ from sundae_ns.errors import CheckpointError
 from sundae_ns.gaussians import FEATURES, from_points, initial_features, random_points
 from sundae_ns.gaussians.parameters import rgb_to_logit, sh_to_rgb
 from sundae_ns.pruning import select_random
+from sundae_ns.storage.kinds import kind_of
 from sundae_ns.storage.runs.checkpoint import read_field
 from sundae_ns.storage.transform import similarity
 from sundae_ns.training.densification import start_of_chain
@@ -99,9 +100,14 @@ def _sparse_field(
 
 
 def _warm_field(options: ModelOptions, source: Path, frame: Frame | None, num_features: int) -> dict[str, Tensor]:
-    params, in_model_frame = read_field(source)
+    params, in_model_frame, _ = read_field(source)
     if options.warm_start_frame != "auto":
         in_model_frame = options.warm_start_frame == "model"
+    elif kind_of(source) == "gsplat":
+        raise CheckpointError(
+            f"{source} does not state its coordinates, and gsplat turns and scales a capture unless it trains with "
+            "--no-normalize-world-space; if it did, give --pipeline.model.warm-start-frame capture"
+        )
     if not in_model_frame:
         if frame is None:
             raise CheckpointError(

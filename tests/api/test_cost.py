@@ -55,7 +55,7 @@ def test_a_file_that_does_not_fit_is_refused_before_it_is_read(
 ) -> None:
     assert stated_size(file) == (N, 59)
     monkeypatch.setattr(cost, "free_memory", lambda: 1_000_000)  # the prune alone would fit
-    monkeypatch.setattr(opening, "load", unreachable)
+    monkeypatch.setattr(opening, "load_with_mask", unreachable)
     with pytest.raises(SystemExit) as end:
         main(["prune", str(file), "-o", str(file.with_name("b.ply"))])
     assert end.value.code == 2
@@ -80,7 +80,7 @@ def test_a_file_states_its_cost_before_it_is_read(
     file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(cost, "LONG", 0.0)
-    monkeypatch.setattr(opening, "load", lambda _: sys.exit(3))
+    monkeypatch.setattr(opening, "load_with_mask", lambda _: sys.exit(3))
     with pytest.raises(SystemExit) as end:
         main(["prune", str(file), "-o", str(file.with_name("b.ply"))])
     assert end.value.code == 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 import zipfile
 from pathlib import Path
@@ -131,8 +132,11 @@ def test_saving_refuses_what_it_cannot(tmp_path: Path) -> None:
         sn.save(scene(), tmp_path / "a.png")
     with pytest.raises(ConfigError, match="leave out upright"):
         sn.save(scene(), tmp_path / "a.sundae", upright=True)
-    with pytest.raises(sn.SundaeError):
-        sn.save(scene(), tmp_path / "no" / "a.ply")
+    (tmp_path / "file").touch()
+    with pytest.raises(sn.SundaeError, match="a file stands where a folder should be"):
+        sn.save(scene(), tmp_path / "file" / "a.ply")
+    sn.save(scene(), tmp_path / "new" / "folder" / "a.ply")
+    assert sn.load(tmp_path / "new" / "folder" / "a.ply").num_primitives == scene().num_primitives
 
 
 def test_a_page_holds_the_scene(tmp_path: Path) -> None:
@@ -214,6 +218,23 @@ def test_primitives_that_are_not_finite_are_dropped() -> None:
     assert sn.prune(truth, keep=1.0, views=views()).num_primitives == 100
     assert torch.isfinite(sn.prune(truth, keep=0.5, views=views()).field["means"]).all()
     assert len(sn.virtual_views(truth, 4)) == 4
+
+
+@pytest.mark.parametrize("kind", [".ply", ".spz", ".sog", ".sundae", ".html"])
+def test_a_scene_of_opaque_and_flat_primitives_is_saved_whole(tmp_path: Path, kind: str) -> None:
+    """One that was made in memory: files are mended when they are opened."""
+    truth = scene()
+    truth.field["opacities"][:90], truth.field["scales"][80:, 1] = torch.inf, -torch.inf
+    truth.field["means"][5] = torch.nan
+    truth = dataclasses.replace(truth, views=tuple(sn.virtual_views(truth, 2, size=32)))
+    sn.save(truth, tmp_path / f"a{kind}")
+    if kind != ".html":
+        found = sn.load(tmp_path / f"a{kind}")
+        assert found.num_primitives == truth.num_primitives - 1
+        assert all(value.isfinite().all() for value in found.field.values())
+        assert int((found.field["opacities"].sigmoid() > 0.999).sum()) == 89
+    small = sn.prune(truth, keep=0.5, views=truth.views)
+    assert all(value.isfinite().all() for value in small.field.values())
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import dataclasses
 import json
+import math
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from colmap_models import write_model
+from foreign_files import FOREIGN, small_field
 from packed_scenes import KINDS, write_kind
 from plyfile import PlyData, PlyElement
 from torch import Tensor
@@ -22,6 +26,7 @@ from sundae_ns.gaussians import from_points
 from sundae_ns.gaussians.parameters import SH_C0, SPLAT_NAMES
 from sundae_ns.storage import MODEL_FRAME, is_nerfstudio_ply, read_ply, write_ply
 from sundae_ns.storage.packing import PackedScene, read_scene, write_scene
+from sundae_ns.storage.primitives import read_primitives
 from sundae_ns.storage.viewers import write_for_viewers
 
 
@@ -67,7 +72,11 @@ def test_export_to_other_formats(tmp_path: Path, kind: str, capsys: pytest.Captu
 @pytest.mark.parametrize("kind", [".spz", ".sog"])
 @pytest.mark.parametrize("comments", [[], ["SplatRenderMode: mip"]])
 def test_export_of_a_ply_of_any_program(
-    tmp_path: Path, kind: str, comments: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    kind: str,
+    comments: list[str],
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The file's name does not matter, and the result equals that of the same field as a packed scene."""
     given = field()
@@ -77,10 +86,9 @@ def test_export_of_a_ply_of_any_program(
     assert run("export", tmp_path / "unnamed.bin", "-o", out) == 0
     output = " ".join(capsys.readouterr().out.split())
     mode = ", antialiased" if comments else ""
-    assert (
-        f"a{kind}: 199 primitives, degree 1{mode}, {out.stat().st_size:,} bytes "
-        "left out 1 primitives that were not finite" in output
-    )
+    assert f"a{kind}: 199 primitives, degree 1{mode}, {out.stat().st_size:,} bytes" in output
+    (line,) = caplog.messages
+    assert line.endswith("unnamed.bin: 200 primitives: dropped 1 that were not finite (NaN or infinite)")
     finite = {name: value[torch.arange(200) != 3] for name, value in given.items()}
     write_for_viewers(same, finite, antialiased=bool(comments))
     assert out.read_bytes() == same.read_bytes()
@@ -126,7 +134,7 @@ def test_export_of_a_model_without_harmonics(tmp_path: Path) -> None:
     [["--views", "4"], ["--score", "opacity", "--selection", "top"], ["--score", "response", "--selection", "band"]],
 )
 def test_prune_does_not_change_kept_rows(
-    tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     source, out = tmp_path / "in.ply", tmp_path / "out.ply"
     write_ply(source, field(), comments=["SplatRenderMode: mip", "by another program"])
@@ -144,7 +152,7 @@ def test_prune_does_not_change_kept_rows(
     assert run("prune", source, "-o", out, "--keep", "0.25", "--no-merge", *options) == 0
     text = capsys.readouterr().out
     assert "50 of 200 primitives" in text
-    assert "dropped 1 primitives that were not finite" in text
+    assert "dropped 1 that were not finite" in caplog.text
     found = PlyData.read(out)
     assert found.comments == ["SplatRenderMode: mip", "by another program"]
     assert found["extra"].data["number"].tolist() == [7]
@@ -171,9 +179,9 @@ def test_prune_does_not_change_kept_rows(
         (["prune", "none.ply", "-o", "a.ply"], "none.ply has 5 primitives, and none is finite; export it again"),
         (["prune", "empty.ply", "-o", "a.ply"], "empty.ply has 0 primitives, and none is finite; export it again"),
         (["export", "none.ply", "-o", "a.spz"], "none.ply has 5 primitives, and none is finite; export it again"),
-        (["prune", "in.ply", "-o", "no/a.ply"], "no is no folder"),
+        (["prune", "in.ply", "-o", "in.bin/a.ply"], "in.bin is no folder"),
         (["export", "in.ply", "-o", "a.splat"], "name it .ply or .spz or .sog"),
-        (["export", "in.ply", "-o", "no/a.sog"], "no is no folder"),
+        (["export", "in.ply", "-o", "in.bin/new/a.sog"], "in.bin is no folder"),
         (
             ["export", "in.ply", "-o", "a.ply"],
             "in.ply is a .ply already; give an output name that ends in .spz or .sog",
@@ -184,13 +192,23 @@ def test_prune_does_not_change_kept_rows(
             "in.bin is no .spz; give a .ply",
         ),
         (["pack", "in.sundae", "-o", "a.sundae"], "in.sundae is a packed scene; give the run that was packed"),
-        (["pack", "in.ply", "-o", "a.sundae"], "in.ply is a .ply file; give the folder of a run"),
+        (["pack", "in.ply", "-o", "a.sundae", "--finetune", "9"], "in.ply is a .ply file without photos; leave out"),
+        (["pack", "in.ply", "-o", "a.sundae", "--target-drop", "1"], "leave out --target-drop, or give a run"),
+        (["report", "a.ksplat", "-o", "out"], "a.ksplat is a scene of GaussianSplats3D; convert it to .ply with"),
+        (["prune", "a.ksplat", "-o", "a.ply"], "a.ksplat is a scene of GaussianSplats3D; convert it to .ply with"),
+        (["export", "a.glb", "-o", "a.ply"], "a.glb is a glTF scene; export the primitives as .ply"),
+        (["render", "a.pth", "-o", "a.png"], "a.pth is a checkpoint of another trainer; give its .ply"),
+        (
+            ["prune", "trained", "-o", "a.ply"],
+            "trained is a folder of 3DGS; give trained/point_cloud/iter",
+        ),
+        (["view", "a.splat"], "a.splat is not a complete .splat (33 bytes are no whole number of primitives"),
         (["unpack", "in.ply"], "in.ply is not a packed scene; give a file that sundae pack wrote"),
         (
-            ["bench", "frame", "--load-config", "in.sundae"],
+            ["bench", "frame", "in.sundae"],
             "in.sundae is a packed scene, which does not name its capture",
         ),
-        (["bench", "frame", "--load-config", "in.ply"], "in.ply is a .ply file; it comes without test views"),
+        (["bench", "frame", "in.ply"], "in.ply is a .ply file; it comes without test views"),
         (["report", "in.ply", "-o", "out"], "in.ply is a .ply file; it comes without test views"),
         (["export", "nothing.sundae", "-o", "a.ply"], "nothing.sundae cannot be read"),
     ],
@@ -208,11 +226,83 @@ def test_refusals_are_one_line(
     Path("in.bin").write_bytes(b"\x1f\x8b\xff")
     write_ply(Path("none.ply"), {name: torch.full_like(value[:5], torch.nan) for name, value in field().items()})
     write_ply(Path("empty.ply"), {name: value[:0] for name, value in field().items()})
+    for name in ("a.ksplat", "a.glb", "a.pth", "a.splat"):
+        Path(name).write_bytes(bytes(33))
+    Path("trained/point_cloud/iteration_7").mkdir(parents=True)
+    Path("trained/point_cloud/iteration_7/point_cloud.ply").touch()
     before = sorted(tmp_path.iterdir())
     assert run(*arguments) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line]
     assert message in line
     assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_every_command_reads_files_of_other_programs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, name: str
+) -> None:
+    """In folders that do not exist yet."""
+    monkeypatch.chdir(tmp_path)
+    truth = small_field()
+    FOREIGN[name](Path(name), truth)
+    colors = read_primitives(Path(name)).mended.field["features_dc"]
+    assert run("prune", name, "-o", "pruned/a/b.ply", "--keep", "0.5", "--views", "4") == 0
+    assert len(read_ply(Path("pruned/a/b.ply"))["means"]) == 150
+    assert run("prune", name, "-o", "same/a.ply", "--keep", "1", "--views", "4") == 0
+    torch.testing.assert_close(read_primitives(Path("same/a.ply")).mended.field["features_dc"], colors)
+    assert run("export", name, "-o", "exported/a.spz") == 0
+    assert run("export", name, "-o", "pages/a.html") == 0
+    assert run("pack", name, "-o", "packed/a.sundae") == 0
+    found = read_scene(Path("packed/a.sundae")).field["means"]
+    assert torch.cdist(truth["means"].double(), found.double()).amin(dim=1).max() < 0.002
+    assert run("render", name, "-o", "images/a.png", "--width", "64") == 0
+    assert run("distill", name, "-o", "small/a.sundae", "--steps", "1", "--no-head", "--keep", "0.5") == 0
+    for file in ("exported/a.spz", "pages/a.html", "images/a.png", "small/a.sundae"):
+        assert Path(file).stat().st_size > 0
+    if name == "plain.ply":
+        assert run("export", name, "-o", "plain/a.ply") == 2  # it is one already
+    else:
+        assert run("export", name, "-o", "plain/a.ply") == 0
+        assert torch.equal(read_ply(Path("plain/a.ply"))["features_dc"], colors)
+    assert not caplog.messages
+
+
+@pytest.mark.parametrize(
+    ("command", "kind"),
+    [
+        *(("prune", kind) for kind in (".ply", ".spz", ".sog", ".sundae")),
+        *(("export", kind) for kind in (".spz", ".sog", ".html")),
+        ("pack", ".sundae"),
+    ],
+)
+def test_opaque_and_flat_primitives_are_all_kept(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, command: str, kind: str
+) -> None:
+    given = field()
+    given["opacities"][:130], given["opacities"][130:135] = math.inf, -math.inf
+    given["scales"][50:, 2] = -math.inf
+    given["quats"][7] = 0
+    given["means"][9, 1], given["features_dc"][10, 0] = math.inf, math.nan
+    write_ply(tmp_path / "in.ply", given)
+    out = tmp_path / f"a{kind}"
+    assert run(command, tmp_path / "in.ply", "-o", out, *(["--keep", "1"] if command == "prune" else [])) == 0
+    (line,) = caplog.messages
+    assert line.endswith(
+        "in.ply: 200 primitives: clamped 133 with opacity 0 or 1 and 150 with width 0 and 1 with rotation 0 to finite "
+        "values, dropped 2 that were not finite (NaN or infinite)"
+    )
+    if kind == ".html":  # the page holds its scene in base64
+        (scene,) = re.findall(r"[A-Za-z0-9+/=]{4000,}", re.sub(r"data:[^\"]*", "", out.read_text()))
+        out = tmp_path / "page.sundae"
+        out.write_bytes(base64.b64decode(scene))
+    found = sn.load(out)
+    assert found.num_primitives == 198
+    assert all(value.isfinite().all() for value in found.field.values())
+    order = torch.cdist(found.field["means"], given["means"].nan_to_num(0, 9, 9)).argmin(dim=1)
+    expected = torch.where(given["opacities"].isinf(), given["opacities"].sign() * 8, given["opacities"])[order]
+    torch.testing.assert_close(found.field["opacities"].sigmoid(), expected.sigmoid(), rtol=0, atol=0.03)
+    flat = found.field["scales"][order >= 50].amin(dim=1)
+    assert (flat <= -9.9).all()
 
 
 WITHOUT = """
@@ -248,6 +338,7 @@ def test_files_are_exported_and_pruned_without_nerfstudio(tmp_path: Path) -> Non
         ["prune", "a.spz", "-o", "pruned.sundae", "--count", "20", "--views", "4"],
         ["export", "a.ply", "-o", "page.html"],
         ["export", "head.sundae", "-o", "head.html"],
+        ["pack", "a.ply", "-o", "packed.sundae"],
     ]
     codes, errors = without("nerfstudio", commands, tmp_path)
     assert codes == [0] * len(commands), errors
@@ -262,7 +353,7 @@ def test_what_needs_no_nerfstudio_to_be_refused(tmp_path: Path) -> None:
     run.mkdir(parents=True)
     (run / "config.yml").touch()
     refused = {"unpack a.sundae": "is a run already"}
-    refused |= dict.fromkeys(("pack a.ply -o x", "export gone -o x.html"), "give the folder of a")
+    refused |= dict.fromkeys(("pack gone -o x", "export gone -o x.html"), "give the folder of a")
     codes, errors = without("nerfstudio", [command.split() for command in refused], tmp_path)
     assert codes == [2] * len(refused)
     for error, reason in zip(errors, refused.values(), strict=True):

@@ -138,7 +138,7 @@ def test_only_files_and_folders_are_replaced(here: Path) -> None:
         ["unpack", "in"],
         ["report", "in", "-o", "x"],
         ["report", "run", "-o", "x"],
-        ["bench", "frame", "--load-config", "in"],
+        ["bench", "frame", "in"],
     ],
 )
 @pytest.mark.parametrize("kind", ["pipe", "device"])

@@ -47,7 +47,7 @@ def test_the_options_of_precision_have_no_prefix(capsys: pytest.CaptureFixture[s
     [
         (["pack", "nothing", "-o", "a.sundae"], "nothing cannot be read"),
         (["pack", "nothing", "-o", "a.sundae", "--scale-step", "2"], "scale-step is 2.0; give 0.0001 to 1"),
-        (["pack", "nothing", "-o", "no/a.sundae"], "no is no folder"),
+        (["pack", "nothing", "-o", "cut.sundae/a.sundae"], "cut.sundae is no folder; choose another"),
         (["pack", "nothing", "-o", "a.sundae", "--finetune", "-1"], "finetune is -1"),
         (["pack", "nothing", "-o", "a.sundae", "--max-cameras", "-1"], "max-cameras is -1"),
         (["pack", "nothing", "-o", "a.sundae", "--target-bytes", "0"], "target-bytes is 0"),

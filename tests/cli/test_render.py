@@ -135,7 +135,7 @@ def test_refusals_are_one_line_and_write_nothing(
         ((packed, "-o", out, "--camera", tmp_path / "none.json"), "none.json"),
         ((tmp_path / "none.sundae", "-o", out), "none.sundae"),
         ((tmp_path / "none", "-o", out), "none does not exist"),
-        ((packed, "-o", tmp_path / "no" / "a.png"), "no is no folder"),
+        ((packed, "-o", damaged / "new" / "a.png"), "damaged.json is no folder; choose another"),
     ):
         assert message in refusal(capsys, *words)
     assert sorted(tmp_path.iterdir()) == before

@@ -446,6 +446,7 @@ def check_pruning(shards: Shards, **options: Any) -> None:
     config = PruningConfig(prune_at=1, keep_ratio=0.3, num_neighbors=6, **options)
     whole = a_field(200)
     whole["scales"][150, 1] = torch.nan
+    whole["opacities"][[20, 170]], whole["scales"][160, 0] = torch.inf, -torch.inf  # opaque and flat ones stay
     weights = torch.rand(200, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     start, end = ((0, 120), (120, 200))[shards.rank]
     params = shard_of(whole, start, end)
@@ -473,6 +474,7 @@ def check_pruning(shards: Shards, **options: Any) -> None:
     assert report.step == 2
     assert (report.tau, report.sigma, report.peak) == (expected.tau, expected.sigma, expected.peak)
     assert state == own_state
+    assert all(bool(value.isfinite().all()) for value in params.values())
     assert sum(shards.counts) == report.after
     here = slice(sum(shards.counts[: shards.rank]), sum(shards.counts[: shards.rank + 1]))
     assert torch.equal(counts["grad2d"], own_counts["grad2d"][here])
@@ -481,6 +483,18 @@ def check_pruning(shards: Shards, **options: Any) -> None:
         for kind in ("exp_avg", "exp_avg_sq"):
             theirs = own_optimizers[name].state[alone[name]][kind][here]
             assert torch.equal(optimizers[name].state[value][kind], theirs), (name, kind)
+
+
+def check_mending(shards: Shards) -> None:
+    """Opaque primitives of one rank become finite, and NaN goes, before primitives move between ranks."""
+    params = own_half(shards)
+    shards.recount(params)
+    if shards.rank == 1:
+        with torch.no_grad():
+            params["opacities"][:5], params["means"][7] = torch.inf, torch.nan
+    assert RankPruner(params, {}, shards=shards).drop_nonfinite() == 1
+    assert shards.total == 89
+    assert all(bool(value.isfinite().all()) for value in params.values())
 
 
 def check_refusal(shards: Shards) -> None:
@@ -563,7 +577,10 @@ def checks(_: Path) -> dict[str, Callable[[Shards], None]]:
     return {
         **{check.__name__: check for check in plain},
         "check_pruningresponse-contribution": by_response,
-        **{check.__name__: check for check in (check_refusal, check_averages, check_batches, check_taking_a_shard)},
+        **{
+            check.__name__: check
+            for check in (check_mending, check_refusal, check_averages, check_batches, check_taking_a_shard)
+        },
     }
 
 

@@ -39,7 +39,7 @@ WORDS: dict[str, list[str]] = {
     "report": ["RUN", "-o", "report"],
     "curve": ["RUN", "-o", "out.png"],
     "eval": ["RUN", "-o", "out.json"],
-    "bench": ["frame", "--load-config", "RUN"],
+    "bench": ["frame", "RUN"],
     "demo": ["DEMO", "--overwrite"],
     "doctor": [],
 }

@@ -141,7 +141,7 @@ def test_a_capture_that_has_moved_is_found_or_named(
     config.output_dir = lost / Path(config.output_dir).relative_to(root)
     config.data = config.pipeline.datamanager.data = lost / tiny.scene.relative_to(root)
     (run / "config.yml").write_text(yaml.dump(config))
-    arguments = ["bench", "frame", "--load-config", str(run), "--views", "1", "--repeats", "1", "--json"]
+    arguments = ["bench", "frame", str(run), "--views", "1", "--repeats", "1", "--json"]
     with pytest.raises(SystemExit) as caught:
         main(arguments)
     assert caught.value.code == 2
@@ -197,7 +197,7 @@ def test_the_head_runs_as_asked_for_inside_a_block(tiny: Any) -> None:
 
 
 def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--load-config", str(tiny.config), "--views", "1", "--repeats", "1", "--factors", "1", "0.25"]
+    arguments = [str(tiny.config), "--views", "1", "--repeats", "1", "--factors", "1", "0.25"]
     with pytest.raises(SystemExit) as caught:
         main(["bench", "frame", *arguments, "--json"])
     assert caught.value.code == 0
@@ -208,12 +208,12 @@ def test_bench_frame_prints_one_line_a_job(tiny: Any, capsys: pytest.CaptureFixt
     assert lines[0]["psnr"] != lines[0]["psnr_base"]
     assert lines[1]["psnr"] == lines[1]["psnr_base"]
     with pytest.raises(SystemExit):
-        main(["bench", "frame", *arguments[2:], "--load-config", str(tiny.folder)])
+        main(["bench", "frame", *arguments[1:], str(tiny.folder)])
     assert "PSNR off" in capsys.readouterr().out
 
 
 def test_bench_frame_prints_null_for_undefined_figures(tiny: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--load-config", str(tiny.config), "--views", "1", "--repeats", "1", "--factors", "0.2", "0.25"]
+    arguments = [str(tiny.config), "--views", "1", "--repeats", "1", "--factors", "0.2", "0.25"]
     with pytest.raises(SystemExit) as caught:
         main(["bench", "frame", *arguments, "--json"])
     assert caught.value.code == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,7 +45,10 @@ def packed(tiny: Any, call: Any, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def test_the_report_counts_every_byte(packed: Packed) -> None:
-    table = packed.output.partition("bits per primitive")[2]
+    table, _, quality = packed.output.partition("bits per primitive")[2].partition("\nPSNR ")
+    assert re.fullmatch(
+        r"\d+\.\d\d -> \d+\.\d\d dB, SSIM 0\.\d{4} -> 0\.\d{4}, before and after, on 3 of 3 test views\n", quality
+    )
     rows = {words[0]: int(words[1].replace(",", "")) for words in map(str.split, table.strip().splitlines())}
     size = packed.file.stat().st_size
     assert rows.pop("all") == size
@@ -81,7 +85,7 @@ def test_grey_is_no_truth(
     tiny: Any, packed: Packed, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     run, out = packed.blind.parent, str(tmp_path / "out")
-    words = ["report", str(run), "-o", out] if command == "report" else ["bench", "frame", "--load-config", str(run)]
+    words = ["report", str(run), "-o", out] if command == "report" else ["bench", "frame", str(run)]
     # Naming a capture makes no run of it: the cameras of the two do not agree.
     for more in ([], ["--data", str(tiny.scene)] if command == "report" else []):
         with pytest.raises(SystemExit, match="2"):

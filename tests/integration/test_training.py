@@ -72,6 +72,16 @@ def test_the_schedule_follows_the_number_of_steps(tiny: Any) -> None:
     assert re.search(rf"prune .* after {tiny.prune_at}", tiny.output)
 
 
+def test_a_finished_training_says_what_it_made(tiny: Any) -> None:
+    """Quality, size and the next command."""
+    n = report(tiny)["after"]
+    found = re.search(r"trained: PSNR (\d+\.\d\d) dB, SSIM 0\.\d{4} on 3 test views\n(.*)\nnext: (.*)\n", tiny.output)
+    assert found is not None, tiny.output
+    assert 5 < float(found[1]) < 60
+    assert re.fullmatch(rf"{n:,} primitives, with a head: 0\.\d\d MB before packing", found[2])
+    assert found[3] == f"sundae pack {tiny.folder} -o scene.sundae"
+
+
 def test_prune_costs_quality_and_training_brings_it_back(tiny: Any) -> None:
     found = report(tiny)
     assert found["pruned"]["psnr"] < found["warm_up"]["psnr"]

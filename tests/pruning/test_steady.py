@@ -14,6 +14,7 @@ from prunes import decide_share
 from torch import Tensor
 
 from sundae_ns.errors import ConfigError, DataError
+from sundae_ns.gaussians import mend
 from sundae_ns.gaussians.covariance import covariances, quaternions, rotation_matrices
 from sundae_ns.pruning import Decision, PruneRule, field_graph, kept_count, response
 from sundae_ns.pruning.redistribution import voronoi_labels
@@ -57,7 +58,8 @@ def decided(params: dict[str, Tensor], config: PruneRule, share: float = SHARE) 
     assert int(decision.mask.sum()) == decision.kept == kept_count(share, n)
     again = decide_share(params, config, share, contribution)
     assert torch.equal(again.mask, decision.mask)
-    assert (decision.values is None) == (config.redistribution == "none" or bool(decision.mask.all()))
+    unmerged = config.redistribution == "none" or bool(decision.mask.all())
+    assert (decision.values is None) == (unmerged and not mend(params).clamped)
     if decision.values is not None and again.values is not None:
         for name, value in decision.values.items():
             assert value.shape == (decision.kept, *params[name].shape[1:])

@@ -17,6 +17,7 @@ from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.utils.eval_utils import eval_setup
 from torch import Tensor
 
+from sundae_ns.api.opening import FRAME_FILE
 from sundae_ns.compensation import CompensationHead, HeadConfig
 from sundae_ns.datamanager import SundaeDatamanagerConfig
 from sundae_ns.errors import CheckpointError, DataError, PackError, StorageError
@@ -142,7 +143,27 @@ def test_a_scene_without_a_head(tmp_path: Path) -> None:
     assert "features" not in model.gauss_params
 
 
-def test_a_run_is_never_replaced(tmp_path: Path) -> None:
+def test_a_run_is_replaced_on_demand(tmp_path: Path) -> None:
+    """Also by a scene of another step, with no transform; other files of its folder stay."""
+    stated = {"frame": {"transform": torch.eye(4)[:3].tolist(), "scale": 0.5}}
+    first = write_run(PackedScene(field(), head(), None, {**meta(), **stated}), tmp_path, "a")
+    stale = first.parent / "nerfstudio_models" / "step-000099999.ckpt"
+    stale.write_bytes(next((first.parent / "nerfstudio_models").glob("*.ckpt")).read_bytes())
+    (first.parent / "thesis.txt").write_text("years of work")
+    assert (first.parent / FRAME_FILE).is_file()
+    smaller = {name: value[:20] for name, value in field(features=0).items()}
+    plain = meta()
+    plain["model"] |= {"head": None, "trained_focal": None}
+    plain.pop("frame", None)
+    again = write_run(PackedScene(smaller, {}, cameras(), plain), tmp_path, "a", overwrite=True)
+    assert again == first
+    assert len(opened(again).model.means) == 20
+    assert not stale.exists()
+    assert not (first.parent / FRAME_FILE).exists()
+    assert (first.parent / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_run_is_never_replaced_unasked(tmp_path: Path) -> None:
     config = write_run(scene(), tmp_path, "a")
     before = config.read_bytes()
     with pytest.raises(PackError, match="is a run already"):

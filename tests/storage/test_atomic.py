@@ -121,9 +121,14 @@ def test_system_errors_become_one_line(
     assert os.listdir(tmp_path) == []
 
 
+def test_missing_folders_are_made(tmp_path: Path) -> None:
+    write_text(tmp_path / "new" / "folder" / "a.txt", "new")
+    assert (tmp_path / "new" / "folder" / "a.txt").read_text() == "new"
+
+
 def test_other_errors_are_not_converted(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        write_text(tmp_path / "nowhere" / "a.txt", "new")
+    with pytest.raises(FileNotFoundError), replacing(tmp_path / "a.txt"):
+        (tmp_path / "nowhere").read_text()
 
 
 def test_only_errors_that_a_user_can_correct_are_converted() -> None:

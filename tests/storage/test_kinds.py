@@ -45,6 +45,6 @@ def test_only_kinds_with_advice_are_refused(files: Path) -> None:
     with pytest.raises(CheckpointError, match=r"packed\.ply is a packed scene; unpack it$"):
         refuse(files / "packed.ply", packed="unpack it")
     with pytest.raises(CheckpointError, match=r"points\.sundae is a \.ply file; give a run$"):
-        refuse(files / "points.sundae", packed="unpack it", ply="give a run")
+        refuse(files / "points.sundae", packed="unpack it", primitives="give a run")
     refuse(files / "points.sundae", packed="unpack it")
-    refuse(files / "word.ply", packed="unpack it", ply="give a run")
+    refuse(files / "word.ply", packed="unpack it", primitives="give a run")

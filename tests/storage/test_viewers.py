@@ -76,7 +76,8 @@ def test_another_program_reads_the_same_scene(tmp_path: Path, kind: str, degree:
 def test_primitives_that_are_not_finite_are_dropped(tmp_path: Path, kind: str) -> None:
     given = field()
     given["means"][3, 0] = torch.nan
-    given["scales"][7, 1] = -torch.inf
+    given["scales"][7, 1] = torch.inf
+    given["scales"][9, 1] = -torch.inf  # a flat primitive
     written = write_for_viewers(tmp_path / f"a{kind}", given)
     assert (written.primitives, written.dropped) == (298, 2)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from sundae_ns.gaussians import finite_mask
+from sundae_ns.gaussians import mend
 from sundae_ns.graphs import NeighborGraph
 from sundae_ns.pruning import Decision, PruneRule, decide, kept_count
 
@@ -19,4 +19,4 @@ def decide_share(
     graph: NeighborGraph | None = None,
 ) -> Decision:
     """The decision that keeps a share of the finite primitives; arguments as of :func:`decide`."""
-    return decide(params, rule, kept_count(share, int(finite_mask(params).sum())), contribution, graph)
+    return decide(params, rule, kept_count(share, mend(params).field.num_primitives), contribution, graph)

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from foreign_files import FOREIGN, small_field
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
@@ -98,6 +99,29 @@ def test_a_ply_of_the_capture_needs_to_know_the_way(build: Build, training_of: T
     with pytest.raises(CheckpointError, match="warm-start-frame model") as caught:
         training_of(build(warm_start=tmp_path / "a.ply"))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [name for name in FOREIGN if name != "colors.ply"])
+def test_files_of_other_programs_start_a_model(
+    build: Build, training_of: TrainingOf, tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """gsplat's trainer normalises a capture in a way of its own, which its file does not state."""
+    given = small_field(50)
+    given["scales"][3, 0] = -torch.inf  # a flat primitive
+    if name == "a.compressed.ply":  # its bounds are finite
+        given["scales"][3, 0] = -20.0
+    FOREIGN[name](tmp_path / name, given)
+    options = {"warm_start": tmp_path / name, "metadata": {DATASET_FRAME: _frame()}}
+    if name.endswith(".pt"):
+        with pytest.raises(CheckpointError, match=r"coordinates.*--pipeline.model.warm-start-frame capture"):
+            training_of(build(**options))
+        caplog.clear()
+        options["warm_start_frame"] = "capture"
+    model = build(**options)
+    expected = similarity(given, *_frame())["means"]
+    torch.testing.assert_close(model.means.detach(), expected, rtol=0, atol=0.001)
+    assert model.gauss_params["scales"].isfinite().all()
+    assert len(caplog.messages) == (name != "a.compressed.ply")
 
 
 def test_a_finished_run_opens_without_what_it_started_from(

@@ -8,22 +8,22 @@ from __future__ import annotations
 import os
 import pickle
 import re
-import zipfile
 from collections.abc import Mapping
 from numbers import Integral
 from pathlib import Path
-from typing import Any, BinaryIO, get_args
+from typing import Any, BinaryIO, NamedTuple, get_args
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from sundae_ns.errors import CheckpointError, StorageError, one_line, regular
+from sundae_ns.errors import CheckpointError, DataError, StorageError, one_line, regular
 from sundae_ns.gaussians.field import Encoding, Field
-from sundae_ns.gaussians.parameters import SPLAT_NAMES, finite_mask, odd_shapes
+from sundae_ns.gaussians.mending import mend
+from sundae_ns.gaussians.parameters import SPLAT_NAMES, odd_shapes
+from sundae_ns.storage.archive import damage_of, load_tensors
 from sundae_ns.storage.atomic import replacing
-from sundae_ns.storage.kinds import kind_of, refuse
-from sundae_ns.storage.ply import is_nerfstudio_ply, read_ply
+from sundae_ns.storage.kinds import kind_of_primitives, refuse
+from sundae_ns.storage.primitives import mended_of, read_primitives
 
 EXTRA_STATE = "_extra_state"
 FORMAT = 2
@@ -83,32 +83,6 @@ def _compact(value: Any) -> Any:
     return value
 
 
-def _damage(file: BinaryIO) -> str | None:
-    """Reason why a file is no whole checkpoint; None if its checksums are right, which torch does not verify."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            entries = archive.infolist()
-            packed = any(entry.compress_type != zipfile.ZIP_STORED for entry in entries)
-            if packed or sum(entry.file_size for entry in entries) > os.fstat(file.fileno()).st_size:
-                return "it would unpack to more than its size"
-            broken = archive.testzip()
-            return None if broken is None else f"{broken} in it is damaged"
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
-        return getattr(error, "strerror", None) or one_line(error)
-
-
-def _check_tensors(value: Any) -> None:
-    """Refuse sparse or quantized tensors, and tensors larger than their storage, whose copy would fill memory."""
-    if isinstance(value, Tensor):
-        if value.layout is not torch.strided or value.is_quantized or value.is_meta:
-            raise ValueError("it holds a tensor that is sparse, quantized or without values")
-        if value.numel() * value.element_size() > value.untyped_storage().nbytes():
-            raise ValueError("it holds a tensor that claims more than it has")
-    elif isinstance(value, (Mapping, list, tuple)):
-        for inner in value.values() if isinstance(value, Mapping) else value:
-            _check_tensors(inner)
-
-
 def read(path: Path) -> dict[str, Any]:
     """Read a checkpoint of nerfstudio's trainer on the CPU, without running code from it.
 
@@ -122,7 +96,7 @@ def read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise _unreadable(path, error.strerror or one_line(error)) from error
     with file:
-        if (damage := _damage(file)) is not None:
+        if (damage := damage_of(file)) is not None:
             raise _unreadable(path, damage)
         return _loaded(file, path)
 
@@ -130,15 +104,12 @@ def read(path: Path) -> dict[str, Any]:
 def _loaded(file: BinaryIO, path: Path) -> dict[str, Any]:
     """The contents of an open checkpoint without damage."""
     try:
-        file.seek(0)
-        with _numpy_numbers_allowed():
-            loaded = torch.load(file, map_location="cpu", weights_only=True)
+        loaded = load_tensors(file)
         state = loaded.get("pipeline") if isinstance(loaded, dict) else None
         if not isinstance(state, Mapping) or not all(isinstance(name, str) for name in state):
             raise ValueError("it holds no model")
         if not isinstance(loaded.get("step"), Integral):
             raise ValueError("it does not say after which step it was saved")
-        _check_tensors(loaded)
     except Exception as error:  # torch.load raises many kinds with one meaning for the user
         reason = str(error).partition("\n")[0] or type(error).__name__
         if isinstance(error, pickle.UnpicklingError):
@@ -186,7 +157,7 @@ def _open_newest(folder: Path) -> tuple[Path, BinaryIO, list[str]]:
             except OSError as error:
                 passed_over.append(f"{path.name} is not whole ({error.strerror or one_line(error)})")
                 continue
-            reason = _damage(file)
+            reason = damage_of(file)
             if reason is None:
                 return path, file, passed_over
             file.close()
@@ -304,38 +275,44 @@ def check_model_state(state: Mapping[str, Any], expected: Mapping[str, Tensor], 
             raise CheckpointError(f"{name} has {value.shape[0]} rows in a checkpoint of {n} primitives; give another")
 
 
-def _numpy_numbers_allowed() -> Any:
-    """A context in which torch reads the numpy floats that stock nerfstudio leaves in a scheduler's state."""
-    scalar: Any = np.float64(0.0).__reduce__()[0]
-    names = [(scalar, f"numpy.{core}.multiarray.scalar") for core in ("core", "_core")]
-    types: list[Any] = [np.dtype, type(np.dtype(np.float64)), type(np.dtype(np.float32))]
-    return torch.serialization.safe_globals([scalar, *names, *types])
+class FinishedField(NamedTuple):
+    """A field to start from or to look at."""
+
+    params: dict[str, Tensor]
+    """Finite, without features, float32 on the CPU, colours as harmonics."""
+    in_model_frame: bool
+    """Whether coordinates are those of nerfstudio's model (checkpoints, ``ns-export``), not the capture's (others)."""
+    dropped: int
+    """Number of primitives left out because they have no meaning (``gaussians.mend``)."""
 
 
-def read_field(path: Path) -> tuple[dict[str, Tensor], bool]:
-    """Read a finished field: a splatfacto or SUNDAE checkpoint (file or folder), or a 3DGS ``.ply``.
+def read_field(path: Path) -> FinishedField:
+    """Read a finished field: a splatfacto or SUNDAE checkpoint (file or folder), or a file of primitives.
 
     Args:
-        path: ``.ckpt`` file, a folder of them (the newest counts), or ``.ply`` file.
-
-    Returns:
-        Parameters without features, float32 on the CPU, colours as harmonics; and whether they are in the coordinates
-        of nerfstudio's model (checkpoints, ``ns-export``), not in those of the capture (other ``.ply``).
+        path: ``.ckpt`` file, a folder of them (the newest counts), or a file that ``storage.primitives`` reads.
 
     Raises:
         CheckpointError: there is no such file, it holds no Gaussian field, or has another format.
     """
+    if not path.exists():
+        raise CheckpointError(f"{path} does not exist; give a .ckpt file, the folder of them, or a .ply")
+    if kind_of_primitives(path) is not None:
+        try:
+            found = read_primitives(path)
+        except DataError as error:
+            raise CheckpointError(str(error)) from error
+        return FinishedField(dict(found.mended.field), found.in_model_frame, found.mended.dropped)
+    refuse(path, packed="sundae unpack makes a run of it: give that, or its checkpoint")
     if path.is_dir():
         if not checkpoints(folder_of(path)):
             raise CheckpointError(f"{path} holds no checkpoint; give a .ckpt file, the folder of them, or a .ply")
         path, loaded = read_newest(path)
-        return dict(field_of(loaded, path).as_harmonics()), True
-    refuse(path, packed="sundae unpack makes a run of it: give that, or its checkpoint")
-    if kind_of(path) == "ply" or (path.suffix == ".ply" and path.is_file()):
-        field = read_ply(path)
-        _check_field(field, path)
-        return field, is_nerfstudio_ply(path)
-    return dict(field_of(read(path), path).as_harmonics()), True
+    else:
+        loaded = read(path)
+    field = field_of(loaded, path)
+    usable = mended_of(field, path).as_harmonics()
+    return FinishedField(dict(usable), True, field.num_primitives - usable.num_primitives)
 
 
 def field_of(loaded: Mapping[str, Any], path: Path) -> Field:
@@ -374,8 +351,8 @@ def _encoding(field: Mapping[str, Tensor], extra: Any) -> Encoding:
 
 
 def _check_field(field: Mapping[str, Tensor], path: Path) -> None:
-    """Check the shape of each parameter, and that a primitive is finite."""
+    """Check the shape of each parameter, and that a primitive has a meaning."""
     for odd in odd_shapes(field):
         raise CheckpointError(f"{path} has a parameter of an odd shape ({odd}); give another file")
-    if not finite_mask(field).any():
+    if not mend(field).field.num_primitives:
         raise CheckpointError(f"{path} holds {len(field['means']):,} primitives, and none is finite; give another file")

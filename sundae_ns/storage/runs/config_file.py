@@ -146,7 +146,7 @@ def check_run(run: Path) -> None:
     refuse(
         run,
         packed="give the run that was packed, or the one that sundae unpack makes of it",
-        ply="give the folder of a run; sundae export turns a .ply into .spz or .sog",
+        primitives="give the folder of a run; sundae prune and sundae export read such files",
     )
     model_options(config_of(run))
 

@@ -29,16 +29,16 @@ def new_name() -> str:
     return datetime.now().strftime("%Y-%m-%d_%H%M%S_%f")
 
 
-def unpacked_folder(output_dir: Path, name: str) -> Path:
+def unpacked_folder(output_dir: Path, name: str, *, overwrite: bool = False) -> Path:
     """Folder below ``output_dir`` of the run that a packed scene is unpacked to; odd characters of its name change.
 
     Raises:
-        PackError: there is a run already.
+        PackError: there is a run already, and it is not to be replaced.
     """
     experiment = re.sub(r"[^\w.-]+", "-", name).strip(".") or "scene"
     folder = output_dir.resolve() / experiment / "sundae" / UNPACKED
-    if (folder / "config.yml").exists():
-        raise PackError(f"{folder} is a run already; choose another --name or folder, or remove it")
+    if (folder / "config.yml").exists() and not overwrite:
+        raise PackError(f"{folder} is a run already; choose another --name or folder, or replace it with --overwrite")
     return folder
 
 

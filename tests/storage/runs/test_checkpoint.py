@@ -133,7 +133,7 @@ def test_stock_checkpoint_with_numpy_numbers(tmp_path: Path, prefix: str) -> Non
     params = stock_checkpoint(tmp_path / "step-000000001.ckpt", prefix)
     with pytest.raises(Exception, match="[Ww]eights.only"):
         torch.load(tmp_path / "step-000000001.ckpt", weights_only=True)
-    read, in_model_frame = checkpoint.read_field(tmp_path / "step-000000001.ckpt")
+    read, in_model_frame, _ = checkpoint.read_field(tmp_path / "step-000000001.ckpt")
     assert in_model_frame
     assert tuple(read) == SPLAT_NAMES
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
@@ -164,7 +164,7 @@ def save_without_harmonics(folder: Path, extra: Any) -> None:
 def test_a_field_of_sh_degree_0_holds_logits_or_harmonics(tmp_path: Path, extra: Any, logits: bool) -> None:
     """Logits if the model was built at degree 0, harmonics if a search has lowered the degree."""
     save_without_harmonics(tmp_path, extra)
-    read, _ = checkpoint.read_field(tmp_path)
+    read, _, _ = checkpoint.read_field(tmp_path)
     stored = field()["features_dc"]
     expected = sh_to_rgb(read["features_dc"]).logit() if logits else read["features_dc"]
     torch.testing.assert_close(expected, stored)
@@ -202,7 +202,7 @@ def test_newest_of_a_folder(tmp_path: Path, inside: str) -> None:
 def test_ply(tmp_path: Path, comments: tuple[str, ...], in_model_frame: bool) -> None:
     params = field()
     write_ply(tmp_path / "a.ply", params, comments=list(comments))
-    read, in_frame = checkpoint.read_field(tmp_path / "a.ply")
+    read, in_frame, _ = checkpoint.read_field(tmp_path / "a.ply")
     assert in_frame is in_model_frame
     assert all(torch.equal(read[name], params[name]) for name in SPLAT_NAMES)
     renamed = (tmp_path / "a.ply").rename(tmp_path / "cloud")

@@ -1,0 +1,137 @@
+"""Files of other programs, made in small: .splat, compressed .ply, colours in a .ply, checkpoints of gsplat."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from sundae_ns.gaussians.parameters import SH_C0
+from sundae_ns.storage import write_ply
+
+_CHUNK = 256
+
+
+def small_field(n: int = 300, degree: int = 1) -> dict[str, Tensor]:
+    """A field of visible primitives within a unit cube."""
+    generator = torch.Generator().manual_seed(0)
+
+    def uniform(*shape: int, low: float, high: float) -> Tensor:
+        return low + (high - low) * torch.rand(*shape, generator=generator)
+
+    return {
+        "means": uniform(n, 3, low=-1, high=1),
+        "scales": uniform(n, 3, low=-4, high=-2),
+        "quats": torch.nn.functional.normalize(torch.randn(n, 4, generator=generator)),
+        "features_dc": uniform(n, 3, low=-1.5, high=1.5),
+        "features_rest": uniform(n, (degree + 1) ** 2 - 1, 3, low=-1, high=1),
+        "opacities": uniform(n, 1, low=-2, high=4),
+    }
+
+
+def _bytes(shares: Tensor) -> np.ndarray:
+    return (shares * 255).round().clamp(0, 255).numpy().astype(np.uint8)
+
+
+def colors_of(field: Mapping[str, Tensor]) -> Tensor:
+    """View-independent colours ``[N, 3]``."""
+    return 0.5 + SH_C0 * field["features_dc"]
+
+
+def write_splat(path: Path, field: Mapping[str, Tensor]) -> None:
+    rows = np.zeros(len(field["means"]), [("m", "<f4", 3), ("s", "<f4", 3), ("c", "u1", 4), ("q", "u1", 4)])
+    rows["m"], rows["s"] = field["means"].numpy(), field["scales"].exp().numpy()
+    rows["c"] = _bytes(torch.cat([colors_of(field), field["opacities"].sigmoid()], dim=1))
+    rows["q"] = (field["quats"] * 128 + 128).round().clamp(0, 255).numpy().astype(np.uint8)
+    path.write_bytes(rows.tobytes())
+
+
+def _word(shares: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    word = np.zeros(len(shares), np.uint32)
+    for column, width in zip(shares.T, bits, strict=True):
+        level = np.rint(np.clip(column, 0, 1) * ((1 << width) - 1)).astype(np.uint32)
+        word = (word << np.uint32(width)) | level
+    return word
+
+
+def write_compressed_ply(path: Path, field: Mapping[str, Tensor], *, old: bool = False, comment: str = "") -> None:
+    """As SuperSplat writes it; ``old`` ones have no bounds of colours."""
+    n, chunks = len(field["means"]), []
+    vertex = np.zeros(n, [(f"packed_{name}", "<u4") for name in ("position", "rotation", "scale", "color")])
+    colors = colors_of(field).numpy()
+    for first in range(0, n, _CHUNK):
+        rows, bounds = slice(first, first + _CHUNK), {}
+        blocks = {"": field["means"].numpy(), "scale_": field["scales"].numpy(), "color": colors}
+        for kind, values in blocks.items():
+            axes = "rgb" if kind == "color" else "xyz"
+            low, high = values[rows].min(axis=0), values[rows].max(axis=0)
+            if kind == "color" and old:
+                low, high = np.zeros(3), np.ones(3)
+            names = [f"{kind.removeprefix('color')}{axis}" for axis in axes]
+            if not (kind == "color" and old):
+                bounds |= {f"min_{name}": value for name, value in zip(names, low, strict=True)}
+                bounds |= {f"max_{name}": value for name, value in zip(names, high, strict=True)}
+            shares = (values[rows] - low) / np.where(high > low, high - low, 1)
+            if kind == "color":
+                alphas = field["opacities"][rows].sigmoid().numpy()
+                vertex["packed_color"][rows] = _word(np.concatenate([shares, alphas], axis=1), (8, 8, 8, 8))
+            else:
+                vertex["packed_position" if kind == "" else "packed_scale"][rows] = _word(shares, (11, 10, 11))
+        chunks.append(bounds)
+    quats = field["quats"].numpy()
+    largest = np.abs(quats).argmax(axis=1)
+    positive = quats * np.sign(quats[np.arange(n), largest])[:, None]
+    others = positive[np.arange(4) != largest[:, None]].reshape(n, 3) * math.sqrt(0.5) + 0.5
+    vertex["packed_rotation"] = _word(np.concatenate([largest[:, None] / 3, others], axis=1), (2, 10, 10, 10))
+    table = np.array([tuple(chunk.values()) for chunk in chunks], [(name, "<f4") for name in chunks[0]])
+    elements = [PlyElement.describe(table, "chunk"), PlyElement.describe(vertex, "vertex")]
+    rest = field["features_rest"].numpy()
+    if rest.shape[1]:
+        levels = np.floor((rest / 8 + 0.5) * 256).clip(0, 255).astype(np.uint8).transpose(0, 2, 1).reshape(n, -1)
+        sh = np.zeros(n, [(f"f_rest_{i}", "u1") for i in range(levels.shape[1])])
+        for i, name in enumerate(sh.dtype.names or ()):
+            sh[name] = levels[:, i]
+        elements.append(PlyElement.describe(sh, "sh"))
+    PlyData(elements, byte_order="<", comments=[comment] if comment else []).write(str(path))
+
+
+def write_colored_ply(path: Path, field: Mapping[str, Tensor], dtype: str = "u1", most: float = 255) -> None:
+    """As ``ns-export gaussian-splat --ply-color-mode rgb``: colours in place of SH coefficients."""
+    values = {"x": field["means"][:, 0], "y": field["means"][:, 1], "z": field["means"][:, 2]}
+    values |= {"opacity": field["opacities"][:, 0], **{f"scale_{i}": field["scales"][:, i] for i in range(3)}}
+    values |= {f"rot_{i}": field["quats"][:, i] for i in range(4)}
+    names = ("red", "green", "blue")
+    rows = np.zeros(len(field["means"]), [(name, "<f4") for name in values] + [(name, dtype) for name in names])
+    for name, value in values.items():
+        rows[name] = value.numpy()
+    for i, name in enumerate(names):
+        color = colors_of(field)[:, i].numpy() * most
+        rows[name] = color if dtype.endswith(("f4", "f8")) else np.rint(color.clip(0, most))
+    comments = ["Generated by Nerstudio 1.1.5"]
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments).write(str(path))
+
+
+def write_gsplat(path: Path, field: Mapping[str, Tensor], **others: object) -> None:
+    """As ``simple_trainer.py`` of gsplat."""
+    splats = {name: field[name] for name in ("means", "scales", "quats")}
+    splats |= {
+        "opacities": field["opacities"][:, 0],
+        "sh0": field["features_dc"][:, None],
+        "shN": field["features_rest"],
+    }
+    torch.save({"step": 6999, "splats": splats, **others}, path)
+
+
+FOREIGN: dict[str, Callable[[Path, Mapping[str, Tensor]], None]] = {
+    "a.splat": write_splat,
+    "a.compressed.ply": write_compressed_ply,
+    "colors.ply": write_colored_ply,
+    "ckpt_6999_rank0.pt": write_gsplat,
+    "plain.ply": write_ply,
+}
+"""Files by their names, and their writers."""
