@@ -10,12 +10,15 @@ import torch
 from torch import Tensor
 
 from sundae_ns.api.scene import Scene
+from sundae_ns.data.camera_axes import world_to_camera
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians import finite_mask
+from sundae_ns.gaussians.covariance import chunks
 from sundae_ns.gaussians.field import Field
-from sundae_ns.rasterization import rasterize
+from sundae_ns.rasterization import rasterize_views
 from sundae_ns.rendering import View
 from sundae_ns.rendering.render import pass_options
+from sundae_ns.rendering.views import poses_looking_at
 
 NEAREST, FARTHEST = 0.3, 2.0
 """Distances of the eyes from the middle of the scene, as multiples of the median distance of its primitives."""
@@ -30,6 +33,8 @@ _PROBE_SIZE = 24
 """Sides of the images that candidates are judged by, pixels."""
 _PROBE_PRIMITIVES = 20_000
 """Most primitives of these images."""
+_PROBES = 64
+"""Images that are rendered at once."""
 
 
 def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = VIRTUAL_SIZE) -> list[View]:
@@ -60,14 +65,15 @@ def virtual_views(scene: Scene, n: int = 128, *, seed: int = 0, size: int = VIRT
     if n < 1 or size < 1:
         raise ConfigError(f"{n} views of {size} x {size} pixels see nothing; give at least 1 of both")
     field = _usable(scene)
-    means = field["means"].cpu().double()
+    means = field["means"]
     middle, reach = _middle_and_reach(field)
     generator = torch.Generator().manual_seed(seed)
     probe, sizes = _probe(field, middle, reach, generator)
     judge = dataclasses.replace(scene, field=probe)
 
     def random_targets(count: int) -> Tensor:
-        return (means[torch.randint(len(means), (count,), generator=generator)] - middle) / reach
+        drawn = torch.randint(len(means), (count,), generator=generator)
+        return (means[drawn.to(means.device)].cpu().double() - middle) / reach
 
     def normal(count: int) -> Tensor:
         return torch.randn(count, 3, generator=generator, dtype=torch.float64)
@@ -136,13 +142,13 @@ def _usable(scene: Scene) -> Field:
 
 
 def _middle_and_reach(field: Field) -> tuple[Tensor, float]:
-    """Median of the centres ``[3]``, float64, and the median distance from it; in one place, a size."""
-    means = field["means"].detach().cpu().double()
+    """Median of the centres ``[3]``, float64 on the CPU, and the median distance from it; in one place, a size."""
+    means = field["means"].detach().double()
     middle = means.median(dim=0).values
     reach = float((means - middle).norm(dim=1).median())
     if reach == 0:
         reach = 3 * float(field["scales"].detach().double().amax(dim=1).median().exp())
-    return middle, max(reach, 1e-30)
+    return middle.cpu(), max(reach, 1e-30)
 
 
 def _probe(field: Field, middle: Tensor, reach: float, generator: torch.Generator) -> tuple[Field, Tensor]:
@@ -156,13 +162,9 @@ def _probe(field: Field, middle: Tensor, reach: float, generator: torch.Generato
     sizes = field["scales"].double().sort(dim=1).values[:, 1:].mean(dim=1) - math.log(reach)
     kept = field
     if field.num_primitives > _PROBE_PRIMITIVES:
-        weight = sizes.cpu() + torch.nn.functional.logsigmoid(field["opacities"].cpu().double()[:, 0]) / 2
+        weight = sizes + torch.nn.functional.logsigmoid(field["opacities"].double()[:, 0]) / 2
         size = (weight - weight.max()).exp()
-        low, high = 0.0, float(field.num_primitives) / float(size.mean())
-        for _ in range(60):  # the factor at which as many are drawn, by bisection
-            factor = (low + high) / 2
-            low, high = (low, factor) if (factor * size).clamp(max=1).sum() > _PROBE_PRIMITIVES else (factor, high)
-        chance = (low * size).clamp(max=1)
+        chance = (_factor(size, _PROBE_PRIMITIVES) * size).clamp(max=1).cpu()
         drawn = torch.rand(len(chance), generator=generator, dtype=torch.float64) < chance
         kept, sizes = field.rows(drawn.to(field["means"].device)), sizes[drawn.to(sizes.device)]
         grown = kept["scales"] - chance[drawn].log().to(kept["scales"])[:, None] / 2
@@ -170,6 +172,14 @@ def _probe(field: Field, middle: Tensor, reach: float, generator: torch.Generato
     moved = (kept["means"].double() - middle.to(kept["means"].device)) / reach
     values = {"means": moved.float(), "scales": kept["scales"] - math.log(reach)}
     return kept.replaced(values), sizes.float()
+
+
+def _factor(values: Tensor, count: int) -> Tensor:
+    """The factor at which values ``[N]``, limited to 1 each, have the sum ``count < N``."""
+    # With the largest k values at 1, the others share what is left. The sum is the least of these sums over k, so the
+    # factor is the largest of theirs.
+    left = count - torch.arange(count, dtype=values.dtype, device=values.device)
+    return (left / values.sort().values.cumsum(0).flip(0)[:count].clamp_min(1e-290)).amax()
 
 
 @torch.no_grad()
@@ -182,10 +192,17 @@ def _coarseness(scene: Scene, sizes: Tensor, eyes: Tensor, targets: Tensor) -> T
         targets: ``[V, 3]``.
     """
     means, settings, found = scene.field["means"], scene.settings(head=False), []
-    for eye, target in zip(eyes, targets, strict=True):
-        view = View.look_at(eye, target, fov=FOV, width=_PROBE_SIZE, height=_PROBE_SIZE).to(scene.device)
-        distances = (means - eye.to(means)).norm(dim=1).clamp_min(1e-9)
+    poses = poses_looking_at(eyes, targets, eyes.new_tensor([0.0, 0.0, 1.0]))
+    eyes, viewmats = eyes.to(means), world_to_camera(poses.float()).to(scene.device)
+    view = View.from_fov(torch.eye(4), FOV, _PROBE_SIZE, _PROBE_SIZE).to(scene.device)
+    options = pass_options(scene.field, view, settings)
+    K = options.pop("K")
+    del options["viewmat"]
+    for some in chunks(len(eyes), _PROBES):
+        distances = (means - eyes[some, None]).norm(dim=2).clamp_min(1e-9)
         angles = (sizes - distances.log()).clamp_max(0)
         # Blending adds nothing where nothing is seen: the logarithm of one radian.
-        found.append(rasterize(colors=angles[:, None], **pass_options(scene.field, view, settings)).colors.mean())
-    return torch.stack(found).cpu()
+        options |= {"viewmats": viewmats[some], "Ks": K.expand(len(distances), 3, 3)}
+        images = rasterize_views(colors=angles[..., None], **options)
+        found.append(images.mean(dim=(1, 2, 3)))
+    return torch.cat(found).cpu()  # the one wait for a GPU
