@@ -172,13 +172,14 @@ def test_the_factor_of_a_limited_sum(count: int) -> None:
 
 
 @pytest.mark.gpu
-def test_a_gpu_judges_cameras_like_a_cpu() -> None:
+@pytest.mark.parametrize("evenness", [0.0, 4.0])
+def test_a_gpu_judges_cameras_like_a_cpu(evenness: float) -> None:
     made, generator = scene(), torch.Generator().manual_seed(0)
     sizes, eyes, targets = made.field["scales"].mean(dim=1), ball(150, generator).double(), made.field["means"][:1]
     targets = targets.double().expand(150, 3)
     on_gpu = made.to("cuda")
-    found = virtual._coarseness(on_gpu, sizes.cuda(), eyes, targets)
-    torch.testing.assert_close(found, virtual._coarseness(made, sizes, eyes, targets), rtol=1e-2, atol=1e-2)
+    found = virtual._coarseness(on_gpu, sizes.cuda(), eyes, targets, evenness)
+    torch.testing.assert_close(found, virtual._coarseness(made, sizes, eyes, targets, evenness), rtol=1e-2, atol=1e-2)
 
 
 def centers_of(made: sn.Scene, n: int = 32) -> torch.Tensor:
