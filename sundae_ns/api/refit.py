@@ -26,6 +26,10 @@ _RATES = {"means": 0.014, "scales": 0.007, "quats": 0.007, "opacities": 0.035, "
 """Size of the first steps; centres move in sizes of their primitive. The rates fall to zero."""
 
 
+FULL_RATES = 0.15
+"""Largest share of the primitives at which the rates are those above; with more of them less is left to fit."""
+
+
 @torch.no_grad()
 def refit(
     small: Field,
@@ -59,7 +63,8 @@ def refit(
     shown = order[JUDGES:] if len(order) >= 2 * JUDGES else order
     size = small["scales"].exp().sort(dim=1).values[:, 1:].mean(dim=1, keepdim=True)
     moved = {name: torch.zeros_like(small[name], requires_grad=True) for name in _RATES}
-    groups = [{"params": [moved[name]], "lr": rate, "full": rate} for name, rate in _RATES.items()]
+    gentle = min(1.0, FULL_RATES * full.num_primitives / small.num_primitives)
+    groups = [{"params": [moved[n]], "lr": gentle * rate, "first": gentle * rate} for n, rate in _RATES.items()]
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15)
 
     def fitted() -> Field:
@@ -81,7 +86,7 @@ def refit(
             with torch.enable_grad():
                 error(fitted(), shown[i % len(shown)]).backward()
         for group in optimizer.param_groups:
-            group["lr"] = group["full"] * (1 - step / STEPS)
+            group["lr"] = group["first"] * (1 - step / STEPS)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
     found = fitted()
