@@ -92,8 +92,14 @@ def prune_with_mask(
     *,
     progress: bool,
     stated: bool = False,
+    trains: bool = False,
 ) -> PrunedScene:
-    """As :func:`prune`, with the mask of the kept primitives; ``stated`` if its cost was stated already."""
+    """As :func:`prune`, with the mask of the kept primitives.
+
+    Args:
+        stated: whether its cost was stated already.
+        trains: whether training follows, which learns more from merged primitives than from fitted ones.
+    """
     check_amount(keep, count)
     rule = rule or DEFAULT_RULE
     finite = finite_mask(scene.field)
@@ -136,7 +142,7 @@ def prune_with_mask(
             )
     pruned = prune_field(field, rule, count, weights)
     small = pruned.field
-    if weights is not None and rule.refits:
+    if weights is not None and rule.refits and not trains:
         factor = size_of(usable)
         small = resized(dataclasses.replace(scene, field=small), 1 / factor).field
         cameras = [view.to(scene.device) for view in seen]
