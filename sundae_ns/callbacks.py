@@ -162,10 +162,10 @@ class NerfstudioRun:
         """Print quality, size and the next command, on the first rank."""
         if self._trainer is None:
             return
-        results = self.evaluate()  # every rank takes part
+        results = self.evaluate() if self.model.config.evaluate_prune else {}  # every rank takes part
         if self.folder is None:
             return
-        state, views = self.state, len(self._datamanager.eval_dataset)
+        state = self.state
         numbers = sum(value[:1].numel() for value in state.field.values())
         size = BYTES_PER_FLOAT * self.source.total * numbers
         size += bytes_of_module(state.head) if state.head is not None and state.head_enabled else 0
@@ -173,7 +173,7 @@ class NerfstudioRun:
         lines = [f"{self.source.total:,} primitives, {head} a head: {megabytes(size)} before packing"]
         if results:
             quality = f"PSNR {results['psnr']:.2f} dB, SSIM {results['ssim']:.4f}"
-            lines.insert(0, f"trained: {quality} on {views} test views")
+            lines.insert(0, f"trained: {quality} on {len(self._datamanager.eval_dataset)} test views")
         lines.append(f"next: {shlex.join(['sundae', 'pack', str(self.folder), '-o', 'scene.sundae'])}")
         for line in lines:
             CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)

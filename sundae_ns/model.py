@@ -77,7 +77,7 @@ class SundaeModelConfig(SplatfactoModelConfig):
     mcmc_cap: int = 1_000_000
     """Highest number of primitives in a warm-up by mcmc."""
     evaluate_prune: bool = True
-    """Evaluate all test views right before and right after the prune, and record both."""
+    """Evaluate all test views right before and right after the prune, and at the end."""
 
     @property
     def num_features(self) -> int:

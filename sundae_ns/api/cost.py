@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import torch
 
+from sundae_ns.api.refit import MOST_PIXELS, STEPS, VIEWS
 from sundae_ns.errors import MemoryExhaustedError
 from sundae_ns.pruning import PruneRule
 
@@ -25,6 +26,8 @@ _PAIR = 80
 """Most bytes of an edge while pairs are merged."""
 _SECONDS, _SECONDS_OF_VIEW, _SECONDS_OF_PIXEL = 14e-6, 0.7e-6, 3e-6
 """Of a primitive in the graph and the merge, of one in a view, and of a pixel; the last two on one thread."""
+_SECONDS_OF_FIT, _SECONDS_OF_FIT_PIXEL = 1.2e-6, 1e-6
+"""Of a kept primitive and of a pixel in a view of the refit, on one thread."""
 
 
 class PruneCost(NamedTuple):
@@ -66,6 +69,9 @@ def prune_cost(
         added = max(_PAIR * rule.num_neighbors + _GRAPH, merge) if rule.selection == "pairs" else drawn
         seconds = primitives * _SECONDS
     seen = primitives * views * _SECONDS_OF_VIEW + pixels * _SECONDS_OF_PIXEL
+    if rule.refits and views:
+        fitted = keep * primitives * _SECONDS_OF_FIT + min(pixels / views, MOST_PIXELS) * _SECONDS_OF_FIT_PIXEL
+        seen += STEPS * VIEWS * fitted
     seconds += seen / torch.get_num_threads()
     return PruneCost(field + added * primitives, field, seconds, field + drawn * primitives)
 

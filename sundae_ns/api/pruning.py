@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from sundae_ns.api.cost import prune_cost, require_memory, state
+from sundae_ns.api.refit import refit
 from sundae_ns.api.scene import Scene
-from sundae_ns.api.virtual import of_unit_size, virtual_views
+from sundae_ns.api.virtual import of_unit_size, resized, size_of, virtual_views
 from sundae_ns.errors import ConfigError, DataError
 from sundae_ns.gaussians import mend
 from sundae_ns.pruning import PruneRule, kept_count, prune_field
@@ -43,7 +44,7 @@ def prune(
     """Keep the primitives that matter most to the views, and merge the others into them.
 
     Primitives with NaN, or infinite values without a meaning, are dropped first. An opacity of 1, a width of 0 and the
-    like become finite.
+    like become finite. After a merge by pairs, a few steps fit the kept ones to the scene's own images of the views.
 
     Args:
         scene: to prune; it does not change.
@@ -91,8 +92,14 @@ def prune_with_mask(
     *,
     progress: bool,
     stated: bool = False,
+    trains: bool = False,
 ) -> PrunedScene:
-    """As :func:`prune`, with the mask of the kept primitives; ``stated`` if its cost was stated already."""
+    """As :func:`prune`, with the mask of the kept primitives.
+
+    Args:
+        stated: whether its cost was stated already.
+        trains: whether training follows, which learns more from merged primitives than from fitted ones.
+    """
     check_amount(keep, count)
     rule = rule or DEFAULT_RULE
     mended = mend(scene.field)
@@ -134,7 +141,14 @@ def prune_with_mask(
                 "give cameras that look at the scene, or export it again"
             )
     pruned = prune_field(field, rule, count, weights)
+    small = pruned.field
+    if weights is not None and rule.refits and not trains:
+        factor = size_of(usable)
+        small = resized(dataclasses.replace(scene, field=small), 1 / factor).field
+        cameras = [view.to(scene.device) for view in seen]
+        small = refit(small, sized.field, cameras, scene.settings(head=False), seed=rule.seed, console=console)
+        small = resized(dataclasses.replace(scene, field=small), factor).field
     mask = finite.clone()
     mask[finite] = pruned.decision.mask
     share = None if weights is None else float((weights > 0).float().mean())
-    return PrunedScene(dataclasses.replace(scene, field=pruned.field), mask, share)
+    return PrunedScene(dataclasses.replace(scene, field=small), mask, share)

@@ -147,10 +147,11 @@ def prune_file(
     seed: int = 0,
     overwrite: Overwrite = False,
 ) -> int:
-    """Prune a scene of any program, without its photos and without training.
+    """Prune a scene of any program, without its photos.
 
-    Kept are the primitives that virtual cameras see most of; the others are merged into them. A million primitives with
-    three bands of harmonics take about 1.7 GB; a prune of more than a minute states its cost first.
+    Kept are the primitives that virtual cameras see most of; the others are merged into them, and 64 steps fit pairs to
+    the scene's own images. A million primitives with three bands of harmonics take about 1.7 GB; a prune of more than a
+    minute states its cost first.
 
     Args:
         source: a .ply, .spz, .sog, .splat or gsplat's .pt, a packed scene, or a run.

@@ -17,6 +17,9 @@ PAIRS = 1 << 18
 ROWS = 1 << 16
 """Primitives whose matrices are computed at once; the steps between take some 600 bytes a primitive."""
 
+_SWEEPS = 6
+"""Rotations of each pair of axes; the error squares with each sweep, and five reach the rounding of float64."""
+
 _LOWER = ([0, 1, 2, 1, 2, 2], [0, 1, 2, 0, 0, 1])
 """Rows and columns of the six entries of a symmetric matrix, diagonal first."""
 
@@ -76,10 +79,34 @@ def quaternions(matrices: Tensor) -> Tensor:
 
 def scales_and_quaternions(covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Standard deviations ``[N, 3]`` and unit quaternions ``[N, 4]`` of symmetric matrices ``[N, 3, 3]``."""
-    eigenvalues, axes = torch.linalg.eigh(covariance)
-    # The sign of an eigenvector is arbitrary; a rotation needs determinant 1.
-    axes[:, :, 2] *= torch.sign(torch.linalg.det(axes))[:, None]
+    eigenvalues, axes = _eigenvectors(covariance)
     return eigenvalues.clamp_min(0).sqrt(), quaternions(axes)
+
+
+def _eigenvectors(matrices: Tensor) -> tuple[Tensor, Tensor]:
+    """Ascending eigenvalues ``[N, 3]``, and rotations whose columns are the eigenvectors ``[N, 3, 3]``.
+
+    By Jacobi's rotations of all matrices at once: LAPACK takes one matrix after the other, CUDA's solver not so many.
+    """
+    a = [list(row.unbind(dim=1)) for row in matrices.unbind(dim=1)]
+    v = [list(row.unbind(dim=1)) for row in torch.eye(3).to(matrices).expand_as(matrices).unbind(dim=1)]
+    for _ in range(_SWEEPS):
+        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+            gap, twice = a[q][q] - a[p][p], 2 * a[p][q]
+            below = gap.abs() + torch.hypot(gap, twice)
+            tangent = torch.where(below > 0, twice * torch.where(gap < 0, -1.0, 1.0) / below, 0.0)
+            cosine = (tangent.square() + 1).rsqrt()
+            sine = tangent * cosine
+            a[p][p], a[q][q] = a[p][p] - tangent * a[p][q], a[q][q] + tangent * a[p][q]
+            a[p][q] = a[q][p] = torch.zeros_like(gap)
+            a[p][r], a[q][r] = cosine * a[p][r] - sine * a[q][r], sine * a[p][r] + cosine * a[q][r]
+            a[r][p], a[r][q] = a[p][r], a[q][r]
+            for row in v:
+                row[p], row[q] = cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]
+    values, order = torch.stack([a[axis][axis] for axis in range(3)], dim=1).sort(dim=1)
+    axes = torch.stack([torch.stack(row, dim=1) for row in v], dim=1).gather(2, order[:, None].expand_as(matrices))
+    axes[:, :, 2] = torch.linalg.cross(axes[:, :, 0], axes[:, :, 1])  # of determinant 1 in every order
+    return values, axes
 
 
 def mean_projected_area(scales: Tensor) -> Tensor:

@@ -34,13 +34,14 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
 
     Returns:
         Parameters ``[M, ...]`` of the primitives that stay, in order, with dtype and device of ``params``; computed in
-        float64 on the CPU. A primitive whose group is itself alone, has no weight or overflows is unchanged, bit for
-        bit.
+        float64 there, in the same order each time. A primitive whose group is itself alone, has no weight or overflows
+        is unchanged, bit for bit.
     """
-    source = {name: value.detach().cpu() for name, value in params.items()}
-    label, w = label.cpu(), weight.detach().double().cpu().nan_to_num(0.0, posinf=0.0).clamp_min(0)
+    source = {name: value.detach() for name, value in params.items()}
+    device = source["means"].device
+    label, w = label.to(device), weight.detach().to(device).double().nan_to_num(0.0, posinf=0.0).clamp_min(0)
     n = len(label)
-    stays = label == torch.arange(n)
+    stays = label == torch.arange(n, device=device)
     place = stays.cumsum(0) - 1
     members = (label >= 0).nonzero().squeeze(1)
     group = place[label[members]]
@@ -48,9 +49,12 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
 
     def total(values: Callable[[slice], Tensor], *shape: int) -> Tensor:
         # In chunks: values of all members in float64 would take several times the memory of the field.
-        result = torch.zeros(count, *shape, dtype=torch.float64)
+        result = torch.zeros(count, *shape, dtype=torch.float64, device=device)
         for some in chunks(len(members)):
-            result.index_add_(0, group[some], values(some))
+            if result.is_cuda:  # there index_add_ adds in any order
+                result.index_put_((group[some],), values(some), accumulate=True)
+            else:
+                result.index_add_(0, group[some], values(some))
         return result
 
     def of(name: str, some: slice) -> Tensor:
@@ -58,7 +62,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
 
     w = w[members]
     # Divide by the largest weight of the group first, so that no sum underflows.
-    largest = torch.zeros(count, dtype=torch.float64).scatter_reduce_(0, group, w, "amax")
+    largest = w.new_zeros(count).scatter_reduce_(0, group, w, "amax")
     w = torch.where(largest[group] > 0, w / largest[group], 0.0)
     normalized = w / total(lambda some: w[some])[group].clamp_min(torch.finfo(torch.float64).tiny)
 
@@ -85,7 +89,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     bounded = covariance.isfinite().all(dim=2).all(dim=1)
     deviations, quats = scales_and_quaternions(torch.where(bounded[:, None, None], covariance, 0.0))
     # A width of zero has no logarithm; limit each axis to the thinnest axis of the members.
-    thinnest = torch.full((count,), torch.inf, dtype=torch.float64)
+    thinnest = torch.full_like(largest, torch.inf)
     for some in chunks(len(members)):
         thinnest.scatter_reduce_(0, group[some], of("scales", some).exp().amin(dim=1), "amin")
     deviations = deviations.maximum(thinnest[:, None])
@@ -108,7 +112,7 @@ def merge(params: Mapping[str, Tensor], label: Tensor, weight: Tensor) -> dict[s
     for name, value in kept.items():
         value = value.clone()
         value[changed] = merged[name][changed].to(value.dtype)
-        result[name] = value.to(params[name].device)
+        result[name] = value
     return result
 
 

@@ -56,7 +56,7 @@ def field_graph(params: Mapping[str, Tensor], rule: PruneRule) -> NeighborGraph:
         tau=rule.tau,
         sigma=rule.sigma,
     )
-    if rule.edges == "centres":
+    if rule.edges == "centres" or not rule.uses_edge_weights:
         return graph
     # In place: of a large field, each value per edge takes gigabytes.
     weights = graph.weights.mul_(_color_affinity(sh_to_rgb(params["features_dc"].detach()), graph))

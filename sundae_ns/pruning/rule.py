@@ -61,6 +61,16 @@ class PruneRule:
         return self.uses_response or self.redistribution == "merge" or self.selection == "pairs"
 
     @property
+    def refits(self) -> bool:
+        """Whether :func:`sundae_ns.prune` fits what is left to the images of the views; training does so by itself."""
+        return self.selection == "pairs" and self.redistribution == "merge"
+
+    @property
+    def uses_edge_weights(self) -> bool:
+        """Whether score or merge need the weights of the graph's edges; pairs need only its neighbours."""
+        return self.uses_response or self.selection != "pairs"
+
+    @property
     def uses_response(self) -> bool:
         """Whether the score needs the high-pass response."""
         return self.score.startswith("response")

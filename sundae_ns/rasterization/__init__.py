@@ -1,14 +1,21 @@
 """Gaussian splatting of one view: one interface, three backends.
 
-:func:`rasterize`, :func:`spherical_harmonics`, :func:`harmonic_colors` and :func:`blending_weights` are the whole
-interface; each takes a :class:`Backend` from :func:`select_backend`. ``gsplat`` runs the CUDA kernels of the gsplat
-package. ``reference`` is differentiable pure torch with the same thresholds, on any device, in float32 or float64.
-``cpu`` computes the same as the reference in loops compiled by numba, several times as fast.
+:func:`rasterize`, :func:`rasterize_views`, :func:`spherical_harmonics`, :func:`harmonic_colors` and
+:func:`blending_weights` are the whole interface; each takes a :class:`Backend` from :func:`select_backend`. ``gsplat``
+runs the CUDA kernels of the gsplat package. ``reference`` is differentiable pure torch with the same thresholds, on any
+device, in float32 or float64. ``cpu`` computes the same as the reference in loops compiled by numba, several times as
+fast.
 """
 
 from sundae_ns.rasterization.gsplat_backend import GsplatBackend, RecordableGsplat
 from sundae_ns.rasterization.gsplat_tiles import Capacity
-from sundae_ns.rasterization.interface import blending_weights, harmonic_colors, rasterize, spherical_harmonics
+from sundae_ns.rasterization.interface import (
+    blending_weights,
+    harmonic_colors,
+    rasterize,
+    rasterize_views,
+    spherical_harmonics,
+)
 from sundae_ns.rasterization.select import BackendName, numba_problem, select_backend
 from sundae_ns.rasterization.types import Backend, Rasterization
 
@@ -23,6 +30,7 @@ __all__ = [
     "numba_problem",
     "harmonic_colors",
     "rasterize",
+    "rasterize_views",
     "select_backend",
     "spherical_harmonics",
 ]

@@ -33,7 +33,7 @@ class GsplatBackend:
         _check_kernels_take(inputs.means)
         if inputs.means.shape[0] == 0:  # CUDA refuses to launch a grid of no blocks
             return ReferenceBackend().rasterize(inputs)
-        splats = _project(inputs)
+        splats = _project(inputs, inputs.viewmat[None], inputs.K[None])
         lists = self._lists(splats, inputs.width, inputs.height)
         channels = inputs.colors
         if inputs.render_depth:
@@ -45,16 +45,29 @@ class GsplatBackend:
         image = blended[0][0][0] if len(blended) == 1 else torch.cat([part[0] for part, _ in blended], dim=-1)
         return finished(image, alpha, splats.means2d, splats.radii, inputs)
 
+    def rasterize_views(self, inputs: Inputs, viewmats: Tensor, Ks: Tensor, colors: Tensor) -> Tensor:
+        """Render several views at once; one wait for the device in all.
+
+        Raises:
+            BackendError: The tensors are not float32 on a CUDA device.
+        """
+        _check_kernels_take(inputs.means)
+        splats = _project(inputs, viewmats, Ks)
+        lists = GsplatBackend._lists(self, splats, inputs.width, inputs.height)
+        parts = colors.split(_CHANNELS_PER_PASS, dim=2)
+        return torch.cat([GsplatBackend._blend(self, splats, part, lists, False)[0] for part in parts], dim=-1)
+
     def _lists(self, splats: Splats, width: int, height: int) -> GsplatLists:
         """gsplat's own lists: every tile that a primitive's bounding square touches."""
         from gsplat import isect_offset_encode, isect_tiles
 
         columns, rows = -(-width // TILE), -(-height // TILE)
         _, pairs, primitives = isect_tiles(splats.means2d, splats.radii, splats.depths, TILE, columns, rows)
-        return GsplatLists(width, height, isect_offset_encode(pairs, 1, columns, rows), primitives)
+        starts = isect_offset_encode(pairs, len(splats.means2d), columns, rows)
+        return GsplatLists(width, height, starts, primitives)
 
     def _blend(self, splats: Splats, colors: Tensor, lists: GsplatLists, absgrad: bool) -> tuple[Tensor, Tensor]:
-        """Image ``[1, H, W, C]`` and alpha ``[1, H, W, 1]`` of colours ``[1, N, C]``."""
+        """Images ``[V, H, W, C]`` and alphas ``[V, H, W, 1]`` of colours ``[V, N, C]``."""
         from gsplat import rasterize_to_pixels
 
         return rasterize_to_pixels(
@@ -111,20 +124,20 @@ class RecordableGsplat(GsplatBackend):
         return harmonic_colors(degree, means, center, features_dc, features_rest)
 
 
-def _project(inputs: Inputs) -> Splats:
-    """Project primitives to the screen."""
+def _project(inputs: Inputs, viewmats: Tensor, Ks: Tensor) -> Splats:
+    """Project primitives to the screens of views, transforms ``[V, 4, 4]`` and intrinsics ``[V, 3, 3]``."""
     from gsplat import fully_fused_projection
 
     opacities = inputs.opacities
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         *(inputs.means, None, _without_zeros(inputs.quats), inputs.scales),
-        *(inputs.viewmat[None], inputs.K[None], inputs.width, inputs.height),
+        *(viewmats, Ks, inputs.width, inputs.height),
         near_plane=inputs.near_plane,
         far_plane=inputs.far_plane,
         calc_compensations=inputs.antialiased,
         **({"opacities": opacities} if _projection_takes_opacities() else {}),
     )
-    opacities = opacities[None] if compensations is None else opacities * compensations
+    opacities = opacities.expand(len(viewmats), -1) if compensations is None else opacities * compensations
     return Splats(radii, means2d, depths, conics, opacities)
 
 

@@ -179,7 +179,7 @@ extern "C" __global__ void list_tiles(FIELD, const int* __restrict__ counts, con
 
 
 class Splats(NamedTuple):
-    """Primitives on the screen of one image, as gsplat projects them; float32, contiguous."""
+    """Primitives on the screen of one image, as gsplat projects them; float32, contiguous. Of V views ``[V, N]``."""
 
     radii: Tensor
     """int32 ``[1, N]``; one per axis ``[1, N, 2]`` from gsplat 1.5 on; 0 where a primitive is culled."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -9,7 +11,7 @@ from sundae_ns.errors import DataError
 from sundae_ns.gaussians.parameters import MAX_SH_DEGREE
 from sundae_ns.rasterization.constants import constant
 from sundae_ns.rasterization.limits import check_memory
-from sundae_ns.rasterization.types import Backend, ColorBackend, Inputs, Rasterization
+from sundae_ns.rasterization.types import Backend, BatchBackend, ColorBackend, Inputs, Rasterization
 
 
 def rasterize(
@@ -56,29 +58,66 @@ def rasterize(
         MemoryExhaustedError: On a CPU, the image or its lists need more memory than there is, or without gradients the
             view has more primitives than any real scene.
     """
-    n = means.shape[0]
-    if width < 1 or height < 1:
-        raise DataError(f"an image of {width}x{height} pixels is empty; width and height must be at least 1")
-    _check_shape("means", means, (n, 3))
-    _check_shape("quats", quats, (n, 4))
-    _check_shape("scales", scales, (n, 3))
-    _check_shape("opacities", opacities, (n,))
-    _check_shape("viewmat", viewmat, (4, 4))
-    _check_shape("K", K, (3, 3))
-    if colors.dim() != 2 or colors.shape[0] != n or colors.shape[1] < 1:
-        raise DataError(f"colors has shape {list(colors.shape)}; pass [{n}, C] with at least one channel")
-    _check_alike("means", means, quats=quats, scales=scales, opacities=opacities, colors=colors, viewmat=viewmat, K=K)
+    inputs = Inputs(
+        *(means, quats, scales, opacities, colors, viewmat, K, width, height, near_plane, far_plane),
+        antialiased=antialiased,
+        absgrad=absgrad,
+        render_depth=render_depth,
+    )
+    _check(inputs)
     if means.device.type == "cpu":
         size = (colors.shape[1] + 2) * width * height * means.element_size()
         check_memory(size, f"images of {width:,} x {height:,} pixels")
-    return backend.rasterize(
-        Inputs(
-            *(means, quats, scales, opacities, colors, viewmat, K, width, height, near_plane, far_plane),
-            antialiased=antialiased,
-            absgrad=absgrad,
-            render_depth=render_depth,
-        )
+    return backend.rasterize(inputs)
+
+
+def rasterize_views(
+    means: Tensor,  # [N, 3]
+    quats: Tensor,  # [N, 4]
+    scales: Tensor,  # [N, 3]
+    opacities: Tensor,  # [N]
+    colors: Tensor,  # [V, N, C]
+    viewmats: Tensor,  # [V, 4, 4]
+    Ks: Tensor,  # [V, 3, 3]
+    width: int,
+    height: int,
+    *,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    antialiased: bool = False,
+    backend: Backend,
+) -> Tensor:
+    """Splat N primitives into V views of one size; for many small images, whose launches would take most of the time.
+
+    Arguments are those of :func:`rasterize`, but for colours, transforms and intrinsics of each view.
+
+    Returns:
+        Blended colours ``[V, H, W, C]``, those of :func:`rasterize` up to rounding.
+
+    Raises:
+        DataError: As :func:`rasterize`, or there is no view.
+    """
+    count = len(viewmats)
+    if not count:
+        raise DataError("there is no view to rasterize; give at least one")
+    _check_shape("viewmats", viewmats, (count, 4, 4))
+    _check_shape("Ks", Ks, (count, 3, 3))
+    if colors.dim() != 3 or colors.shape[0] != count:
+        raise DataError(f"colors has shape {list(colors.shape)}; pass [{count}, {len(means)}, C]")
+    shared = (means, quats, scales, opacities)
+    if not isinstance(backend, BatchBackend) or not len(means):
+        options: dict[str, Any] = {"near_plane": near_plane, "far_plane": far_plane, "antialiased": antialiased}
+        views = zip(colors, viewmats, Ks, strict=True)
+        images = (rasterize(*shared, *view, width, height, **options, backend=backend) for view in views)
+        return torch.stack([image.colors for image in images])
+    inputs = Inputs(
+        *(*shared, colors[0], viewmats[0], Ks[0], width, height, near_plane, far_plane),
+        antialiased=antialiased,
+        absgrad=False,
+        render_depth=False,
     )
+    _check(inputs)
+    return backend.rasterize_views(inputs, viewmats, Ks, colors)
 
 
 def spherical_harmonics(degree: int, directions: Tensor, coeffs: Tensor, *, backend: Backend) -> Tensor:
@@ -183,6 +222,23 @@ def blending_weights(
         ).colors
         (weights,) = torch.autograd.grad(image.sum() if pixels is None else (image[..., 0] * pixels).sum(), ones)
     return weights[:, 0]
+
+
+def _check(inputs: Inputs) -> None:
+    means, colors, n = inputs.means, inputs.colors, len(inputs.means)
+    if inputs.width < 1 or inputs.height < 1:
+        size = f"{inputs.width}x{inputs.height}"
+        raise DataError(f"an image of {size} pixels is empty; width and height must be at least 1")
+    _check_shape("means", means, (n, 3))
+    _check_shape("quats", inputs.quats, (n, 4))
+    _check_shape("scales", inputs.scales, (n, 3))
+    _check_shape("opacities", inputs.opacities, (n,))
+    _check_shape("viewmat", inputs.viewmat, (4, 4))
+    _check_shape("K", inputs.K, (3, 3))
+    if colors.dim() != 2 or colors.shape[0] != n or colors.shape[1] < 1:
+        raise DataError(f"colors has shape {list(colors.shape)}; pass [{n}, C] with at least one channel")
+    others = ("quats", "scales", "opacities", "colors", "viewmat", "K")
+    _check_alike("means", means, **{name: getattr(inputs, name) for name in others})
 
 
 def _check_shape(name: str, value: Tensor, shape: tuple[int, ...]) -> None:

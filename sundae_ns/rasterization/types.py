@@ -68,6 +68,14 @@ class Backend(Protocol):
 
 
 @runtime_checkable
+class BatchBackend(Protocol):
+    """A backend that renders several views at once."""
+
+    def rasterize_views(self, inputs: Inputs, viewmats: Tensor, Ks: Tensor, colors: Tensor) -> Tensor:
+        """See :func:`sundae_ns.rasterization.rasterize_views`; of the inputs, these three take the place of one's."""
+
+
+@runtime_checkable
 class ColorBackend(Protocol):
     """A backend that makes colours by itself."""
 

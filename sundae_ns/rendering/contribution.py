@@ -78,11 +78,31 @@ def weights_by_batch(
             )
         primitives = source.primitives(view, settings, features=False, colors=count is not None)
         pixels = None if mask is None else mask[..., 0].to(primitives["means"])
-        if count is not None:
-            background = background.to(primitives["means"].device)
-            images, splatted = draw(primitives, view, background, settings.without_head(), depth=False)
-            # A prune keeps the same share of the visible primitives as of all.
-            visible = float((splatted.radii > 0).sum())
-            detail = pixel_detail(images["base_rgb"], count / source.total * visible)
-            pixels = detail if pixels is None else detail * pixels
-        yield batch, view, primitives, blending_weights(pixels=pixels, **pass_options(primitives, view, settings))
+        if count is None:
+            weights = blending_weights(pixels=pixels, **pass_options(primitives, view, settings))
+        else:
+            share, background = count / source.total, background.to(primitives["means"].device)
+            weights = _detail_weights(primitives, view, background, settings, share, pixels)
+        yield batch, view, primitives, weights
+
+
+def _detail_weights(
+    primitives: Primitives,
+    view: View,
+    background: Tensor,
+    settings: RenderSettings,
+    share: float,
+    pixels: Tensor | None,
+) -> Tensor:
+    """Blending weights ``[M]`` over pixels weighted by their detail, and by ``pixels`` ``[H, W]``."""
+    # As in blending_weights, but one pass gives the image and the weights: the gradient of the first channel.
+    fixed = Primitives({name: value.detach() for name, value in primitives.items()})
+    fixed["colors"].requires_grad_()
+    with torch.enable_grad():
+        images, splatted = draw(fixed, view, background, settings.without_head(), depth=False)
+    # A prune keeps the same share of the visible primitives as of all.
+    detail = pixel_detail(images["base_rgb"], share * float((splatted.radii > 0).sum()))
+    pixels = detail if pixels is None else detail * pixels
+    with torch.enable_grad():
+        blended = (splatted.colors[..., 0] * pixels).sum()
+    return torch.autograd.grad(blended, fixed["colors"])[0][:, 0]

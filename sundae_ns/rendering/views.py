@@ -81,13 +81,7 @@ class View(NamedTuple):
         tensor([ 0., -2.,  0.])
         """
         eye, target, up = (torch.as_tensor(v, dtype=torch.float64, device="cpu") for v in (eye, target, up))
-        back = torch.nn.functional.normalize(eye - target, dim=0)
-        right = torch.linalg.cross(up, back)
-        if right.norm() < 1e-6:
-            right = torch.linalg.cross(torch.roll(back, 1) + torch.tensor([1.0, 0.0, 0.0]), back)
-        right = torch.nn.functional.normalize(right, dim=0)
-        pose = torch.stack([right, torch.linalg.cross(back, right), back, eye], dim=1)
-        return cls.from_fov(pose, fov, width, height)
+        return cls.from_fov(poses_looking_at(eye, target, up), fov, width, height)
 
     @property
     def center(self) -> Tensor:
@@ -122,6 +116,25 @@ class View(NamedTuple):
             viewmat[0].neg_()
             K[0, 2].neg_().add_(window.width)
         return View(viewmat, K, window.width, window.height, self.focal)
+
+
+def poses_looking_at(eyes: Tensor, targets: Tensor, up: Tensor) -> Tensor:
+    """Poses of cameras that look at points, camera-to-world with OpenGL axes; arguments as for :meth:`View.look_at`.
+
+    Args:
+        eyes: centres of the cameras ``[..., 3]``.
+        targets: points in the middle of their images ``[..., 3]``.
+        up: direction that is upwards in the images ``[3]``.
+
+    Returns:
+        ``[..., 3, 4]``, dtype of the eyes.
+    """
+    back = torch.nn.functional.normalize(eyes - targets, dim=-1)
+    right = torch.linalg.cross(up.expand_as(back), back)
+    other = torch.linalg.cross(torch.roll(back, 1, dims=-1) + back.new_tensor([1.0, 0.0, 0.0]), back)
+    right = torch.where(right.norm(dim=-1, keepdim=True) < 1e-6, other, right)
+    right = torch.nn.functional.normalize(right, dim=-1)
+    return torch.stack([right, torch.linalg.cross(back, right), back, eyes], dim=-1)
 
 
 def zoomed(camera: Cameras, factor: float) -> Cameras:

@@ -116,7 +116,8 @@ class Distillation:
         self.cameras = [view.to(teacher.device) for view in seen[: len(given)]]
         self.held_out = [view.to(teacher.device) for view in seen[len(given) :]][:HELD_OUT]
         self._steps, self._seed = steps, seed
-        cut = prune_with_mask(self._teacher, keep, count, self.cameras[:PRUNED_BY], None, progress=progress)
+        seen = self.cameras[:PRUNED_BY]
+        cut = prune_with_mask(self._teacher, keep, count, seen, None, progress=progress, trains=True)
         self._config = SundaeModelConfig(prior_after_prune=0.0, background_color=teacher.background_color)
         self._head_config = None
         if head:

@@ -13,6 +13,7 @@ from colmap_models import write_model
 from fields import random_field
 
 import sundae_ns as sn
+from sundae_ns.api import virtual
 from sundae_ns.api.pruning import prune_with_mask
 from sundae_ns.api.views import is_frame, read_cameras
 from sundae_ns.errors import ConfigError, DataError
@@ -160,6 +161,25 @@ def test_a_scene_of_any_size_is_pruned_alike(factor: float) -> None:
     own, other = (prune_with_mask(each, 0.3, None, None, None, progress=False) for each in (scene(), moved))
     assert other.seen == own.seen
     assert (own.mask == other.mask).float().mean() > 0.95
+
+
+@pytest.mark.parametrize("count", [5, 999])
+def test_the_factor_of_a_limited_sum(count: int) -> None:
+    values = torch.rand(1000, generator=torch.Generator().manual_seed(0), dtype=torch.float64).pow(9)
+    factor = virtual._factor(values, count)
+    assert float((factor * values).clamp(max=1).sum()) == pytest.approx(count)
+    assert virtual._factor(torch.zeros(1000).double(), count).isfinite()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("evenness", [0.0, 4.0])
+def test_a_gpu_judges_cameras_like_a_cpu(evenness: float) -> None:
+    made, generator = scene(), torch.Generator().manual_seed(0)
+    sizes, eyes, targets = made.field["scales"].mean(dim=1), ball(150, generator).double(), made.field["means"][:1]
+    targets = targets.double().expand(150, 3)
+    on_gpu = made.to("cuda")
+    found = virtual._coarseness(on_gpu, sizes.cuda(), eyes, targets, evenness)
+    torch.testing.assert_close(found, virtual._coarseness(made, sizes, eyes, targets, evenness), rtol=1e-2, atol=1e-2)
 
 
 def centers_of(made: sn.Scene, n: int = 32) -> torch.Tensor:

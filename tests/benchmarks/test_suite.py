@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from bench_jobs import Runner, measured
 from csv_rows import read_rows
+from PIL import Image
 from rich.console import Console
 from suite import ARMS as SUITE
 from suite import SuiteOptions, find_captures, plan_suite, run_suite
@@ -21,7 +22,7 @@ from harness.plan import Job, done_file
 from sundae_ns.errors import DataError
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
-FRAME = {
+FRAME: dict[str, Any] = {
     "file_path": "images/a.png",
     "transform_matrix": POSE,
     "fl_x": 50,
@@ -48,6 +49,8 @@ def captures(tmp_path: Path) -> Path:
 def capture(folder: Path, frames: int = 1) -> None:
     folder.mkdir(parents=True)
     (folder / "transforms.json").write_text(json.dumps({"frames": [FRAME] * frames}))
+    (folder / "images").mkdir()
+    Image.new("RGB", (FRAME["w"], FRAME["h"])).save(folder / FRAME["file_path"])
 
 
 def suite(captures: Path, runner: Runner, **changed: Any) -> tuple[int, str]:

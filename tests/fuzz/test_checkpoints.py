@@ -41,6 +41,8 @@ class Pipeline(torch.nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self._model = small_model()
+        outputs = SimpleNamespace(dataparser_transform=torch.eye(4)[:3], dataparser_scale=1.0)
+        self.datamanager = SimpleNamespace(train_dataparser_outputs=outputs)
 
     @property
     def model(self) -> SundaeModel:

@@ -10,7 +10,14 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from sundae_ns.errors import DataError
-from sundae_ns.gaussians.covariance import covariances, mean_projected_area, overlap, quaternions, rotation_matrices
+from sundae_ns.gaussians.covariance import (
+    covariances,
+    mean_projected_area,
+    overlap,
+    quaternions,
+    rotation_matrices,
+    scales_and_quaternions,
+)
 from sundae_ns.gaussians.merging import merge
 from sundae_ns.gaussians.surgery import rewrite
 
@@ -191,6 +198,24 @@ def test_quaternions_inverts_rotations_also_at_half_turns() -> None:
     turns = torch.cat([torch.eye(4), torch.randn(200, 4), torch.randn(200, 4) * torch.tensor([1e-4, 1, 1, 1])]).double()
     torch.testing.assert_close(rotation_matrices(quaternions(rotation_matrices(turns))), rotation_matrices(turns))
     assert torch.equal(rotation_matrices(torch.zeros(1, 4)), torch.eye(3)[None])
+
+
+def test_scales_and_quaternions_invert_covariances_also_of_equal_axes_needles_and_single_points() -> None:
+    generator = torch.Generator().manual_seed(0)
+    scales = torch.rand(300, 3, generator=generator, dtype=torch.float64).pow(4)
+    scales[:20] = 0.3
+    scales[20:40, 1] = scales[20:40, 0]
+    scales[40:60] *= torch.tensor([1e-9, 1.0, 1e-5])
+    scales[60:80] = 0
+    scales[80:100] *= 1e-100
+    scales[100:120] *= 1e100
+    turns = torch.randn(300, 4, generator=generator, dtype=torch.float64)
+    turns[::7] = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64)
+    found, quats = scales_and_quaternions(covariances(scales, turns))
+    largest = scales.amax(dim=1, keepdim=True).clamp_min(1e-300)
+    torch.testing.assert_close(found / largest, scales.sort(dim=1).values / largest, rtol=0, atol=1e-7)
+    back, first = (covariances(s / largest, q) for s, q in ((found, quats), (scales, turns)))
+    torch.testing.assert_close(back, first, rtol=0, atol=1e-14)
 
 
 def test_mean_projected_area_of_spheres_and_discs() -> None:

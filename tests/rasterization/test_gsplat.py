@@ -12,6 +12,7 @@ from importlib.metadata import version
 
 import pytest
 import torch
+from splat_inputs import several_views
 from torch import Tensor
 
 from sundae_ns.errors import BackendError
@@ -21,6 +22,7 @@ from sundae_ns.rasterization import (
     RecordableGsplat,
     blending_weights,
     rasterize,
+    rasterize_views,
     select_backend,
     spherical_harmonics,
 )
@@ -128,6 +130,22 @@ def test_values_and_gradients(
     for attribute in ("grad", "absgrad"):
         a, b = (getattr(results[name].info["means2d"], attribute) for name in ("gsplat", "reference"))
         within(f"means2d.{attribute}", a, b, 2e-1 if rim else 1e-3)  # measured: 2.0e-5
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("channels", [1, 35])
+@pytest.mark.parametrize("recordable", [False, True], ids=["gsplat", "recordable"])
+def test_several_views_are_those_of_single_passes(
+    antialiased: bool, channels: int, recordable: bool, within: Callable
+) -> None:
+    shared, views = several_views(3000, channels)
+    shared, views = ({name: value.cuda() for name, value in values.items()} for values in (shared, views))
+    options = {"width": 40, "height": 30, "antialiased": antialiased}
+    images = rasterize_views(**shared, **views, **options, backend=select_backend("gsplat", "cuda"))
+    backend = RecordableGsplat(Capacity()) if recordable else select_backend("gsplat", "cuda")
+    for image, colors, viewmat, K in zip(images, *views.values(), strict=True):
+        single = rasterize(**shared, colors=colors, viewmat=viewmat, K=K, **options, backend=backend).colors
+        within("image", image, single, 1e-6)
 
 
 def test_radii() -> None:

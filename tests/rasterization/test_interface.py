@@ -7,9 +7,17 @@ import sys
 
 import pytest
 import torch
+from splat_inputs import several_views
 
 from sundae_ns.errors import BackendError, ConfigError, DataError
-from sundae_ns.rasterization import blending_weights, rasterize, select_backend, spherical_harmonics
+from sundae_ns.rasterization import (
+    BackendName,
+    blending_weights,
+    rasterize,
+    rasterize_views,
+    select_backend,
+    spherical_harmonics,
+)
 
 REFERENCE = select_backend("reference", "cpu")
 
@@ -142,3 +150,29 @@ def test_blending_weights_with_pixel_weights() -> None:
     assert not torch.equal(of_left, of_right)
     with pytest.raises(DataError, match="pixels has shape"):
         blending_weights(**arguments, pixels=left[1:])
+
+
+@pytest.mark.parametrize("name", ["cpu", "reference"])
+def test_several_views_are_those_of_single_passes(name: BackendName) -> None:
+    shared, views = several_views()
+    options = {"width": 40, "height": 30, "antialiased": True, "backend": select_backend(name, "cpu")}
+    images = rasterize_views(**shared, **views, **options)
+    assert images.shape == (3, 30, 40, 4)
+    for image, colors, viewmat, K in zip(images, *views.values(), strict=True):
+        assert float(image.max()) > 0.1
+        torch.testing.assert_close(image, rasterize(**shared, colors=colors, viewmat=viewmat, K=K, **options).colors)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"viewmats": torch.ones(0, 4, 4)}, "there is no view to rasterize"),
+        ({"Ks": torch.ones(2, 3, 3)}, r"Ks has shape \[2, 3, 3\]; pass \[3, 3, 3\]"),
+        ({"colors": torch.ones(2, 50, 4)}, r"colors has shape \[2, 50, 4\]; pass \[3, 50, C\]"),
+        ({"colors": torch.ones(3, 49, 4)}, r"colors has shape \[49, 4\]; pass \[50, C\]"),
+    ],
+)
+def test_wrong_views(change: dict, message: str) -> None:
+    shared, views = several_views()
+    with pytest.raises(DataError, match=message):
+        rasterize_views(**shared, **{**views, **change}, width=4, height=4, backend=REFERENCE)

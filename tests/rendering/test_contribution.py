@@ -8,12 +8,17 @@ from typing import Any
 
 import pytest
 import torch
+from fields import random_field
 from torch import Tensor
 
+import sundae_ns as sn
 from sundae_ns.errors import DataError
+from sundae_ns.gaussians.field import Field
 from sundae_ns.model import SundaeModel
 from sundae_ns.pruning.detail import pixel_detail
-from sundae_ns.rendering import contribution
+from sundae_ns.rasterization import blending_weights, rasterize
+from sundae_ns.rendering import LocalField, TrainingView, contribution
+from sundae_ns.rendering.render import pass_options
 
 Build = Callable[..., SundaeModel]
 TrainingOf = Callable[[SundaeModel], Any]
@@ -70,6 +75,22 @@ def test_contribution_to_detail_weighs_the_pixels_and_is_the_same_each_time(buil
     ratio = found[1][seen] / found[0][seen]
     assert float(ratio.max()) > 1.1
     assert float(ratio.min()) < 0.9
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_weights_by_detail_are_those_of_an_image_and_a_second_pass(masked: bool) -> None:
+    scene = sn.Scene(Field(random_field(60, features=0)))
+    view, settings = sn.virtual_views(scene, 1, size=40)[0], scene.settings()
+    mask = torch.rand(40, 40, 1, generator=torch.Generator().manual_seed(0)) < 0.5 if masked else None
+    found = contribution(LocalField(scene.field), [TrainingView(view, mask)], scene.background, settings, 20)
+    image = sn.render(scene, view)
+    visible = rasterize(colors=scene.field["features_dc"], **pass_options(scene.field, view, settings)).radii > 0
+    pixels = pixel_detail(image.rgb, 20 / 60 * float(visible.sum()))
+    pixels = pixels if mask is None else pixels * mask[..., 0]
+    expected = blending_weights(pixels=pixels, **pass_options(scene.field, view, settings))
+    assert float(expected.max()) > 0.1
+    torch.testing.assert_close(found, expected)
+    assert not any(value.requires_grad for value in scene.field.values())
 
 
 def test_a_prune_weighs_detail_for_the_count_that_it_keeps(

@@ -192,7 +192,8 @@ def test_broken_primitives_are_dropped_before_the_contribution_and_counted() -> 
     made = field()
     params, optimizers = made
     params["means"].data[5] = torch.nan
-    params["opacities"].data[[5, 9]] = torch.inf
+    params["means"].data[9] = torch.inf
+    params["opacities"].data[[5, 11]] = torch.inf  # an opacity of 1 has a meaning
     asked: list[tuple[int | None, int]] = []
 
     def contribute(count: int | None) -> Tensor:

@@ -1,0 +1,91 @@
+"""The refit of a pruned field: it matches the images of the full field better, or changes nothing."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+import sundae_ns as sn
+from sundae_ns.api import refit as module
+from sundae_ns.api.refit import refit
+from sundae_ns.gaussians.field import Encoding, Field
+from sundae_ns.gaussians.parameters import sh_to_rgb
+from sundae_ns.pruning import prune_field
+
+N = 1500
+
+
+def scene(encoding: Encoding = "harmonics") -> sn.Scene:
+    """A ball with stripes."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.nn.functional.normalize(torch.randn(N, 3, generator=generator), dim=1)
+    made = sn.Scene.from_points(points, 0.5 + 0.4 * (6 * points).sin())
+    made.field["opacities"][:], made.field["scales"][:] = 2.0, math.log(0.05)
+    if encoding == "harmonics":
+        return made
+    colors = sh_to_rgb(made.field["features_dc"]).logit()
+    return sn.Scene(Field({**made.field, "features_dc": colors}, encoding))
+
+
+def pruned(full: sn.Scene, count: int = 150) -> Field:
+    return prune_field(full.field, sn.PruneRule(selection="pairs"), count, torch.ones(N)).field
+
+
+@pytest.mark.parametrize("encoding", ["harmonics", "logits"])
+def test_a_refit_matches_views_that_it_was_not_given(encoding: Encoding) -> None:
+    full = scene(encoding)
+    small, views = pruned(full), sn.virtual_views(full, 32, size=32)
+    values = {name: value.clone() for name, value in small.items()}
+    found = refit(small, full.field, views, full.settings())
+    assert all(torch.equal(small[name], value) for name, value in values.items())
+    assert found.encoding == encoding
+    assert found.num_primitives == 150
+    assert not any(value.requires_grad for value in found.values())
+    again = refit(small, full.field, views, full.settings())
+    assert all(torch.equal(found[name], again[name]) for name in found)
+    held_out = sn.virtual_views(full, 8, seed=1, size=32)
+    before, after = (sn.measure(sn.Scene(field), full, held_out).psnr for field in (small, found))
+    assert after > before + 1
+
+
+def test_a_field_that_matches_already_is_unchanged() -> None:
+    full = scene()
+    assert refit(full.field, full.field, sn.virtual_views(full, 4, size=24), full.settings()) is full.field
+
+
+def test_a_refit_that_diverges_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = scene()
+    small, views = pruned(full), sn.virtual_views(full, 4, size=24)
+    monkeypatch.setattr(module, "_RATES", dict.fromkeys(module._RATES, math.inf))
+    assert refit(small, full.field, views, full.settings()) is small
+
+
+def test_large_views_are_rendered_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "MOST_PIXELS", 24 * 24)
+    full, sizes = scene(), set()
+    images = module._images
+
+    def spy(field: Field, view: sn.View, settings: object) -> torch.Tensor:
+        sizes.add((view.width, view.height))
+        return images(field, view, settings)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(module, "_images", spy)
+    refit(
+        pruned(full),
+        full.field,
+        [*sn.virtual_views(full, 2, size=96), *sn.virtual_views(full, 1, size=12)],
+        full.settings(),
+    )
+    assert sizes == {(24, 24), (12, 12)}
+
+
+def test_prune_refits_after_merges_by_pairs_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    full, called = scene(), []
+    monkeypatch.setattr("sundae_ns.api.pruning.refit", lambda small, *_, **__: called.append(small) or small)
+    views = sn.virtual_views(full, 2, size=24)
+    for rule in (sn.PruneRule(), sn.PruneRule(selection="pairs", redistribution="none"), None):
+        assert not called
+        sn.prune(full, keep=0.1, views=views, rule=rule)
+    assert [small.num_primitives for small in called] == [150]
