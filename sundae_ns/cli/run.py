@@ -8,6 +8,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -18,7 +19,7 @@ from sundae_ns.cli.poses import Matching, Poses
 from sundae_ns.cli.process import quoted, run_in_group, word
 from sundae_ns.cli.results import is_evaluation, is_packed, is_page, is_report
 from sundae_ns.cli.train import command
-from sundae_ns.errors import STOPPED, CheckpointError, ConfigError, DataError, StorageError, SundaeError, writing
+from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, SundaeError, writing
 
 SETTINGS = "run.json"
 """File with the settings of the first command; a repeated one must share them."""
@@ -56,7 +57,14 @@ class Project:
     @property
     def capture(self) -> Path:
         """Folder with images and poses."""
-        return self.photos if (self.photos / "transforms.json").is_file() else self.out / "capture"
+        return self.photos if self.posed else self.out / "capture"
+
+    @cached_property
+    def posed(self) -> bool:
+        """Whether the photos have poses already."""
+        from sundae_ns.data.layouts import is_posed
+
+        return is_posed(self.photos)
 
     @property
     def run(self) -> Path:
@@ -107,11 +115,11 @@ class Project:
 
             with writing(f"cannot replace {self.run}"):
                 put_aside(self.run)
-        # Without a number of steps, a resumed run trains those that are left.
-        words = command(self.capture, self.out / "runs", self.method, self.keep, None if resumes else self.steps)
         # Curves of the report come from tensorboard's files. The name may begin with a dash.
-        words += [f"--experiment-name={self.name}", "--timestamp", self.run.name, "--vis", "viewer+tensorboard"]
-        return [*words, "--load-dir", word(saved)] if resumes else words
+        more = [f"--experiment-name={self.name}", "--timestamp", self.run.name, "--vis", "viewer+tensorboard"]
+        more += ["--load-dir", word(saved)] if resumes else []
+        # Without a number of steps, a resumed run trains those that are left.
+        return command(self.capture, self.out / "runs", self.method, self.keep, None if resumes else self.steps, more)
 
     def trained(self) -> bool:
         """Whether the last step of the schedule is saved."""
@@ -119,15 +127,9 @@ class Project:
         return left is not None and left <= 0
 
     def _steps_left(self) -> int | None:
-        """Number of steps after the newest whole checkpoint; None if there is nothing to resume."""
-        from sundae_ns.storage.runs.checkpoint import newest_step
-        from sundae_ns.storage.runs.config_file import schedule_length
+        from sundae_ns.storage.runs.unfinished import steps_left
 
-        try:
-            step, length = newest_step(self.run), schedule_length(self.run / "config.yml")
-        except CheckpointError:
-            return None
-        return None if step is None else length - step - 1
+        return steps_left(self.run)
 
     def claim(self) -> int:
         """Make the folder and lock it, or check that an earlier command with the same settings made it.
@@ -228,12 +230,16 @@ def run(
 
 def _check_input(photos: Path) -> None:
     """Raise ``DataError`` for a path that is neither a capture nor a folder that may hold photos."""
-    from sundae_ns.data.advice import models_in, no_transforms
+    from sundae_ns.data.advice import no_transforms
+    from sundae_ns.data.layouts import colmap_layout, is_model, is_posed
 
     if not photos.exists():
         raise DataError(f"{photos} does not exist; give a folder of photos, or a capture")
-    if (photos / "transforms.json").is_file():
+    if is_posed(photos):
+        layout = colmap_layout(photos)
+        if layout is not None:
+            print(f"# capture in COLMAP layout: {layout}", flush=True)
         return
-    posed = (photos / "sparse").is_dir() or (photos / "transforms_train.json").is_file()
-    if photos.is_file() or posed or models_in(photos):
+    blender = (photos / "transforms_train.json").is_file()
+    if photos.is_file() or (photos / "sparse").is_dir() or blender or is_model(photos):
         raise no_transforms(photos)  # says how to use a video, or a capture in another layout

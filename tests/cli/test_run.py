@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from colmap_models import write_model
 from PIL import Image
 
 from sundae_ns.cli import main
@@ -247,6 +248,29 @@ def test_a_capture_needs_no_poses_and_no_colmap(commands: Commands, tmp_path: Pa
     assert not Path("again/capture").exists()
 
 
+def test_a_capture_in_colmap_layout_needs_no_poses(
+    commands: Commands, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(tmp_path / "bin")
+    shutil.copytree("photos", "scene/dense/images")
+    write_model(tmp_path / "scene" / "dense" / "sparse", [f"{index}.JPG" for index in range(PHOTOS)], (16, 12))
+    assert run("scene", "-o", "my scene") == 0
+    assert commands.names == STEPS[1:]
+    said = "# capture in COLMAP layout: 8 images in dense/images, poses of dense/sparse\n"
+    assert capsys.readouterr().out.startswith(said)
+    parser = ["colmap", "--colmap-path", "dense/sparse", "--images-path", "dense/images", "--downscale-factor", "1"]
+    assert commands.ran[0][-len(parser) :] == parser
+    assert commands.option("--output-dir", 0) == "my scene/runs"
+    commands.ran.clear()
+    shutil.rmtree("my scene/runs")
+    commands.codes["ns-train"] = 130
+    assert run("scene", "-o", "my scene") == 130
+    commands.codes.clear()
+    assert run("scene", "-o", "my scene") == 0
+    assert commands.ran[1][-len(parser) :] == parser, "a resumed training reads the same"
+    assert "--load-dir" in commands.ran[1]
+
+
 @pytest.mark.parametrize("missing", ["colmap", "ffmpeg"])
 def test_a_missing_program_is_named(
     commands: Commands, tmp_path: Path, capsys: pytest.CaptureFixture[str], missing: str
@@ -298,8 +322,9 @@ def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.Captur
         (["gone", "-o", "out"], "gone does not exist"),
         (["empty", "-o", "out"], "holds no photos"),
         (["video.mp4", "-o", "out"], "ns-process-data video"),
-        (["model", "-o", "out"], "colmap --colmap-path sparse/0"),
-        (["undistorted", "-o", "out"], "colmap --colmap-path dense/sparse --images-path dense/images"),
+        (["model", "-o", "out"], "model/sparse/0: cameras.bin ends early"),
+        (["model/sparse/0", "-o", "out"], "is a COLMAP model without its images"),
+        (["undistorted", "-o", "out"], "undistorted has no image 0.png, which its model dense/sparse states"),
         (["blender", "-o", "out"], "add `blender-data` to ns-train"),
         (["photos", "-o", "photos/out"], "lies in photos"),
         (["photos", "-o", "."], "holds what the command reads"),
@@ -315,9 +340,7 @@ def test_refusals_come_before_anything_is_written(
     (tmp_path / "video.mp4").touch()
     (tmp_path / "model" / "sparse" / "0").mkdir(parents=True)
     (tmp_path / "model" / "sparse" / "0" / "cameras.bin").touch()
-    (tmp_path / "undistorted" / "dense" / "sparse").mkdir(parents=True)
-    (tmp_path / "undistorted" / "dense" / "sparse" / "cameras.bin").touch()
-    (tmp_path / "undistorted" / "dense" / "images").mkdir()
+    write_model(tmp_path / "undistorted" / "dense" / "sparse", ["0.png"], (20, 16))
     (tmp_path / "blender").mkdir()
     (tmp_path / "blender" / "transforms_train.json").touch()
     (tmp_path / "used").mkdir()
