@@ -23,6 +23,8 @@ from sundae_ns.errors import STOPPED, ConfigError, DataError, StorageError, Sund
 
 SETTINGS = "run.json"
 """File with the settings of the first command; a repeated one must share them."""
+TRAIN = "train"
+"""Name of the step that saves itself when it is interrupted."""
 BUSY = "works in {}; wait for it, or choose another folder"
 
 
@@ -92,7 +94,7 @@ class Project:
 
         report = ("sundae", "report", self.run, packed, *data, "-o", page.parent, "--overwrite")
         steps = [
-            Step("train", self.train, self.trained),
+            Step(TRAIN, self.train, self.trained),
             step("evaluate", evaluated, is_evaluation, "sundae", "eval", self.run, *data, "-o", evaluated),
             step("pack", packed, is_packed, "sundae", "pack", self.run, "-o", packed, *data),
             step("report", page, is_report, *report),
@@ -212,7 +214,7 @@ def run(
                     later.result.unlink(missing_ok=True)
             place = "" if step.folder is None else f"cd {quoted(step.folder)} && "
             print(f"{heading}:\n{place}{shlex.join(words)}", flush=True)
-            code = run_in_group(words, folder=step.folder, locks=[lock])
+            code = run_in_group(words, folder=step.folder, locks=[lock], saves=step.name == TRAIN)
             if code in STOPPED:
                 print("sundae: interrupted; the same command continues here", file=sys.stderr)
                 return code

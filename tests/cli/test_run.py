@@ -41,7 +41,9 @@ class Commands:
         """Step of the checkpoint, by the exit code of the training."""
         self.silent = False
 
-    def __call__(self, words: list[str], *, folder: Path | None = None, locks: Sequence[int] = ()) -> int:
+    def __call__(
+        self, words: list[str], *, folder: Path | None = None, locks: Sequence[int] = (), saves: bool = True
+    ) -> int:
         self.ran.append(list(words))
         self.folders.append(folder)
         name = self.names[-1]

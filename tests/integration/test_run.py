@@ -36,7 +36,7 @@ def run(tiny: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     monkeypatch.setattr("sundae_ns.cli.poses.shutil.which", lambda _: "/bin/true")
     monkeypatch.setattr("sundae_ns.cli.poses._colmap_uses_gpu", lambda: False)
 
-    def here(words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = ()) -> int:
+    def here(words: Sequence[str], *, folder: Path | None = None, locks: Sequence[int] = (), saves: bool = True) -> int:
         if words[0] == "ns-process-data":
             assert folder is not None
             shutil.copytree(tiny.scene, folder / words[words.index("--output-dir") + 1])
