@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
+from sundae_ns.cli.forecast import measured_step, trained_size
 from sundae_ns.cli.outputs import check_folder
 from sundae_ns.cli.poses import Matching, Poses
 from sundae_ns.cli.process import quoted, run_in_group, word
@@ -25,6 +26,17 @@ SETTINGS = "run.json"
 """File with the settings of the first command; a repeated one must share them."""
 TRAIN = "train"
 """Name of the step that saves itself when it is interrupted."""
+Quality = Literal["draft", "normal", "best"]
+QUALITIES: dict[Quality, list[str]] = {
+    "draft": [],
+    "normal": [],
+    "best": ["--pipeline.model.pruning.max-drop", "0.03"],
+}
+"""Options of ns-train for each quality; a draft has fewer steps."""
+DRAFT_STEPS = 3000
+DECIDES = ("sundae", "sundae-auto")
+"""Methods whose trials decide the number of primitives."""
+MEGABYTE = 1_000_000
 BUSY = "works in {}; wait for it, or choose another folder"
 
 
@@ -55,6 +67,8 @@ class Project:
     keep: float | None
     steps: int | None
     matching: Matching
+    quality: Quality = "normal"
+    max_mb: float | None = None
 
     @property
     def capture(self) -> Path:
@@ -87,6 +101,7 @@ class Project:
         """The steps in their order; a capture needs no poses."""
         evaluated, packed, page = self.out / "eval.json", self.out / "scene.sundae", self.out / "report" / "report.md"
         web, data = self.out / "scene.html", ("--data", self.capture)
+        size = () if self.max_bytes is None else ("--target-bytes", self.max_bytes)
 
         def step(name: str, result: Path, whole: Callable[[Path], bool], *words: object) -> Step:
             line = [word(part) if isinstance(part, Path) else str(part) for part in words]
@@ -96,7 +111,7 @@ class Project:
         steps = [
             Step(TRAIN, self.train, self.trained),
             step("evaluate", evaluated, is_evaluation, "sundae", "eval", self.run, *data, "-o", evaluated),
-            step("pack", packed, is_packed, "sundae", "pack", self.run, "-o", packed, *data),
+            step("pack", packed, is_packed, "sundae", "pack", self.run, "-o", packed, *data, *size),
             step("report", page, is_report, *report),
             step("web page", web, is_page, "sundae", "export", packed, "-o", web),
         ]
@@ -120,8 +135,60 @@ class Project:
         # Curves of the report come from tensorboard's files. The name may begin with a dash.
         more = [f"--experiment-name={self.name}", "--timestamp", self.run.name, "--vis", "viewer+tensorboard"]
         more += ["--load-dir", word(saved)] if resumes else []
+        if not resumes:
+            more += self.options
         # Without a number of steps, a resumed run trains those that are left.
-        return command(self.capture, self.out / "runs", self.method, self.keep, None if resumes else self.steps, more)
+        steps = None if resumes else self.num_steps
+        return command(self.capture, self.out / "runs", self.method, self.keep, steps, more)
+
+    @property
+    def num_steps(self) -> int | None:
+        """Number of training steps; None for that of the method."""
+        return DRAFT_STEPS if self.quality == "draft" else self.steps
+
+    @property
+    def max_bytes(self) -> int | None:
+        """Most bytes of the packed scene."""
+        return None if self.max_mb is None else round(self.max_mb * MEGABYTE)
+
+    @property
+    def options(self) -> list[str]:
+        """Options of ns-train for the quality and the size."""
+        size = [] if self.max_bytes is None else ["--pipeline.model.pruning.max-bytes", str(self.max_bytes)]
+        return [*QUALITIES[self.quality], *size]
+
+    def check(self) -> None:
+        """Raise ``ConfigError`` for options that contradict each other."""
+        if self.max_mb is not None and not 0.01 <= self.max_mb <= 1e6:
+            raise ConfigError(f"max-mb is {self.max_mb:g}; give at least 0.01")
+        if self.quality == "draft" and self.steps is not None:
+            raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality")
+        for name, given in (("--max-mb", self.max_mb is not None), ("--quality best", self.quality == "best")):
+            if given and (self.keep is not None or self.method not in DECIDES):
+                raise ConfigError(
+                    f"{name} needs a method that decides the number of primitives; leave out --keep and --method"
+                )
+        if self.quality == "draft" and self.method == "sundae-tiny":
+            raise ConfigError("sundae-tiny is shorter than a draft; leave out --quality")
+
+    def forecast(self) -> None:
+        """Print how long the training takes on this machine, if it starts anew; on a CPU, with what is faster."""
+        from sundae_ns.training.duration import LONG, duration
+
+        size = None if self._steps_left() is not None else trained_size(self.photos)
+        found = None if size is None else measured_step(self.method, *size)
+        if size is None or found is None:
+            return
+        steps, cpu = self.num_steps or found.steps, found.device == "cpu"
+        took = f"{'at least' if cpu else 'about'} {duration(steps * found.step_s)}"
+        told = f"{steps:,} training steps take {took} on this {'CPU' if cpu else 'GPU'}"
+        told += f", {1000 * found.step_s:.0f} ms each at {size[0]} x {size[1]} px"
+        if not cpu or steps * found.step_s <= LONG:
+            print(f"# forecast: {told}", flush=True)
+            return
+        faster = [] if steps <= DRAFT_STEPS else [f"--quality draft ({duration(DRAFT_STEPS * found.step_s)})"]
+        faster += ["--method sundae-tiny"] if self.method != "sundae-tiny" else []
+        print(f"# warning: {told}; faster are {', '.join([*faster, 'smaller photos and a GPU'])}", flush=True)
 
     def trained(self) -> bool:
         """Whether the last step of the schedule is saved."""
@@ -161,8 +228,8 @@ class Project:
             write_text(path, json.dumps(settings, indent=1) + "\n")
             return lock
         try:
-            before = dict(json.loads(path.read_bytes()).items())
-        except (ValueError, AttributeError) as error:
+            before = {"quality": "normal", **json.loads(path.read_bytes())}
+        except (ValueError, TypeError) as error:
             raise StorageError(f"{path} is damaged; choose another folder") from error
         for name, value in settings.items():
             if before.get(name) != value:
@@ -181,6 +248,8 @@ def run(
     keep: float | None = None,
     steps: int | None = None,
     matching: Matching = "exhaustive",
+    quality: Quality = "normal",
+    max_mb: float | None = None,
 ) -> int:
     """Turn photos into a packed scene: find camera poses, train, evaluate, pack, and write a report and a web page.
 
@@ -195,13 +264,17 @@ def run(
         steps: number of training steps; by default that of the method.
         matching: photos that COLMAP compares: all pairs, neighbours by name (for frames of a video), or similar ones
             (for thousands of photos; downloads a vocabulary).
+        quality: draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03).
+        max_mb: most megabytes of the packed scene; fewer primitives and coarser steps keep to it.
     """
     _check_input(photos)
     command(photos, out, method, keep, steps)  # refuses numbers out of range before the first step
-    project = Project(photos, out, method, keep, steps, matching)
+    project = Project(photos, out, method, keep, steps, matching, quality, max_mb)
+    project.check()
     if project.poses is not None and not project.poses.found:
         project.poses.check()
     lock = project.claim()
+    project.forecast()
     plan = project.plan()
     for number, step in enumerate(plan, start=1):
         heading = f"# step {number} of {len(plan)}, {step.name}"

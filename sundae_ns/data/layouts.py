@@ -29,6 +29,8 @@ class ColmapLayout:
     """Folder of the images, relative to the capture."""
     num_images: int
     num_models: int
+    size: tuple[int, int]
+    """Width and height of the first image, pixels."""
     downscale: int
     """Scale of the images to train on: those of ``images_4`` for 4."""
 
@@ -66,7 +68,8 @@ def colmap_layout(data: Path) -> ColmapLayout | None:
     except DataError as error:
         raise DataError(f"{data / model}: {error}") from error
     folder = _folder_of(data, model, names[0])
-    return ColmapLayout(model, folder, len(names), len(found), _downscale(data / folder, names[0]))
+    size = check_image(data / folder / names[0])
+    return ColmapLayout(model, folder, len(names), len(found), size, _downscale(data / folder, names[0], size))
 
 
 def _folder_of(data: Path, model: str, name: str) -> str:
@@ -82,9 +85,9 @@ def _folder_of(data: Path, model: str, name: str) -> str:
     )
 
 
-def _downscale(images: Path, name: str) -> int:
+def _downscale(images: Path, name: str, size: tuple[int, int]) -> int:
     """The least factor with a longest side of at most :data:`_LONGEST` for which there are smaller images; else 1."""
-    longest, factor = max(check_image(images / name)), 1
+    longest, factor = max(size), 1
     while longest / factor > _LONGEST:
         if not (images.with_name(f"{images.name}_{2 * factor}") / name).is_file():
             return factor

@@ -8,13 +8,12 @@ from typing import Any
 
 from nerfstudio.utils.writer import EVENT_STORAGE, GLOBAL_BUFFER, EventName, LocalWriter
 
+from sundae_ns.training.duration import LONG, duration
+
 METRICS_EVENT = "Train Metrics Dict"
 """Event of nerfstudio's trainer with the metrics of a training image."""
 LINE_EVERY = 10.0
 """Seconds between two lines."""
-
-LONG = 1800.0
-"""Seconds of a training on a CPU that are worth a warning."""
 
 
 class TimeLeft:
@@ -98,12 +97,3 @@ def long_on_cpu(seconds: float, left: int) -> str | None:
         "step). sundae-tiny is made for a CPU, --max-num-iterations shortens the whole schedule, and smaller images "
         "are faster: end the command with nerfstudio-data --downscale-factor 4"
     )
-
-
-def duration(seconds: float) -> str:
-    """A duration in two units at most: ``1 h 5 min``, ``2 min``, ``40 s``."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

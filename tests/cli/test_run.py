@@ -12,13 +12,17 @@ import sys
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+import tyro
 from colmap_models import write_model
 from PIL import Image
 
+from sundae_ns import method_configs
 from sundae_ns.cli import main
+from sundae_ns.cli.forecast import Forecast, trained_size
 from sundae_ns.gaussians import from_points
 from sundae_ns.storage.packing import PackedScene, fit_scene, pack_bytes
 
@@ -40,6 +44,13 @@ class Commands:
         self.saved_at = {0: 99, 130: 39}
         """Step of the checkpoint, by the exit code of the training."""
         self.silent = False
+        self.forecast: Forecast | None = None
+        self.asked: list[tuple[str, int, int]] = []
+
+    def measured(self, *asked: Any) -> Forecast | None:
+        """Stands for the process that times steps."""
+        self.asked.append(asked)
+        return self.forecast
 
     def __call__(
         self, words: list[str], *, folder: Path | None = None, locks: Sequence[int] = (), saves: bool = True
@@ -120,6 +131,7 @@ def commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Commands:
     monkeypatch.setenv("PATH", str(tmp_path / "bin"))
     made = Commands()
     monkeypatch.setattr("sundae_ns.cli.run.run_in_group", made)
+    monkeypatch.setattr("sundae_ns.cli.run.measured_step", made.measured)
     return made
 
 
@@ -333,6 +345,10 @@ def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.Captur
         (["photos", "-o", "used"], "holds files"),
         (["photos", "-o", "out", "--keep", "2"], "keep is 2.0"),
         (["photos", "-o", "out", "--steps", "0"], "steps is 0"),
+        (["photos", "-o", "out", "--max-mb", "0"], "max-mb is 0; give at least 0.01"),
+        (["photos", "-o", "out", "--max-mb", "2", "--keep", "0.1"], "--max-mb needs a method that decides"),
+        (["photos", "-o", "out", "--quality", "best", "--method", "sundae-fast"], "--quality best needs a method that"),
+        (["photos", "-o", "out", "--quality", "draft", "--steps", "9"], "a draft has 3,000 steps"),
     ],
 )
 def test_refusals_come_before_anything_is_written(
@@ -366,6 +382,65 @@ def test_other_settings_are_refused(
 ) -> None:
     assert run("photos", "-o", "out") == 0
     assert cause in refusal(capsys, "photos", "-o", "out", *more)
+
+
+def test_a_size_and_a_quality(commands: Commands) -> None:
+    assert run("photos", "-o", "out", "--max-mb", "2", "--quality", "best") == 0
+    usual = method_configs.sundae.config
+    words = commands.ran[1]
+    config = tyro.cli(type(usual), default=usual, args=words[2:])
+    assert config.pipeline.model.pruning.max_bytes == 2_000_000
+    assert config.pipeline.model.pruning.max_drop == 0.03
+    config.pipeline.model.pruning.validate()
+    assert commands.option("--target-bytes", 3) == "2000000"
+    commands.ran.clear()
+    assert run("photos", "-o", "draft", "--quality", "draft") == 0
+    assert commands.option("--max-num-iterations", 1) == "3000"
+    assert "--target-bytes" not in commands.ran[3]
+
+
+def test_a_folder_of_an_earlier_version_has_the_normal_quality(
+    commands: Commands, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("photos", "-o", "out") == 0
+    settings = json.loads(Path("out/run.json").read_text())
+    for name in ("quality", "max_mb"):
+        del settings[name]
+    Path("out/run.json").write_text(json.dumps(settings))
+    assert run("photos", "-o", "out") == 0
+    assert "quality normal, not draft" in refusal(capsys, "photos", "-o", "out", "--quality", "draft")
+
+
+def test_a_training_of_hours_on_a_cpu_is_foretold_before_it_starts(
+    commands: Commands, capsys: pytest.CaptureFixture[str]
+) -> None:
+    commands.forecast = Forecast(2.0, 30000, "cpu")
+    commands.codes["ns-train"] = 130
+    assert run("photos", "-o", "out") == 130
+    said, rest = capsys.readouterr().out.split("\n", 1)
+    assert said.startswith(
+        "# warning: 30,000 training steps take at least 16 h 40 min on this CPU, 2000 ms each at 16 x 12"
+    )
+    assert "--quality draft (1 h 40 min), --method sundae-tiny" in said
+    assert "# step 1 of 7" in rest
+    assert run("photos", "-o", "out") == 130
+    assert len(commands.asked) == 1, "a resumed training has a forecast of its own"
+    commands.forecast = Forecast(0.004, 30000, "cuda")
+    commands.codes.clear()
+    assert run("photos", "-o", "other") == 0
+    assert "# forecast: 30,000 training steps take about 2 min 0 s on this GPU" in capsys.readouterr().out
+
+
+def test_the_size_of_training_images(tmp_path: Path) -> None:
+    assert trained_size(tmp_path) is None
+    for index in range(3):
+        Image.new("RGB", (4000, 30), "grey").save(tmp_path / f"{index}.png")
+    assert trained_size(tmp_path) == (1000, 7)
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [{"file_path": "1.png"}]}))
+    assert trained_size(tmp_path) == (1000, 7)
+    (tmp_path / "transforms.json").unlink()
+    write_model(tmp_path / "sparse" / "0", ["0.png"], (4000, 30))
+    assert trained_size(tmp_path) == (4000, 30), "there are no smaller images"
 
 
 def test_damaged_settings(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,8 @@ from nerfstudio.utils import writer
 
 from sundae_ns.cli.process import percent_of
 from sundae_ns.training import progress
-from sundae_ns.training.progress import METRICS_EVENT, ProgressWriter, TimeLeft, duration, long_on_cpu
+from sundae_ns.training.duration import duration
+from sundae_ns.training.progress import METRICS_EVENT, ProgressWriter, TimeLeft, long_on_cpu
 
 
 def test_a_line_says_what_is_done_and_left(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
