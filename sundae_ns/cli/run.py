@@ -69,6 +69,7 @@ class Project:
     matching: Matching
     quality: Quality = "normal"
     max_mb: float | None = None
+    masks: Path | None = None
 
     @property
     def capture(self) -> Path:
@@ -95,7 +96,7 @@ class Project:
     @property
     def poses(self) -> Poses | None:
         """Makes the capture; None if it is given."""
-        return None if self.capture == self.photos else Poses(self.photos, self.capture, self.matching)
+        return None if self.capture == self.photos else Poses(self.photos, self.capture, self.matching, self.masks)
 
     def plan(self) -> list[Step]:
         """The steps in their order; a capture needs no poses."""
@@ -161,6 +162,13 @@ class Project:
         """Raise ``ConfigError`` for options that contradict each other."""
         if self.max_mb is not None and not 0.01 <= self.max_mb <= 1e6:
             raise ConfigError(f"max-mb is {self.max_mb:g}; give at least 0.01")
+        if self.masks is not None and not self.masks.is_dir():
+            raise DataError(f"{self.masks} is no folder of masks; give one with an image for each photo")
+        if self.masks is not None and self.posed:
+            raise ConfigError(
+                f"{self.photos} has poses already; give each frame of transforms.json its mask_path, or a COLMAP model "
+                "its masks with `sundae train CAPTURE -- colmap --masks-path`"
+            )
         if self.quality == "draft" and self.steps is not None:
             raise ConfigError(f"a draft has {DRAFT_STEPS:,} steps; leave out --steps or --quality")
         for name, given in (("--max-mb", self.max_mb is not None), ("--quality best", self.quality == "best")):
@@ -214,6 +222,7 @@ class Project:
         from sundae_ns.storage.runs.folder import LOCK, reserve
 
         settings = {**asdict(self), "photos": str(self.photos.resolve())}
+        settings["masks"] = None if self.masks is None else str(self.masks.resolve())
         del settings["out"]
         path = self.out / SETTINGS
         if self.out.resolve().is_relative_to(self.photos.resolve()):
@@ -250,6 +259,7 @@ def run(
     matching: Matching = "exhaustive",
     quality: Quality = "normal",
     max_mb: float | None = None,
+    masks: Path | None = None,
 ) -> int:
     """Turn photos into a packed scene: find camera poses, train, evaluate, pack, and write a report and a web page.
 
@@ -266,10 +276,11 @@ def run(
             (for thousands of photos; downloads a vocabulary).
         quality: draft trains 3,000 steps; best loses less to a smaller size (pruning.max-drop 0.03).
         max_mb: most megabytes of the packed scene; fewer primitives and coarser steps keep to it.
+        masks: folder with a mask for each photo, under its name; training leaves out what is black.
     """
     _check_input(photos)
     command(photos, out, method, keep, steps)  # refuses numbers out of range before the first step
-    project = Project(photos, out, method, keep, steps, matching, quality, max_mb)
+    project = Project(photos, out, method, keep, steps, matching, quality, max_mb, masks)
     project.check()
     if project.poses is not None and not project.poses.found:
         project.poses.check()

@@ -76,12 +76,13 @@ def _check_one_scene(folder: Path, photos: Sequence[Path]) -> None:
     )
 
 
-def left_out(folder: Path, photos: Sequence[Path]) -> list[str]:
+def left_out(folder: Path, photos: Sequence[Path], *, masked: bool = False) -> list[str]:
     """Remarks on photos that no scene is made of, one each: of other formats, of an odd size, and masks.
 
     Args:
         folder: of the photos.
         photos: from :func:`find_photos`.
+        masked: whether masks are given.
     """
     remarks = []
     if others := _other_formats(folder):
@@ -101,10 +102,10 @@ def left_out(folder: Path, photos: Sequence[Path]) -> list[str]:
         )
     for place, folders, _ in os.walk(folder):
         for name in sorted(folders):
-            if name.lower() in MASKS:
+            if name.lower() in MASKS and not masked:
                 remarks.append(
                     f"{Path(place, name)} is left out, as masks are not used for camera poses; to leave out what they "
-                    "hide in training, give each frame of transforms.json its mask_path"
+                    "hide in training, give --masks, or each frame of transforms.json its mask_path"
                 )
     return remarks
 

@@ -44,6 +44,8 @@ class Commands:
         self.saved_at = {0: 99, 130: 39}
         """Step of the checkpoint, by the exit code of the training."""
         self.silent = False
+        self.framed = False
+        """Whether images and frames have the names that the program gives, and there are smaller images."""
         self.forecast: Forecast | None = None
         self.asked: list[tuple[str, int, int]] = []
 
@@ -98,7 +100,14 @@ class Commands:
                     model = capture / "colmap" / "sparse" / str(index)
                     model.mkdir(parents=True)
                     (model / "images.bin").write_bytes(struct.pack("<Q", images) + bytes(100 * images))
-            (capture / "transforms.json").write_text(json.dumps({"frames": [{}] * placed}))
+            frames: list[dict[str, str]] = [{}] * placed
+            if self.framed:
+                frames = [{"file_path": f"images/frame_{number:05d}.jpg"} for number in range(1, placed + 1)]
+                (capture / "images_2").mkdir()
+                for path in sorted((capture / "images").glob("0*")):
+                    path.rename(path.with_name(f"frame_{path.name}"))
+                    Image.new("RGB", (8, 6)).save(capture / "images_2" / f"frame_{path.name}")
+            (capture / "transforms.json").write_text(json.dumps({"frames": frames}))
         elif name == "sundae eval":
             Path(self.option("-o")).write_text('{"results": {"psnr": 20.0}}')
         elif name == "sundae pack":
@@ -349,6 +358,8 @@ def test_a_command_that_writes_nothing(commands: Commands, capsys: pytest.Captur
         (["photos", "-o", "out", "--max-mb", "2", "--keep", "0.1"], "--max-mb needs a method that decides"),
         (["photos", "-o", "out", "--quality", "best", "--method", "sundae-fast"], "--quality best needs a method that"),
         (["photos", "-o", "out", "--quality", "draft", "--steps", "9"], "a draft has 3,000 steps"),
+        (["photos", "-o", "out", "--masks", "gone"], "gone is no folder of masks"),
+        (["photos", "-o", "out", "--masks", "empty"], "photos/0.JPG has no mask 0.png in empty"),
     ],
 )
 def test_refusals_come_before_anything_is_written(
@@ -441,6 +452,26 @@ def test_the_size_of_training_images(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").unlink()
     write_model(tmp_path / "sparse" / "0", ["0.png"], (4000, 30))
     assert trained_size(tmp_path) == (4000, 30), "there are no smaller images"
+
+
+def test_masks_reach_the_capture(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("photos/masks").mkdir()
+    for index in range(PHOTOS):
+        mask = Image.new("L", (16, 12), 255)
+        mask.putpixel((index, 0), 0)
+        mask.save(f"photos/masks/{index}.png")
+    commands.framed = True
+    assert run("photos", "-o", "out", "--masks", "photos/masks") == 0
+    said = capsys.readouterr().out
+    assert f"# masks: {PHOTOS} of {PHOTOS}\n" in said
+    assert "is left out" not in said
+    frames = json.loads(Path("out/capture/transforms.json").read_text())["frames"]
+    assert frames[2]["mask_path"] == "masks/frame_00003.png"
+    with Image.open("out/capture/masks/frame_00003.png") as stored:
+        assert (stored.getpixel((2, 0)), stored.getpixel((3, 0))) == (0, 255)
+    with Image.open("out/capture/masks_2/frame_00003.png") as stored:
+        assert (stored.size, stored.mode) == ((8, 6), "L")
+    assert "not left out; repeat the first command" in refusal(capsys, "photos", "-o", "out")
 
 
 def test_damaged_settings(commands: Commands, capsys: pytest.CaptureFixture[str]) -> None:
